@@ -1,0 +1,257 @@
+"""A Franka Emika Panda from primitive shapes, and its Cartesian position control.
+
+Kinematics and joint limits are the manufacturer's (Franka Control Interface documentation), link inertias those identified
+by Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot with Retrieval of Feasible Parameters" (RA-L 2019).
+Shapes are boxes and capsules: at 84 pixels meshes add nothing and cost tens of milliseconds a frame.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+N_JOINTS = 7
+PHYSICS_TIMESTEP = 0.002  # s
+
+# Distance from the hand's frame to the point between the fingertips (Franka's own tool centre point), and to the tips' ends.
+_TCP_OFFSET = 0.1034  # m
+_FINGERTIP_END = 0.112  # m
+TIP_BELOW_TCP = _FINGERTIP_END - _TCP_OFFSET  # m: the fingers reach this much below the controlled point
+FINGER_THICKNESS = 0.01  # m, along the opening
+FINGER_WIDTH = 0.02  # m
+FINGER_FRICTION = 0.3  # bare steel: the rough cube tips over a pushing finger instead of jamming against it
+
+HOME_JOINTS = np.array([0.0, -0.25, 0.0, -2.55, 0.0, 2.30, np.pi / 4])  # rad, elbow up, hand pointing down
+_SERVO_STIFFNESS = (20000, 20000, 20000, 20000, 8000, 8000, 8000)  # Nm/rad
+_SERVO_DAMPING = (400, 400, 400, 400, 100, 100, 100)  # Nms/rad
+# What a servo may add to gravity compensation before the arm gives way: the collision thresholds of the real arm, not its
+# strength, so that a finger that comes down on the cube stays there and does not force its way past.
+_TORQUE_LIMITS = (20, 20, 18, 18, 10, 8, 8)  # Nm
+_FINGER_STIFFNESS = 40000  # N/m: a spindle drive does not give way
+_FINGER_DAMPING = 400  # Ns/m
+_FINGER_SPEED = 0.05  # m/s per finger, the real hand's maximum
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """What is ours to tune about the arm.
+
+    base: position of the robot's base in the world [m].
+    max_opening: distance between the fingers' inner faces when open [m]; the real hand opens 0.08.
+    grip_force: largest force of a finger [N].
+    gripper_cooldown: seconds for which a change of the gripper command blocks the next one (the paper's appendix: 2 s).
+    workspace: lower and upper corner of the box that the commanded tool centre point stays in, world frame [m].
+    max_lead: how far the commanded point may run ahead of the measured one [m]; bounds the force on an obstacle.
+    """
+
+    base: tuple[float, float, float] = (-0.5, 0.0, 0.80)
+    max_opening: float = 0.055
+    grip_force: float = 40.0
+    gripper_cooldown: float = 2.0
+    workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
+        (-0.25, -0.38, 0.812),
+        (0.155, 0.40, 1.15),
+    )
+    max_lead: float = 0.06
+
+
+# name, position, quaternion (w x y z), joint range, mass, centre of mass, full inertia, capsule (from, to, radius) or None
+_R = 2**-0.5
+_LINKS = (
+    (
+        ("link1", (0, 0, 0.333), (1, 0, 0, 0), (-2.8973, 2.8973), 4.970684, (0.003875, 0.002081, -0.04762)),
+        (0.70337, 0.70661, 0.0091170, -0.00013900, 0.0067720, 0.019169),
+        ((0, 0, -0.20), (0, 0, -0.02), 0.06),
+    ),
+    (
+        ("link2", (0, 0, 0), (_R, -_R, 0, 0), (-1.7628, 1.7628), 0.646926, (-0.003141, -0.02872, 0.003495)),
+        (0.0079620, 0.028110, 0.025995, -0.003925, 0.010254, 0.000704),
+        ((0, 0, -0.06), (0, 0, 0.06), 0.06),
+    ),
+    (
+        ("link3", (0, -0.316, 0), (_R, _R, 0, 0), (-2.8973, 2.8973), 3.228604, (0.027518, 0.039252, -0.066502)),
+        (0.037242, 0.036155, 0.010830, -0.004761, -0.011396, -0.012805),
+        ((0, 0, -0.25), (0, 0, -0.05), 0.055),
+    ),
+    (
+        ("link4", (0.0825, 0, 0), (_R, _R, 0, 0), (-3.0718, -0.0698), 3.587895, (-0.05317, 0.104419, 0.027454)),
+        (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641),
+        ((0, 0, -0.05), (0, 0, 0.05), 0.055),
+    ),
+    (
+        (
+            "link5",
+            (-0.0825, 0.384, 0),
+            (_R, -_R, 0, 0),
+            (-2.8973, 2.8973),
+            1.225946,
+            (-0.011953, 0.041065, -0.038437),
+        ),
+        (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229),
+        ((0, 0.02, -0.28), (0, 0.03, -0.06), 0.05),
+    ),
+    (
+        ("link6", (0, 0, 0), (_R, _R, 0, 0), (-0.0175, 3.7525), 1.666555, (0.060149, -0.014117, -0.010517)),
+        (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341),
+        ((0, 0, -0.03), (0.06, 0, 0.0), 0.05),
+    ),
+    (
+        ("link7", (0.088, 0, 0), (_R, _R, 0, 0), (-2.8973, 2.8973), 0.735522, (0.010517, -0.004252, 0.061597)),
+        (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741),
+        ((0, 0, 0.0), (0, 0, 0.08), 0.045),
+    ),
+)
+
+
+def _vector(values) -> str:
+    return " ".join(f"{value:.8g}" for value in values)
+
+
+def _hand_xml(max_opening: float) -> str:
+    tip_half, finger_z = 0.0536 / 2, 0.0584
+    fingers = ""
+    for side, sign in (("left", 1), ("right", -1)):
+        fingers += f"""
+        <body name="{side}_finger" gravcomp="1" pos="0 0 {finger_z}">
+          <joint name="{side}_finger" type="slide" axis="0 {sign} 0" range="0 {max_opening / 2}" armature="0.1" damping="5"/>
+          <inertial pos="0 {sign * FINGER_THICKNESS / 2} {tip_half}" mass="0.015" diaginertia="2.4e-6 2.4e-6 7.5e-7"/>
+          <geom name="{side}_finger" class="robot" type="box" size="{FINGER_WIDTH / 2} {FINGER_THICKNESS / 2} {tip_half}"
+                pos="0 {sign * FINGER_THICKNESS / 2} {tip_half}" rgba="0.25 0.25 0.27 1" priority="1" condim="4"
+                friction="{FINGER_FRICTION} 0.005 0.0001"/>
+        </body>"""
+    return f"""
+      <body name="hand" gravcomp="1" pos="0 0 0.107" quat="0.9238795 0 0 -0.3826834">
+        <inertial pos="-0.01 0 0.03" mass="0.73" diaginertia="0.001 0.0025 0.0017"/>
+        <geom name="hand" class="robot" type="box" size="0.03 0.1 0.032" pos="0 0 0.034" rgba="0.92 0.92 0.92 1"/>
+        <site name="tcp" pos="0 0 {_TCP_OFFSET}"/>{fingers}
+      </body>"""
+
+
+def arm_body_xml(config: ArmConfig) -> str:
+    """MJCF of the arm's body tree: base, seven links, hand, two fingers. Its nine joints come first in the model."""
+    body = ""
+    for (name, pos, quat, limits, mass, com), inertia, (start, end, radius) in _LINKS:
+        body += f"""
+      <body name="{name}" pos="{_vector(pos)}" quat="{_vector(quat)}" gravcomp="1">
+        <inertial pos="{_vector(com)}" mass="{mass}" fullinertia="{_vector(inertia)}"/>
+        <joint name="{name}" range="{_vector(limits)}" armature="0.1" damping="1"/>
+        <geom name="{name}" class="robot" type="capsule" fromto="{_vector((*start, *end))}" size="{radius}"/>"""
+    return f"""
+    <body name="base" pos="{_vector(config.base)}">
+      <geom name="base" class="robot" type="box" size="0.08 0.08 0.07" pos="-0.03 0 0.07"/>{body}{_hand_xml(config.max_opening)}
+      {"</body>" * N_JOINTS}
+    </body>"""
+
+
+def arm_actuator_xml(config: ArmConfig) -> str:
+    """MJCF of the joint servos (seven positions) and of the fingers' drive (one position, both fingers coupled)."""
+    servos = "".join(
+        f'<position name="{link[0][0]}" joint="{link[0][0]}" kp="{kp}" kv="{kv}" forcerange="{-limit} {limit}"/>'
+        for link, kp, kv, limit in zip(
+            _LINKS, _SERVO_STIFFNESS, _SERVO_DAMPING, _TORQUE_LIMITS, strict=True
+        )
+    )
+    return f"""
+  <equality><joint joint1="left_finger" joint2="right_finger" solref="0.004 1"/></equality>
+  <actuator>{servos}
+    <position name="fingers" joint="left_finger" kp="{_FINGER_STIFFNESS}" kv="{_FINGER_DAMPING}"
+              forcerange="{-config.grip_force} {config.grip_force}"/>
+  </actuator>"""
+
+
+ARM_DEFAULT_XML = """<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>"""
+
+
+class CartesianController:
+    """Turns the 4-number action into servo targets: a damped-least-squares inverse kinematics with fixed orientation.
+
+    It keeps the commanded pose, not the measured one, as its own state, so that a blocked or sagging arm does not drift. The
+    kinematics run on a copy of the arm alone.
+    """
+
+    def __init__(self, config: ArmConfig, control_hz: int):
+        self.config = config
+        self.n_substeps = round(1 / (control_hz * PHYSICS_TIMESTEP))
+        self._cooldown_steps = round(config.gripper_cooldown * control_hz)
+        self._finger_step = _FINGER_SPEED * PHYSICS_TIMESTEP
+        xml = f"""<mujoco><compiler angle="radian"/><default>{ARM_DEFAULT_XML}</default><worldbody>{arm_body_xml(config)}</worldbody></mujoco>"""
+        self._model = mujoco.MjModel.from_xml_string(xml)
+        self._data = mujoco.MjData(self._model)
+        self._site = self._model.site("tcp").id
+        self._jacobian = np.zeros((6, self._model.nv))
+        self._lower = self._model.jnt_range[:N_JOINTS, 0] + 0.02
+        self._upper = self._model.jnt_range[:N_JOINTS, 1] - 0.02
+        self._orientation = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # hand pointing down, fingers open along y
+        self._workspace = np.array(config.workspace)
+        self.joints = HOME_JOINTS.copy()
+        self.target = np.zeros(3)
+        self.finger_target = config.max_opening / 2
+        self._closed = False
+        self._steps_since_change = self._cooldown_steps
+
+    def reset(self, position: np.ndarray) -> np.ndarray:
+        """Places the commanded point at `position` (3,) [m, world], fingers open. Returns the nine joint positions."""
+        self.joints = HOME_JOINTS.copy()
+        self.target = np.asarray(position, dtype=float).copy()
+        self._solve(iterations=100)
+        self.finger_target = self.config.max_opening / 2
+        self._closed = False
+        self._steps_since_change = self._cooldown_steps
+        return np.concatenate([self.joints, [self.finger_target] * 2])
+
+    def command(self, action: np.ndarray, measured: np.ndarray, scale: float) -> np.ndarray:
+        """One control step.
+
+        Args:
+            action: (4,) in [-1, 1]: displacement in units of `scale`, gripper (> 0 closes).
+            measured: (3,) the tool centre point as it is [m, world].
+            scale: metres per unit of action.
+
+        Returns:
+            (n_substeps, 8) servo targets at physics rate: seven joints [rad], finger position [m].
+        """
+        target = self.target + scale * np.asarray(action[:3], dtype=float)
+        lead = target - measured
+        distance = float(np.linalg.norm(lead))
+        if distance > self.config.max_lead:
+            target = measured + lead * (self.config.max_lead / distance)
+        self.target = np.clip(target, self._workspace[0], self._workspace[1])
+        before = self.joints.copy()
+        self._solve(iterations=2)
+        self._update_gripper(action[3] > 0)
+
+        ramp = np.arange(1, self.n_substeps + 1)[:, None] / self.n_substeps
+        controls = np.empty((self.n_substeps, N_JOINTS + 1))
+        controls[:, :N_JOINTS] = before + ramp * (self.joints - before)
+        goal = 0.0 if self._closed else self.config.max_opening / 2
+        travel = self._finger_step * np.arange(1, self.n_substeps + 1)
+        sign = np.sign(goal - self.finger_target)
+        fingers = self.finger_target + sign * np.minimum(travel, abs(goal - self.finger_target))
+        controls[:, N_JOINTS] = fingers
+        self.finger_target = float(fingers[-1])
+        return controls
+
+    def _update_gripper(self, close: bool) -> None:
+        self._steps_since_change += 1
+        if close != self._closed and self._steps_since_change > self._cooldown_steps:
+            self._closed = close
+            self._steps_since_change = 0
+
+    def _solve(self, iterations: int) -> None:
+        model, data = self._model, self._data
+        for _ in range(iterations):
+            data.qpos[:N_JOINTS] = self.joints
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_jacSite(model, data, self._jacobian[:3], self._jacobian[3:], self._site)
+            jacobian = self._jacobian[:, :N_JOINTS]
+            rotation = data.site_xmat[self._site].reshape(3, 3)
+            error = np.empty(6)
+            error[:3] = self.target - data.site_xpos[self._site]
+            error[3:] = 0.5 * np.cross(rotation.T, self._orientation.T).sum(axis=0)
+            gram = jacobian @ jacobian.T
+            gram[np.diag_indices(6)] += 1e-5
+            # The seventh degree of freedom is drawn home, in the null space of the task.
+            posture = 0.05 * (HOME_JOINTS - self.joints)
+            step = posture + jacobian.T @ np.linalg.solve(gram, error - jacobian @ posture)
+            self.joints = np.clip(self.joints + step, self._lower, self._upper)

@@ -1,0 +1,336 @@
+"""What all tasks share: the arm on its table, one control step, observations, sound, rendering."""
+
+import time
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium import spaces
+from mujoco import rollout
+
+from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, contact_pairs, contact_sensor_xml, cube_xml, table_xml
+from gym_playbyear.arm import (
+    ARM_DEFAULT_XML,
+    N_JOINTS,
+    PHYSICS_TIMESTEP,
+    ArmConfig,
+    CartesianController,
+    arm_actuator_xml,
+    arm_body_xml,
+)
+from gym_playbyear.rendering import SceneRenderer, Window
+from gym_playbyear.sound import ContactPair, ContactSound
+
+ACTION_SCALE = 0.05  # m of displacement per unit of action and step (the authors' code)
+CONTROL_HZ = 20
+SOUND_MODES = ("waveform", "contact_force", "none")
+_SETTLE_STEPS = 10
+_CARRIED_HEIGHT = TABLE_TOP + CUBE_HALF_SIZE + 0.015  # m: the cube's centre is this high only when it was picked up
+_LIFTED_SILENCE_HEIGHT = 0.84  # m: above it the paper's force proxy is silent (the authors' code)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviation and quantum of what the arm measures of itself, as on a real one. Zero switches noise off.
+
+    position: end effector [m]; finger: finger positions [m]; finger_velocity: [m/s]; quantum_*: rounding step.
+    """
+
+    position: float = 0.0003
+    finger: float = 0.0002
+    finger_velocity: float = 0.002
+    quantum_position: float = 0.0001
+    quantum_velocity: float = 0.001
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The numbers of a task that decide whether it can be solved without hearing.
+
+    cube_y, cube_x: ranges of the hidden cube's position [m]; cube_yaw: largest yaw, either way [rad];
+    cube_density [kg/m3]; cube_friction: sliding friction; max_shove: how far the cube may be shoved along the table before
+    the attempt has failed [m]; horizon: steps of an episode; arm, sensors: their numbers.
+    """
+
+    cube_x: tuple[float, float]
+    cube_y: tuple[float, float]
+    cube_yaw: float
+    cube_density: float
+    cube_friction: float
+    horizon: int
+    max_shove: float = np.inf
+    arm: ArmConfig = field(default_factory=ArmConfig)
+    sensors: SensorNoise = field(default_factory=SensorNoise)
+
+
+class PlayByEarEnv(gym.Env):
+    """Base of the tasks. A task gives its fixed bodies, places what moves, and says when it is solved.
+
+    Subclasses define `VARIANTS`, `task`, `task_description`, `_scene_xml`, `_scene_bodies`, `_place` and `_is_success`.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": CONTROL_HZ}
+    VARIANTS: ClassVar[dict[str, Any]]
+    task: str
+    task_description: str
+    _scene_bodies: tuple[str, ...]
+    _start_position: tuple[float, float, float] = (-0.12, 0.0, 0.98)  # m, before each episode's own offset
+    _start_spread = 0.02  # m
+
+    def __init__(
+        self,
+        *,
+        image_size: int = 84,
+        sample_rate: int = 16000,
+        sound: str = "waveform",
+        noise_level: float = 1.0,
+        microphones: tuple[str, ...] = ("gripper",),
+        horizon: int | None = None,
+        variant: str = "default",
+        render_mode: str | None = None,
+        render_size: int = 480,
+    ):
+        _check_option("sound", sound, SOUND_MODES)
+        _check_option("variant", variant, tuple(self.VARIANTS))
+        _check_option("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        if image_size < 8:
+            raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
+        self.variant = self.VARIANTS[variant]
+        self.control_hz = CONTROL_HZ
+        self._max_episode_steps = int(horizon or self.variant.horizon)
+        self.render_mode, self._render_size = render_mode, render_size
+        self._image_size, self._sound_mode = image_size, sound
+        self._sample_rate = sample_rate
+
+        self.pairs = contact_pairs(self._scene_bodies)
+        self.model = mujoco.MjModel.from_xml_string(self._model_xml())
+        self.data = mujoco.MjData(self.model)
+        self._controller = CartesianController(self.variant.arm, CONTROL_HZ)
+        self._sound: ContactSound | None = None
+        if sound == "waveform":
+            pairs = [ContactPair(name=f"{a}-{b}", materials=(a, b), bodies=(a, b)) for a, b in self.pairs]
+            self._sound = ContactSound(
+                pairs, tuple(microphones), sample_rate, CONTROL_HZ, PHYSICS_TIMESTEP, noise_level
+            )
+        self._tcp = self.model.site("tcp").id
+        self._cube = self.model.body("cube").id
+        self._base = np.array(self.variant.arm.base)
+        self._state_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        self._rollout_state = np.empty((1, self._controller.n_substeps, self._state_size))
+        self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
+        self._state = np.empty(self._state_size)
+        self._camera: SceneRenderer | None = None
+        self._people_camera: SceneRenderer | None = None
+        self._window: Window | None = None
+        self._n_steps = 0
+
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        observation: dict[str, spaces.Space] = {
+            "pixels": spaces.Dict({"front": spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)}),
+            "agent_pos": spaces.Box(-np.inf, np.inf, (7,), np.float32),
+        }
+        if self._sound is not None:
+            for microphone in microphones:
+                shape = (sample_rate // CONTROL_HZ,)
+                observation[f"audio.{microphone}"] = spaces.Box(-32768, 32767, shape, np.int16)
+        if sound == "contact_force":
+            observation["contact_force"] = spaces.Box(-np.inf, np.inf, (6,), np.float32)
+        self.observation_space = spaces.Dict(observation)
+
+    # What a task defines
+
+    def _scene_xml(self) -> str:
+        raise NotImplementedError
+
+    def _place(self, options: dict[str, Any]) -> None:
+        raise NotImplementedError
+
+    def _is_success(self) -> bool:
+        raise NotImplementedError
+
+    def scripted_expert(self):
+        """An expert for the current episode, with privileged knowledge: `act()` gives an action (4,). Make it after `reset`."""
+        raise NotImplementedError
+
+    def blind_baselines(self) -> dict[str, Any]:
+        """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""
+        raise NotImplementedError
+
+    # Gymnasium's interface
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        super().reset(seed=seed)
+        options = dict(options or {})
+        mujoco.mj_resetData(self.model, self.data)
+        spread = self.np_random.uniform(-self._start_spread, self._start_spread, 3)
+        self.data.qpos[: N_JOINTS + 2] = self._controller.reset(np.array(self._start_position) + spread)
+        self.data.ctrl[:N_JOINTS] = self._controller.joints
+        self.data.ctrl[N_JOINTS] = self._controller.finger_target
+        self._place(options)
+        self.expert_rng = np.random.default_rng(self.np_random.integers(2**63))
+        if self._sound is not None:
+            self._sound.reset(np.random.default_rng(self.np_random.integers(2**63)))
+        self._n_steps = 0
+        mujoco.mj_forward(self.model, self.data)
+        hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)
+        for _ in range(_SETTLE_STEPS):
+            sensors = self._advance(hold)
+        self._first_cube_position, self._was_carried = self.cube_position, False
+        return self._observe(np.zeros_like(sensors)), {"is_success": False}
+
+    def step(self, action):
+        action = np.asarray(action, dtype=float)
+        if action.shape != (4,) or not np.isfinite(action).all():
+            raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
+        controls = self._controller.command(np.clip(action, -1, 1), self.eef_position, ACTION_SCALE)
+        sensors = self._advance(controls)
+        self._n_steps += 1
+        success = self._is_success()
+        failed = not success and self._was_shoved()
+        truncated = not (success or failed) and self._n_steps >= self._max_episode_steps
+        observation = self._observe(sensors)
+        if self.render_mode == "human":
+            self.render()
+        return observation, float(success), success or failed, truncated, {"is_success": success}
+
+    def render(self):
+        if self.render_mode == "human":
+            if self._window is None:
+                self._window = Window(self.model, self.data)
+            self._window.update()
+            time.sleep(1 / CONTROL_HZ)
+            return None
+        if self.render_mode != "rgb_array":
+            return None
+        if self._people_camera is None:
+            self._people_camera = SceneRenderer(self.model, self._render_size, self._render_size)
+        return self._people_camera.render(self.data, "people")
+
+    def close(self):
+        for resource in (self._camera, self._people_camera, self._window):
+            if resource is not None:
+                resource.close()
+        self._camera = self._people_camera = self._window = None
+
+    # Privileged state, for experts, tests and probes
+
+    @property
+    def eef_position(self) -> np.ndarray:
+        """(3,) the point between the fingertips [m, world frame], without sensor noise."""
+        return self.data.site_xpos[self._tcp].copy()
+
+    @property
+    def cube_position(self) -> np.ndarray:
+        """(3,) the cube's centre [m, world frame]."""
+        return self.data.xpos[self._cube].copy()
+
+    @property
+    def finger_positions(self) -> np.ndarray:
+        """(2,) [m], without sensor noise."""
+        return self.data.qpos[N_JOINTS : N_JOINTS + 2].copy()
+
+    @property
+    def contact_forces(self) -> dict[str, float]:
+        """Largest net force of each pair of bodies in the last control step [N], e.g. `gripper-cube`."""
+        return {f"{a}-{b}": float(force) for (a, b), force in zip(self.pairs, self._peak_forces, strict=True)}
+
+    def cube_pixels(self) -> int:
+        """How many pixels of the policy's camera show the cube (segmentation rendering)."""
+        geom = self.model.geom("cube").id
+        return int((self._front_camera().segmentation(self.data, "front") == geom).sum())
+
+    # One control step
+
+    def _advance(self, controls: np.ndarray) -> np.ndarray:
+        """Runs the physics of one control step in one call. Returns the contact sensors (n_substeps, n_sensors)."""
+        mujoco.mj_getState(self.model, self.data, self._state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        rollout.rollout(
+            self.model,
+            self.data,
+            self._state[None],
+            controls[None],
+            initial_warmstart=self.data.qacc_warmstart[None].copy(),
+            state=self._rollout_state,
+            sensordata=self._rollout_sensors,
+            skip_checks=False,
+        )
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)
+        sensors = self._rollout_sensors[0]
+        self._peak_forces = self._pair_forces(sensors).max(axis=0)
+        return sensors
+
+    def _was_shoved(self) -> bool:
+        self._was_carried |= bool(self.cube_position[2] > _CARRIED_HEIGHT)
+        distance = np.linalg.norm((self.cube_position - self._first_cube_position)[:2])
+        return not self._was_carried and bool(distance > self.variant.max_shove)
+
+    def _pair_forces(self, sensors: np.ndarray) -> np.ndarray:
+        vectors = sensors[:, : 3 * len(self.pairs)].reshape(len(sensors), len(self.pairs), 3)
+        return np.sqrt(np.einsum("tpc,tpc->tp", vectors, vectors))
+
+    def _observe(self, sensors: np.ndarray) -> dict[str, Any]:
+        observation: dict[str, Any] = {
+            "pixels": {"front": self._front_camera().render(self.data, "front")},
+            "agent_pos": self._proprioception(),
+        }
+        if self._sound is not None:
+            first_qvel = 1 + self.model.nq
+            speed = np.abs(self._rollout_state[0, :, first_qvel : first_qvel + N_JOINTS]).mean(axis=1)
+            for microphone, block in self._sound.step(self._pair_forces(sensors), speed).items():
+                observation[f"audio.{microphone}"] = block
+        if self._sound_mode == "contact_force":
+            silent = self.cube_position[2] > _LIFTED_SILENCE_HEIGHT
+            force = np.zeros(6) if silent else sensors[:, -6:].mean(axis=0)
+            observation["contact_force"] = force.astype(np.float32)
+        return observation
+
+    def _proprioception(self) -> np.ndarray:
+        noise = self.variant.sensors
+        fingers = slice(N_JOINTS, N_JOINTS + 2)
+        values = np.concatenate([self.eef_position - self._base, self.data.qpos[fingers], self.data.qvel[fingers]])
+        scale = np.repeat([noise.position, noise.finger, noise.finger_velocity], (3, 2, 2))
+        values += scale * self.np_random.standard_normal(7)
+        quantum = np.repeat([noise.quantum_position, noise.quantum_velocity], (5, 2))
+        coarse = quantum > 0
+        values[coarse] = np.round(values[coarse] / quantum[coarse]) * quantum[coarse]
+        return values.astype(np.float32)
+
+    def _front_camera(self) -> SceneRenderer:
+        if self._camera is None:
+            self._camera = SceneRenderer(self.model, self._image_size, self._image_size)
+        return self._camera
+
+    def _place_cube(self, position: np.ndarray, yaw: float) -> None:
+        address = self.model.joint("cube").qposadr[0]
+        self.data.qpos[address : address + 3] = position
+        self.data.qpos[address + 3 : address + 7] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
+
+    def _place_body(self, name: str, position: np.ndarray) -> None:
+        self.model.body(name).pos[:] = position
+
+    def _model_xml(self) -> str:
+        size = max(self._render_size, self._image_size)
+        return f"""
+<mujoco model="playbyear">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{PHYSICS_TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="10"/>
+  <visual>
+    <global offwidth="{size}" offheight="{size}"/><quality offsamples="0" numslices="10" numstacks="5"/>
+    <headlight ambient="0.45 0.45 0.45" diffuse="0.45 0.45 0.45" specular="0 0 0"/>
+    <map znear="0.02" zfar="20"/>
+  </visual>
+  <statistic extent="1.5" center="0 0 0.9"/>
+  <default>{ARM_DEFAULT_XML}</default>
+  <worldbody>{arm_body_xml(self.variant.arm)}{table_xml()}{self._scene_xml()}
+    {cube_xml(self.variant.cube_density, self.variant.cube_friction)}
+  </worldbody>
+  {arm_actuator_xml(self.variant.arm)}{contact_sensor_xml(self.pairs)}
+</mujoco>"""
+
+
+def _check_option(name: str, value, allowed: tuple) -> None:
+    if value not in allowed:
+        raise ValueError(f"{name}={value!r} is not known: choose one of {', '.join(map(repr, allowed))}.")

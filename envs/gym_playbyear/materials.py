@@ -1,0 +1,125 @@
+"""What can be heard and who listens: materials, pairs of bodies that touch, and microphones.
+
+A struck body rings in its modes: damped sines whose frequencies and decays belong to material and shape, and
+whose mix depends on where it was hit. This is modal synthesis (van den Doel, Kry and Pai, "FoleyAutomatic",
+SIGGRAPH 2001). The numbers are our own choice, made so that materials are distinct below 4 kHz, the part of the
+spectrum that the policy hears (paper, real-robot set-up: the lowest 160 bins of 25 Hz); the paper measured none.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Material:
+    """The modes in which a body rings.
+
+    Attributes:
+        name: What it is called in `MATERIALS`.
+        frequencies: Frequency of each mode [Hz].
+        decays: Decay rate of each mode's amplitude [1/s]; it falls to 1/e in `1 / decay` seconds.
+        gains: Relative amplitude of each mode. Only ratios count: an equal blow is equally loud on every material.
+    """
+
+    name: str
+    frequencies: tuple[float, ...]
+    decays: tuple[float, ...]
+    gains: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        lengths = (len(self.frequencies), len(self.decays), len(self.gains))
+        if len(set(lengths)) != 1 or not self.frequencies:
+            raise ValueError(
+                f"Material '{self.name}' has {lengths[0]} frequencies, {lengths[1]} decays and {lengths[2]} gains; "
+                "give one of each for every mode, and at least one mode."
+            )
+        if min(*self.frequencies, *self.decays) <= 0:
+            raise ValueError(f"Material '{self.name}' has a frequency or decay <= 0; both must be positive.")
+
+    def amplitudes(self) -> np.ndarray:
+        """The gains, scaled so that the square of the whole ring, integrated over time, is 1 second."""
+        gains = np.array(self.gains)
+        # A damped sine of amplitude g and decay d has energy g^2 / 4d (for d far below its frequency).
+        return gains / np.sqrt(np.sum(gains**2 / (4.0 * np.array(self.decays))))
+
+
+MATERIALS: dict[str, Material] = {
+    material.name: material
+    for material in (
+        # Steel fingers: small and stiff, so high and clear.
+        Material("gripper", (1980.0, 2870.0, 3720.0), (90.0, 110.0, 140.0), (1.0, 0.8, 0.6)),
+        # Hollow wooden block: a knock with a pitch.
+        Material("cube", (640.0, 1120.0, 1510.0, 2420.0), (90.0, 110.0, 140.0, 190.0), (1.0, 1.0, 0.7, 0.5)),
+        # Large panel: low, and it rings longest.
+        Material("wall", (115.0, 170.0, 235.0, 300.0), (45.0, 50.0, 60.0, 80.0), (0.7, 1.0, 0.8, 0.5)),
+        # Thick wood: a dull thud between panel and block.
+        Material("table", (380.0, 470.0, 800.0, 905.0), (130.0, 150.0, 180.0, 200.0), (1.0, 0.9, 0.5, 0.3)),
+        # Thin plastic tray: a light, bright rattle.
+        Material("bin", (870.0, 1320.0, 1740.0, 3300.0), (80.0, 100.0, 120.0, 170.0), (0.6, 0.8, 1.0, 0.7)),
+        # Aluminium links.
+        Material("arm", (520.0, 730.0, 1240.0, 2160.0), (60.0, 70.0, 90.0, 120.0), (1.0, 0.8, 0.6, 0.4)),
+    )
+}
+
+# Bodies that move freely. They carry sound to whatever they press against.
+LOOSE_BODIES = frozenset({"cube"})
+
+
+@dataclass(frozen=True)
+class ContactPair:
+    """Two bodies whose contact can be heard.
+
+    Attributes:
+        name: What the pair is called, for messages.
+        materials: Names in `MATERIALS` of what the two bodies are made of.
+        bodies: The two bodies, such as `("gripper", "cube")`, in the same order.
+    """
+
+    name: str
+    materials: tuple[str, str]
+    bodies: tuple[str, str]
+
+    def __post_init__(self) -> None:
+        for material in self.materials:
+            if material not in MATERIALS:
+                raise ValueError(
+                    f"Contact pair '{self.name}' names material '{material}'; known are {sorted(MATERIALS)}."
+                )
+
+
+@dataclass(frozen=True)
+class Microphone:
+    """A contact microphone.
+
+    Attributes:
+        name: What it is called in `MICROPHONES` and in observations.
+        mounted_on: The body that it is fixed to.
+        structure: Bodies whose contacts reach it through solid matter, `mounted_on` among them. A loose body
+            joins them for as long as it presses against one of them.
+        hum: Level of the arm's motors, as a factor on their level at the arm itself.
+    """
+
+    name: str
+    mounted_on: str
+    structure: frozenset[str]
+    hum: float
+
+    def structure_borne(self, pairs: tuple[ContactPair, ...]) -> list[np.ndarray | None]:
+        """For each pair None if its sound is always structure-borne here, else the pairs that make it so while
+        they press: those between the pair's loose body and this microphone's structure (indices, perhaps none)."""
+        links: list[np.ndarray | None] = []
+        for pair in pairs:
+            if self.structure & {*pair.bodies}:
+                links.append(None)
+                continue
+            loose = LOOSE_BODIES & {*pair.bodies}
+            touching = [loose & {*p.bodies} and self.structure & {*p.bodies} for p in pairs]
+            links.append(np.flatnonzero([bool(touches) for touches in touching]))
+        return links
+
+
+MICROPHONES: dict[str, Microphone] = {
+    "gripper": Microphone("gripper", "gripper", frozenset({"gripper"}), 1.0),
+    "table": Microphone("table", "table", frozenset({"table", "wall", "bin"}), 0.3),
+}

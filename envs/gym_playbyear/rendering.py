@@ -1,0 +1,62 @@
+"""Pictures of the scene: the policy's camera, a larger view for people, and a window."""
+
+import os
+
+import mujoco
+import mujoco.viewer
+import numpy as np
+
+
+class GLUnavailableError(RuntimeError):
+    """No OpenGL library could be loaded for off-screen rendering."""
+
+
+class SceneRenderer:
+    """Renders one model's cameras off screen, without shadows and reflections (they cost time and show nothing here)."""
+
+    def __init__(self, model: mujoco.MjModel, height: int, width: int):
+        try:
+            self._renderer = mujoco.Renderer(model, height=height, width=width)
+        except Exception as error:
+            raise GLUnavailableError(
+                f"No OpenGL context could be made for rendering (MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}): {error}. "
+                "Install Mesa's EGL (Debian: apt-get install libegl1 libgl1-mesa-dri) and set MUJOCO_GL=egl."
+            ) from error
+        for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+            self._renderer.scene.flags[flag] = 0
+        self._option = mujoco.MjvOption()
+        self._option.sitegroup[:] = 0
+
+    def render(self, data: mujoco.MjData, camera: str) -> np.ndarray:
+        """The camera's picture, (height, width, 3) uint8."""
+        self._renderer.update_scene(data, camera=camera, scene_option=self._option)
+        return self._renderer.render()
+
+    def segmentation(self, data: mujoco.MjData, camera: str) -> np.ndarray:
+        """Which geom each pixel shows, (height, width) int32; -1 for none."""
+        self._renderer.enable_segmentation_rendering()
+        try:
+            self._renderer.update_scene(data, camera=camera, scene_option=self._option)
+            return self._renderer.render()[..., 0]
+        finally:
+            self._renderer.disable_segmentation_rendering()
+
+    def close(self) -> None:
+        self._renderer.close()
+
+
+class Window:
+    """A live view for a person (`render_mode="human"`); needs a display."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._viewer = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+        with self._viewer.lock():
+            self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
+            self._viewer.cam.fixedcamid = model.camera("people").id
+
+    def update(self) -> None:
+        if self._viewer.is_running():
+            self._viewer.sync()
+
+    def close(self) -> None:
+        self._viewer.close()
