@@ -5,6 +5,7 @@ import numpy as np
 TABLE_TOP = 0.80  # m, world frame
 TABLE_HALF_SIZE = 0.40  # m
 CUBE_HALF_SIZE = 0.02  # m
+FINGERS = ("left_finger", "right_finger")
 _SCENE = 'contype="0" conaffinity="3"'
 
 FRONT_CAMERA_XML = '<camera name="front" pos="0.5 0 1.35" quat="0.653 0.271 0.271 0.653" fovy="45"/>'
@@ -66,14 +67,25 @@ def contact_pairs(scene_bodies: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
 
 
 def contact_sensor_xml(pairs: tuple[tuple[str, str], ...]) -> str:
-    """One net-force sensor (3 numbers, N, world frame) per pair, then the cube's net force and torque (6 numbers)."""
+    """Net-force sensors (3 numbers each, N, world frame), then the cube's net force and torque (6 numbers).
 
-    def side(body: str, number: int) -> str:
-        return f'subtree{number}="link5"' if body == "gripper" else f'body{number}="{body}"'
+    The first pair, gripper and cube, has one sensor per finger, since the forces of a squeeze cancel in their sum; every
+    other pair has one.
+    """
+    sides = {"gripper": 'subtree{}="link5"', **{finger: f'body{{}}="{finger}"' for finger in FINGERS}}
 
-    sensors = "".join(
-        f'<contact name="{a}-{b}" {side(a, 1)} {side(b, 2)} num="1" data="force" reduce="netforce"/>'
-        for a, b in pairs
-    )
+    def sensor(a: str, b: str) -> str:
+        first, second = (sides.get(body, f'body{{}}="{body}"').format(i) for i, body in ((1, a), (2, b)))
+        return f'<contact name="{a}-{b}" {first} {second} num="1" data="force" reduce="netforce"/>'
+
+    sensors = [sensor(finger, "cube") for finger in FINGERS] + [sensor(a, b) for a, b in pairs[1:]]
     cube = '<contact name="cube" body1="cube" num="1" data="force torque" reduce="netforce"/>'
-    return f"<sensor>{sensors}{cube}</sensor>"
+    return f"<sensor>{''.join(sensors)}{cube}</sensor>"
+
+
+def pair_forces(sensors: np.ndarray, n_pairs: int) -> np.ndarray:
+    """Magnitudes of the pairs' contact forces, (T, n_pairs) [N], from sensor readings (T, n_sensors)."""
+    vectors = sensors[:, : 3 * (n_pairs + 1)].reshape(len(sensors), n_pairs + 1, 3)
+    magnitudes = np.sqrt(np.einsum("tpc,tpc->tp", vectors, vectors))
+    magnitudes[:, 1] += magnitudes[:, 0]
+    return magnitudes[:, 1:]

@@ -26,7 +26,7 @@ _SERVO_STIFFNESS = (20000, 20000, 20000, 20000, 8000, 8000, 8000)  # Nm/rad
 _SERVO_DAMPING = (400, 400, 400, 400, 100, 100, 100)  # Nms/rad
 # What a servo may add to gravity compensation before the arm gives way: the collision thresholds of the real arm, not its
 # strength, so that a finger that comes down on the cube stays there and does not force its way past.
-_TORQUE_LIMITS = (20, 20, 18, 18, 10, 8, 8)  # Nm
+_TORQUE_LIMITS = (30, 40, 25, 25, 10, 10, 10)  # Nm
 _FINGER_STIFFNESS = 40000  # N/m: a spindle drive does not give way
 _FINGER_DAMPING = 400  # Ns/m
 _FINGER_SPEED = 0.05  # m/s per finger, the real hand's maximum

@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from mujoco import rollout
 
-from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, contact_pairs, contact_sensor_xml, cube_xml, table_xml
+from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, contact_pairs, contact_sensor_xml, cube_xml, pair_forces, table_xml
 from gym_playbyear.arm import (
     ARM_DEFAULT_XML,
     N_JOINTS,
@@ -259,17 +259,13 @@ class PlayByEarEnv(gym.Env):
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
         sensors = self._rollout_sensors[0]
-        self._peak_forces = self._pair_forces(sensors).max(axis=0)
+        self._peak_forces = pair_forces(sensors, len(self.pairs)).max(axis=0)
         return sensors
 
     def _was_shoved(self) -> bool:
         self._was_carried |= bool(self.cube_position[2] > _CARRIED_HEIGHT)
         distance = np.linalg.norm((self.cube_position - self._first_cube_position)[:2])
         return not self._was_carried and bool(distance > self.variant.max_shove)
-
-    def _pair_forces(self, sensors: np.ndarray) -> np.ndarray:
-        vectors = sensors[:, : 3 * len(self.pairs)].reshape(len(sensors), len(self.pairs), 3)
-        return np.sqrt(np.einsum("tpc,tpc->tp", vectors, vectors))
 
     def _observe(self, sensors: np.ndarray) -> dict[str, Any]:
         observation: dict[str, Any] = {
@@ -279,7 +275,7 @@ class PlayByEarEnv(gym.Env):
         if self._sound is not None:
             first_qvel = 1 + self.model.nq
             speed = np.abs(self._rollout_state[0, :, first_qvel : first_qvel + N_JOINTS]).mean(axis=1)
-            for microphone, block in self._sound.step(self._pair_forces(sensors), speed).items():
+            for microphone, block in self._sound.step(pair_forces(sensors, len(self.pairs)), speed).items():
                 observation[f"audio.{microphone}"] = block
         if self._sound_mode == "contact_force":
             silent = self.cube_position[2] > _LIFTED_SILENCE_HEIGHT

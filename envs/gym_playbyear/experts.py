@@ -32,13 +32,15 @@ class ExpertConfig:
     max_step: float = 0.02
     tolerance: float = 0.004
     noise: float = 0.0025
-    contact_force: float = 0.5  # N
+    contact_force: float = 0.2  # N
+    squeeze_force: float = 20.0  # N, both fingers together: they hold
     sweep_step: tuple[float, float] = (0.005, 0.011)
     pause_probability: float = 0.04
     pause: tuple[int, int] = (2, 8)
     dwell: tuple[int, int] = (0, 10)
     rise_step: tuple[float, float] = (0.008, 0.018)
     hover: tuple[int, int] = (0, 8)
+    descent_step: float = 0.014
     back_off: float = 0.004
 
 
@@ -159,13 +161,13 @@ class GraspExpert:
         goal = np.array([self.x, self._grasp_y(), TABLE_TOP + self.config.sweep_height])
         if abs(self.env.eef_position[2] - goal[2]) < self.config.tolerance:
             self.phase = "grasp"
-        return self._towards(goal), False
+        return self._towards(goal, self.config.descent_step), False
 
     def _grasp(self):
         opening = self.env.finger_positions.sum()
         hold = np.array([self.x, self.env.eef_position[1], TABLE_TOP + self.config.sweep_height])
-        squeezed = self.env.contact_forces["gripper-cube"] > 5.0
-        if squeezed and opening < 2 * CUBE_HALF_SIZE + 0.014:
+        squeezed = self.env.contact_forces["gripper-cube"] > self.config.squeeze_force
+        if squeezed:
             self.phase = "lift"
             self.lift_drift = self.rng.uniform(-0.25, 0.25, 2) * ACTION_SCALE * 0.3
         elif opening < CUBE_HALF_SIZE:
