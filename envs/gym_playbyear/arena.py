@@ -27,7 +27,9 @@ def box_xml(name: str, half_size, position, rgba: str, *, solid: bool = True) ->
     """A fixed box of its own body; `solid=False` is for what is only seen."""
     contact = _SCENE if solid else 'contype="0" conaffinity="0"'
     size, pos = " ".join(map(str, half_size)), " ".join(map(str, position))
-    return f'<body name="{name}" pos="{pos}"><geom name="{name}" type="box" size="{size}" {contact} rgba="{rgba}"/></body>'
+    return (
+        f'<body name="{name}" pos="{pos}"><geom name="{name}" type="box" size="{size}" {contact} rgba="{rgba}"/></body>'
+    )
 
 
 def tray_xml(name: str, half_width: float, half_height: float) -> str:

@@ -45,11 +45,11 @@ class ArmConfig:
     """
 
     base: tuple[float, float, float] = (-0.5, 0.0, 0.80)
-    max_opening: float = 0.055
+    max_opening: float = 0.054
     grip_force: float = 40.0
     gripper_cooldown: float = 2.0
     workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
-        (-0.25, -0.38, 0.812),
+        (-0.25, -0.39, 0.812),
         (0.155, 0.40, 1.15),
     )
     max_lead: float = 0.06
@@ -69,12 +69,26 @@ _LINKS = (
         ((0, 0, -0.06), (0, 0, 0.06), 0.06),
     ),
     (
-        ("link3", (0, -0.316, 0), (_R, _R, 0, 0), (-2.8973, 2.8973), 3.228604, (0.027518, 0.039252, -0.066502)),
+        (
+            "link3",
+            (0, -0.316, 0),
+            (_R, _R, 0, 0),
+            (-2.8973, 2.8973),
+            3.228604,
+            (0.027518, 0.039252, -0.066502),
+        ),
         (0.037242, 0.036155, 0.010830, -0.004761, -0.011396, -0.012805),
         ((0, 0, -0.25), (0, 0, -0.05), 0.055),
     ),
     (
-        ("link4", (0.0825, 0, 0), (_R, _R, 0, 0), (-3.0718, -0.0698), 3.587895, (-0.05317, 0.104419, 0.027454)),
+        (
+            "link4",
+            (0.0825, 0, 0),
+            (_R, _R, 0, 0),
+            (-3.0718, -0.0698),
+            3.587895,
+            (-0.05317, 0.104419, 0.027454),
+        ),
         (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641),
         ((0, 0, -0.05), (0, 0, 0.05), 0.055),
     ),
@@ -96,7 +110,14 @@ _LINKS = (
         ((0, 0, -0.03), (0.06, 0, 0.0), 0.05),
     ),
     (
-        ("link7", (0.088, 0, 0), (_R, _R, 0, 0), (-2.8973, 2.8973), 0.735522, (0.010517, -0.004252, 0.061597)),
+        (
+            "link7",
+            (0.088, 0, 0),
+            (_R, _R, 0, 0),
+            (-2.8973, 2.8973),
+            0.735522,
+            (0.010517, -0.004252, 0.061597),
+        ),
         (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741),
         ((0, 0, 0.0), (0, 0, 0.08), 0.045),
     ),
@@ -147,9 +168,7 @@ def arm_actuator_xml(config: ArmConfig) -> str:
     """MJCF of the joint servos (seven positions) and of the fingers' drive (one position, both fingers coupled)."""
     servos = "".join(
         f'<position name="{link[0][0]}" joint="{link[0][0]}" kp="{kp}" kv="{kv}" forcerange="{-limit} {limit}"/>'
-        for link, kp, kv, limit in zip(
-            _LINKS, _SERVO_STIFFNESS, _SERVO_DAMPING, _TORQUE_LIMITS, strict=True
-        )
+        for link, kp, kv, limit in zip(_LINKS, _SERVO_STIFFNESS, _SERVO_DAMPING, _TORQUE_LIMITS, strict=True)
     )
     return f"""
   <equality><joint joint1="left_finger" joint2="right_finger" solref="0.004 1"/></equality>
@@ -159,7 +178,9 @@ def arm_actuator_xml(config: ArmConfig) -> str:
   </actuator>"""
 
 
-ARM_DEFAULT_XML = """<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>"""
+ARM_DEFAULT_XML = (
+    """<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>"""
+)
 
 
 class CartesianController:

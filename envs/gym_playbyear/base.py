@@ -10,7 +10,15 @@ import numpy as np
 from gymnasium import spaces
 from mujoco import rollout
 
-from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, contact_pairs, contact_sensor_xml, cube_xml, pair_forces, table_xml
+from gym_playbyear.arena import (
+    CUBE_HALF_SIZE,
+    TABLE_TOP,
+    contact_pairs,
+    contact_sensor_xml,
+    cube_xml,
+    pair_forces,
+    table_xml,
+)
 from gym_playbyear.arm import (
     ARM_DEFAULT_XML,
     N_JOINTS,
@@ -178,22 +186,27 @@ class PlayByEarEnv(gym.Env):
         for _ in range(_SETTLE_STEPS):
             sensors = self._advance(hold)
         self._first_cube_position, self._was_carried = self.cube_position, False
-        return self._observe(np.zeros_like(sensors)), {"is_success": False}
+        return self._observe(sensors), {"is_success": False}
 
     def step(self, action):
+        reward, terminated, truncated, info = self.advance(action)
+        observation = self._observe(self._rollout_sensors[0])
+        if self.render_mode == "human":
+            self.render()
+        return observation, reward, terminated, truncated, info
+
+    def advance(self, action) -> tuple[float, bool, bool, dict[str, Any]]:
+        """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise."""
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
         controls = self._controller.command(np.clip(action, -1, 1), self.eef_position, ACTION_SCALE)
-        sensors = self._advance(controls)
+        self._advance(controls)
         self._n_steps += 1
         success = self._is_success()
         failed = not success and self._was_shoved()
         truncated = not (success or failed) and self._n_steps >= self._max_episode_steps
-        observation = self._observe(sensors)
-        if self.render_mode == "human":
-            self.render()
-        return observation, float(success), success or failed, truncated, {"is_success": success}
+        return float(success), success or failed, truncated, {"is_success": success}
 
     def render(self):
         if self.render_mode == "human":

@@ -74,7 +74,7 @@ class GraspExpert:
 
     def _sweep_range(self) -> tuple[float, float]:
         lower, upper = self.env.hidden_range
-        margin = self.config.margin + 0.006 + self.rng.uniform(0, 0.02)
+        margin = self.config.margin + self.rng.uniform(0, 0.02)
         return lower - self.reach - margin, upper - self.reach + 0.02
 
     def act(self) -> np.ndarray:
@@ -130,18 +130,14 @@ class GraspExpert:
         return self._towards(hold), False
 
     def _rise(self):
-        goal = np.array(
-            [self.x, self.contact_y - self.config.back_off, TABLE_TOP + self.config.clear_height]
-        )
+        goal = np.array([self.x, self.contact_y - self.config.back_off, TABLE_TOP + self.config.clear_height])
         if self.env.eef_position[2] > goal[2] - self.config.tolerance:
             self.phase = "hover"
             self._wait = int(self.rng.integers(*self.config.hover, endpoint=True))
         return self._towards(goal, self.rise_step), False
 
     def _hover(self):
-        goal = np.array(
-            [self.x, self.contact_y - self.config.back_off, TABLE_TOP + self.config.clear_height]
-        )
+        goal = np.array([self.x, self.contact_y - self.config.back_off, TABLE_TOP + self.config.clear_height])
         if self._wait > 0:
             self._wait -= 1
         else:

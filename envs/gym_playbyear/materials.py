@@ -2,8 +2,8 @@
 
 A struck body rings in its modes: damped sines whose frequencies and decays belong to material and shape, and
 whose mix depends on where it was hit. This is modal synthesis (van den Doel, Kry and Pai, "FoleyAutomatic",
-SIGGRAPH 2001). The numbers are our own choice, made so that materials are distinct below 4 kHz, the part of the
-spectrum that the policy hears (paper, real-robot set-up: the lowest 160 bins of 25 Hz); the paper measured none.
+SIGGRAPH 2001). The numbers are our own choice, made so that materials are distinct below 4 kHz, the part of
+the spectrum that the policy hears (paper, real-robot set-up: the lowest 160 bins of 25 Hz).
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ class Material:
         name: What it is called in `MATERIALS`.
         frequencies: Frequency of each mode [Hz].
         decays: Decay rate of each mode's amplitude [1/s]; it falls to 1/e in `1 / decay` seconds.
-        gains: Relative amplitude of each mode. Only ratios count: an equal blow is equally loud on every material.
+        gains: Relative amplitude of each mode. Only ratios count: equal blows are equally loud.
     """
 
     name: str
@@ -31,8 +31,8 @@ class Material:
         lengths = (len(self.frequencies), len(self.decays), len(self.gains))
         if len(set(lengths)) != 1 or not self.frequencies:
             raise ValueError(
-                f"Material '{self.name}' has {lengths[0]} frequencies, {lengths[1]} decays and {lengths[2]} gains; "
-                "give one of each for every mode, and at least one mode."
+                f"Material '{self.name}' has {lengths[0]} frequencies, {lengths[1]} decays and {lengths[2]} "
+                "gains; give one of each for every mode, and at least one mode."
             )
         if min(*self.frequencies, *self.decays) <= 0:
             raise ValueError(f"Material '{self.name}' has a frequency or decay <= 0; both must be positive.")
@@ -106,8 +106,12 @@ class Microphone:
     hum: float
 
     def structure_borne(self, pairs: tuple[ContactPair, ...]) -> list[np.ndarray | None]:
-        """For each pair None if its sound is always structure-borne here, else the pairs that make it so while
-        they press: those between the pair's loose body and this microphone's structure (indices, perhaps none)."""
+        """Tells for each pair when its sound reaches this microphone through structure.
+
+        Returns:
+            For each pair None for always, or the indices of the pairs of which one has to press: those between
+            the pair's loose body and this microphone's structure, perhaps none.
+        """
         links: list[np.ndarray | None] = []
         for pair in pairs:
             if self.structure & {*pair.bodies}:

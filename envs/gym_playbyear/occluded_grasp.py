@@ -71,12 +71,12 @@ class OccludedGraspEnv(PlayByEarEnv):
     VARIANTS: ClassVar[dict[str, Variant]] = {
         "default": Variant(
             cube_x=(0.0, 0.0),
-            cube_y=(-0.26, 0.26),
+            cube_y=(-0.28, 0.28),
             cube_yaw=np.pi / 12,
             cube_density=2000,
             cube_friction=0.4,
             max_shove=0.03,
-            horizon=150,
+            horizon=120,
         ),
         "paper": Variant(
             cube_x=(0.0, 0.0),

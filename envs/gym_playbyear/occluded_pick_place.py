@@ -74,12 +74,12 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
     VARIANTS: ClassVar[dict[str, Variant]] = {
         "default": Variant(
             cube_x=(-0.001, 0.001),
-            cube_y=(0.12, 0.30),
+            cube_y=(0.11, 0.31),
             cube_yaw=np.pi / 12,
             cube_density=3000,
             cube_friction=0.4,
             max_shove=0.03,
-            horizon=250,
+            horizon=220,
         ),
         "paper": Variant(
             cube_x=(-0.001, 0.001),

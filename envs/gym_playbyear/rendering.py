@@ -2,6 +2,7 @@
 
 import os
 
+import glfw
 import mujoco
 import mujoco.viewer
 import numpy as np
@@ -49,6 +50,11 @@ class Window:
     """A live view for a person (`render_mode="human"`); needs a display."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        if not glfw.init():
+            raise GLUnavailableError(
+                f"No window can be opened (DISPLAY={os.environ.get('DISPLAY', '')!r}): render_mode='human' needs a display. "
+                "Use render_mode='rgb_array' to get pictures without one."
+            )
         self._viewer = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
         with self._viewer.lock():
             self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED

@@ -1,12 +1,13 @@
 """The sound of contact: what microphones hear of the forces that the physics computes.
 
-Every change of a contact force strikes both partners, which ring in the modes of their materials. A steady force
-is silent, an onset is a click that rings, a fluctuating force (sliding) is a scrape. A microphone hears at full
-level what its structure touches, and everything else through the air, weaker (paper, real-robot set-up: the
-microphone touches the gripper and hears both air- and structure-borne sound, without noise reduction).
-Background noise and the arm's motors are always there. Nothing that is silent in the world is audible.
+Every change of a contact force strikes both partners, which ring in the modes of their materials. A steady
+force is silent, an onset is a click that rings, a fluctuating force (sliding) is a scrape. A microphone hears
+at full level what its structure touches, and everything else through the air, weaker (paper, real-robot
+set-up: the microphone touches the gripper and hears both air- and structure-borne sound, without noise
+reduction). Background noise and the arm's motors are always there. Nothing silent is audible.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,7 +26,7 @@ _TOUCH_SECONDS = 0.05
 _AIR_GAIN = 10 ** (-30 / 20)  # air-borne relative to structure-borne
 _RELEASE_GAIN = 0.3  # letting go is quieter than hitting
 
-# Force changes per physics step below the first are solver jitter, and silent; above the second all counts [N].
+# Force changes per physics step below the first are solver jitter: silent; above the second all counts [N].
 _DEAD_ZONE_N = (0.1, 0.5)
 
 # Spreads: of a body's pitch between episodes, of the mix of its modes between contacts, of a blow's strength.
@@ -33,8 +34,8 @@ _PITCH_SPREAD = 0.02
 _MIX_SPREAD = 0.2
 _STRENGTH_SPREAD = 0.2
 
-# Motors: pitch [Hz], relative amplitudes of the harmonics, growth of their level with speed and the speed scale
-# of that [rad/s], and its response time [s]: so slow that an arm checked by a contact does not reveal it.
+# Motors: pitch [Hz], relative amplitudes of the harmonics, growth of their level with speed and the speed
+# scale of that [rad/s], and its response time [s]: so slow that an arm checked by a contact does not tell.
 _HUM_HZ = (55.0, 65.0)
 _HUM_HARMONICS = np.array([0.81, 0.49, 0.28, 0.16])
 _HUM_GROWTH = 0.5
@@ -52,8 +53,8 @@ def pcm16(wave: np.ndarray) -> np.ndarray:
 class ContactSound:
     """Synthesises what each microphone hears, one control step at a time, without seams between steps.
 
-    A mode is a complex number: a blow adds to it, a physics step multiplies it by a constant, and the samples in
-    that step are the number times a fixed table. A control step is thus one cumulative sum and one matrix product.
+    A mode is a complex number: a blow adds to it, a physics step multiplies it by a constant, and the samples
+    in that step are the number times a fixed table. A control step is one cumulative sum and one matrix product.
 
     Args:
         pairs: Contacts that can be heard, in the order of the columns of `forces`.
@@ -85,13 +86,14 @@ class ContactSound:
             raise ValueError(f"noise_level is {noise_level}; it must be 0 (silent background) or greater.")
         self.noise_level = float(noise_level)
         self._noise_filter = _pink_filter(sample_rate)
+        self._hum_levels = np.array([[microphone.hum] for microphone in self.microphones], np.float32)
         self._links = [microphone.structure_borne(self.pairs) for microphone in self.microphones]
         self._lay_out_modes()
         self._lay_out_samples()
         self.reset(np.random.default_rng(0))
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Starts an episode in silence, with every body at its own pitch. What touches already makes no click."""
+        """Starts an episode in silence, every body at its own pitch. What touches already makes no click."""
         # Separate streams: the number of blows changes neither the noise nor the blows of another pair.
         pitch_rng, self._blow_rng, self._noise_rng, *self._mix_rngs = rng.spawn(3 + len(self.pairs))
         self._tune_modes(pitch_rng)
@@ -100,7 +102,7 @@ class ContactSound:
         self._last_forces: np.ndarray | None = None
         self._noise_state = np.zeros((len(self.microphones), len(self._noise_filter[1]) - 1), np.float32)
         self._noise(self.sample_rate // 10)  # let the filter forget that it started from nothing
-        self._tune_hum(self._noise_rng)
+        self._hum = _Hum(self._noise_rng, self.sample_rate, self.samples_per_step)
 
     def step(self, forces: np.ndarray, joint_speed: np.ndarray) -> dict[str, np.ndarray]:
         """Synthesises the sound of one control step.
@@ -118,20 +120,15 @@ class ContactSound:
         forces, speed = np.asarray(forces, dtype=float), float(np.mean(joint_speed))
         if forces.shape != (self.n_substeps, len(self.pairs)):
             wanted = (self.n_substeps, len(self.pairs))
-            raise ValueError(
-                f"forces has shape {forces.shape}; wanted {wanted}: (physics steps, contact pairs)."
-            )
+            raise ValueError(f"forces has shape {forces.shape}; wanted {wanted}: (physics steps, contact pairs).")
         if not np.isfinite(forces.sum() + speed):
-            raise ValueError(
-                "A force or joint speed is not finite: the simulation diverged; reduce physics_dt."
-            )
+            raise ValueError("A force or joint speed is not finite: the simulation diverged; reduce physics_dt.")
         wave = self._ring(forces)  # (n_microphones, S)
         if self.noise_level > 0.0:
-            wave = wave + self.noise_level * (self._noise(self.samples_per_step) + self._hum(speed))
+            hum = self._hum_levels * self._hum.next(speed)
+            wave = wave + self.noise_level * (self._noise(self.samples_per_step) + hum)
         samples = pcm16(np.tanh(wave))  # a hard blow saturates softly
         return {microphone.name: row for microphone, row in zip(self.microphones, samples, strict=True)}
-
-    # Contact: forces, blows, ringing modes.
 
     def _ring(self, forces: np.ndarray) -> np.ndarray:
         strengths, mixes = self._blows(forces)
@@ -160,17 +157,15 @@ class ContactSound:
         change = forces - earlier
         size = np.abs(change)
         above = np.clip((size - _DEAD_ZONE_N[0]) / (_DEAD_ZONE_N[1] - _DEAD_ZONE_N[0]), 0.0, 1.0)
-        strengths = (
-            np.sqrt(size) * above**2 * (3.0 - 2.0 * above) * np.where(change < 0.0, _RELEASE_GAIN, 1.0)
-        )
-        # Drawn for every physics step, blow or not, so that it does not matter where control steps begin. Random
-        # signs keep a steady scrape from becoming a tone at the physics rate.
+        strengths = np.sqrt(size) * above**2 * (3.0 - 2.0 * above) * np.where(change < 0.0, _RELEASE_GAIN, 1.0)
+        # Drawn for every physics step, blow or not, so that it does not matter where control steps begin.
+        # Random signs keep a steady scrape from becoming a tone at the physics rate.
         rough = self._blow_rng.uniform(-1.0, 1.0, forces.shape)
         strengths *= np.sign(rough) * (1.0 + _STRENGTH_SPREAD * (2.0 * np.abs(rough) - 1.0))
         return strengths, self._mix((earlier <= 0.0) & (forces > 0.0))
 
     def _mix(self, onsets: np.ndarray) -> list[np.ndarray]:
-        """Amplitudes of each pair's modes, (n_substeps or 1, modes); a new contact is elsewhere and mixes anew."""
+        """Amplitudes of each pair's modes, (n_substeps or 1, modes): a new contact, elsewhere, mixes them anew."""
         mixes = [mix[None] for mix in self._mixes]
         for pair in np.flatnonzero(onsets.any(axis=0)):
             contact = np.cumsum(onsets[:, pair])
@@ -183,23 +178,10 @@ class ContactSound:
         spread = self._mix_rngs[pair].standard_normal((count, len(amplitudes)))
         return amplitudes * np.exp(_MIX_SPREAD * spread)
 
-    # Background: noise and motors.
-
     def _noise(self, n_samples: int) -> np.ndarray:
         white = self._noise_rng.standard_normal((len(self.microphones), n_samples), dtype=np.float32)
         noise, self._noise_state = signal.lfilter(*self._noise_filter, white, zi=self._noise_state)
         return noise
-
-    def _hum(self, speed: float) -> np.ndarray:
-        before = self._hum_speed
-        self._hum_speed += -np.expm1(-1.0 / (self.control_hz * _HUM_SECONDS)) * (speed - before)
-        level = 1.0 + _HUM_GROWTH * np.tanh(np.array([before, self._hum_speed]) / _HUM_SPEED)
-        tone = (
-            np.concatenate([self._hum_state.real, self._hum_state.imag]).astype(np.float32) @ self._hum_table
-        )
-        self._hum_state = self._hum_state * self._hum_turn
-        tone *= np.linspace(*level, self.samples_per_step, dtype=np.float32)
-        return self._hum_levels * tone
 
     # Tables: computed once, or once per episode.
 
@@ -210,8 +192,7 @@ class ContactSound:
         materials = [MATERIALS[material] for _, material in banks]
         self._bank_of_mode = np.repeat(np.arange(len(banks)), [len(m.frequencies) for m in materials])
         self._pair_modes = [
-            np.flatnonzero(np.isin(self._bank_of_mode, [banks.index(side) for side in pair]))
-            for pair in sides
+            np.flatnonzero(np.isin(self._bank_of_mode, [banks.index(side) for side in pair])) for pair in sides
         ]
         self._frequencies = np.array([f for material in materials for f in material.frequencies])
         self._decays = np.array([d for material in materials for d in material.decays])
@@ -239,23 +220,35 @@ class ContactSound:
         self._powers = np.exp(poles * self.physics_dt * steps)  # (n_substeps, 1, n_modes)
         self._advance = np.exp(poles * self._lead[:, None, None])
         wave = np.exp(poles[:, None] * np.arange(self._longest) / self.sample_rate)
-        wave[self._frequencies > 0.45 * self.sample_rate] = (
-            0.0  # no sample rate can hold what lies above its half
-        )
+        wave[self._frequencies > 0.45 * self.sample_rate] = 0.0  # no sample rate can hold what lies above its half
         # A body that is struck starts as a sine, from rest: the imaginary part.
-        self._table = np.concatenate([wave.imag, wave.real]).astype(
-            np.float32
-        )  # (2 n_modes, samples of a step)
+        self._table = np.concatenate([wave.imag, wave.real]).astype(np.float32)  # (2 n_modes, samples of a step)
 
-    def _tune_hum(self, rng: np.random.Generator) -> None:
-        angles = 2j * np.pi * rng.uniform(*_HUM_HZ) * np.arange(1, len(_HUM_HARMONICS) + 1) / self.sample_rate
+
+class _Hum:
+    """The arm's motors: a tone of an episode's own pitch with harmonics, whose level follows the speed slowly."""
+
+    def __init__(self, rng: np.random.Generator, sample_rate: int, n_samples: int) -> None:
+        angles = 2j * np.pi * rng.uniform(*_HUM_HZ) * np.arange(1, len(_HUM_HARMONICS) + 1) / sample_rate
         phases = np.exp(2j * np.pi * rng.uniform(size=len(_HUM_HARMONICS)))
-        self._hum_state = _HUM_RMS * np.sqrt(2.0) * _HUM_HARMONICS * phases
-        self._hum_turn = np.exp(angles * self.samples_per_step)
-        wave = np.exp(angles[:, None] * np.arange(self.samples_per_step))
-        self._hum_table = np.concatenate([wave.imag, wave.real]).astype(np.float32)
-        self._hum_levels = np.array([[microphone.hum] for microphone in self.microphones], np.float32)
-        self._hum_speed = 0.0
+        self._harmonics = _HUM_RMS * np.sqrt(2.0) * _HUM_HARMONICS * phases
+        self._turn = np.exp(angles * n_samples)
+        wave = np.exp(angles[:, None] * np.arange(n_samples))
+        self._table = np.concatenate([wave.imag, wave.real]).astype(np.float32)  # (2 n_harmonics, n_samples)
+        self._ramp = np.linspace(0.0, 1.0, n_samples, dtype=np.float32)
+        self._response = -np.expm1(-n_samples / (sample_rate * _HUM_SECONDS))
+        self._speed = 0.0
+
+    def next(self, speed: float) -> np.ndarray:
+        """The next samples, (n_samples,), while the joints move at `speed` [rad/s]."""
+        before = self._level()
+        self._speed += self._response * (speed - self._speed)
+        parts = np.concatenate([self._harmonics.real, self._harmonics.imag]).astype(np.float32)
+        self._harmonics = self._harmonics * self._turn
+        return (parts @ self._table) * (before + (self._level() - before) * self._ramp)
+
+    def _level(self) -> float:
+        return 1.0 + _HUM_GROWTH * math.tanh(self._speed / _HUM_SPEED)
 
 
 def _path_gain(forces: np.ndarray, links: np.ndarray | None) -> np.ndarray | float:
@@ -266,7 +259,7 @@ def _path_gain(forces: np.ndarray, links: np.ndarray | None) -> np.ndarray | flo
 
 
 def _pink_filter(sample_rate: int) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients that make white noise of variance 1 nearly pink, equally loud per hertz at every sample rate."""
+    """Coefficients that make white noise nearly pink, equally loud per hertz at every sample rate."""
     zeros, poles = -2 * np.pi * np.array([95.0, 950.0]), -2 * np.pi * np.array([30.0, 300.0, 3000.0])
     numerator, denominator = signal.zpk2tf(*signal.bilinear_zpk(zeros, poles, 1.0, sample_rate))
     band = np.linspace(0.0, _NOISE_BAND_HZ, 4001)
@@ -277,9 +270,7 @@ def _pink_filter(sample_rate: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _microphones(names: Sequence[str]) -> tuple[Microphone, ...]:
     if not names or len(set(names)) != len(names) or not set(names) <= set(MICROPHONES):
-        raise ValueError(
-            f"microphones is {names!r}; name at least one of {sorted(MICROPHONES)}, each only once."
-        )
+        raise ValueError(f"microphones is {names!r}; name at least one of {sorted(MICROPHONES)}, each only once.")
     return tuple(MICROPHONES[name] for name in names)
 
 
@@ -288,8 +279,8 @@ def _samples_per_step(sample_rate: int, control_hz: int) -> int:
         raise ValueError(f"sample_rate is {sample_rate}; use at least 8000, to keep what lies below 4 kHz.")
     if control_hz <= 0 or sample_rate % control_hz:
         raise ValueError(
-            f"sample_rate {sample_rate} is not a multiple of control_hz {control_hz}: a control step would not hold "
-            "a whole number of samples. Change one of the two, for example to 16000 and 20."
+            f"sample_rate {sample_rate} is not a multiple of control_hz {control_hz}: a control step would not "
+            "hold a whole number of samples. Change one of the two, for example to 16000 and 20."
         )
     return int(sample_rate // control_hz)
 
@@ -298,7 +289,7 @@ def _physics_steps(control_hz: int, physics_dt: float) -> int:
     steps = 1.0 / (control_hz * physics_dt) if physics_dt > 0 else 0.0
     if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
         raise ValueError(
-            f"physics_dt {physics_dt} s does not divide a control step of 1/{control_hz} s into whole physics steps. "
-            "Change one of the two, for example to 0.002 and 20."
+            f"physics_dt {physics_dt} s does not divide a control step of 1/{control_hz} s into whole physics "
+            "steps. Change one of the two, for example to 0.002 and 20."
         )
     return round(steps)

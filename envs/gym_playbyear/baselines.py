@@ -1,0 +1,56 @@
+"""How often the expert and the blind baselines succeed: `python -m gym_playbyear.baselines --task OccludedGrasp-v0`."""
+
+import argparse
+import json
+
+import gymnasium as gym
+
+import gym_playbyear
+from gym_playbyear.experts import BLIND_STRATEGIES
+
+EXPERT = "expert"
+
+
+def success_rates(task: str, strategies: tuple[str, ...], seeds: range, **options) -> dict[str, float]:
+    """Share of the seeds' episodes that each strategy solves.
+
+    Args:
+        task: Name of the task, such as `OccludedGrasp-v0`.
+        strategies: `"expert"` and names of blind baselines.
+        seeds: One episode each.
+        options: For `gymnasium.make`.
+    """
+    env = gym.make(f"gym_playbyear/{task}", sound="none", **options)
+    task_env = env.unwrapped
+    rates = {}
+    for strategy in strategies:
+        successes = 0
+        for seed in seeds:
+            env.reset(seed=seed)
+            is_expert = strategy == EXPERT
+            actor = task_env.scripted_expert() if is_expert else task_env.blind_baselines()[strategy]
+            done = False
+            while not done:
+                _, terminated, truncated, info = task_env.advance(actor.act())
+                done = terminated or truncated
+            successes += info["is_success"]
+        rates[strategy] = successes / len(seeds)
+    env.close()
+    return rates
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", nargs="+", default=list(gym_playbyear.TASKS))
+    parser.add_argument("--variant", default="default")
+    parser.add_argument("--n_episodes", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1000)
+    arguments = parser.parse_args()
+    seeds = range(arguments.seed, arguments.seed + arguments.n_episodes)
+    for task in arguments.task:
+        rates = success_rates(task, (EXPERT, *BLIND_STRATEGIES), seeds, variant=arguments.variant)
+        print(json.dumps({"task": task, "variant": arguments.variant, "seeds": [seeds[0], seeds[-1]], **rates}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,173 @@
+"""`--env.type=playbyear`: how LeRobot makes the environments and names what they observe."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from draccus.utils import DecodingError
+from gymnasium.vector import AutoresetMode
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
+
+from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
+
+SOUND_MODES = ("waveform", "contact_force", "none")
+VARIANTS = ("default", "paper")
+CONTROL_HZ = 20  # the tasks' control rate; `fps` has to be the same
+_STATE_DIM, _ACTION_DIM, _FORCE_DIM = 7, 4, 6
+
+
+@EnvConfig.register_subclass("playbyear")
+@dataclass
+class PlaybyearEnvConfig(EnvConfig):
+    """The tasks that contact sound solves and a camera does not.
+
+    Args:
+        task: `OccludedGrasp-v0` or `OccludedPickPlace-v0` (any task that `gym_playbyear` registers).
+        fps: Control steps, pictures and sound blocks per second; the tasks run at 20.
+        episode_length: Steps after which an episode is cut off. None: the task's own horizon.
+        image_size: Height and width of the `front` camera's picture [pixels].
+        sample_rate: Of every microphone [Hz]; divisible by `fps`, so that each frame has the same number of samples.
+        sound: `waveform` (int16 PCM per microphone), `contact_force` (the paper's proxy, 6 numbers), or `none`.
+        microphones: Names of the microphones that are on, with `sound=waveform`: `gripper`, `table`.
+        noise_level: Multiplies the background noise and the arm's own hum. 1 is the task as published, 0 silence.
+        variant: `default`, or `paper` for the paper's values where ours differ.
+        visualization_width, visualization_height: Of the picture that `render()` gives people; the same number twice [pixels].
+        render_mode: `rgb_array` (for videos), or `human` for a window.
+
+    Raises:
+        DecodingError: A value is not one that the tasks know. LeRobot's commands print it as one line and stop.
+    """
+
+    task: str | None = "OccludedGrasp-v0"
+    fps: int = CONTROL_HZ
+    episode_length: int | None = None
+    # Observations
+    image_size: int = 84
+    sample_rate: int = 16000
+    sound: str = "waveform"
+    microphones: list[str] = field(default_factory=lambda: ["gripper"])
+    noise_level: float = 1.0
+    # Task
+    variant: str = "default"
+    # For people
+    visualization_width: int = 480
+    visualization_height: int = 480
+    render_mode: str = "rgb_array"
+    # Filled in by __post_init__ from the fields above
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._check()
+        entries: dict[str, tuple[FeatureType, tuple[int, ...], str]] = {
+            ACTION: (FeatureType.ACTION, (_ACTION_DIM,), ACTION),
+            "pixels/front": (FeatureType.VISUAL, (self.image_size, self.image_size, 3), f"{OBS_IMAGES}.front"),
+            "agent_pos": (FeatureType.STATE, (_STATE_DIM,), OBS_STATE),
+        }
+        if self.sound == "waveform":
+            for mic in self.microphones:
+                entries[f"audio.{mic}"] = (FeatureType.STATE, (self.samples_per_frame,), f"{OBS_STR}.audio.{mic}")
+        elif self.sound == "contact_force":
+            entries["contact_force"] = (FeatureType.STATE, (_FORCE_DIM,), f"{OBS_STR}.contact_force")
+        self.features = {key: PolicyFeature(type=kind, shape=shape) for key, (kind, shape, _) in entries.items()}
+        self.features_map = {key: policy_key for key, (_, _, policy_key) in entries.items()}
+
+    @property
+    def samples_per_frame(self) -> int:
+        """Samples of one microphone between two frames, S."""
+        return self.sample_rate // self.fps
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """The arguments of the tasks' constructor."""
+        return {
+            "image_size": self.image_size,
+            "sample_rate": self.sample_rate,
+            "sound": self.sound,
+            "noise_level": self.noise_level,
+            "microphones": tuple(self.microphones),
+            "horizon": self.episode_length,
+            "variant": self.variant,
+            "render_mode": self.render_mode,
+            "render_size": self.visualization_width,
+        }
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """Makes `n_envs` environments that step together.
+
+        Each factory imports `gym_playbyear` itself, because the workers of an asynchronous vector environment start
+        from a fresh process. An environment whose episode has ended stands still until the next rollout, instead of
+        simulating an episode that nobody looks at.
+
+        Args:
+            n_envs: How many, at least 1.
+            use_async_envs: One process each instead of all in this one; without effect for `n_envs=1`.
+
+        Returns:
+            {"playbyear": {0: the vector environment}}.
+
+        Raises:
+            DecodingError: `task` is none that `gym_playbyear` registers.
+        """
+        self._check()
+        make = partial(
+            gym.make,
+            f"{self.package_name}:{self.gym_id}",
+            disable_env_checker=self.disable_env_checker,
+            **self.gym_kwargs,
+        )
+        factories = [freeze_after_episode_end(make) for _ in range(n_envs)]
+        vec: gym.vector.VectorEnv
+        if use_async_envs and n_envs > 1:
+            vec = gym.vector.AsyncVectorEnv(factories, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
+        else:
+            vec = gym.vector.SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
+        return {self.type: {0: vec}}
+
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """What LeRobot runs on each observation before, and on each action after, the policy's own processors."""
+        return PolicyProcessorPipeline(steps=[PcmToFloatProcessorStep()]), PolicyProcessorPipeline(steps=[])
+
+    def _check(self) -> None:
+        tasks = known_tasks()
+        _check_choice("task", self.task, tasks)
+        _check_choice("sound", self.sound, SOUND_MODES)
+        _check_choice("variant", self.variant, VARIANTS)
+        if self.fps != CONTROL_HZ:
+            raise _error("fps", self.fps, f"the tasks are controlled at {CONTROL_HZ} Hz, give {CONTROL_HZ}")
+        if self.sample_rate <= 0 or self.sample_rate % self.fps:
+            raise _error(
+                "sample_rate",
+                self.sample_rate,
+                f"each of the {self.fps} frames per second must hold the same number of samples; "
+                f"give a multiple of {self.fps}, such as 16000 or 48000",
+            )
+        if self.sound == "waveform" and (not self.microphones or len(set(self.microphones)) < len(self.microphones)):
+            raise _error("microphones", self.microphones, "give at least one name and each only once")
+        if self.visualization_width != self.visualization_height:
+            raise _error(
+                "visualization_width", self.visualization_width, "the picture is square: give both sides the same"
+            )
+
+
+def known_tasks() -> tuple[str, ...]:
+    """The ids that `gym_playbyear` registers, without the namespace."""
+    import gym_playbyear  # noqa: F401  (registers the tasks)
+
+    prefix = "gym_playbyear/"
+    return tuple(sorted(key.removeprefix(prefix) for key in gym.registry if key.startswith(prefix)))
+
+
+def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise _error(name, value, f"choose one of {', '.join(choices)}")
+
+
+def _error(name: str, value: object, what_to_do: str) -> DecodingError:
+    # Not a ValueError: draccus hides a ValueError of __post_init__ behind a traceback, and prints this as one line.
+    return DecodingError(("env", name), f"{value!r} does not work: {what_to_do}.")

@@ -1,0 +1,192 @@
+"""The tasks as Gymnasium environments: interface, hidden cube, experts, blind baselines, sound."""
+
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from gym_playbyear import TASKS
+from gym_playbyear.baselines import EXPERT, success_rates
+from gym_playbyear.experts import BLIND_STRATEGIES
+
+
+def make(task: str, **options):
+    return gym.make(f"gym_playbyear:gym_playbyear/{task}", **options)
+
+
+def roll_out(env, seed: int):
+    """One expert episode: list of (observation, phase, largest contact forces)."""
+    env.reset(seed=seed)
+    task = env.unwrapped
+    expert = task.scripted_expert()
+    frames, done = [], False
+    while not done:
+        phase = expert.phase
+        observation, _, terminated, truncated, info = env.step(expert.act())
+        frames.append((observation, phase, task.contact_forces))
+        done = terminated or truncated
+    return frames, info
+
+
+def level(block: np.ndarray) -> float:
+    """Level of a block of PCM [dB re full scale]."""
+    return 10 * np.log10(np.mean((block / 32768.0) ** 2) + 1e-12)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_checker_passes(task):
+    env = make(task, render_mode="rgb_array").unwrapped
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env, skip_render_check=True)
+    # The state of an arm has no bounds worth naming; Gymnasium remarks on every such space.
+    assert [str(w.message) for w in caught if "infinity" not in str(w.message)] == []
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_observation_contract(task):
+    env = make(task, microphones=("gripper", "table"), image_size=64, sample_rate=48000)
+    observation, info = env.reset(seed=0)
+    assert observation["pixels"]["front"].shape == (64, 64, 3)
+    assert observation["agent_pos"].shape == (7,)
+    assert observation["agent_pos"].dtype == np.float32
+    for microphone in ("gripper", "table"):
+        assert observation[f"audio.{microphone}"].shape == (2400,)
+        assert observation[f"audio.{microphone}"].dtype == np.int16
+    assert info["is_success"] is False
+    env.close()
+
+
+def test_force_proxy_replaces_sound():
+    env = make("OccludedGrasp-v0", sound="contact_force")
+    observation, _ = env.reset(seed=0)
+    assert observation["contact_force"].shape == (6,)
+    assert not any(key.startswith("audio.") for key in observation)
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_same_seed_same_bytes(task):
+    env = make(task)
+
+    def record():
+        observations = [env.reset(seed=5)[0]]
+        expert = env.unwrapped.scripted_expert()
+        observations += [env.step(expert.act())[0] for _ in range(40)]
+        return [(o["pixels"]["front"], o["agent_pos"], o["audio.gripper"]) for o in observations]
+
+    for first, second in zip(record(), record(), strict=True):
+        for a, b in zip(first, second, strict=True):
+            np.testing.assert_array_equal(a, b)
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_camera_never_sees_the_resting_cube(task):
+    env = make(task)
+    for seed in range(3):
+        env.reset(seed=seed)
+        env_task = env.unwrapped
+        expert = env_task.scripted_expert()
+        assert env_task.cube_pixels() == 0
+        while expert.phase != "lift":
+            env.step(expert.act())
+            assert env_task.cube_pixels() == 0
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_expert_succeeds(task):
+    assert success_rates(task, (EXPERT,), range(20))[EXPERT] >= 0.95
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_expert_succeeds_and_the_blind_fail_over_100_seeds(task):
+    rates = success_rates(task, (EXPERT, *BLIND_STRATEGIES), range(2000, 2100))
+    assert rates[EXPERT] >= 0.95
+    assert max(rates[strategy] for strategy in BLIND_STRATEGIES) <= 0.20
+
+
+def test_touch_is_heard_in_its_frame_and_nothing_before():
+    env = make("OccludedGrasp-v0")
+    for seed in range(3):
+        frames, _ = roll_out(env, seed)
+        touched = [forces["gripper-cube"] > 0.2 for _, _, forces in frames]
+        first = touched.index(True)
+        levels = [level(observation["audio.gripper"]) for observation, _, _ in frames]
+        floor = levels[:first]
+        assert max(floor) - min(floor) < 6
+        assert levels[first] > np.mean(floor) + 20
+    env.close()
+
+
+def test_reset_options_place_cube_and_bin():
+    env = make("OccludedPickPlace-v0")
+    env.reset(seed=0, options={"cube_position": (0.0, 0.2), "cube_yaw": 0.1, "bin_position": (0.0, -0.2)})
+    np.testing.assert_allclose(env.unwrapped.cube_position[:2], (0.0, 0.2), atol=1e-3)
+    np.testing.assert_allclose(env.unwrapped.bin_position[:2], (0.0, -0.2))
+    env.close()
+
+
+def test_shoved_cube_ends_the_episode():
+    env = make("OccludedGrasp-v0")
+    env.reset(seed=0)
+    pusher = env.unwrapped.blind_baselines()["push"]
+    for _ in range(150):
+        _, reward, terminated, truncated, info = env.step(pusher.act())
+        if terminated or truncated:
+            break
+    assert terminated
+    assert reward == 0
+    assert not info["is_success"]
+    env.close()
+
+
+def test_horizon_truncates():
+    env = make("OccludedGrasp-v0", horizon=3)
+    env.reset(seed=0)
+    flags = [env.step(np.array([0, 0, 0, -1.0]))[3] for _ in range(3)]
+    assert flags == [False, False, True]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sound": "loud"}, "sound='loud'"),
+        ({"variant": "easy"}, "variant='easy'"),
+        ({"sample_rate": 16001}, "16001"),
+        ({"microphones": ("hat",)}, "hat"),
+        ({"image_size": 2}, "image_size=2"),
+    ],
+)
+def test_bad_options_are_named(options, message):
+    with pytest.raises(ValueError, match=message):
+        make("OccludedGrasp-v0", **options)
+
+
+def test_bad_action_is_named():
+    env = make("OccludedGrasp-v0", sound="none")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="4 finite numbers"):
+        env.unwrapped.step(np.array([np.nan, 0, 0, 0]))
+    env.close()
+
+
+def test_absent_gl_is_explained():
+    code = "import gymnasium as gym, gym_playbyear; gym.make('gym_playbyear/OccludedGrasp-v0').reset(seed=0)"
+    environment = {
+        "MUJOCO_GL": "egl",
+        "EGL_PLATFORM": "surfaceless",
+        "PATH": "/usr/bin",
+        "__EGL_VENDOR_LIBRARY_FILENAMES": "/nowhere.json",
+    }
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert result.returncode != 0
+    assert "MUJOCO_GL=egl" in result.stderr
