@@ -1,1 +1,8 @@
-__version__ = "0.1.0"
+"""The module that LeRobot's plugin discovery imports: it registers the policy `playbyear`."""
+
+from lerobot_playbyear import __version__
+from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.processor_playbyear import make_playbyear_pre_post_processors
+
+__all__ = ["PlaybyearConfig", "PlaybyearPolicy", "__version__", "make_playbyear_pre_post_processors"]

@@ -1,0 +1,79 @@
+"""Images into the vision encoder: augmentation and resizing in one sampling pass."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+# Colour as luma and two chroma components (NTSC); turning the chroma plane turns the hue.
+_YIQ = torch.tensor([[0.299, 0.587, 0.114], [0.5959, -0.2746, -0.3213], [0.2115, -0.5227, 0.3112]])
+_RGB = torch.linalg.inv(_YIQ)
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Strengths, as in `PlaybyearConfig`: crop [pixels], brightness, hue, degrees, translate, scale."""
+
+    crop: float
+    brightness: float
+    hue: float
+    degrees: float
+    translate: float
+    scale: float
+
+    def __call__(self, images: Tensor, size: int) -> Tensor:
+        """Augments runs of images and resizes them; all images of a run get the same draw.
+
+        Args:
+            images: (B, T, 3, H, W) in [0, 1].
+            size: Height and width wanted [pixels].
+
+        Returns:
+            (B, T, 3, size, size).
+        """
+        return self._warp(self._recolour(images), size)
+
+    def _recolour(self, images: Tensor) -> Tensor:
+        n_runs, device = images.shape[0], images.device
+        brightness = 1 + self.brightness * _uniform(n_runs, device)
+        angle = 2 * math.pi * self.hue * _uniform(n_runs, device)
+        turn = torch.zeros(n_runs, 3, 3, device=device)
+        turn[:, 0, 0] = 1
+        turn[:, 1, 1] = turn[:, 2, 2] = angle.cos()
+        turn[:, 2, 1], turn[:, 1, 2] = angle.sin(), -angle.sin()
+        matrix = brightness[:, None, None] * (_RGB.to(device) @ turn @ _YIQ.to(device))  # (B, 3, 3)
+        flat = images.transpose(1, 2).flatten(2)  # (B, 3, T * H * W)
+        recoloured = (matrix.to(images.dtype) @ flat).clamp_(0, 1)
+        return recoloured.view(images.shape[0], 3, images.shape[1], *images.shape[3:]).transpose(1, 2)
+
+    def _warp(self, images: Tensor, size: int) -> Tensor:
+        n_runs, n_frames, _, height, width = images.shape
+        device = images.device
+        angle = math.radians(self.degrees) * _uniform(n_runs, device)
+        scale = 1 / (1 + self.scale * _uniform(n_runs, device))
+        theta = torch.zeros(n_runs, 2, 3, device=device)
+        theta[:, 0, 0] = theta[:, 1, 1] = scale * angle.cos()
+        theta[:, 0, 1], theta[:, 1, 0] = -scale * angle.sin(), scale * angle.sin()
+        # Coordinates run from -1 to 1: a shift of the whole size is 2.
+        shift_x = self.translate * _uniform(n_runs, device) + self.crop / width * _uniform(n_runs, device)
+        shift_y = self.translate * _uniform(n_runs, device) + self.crop / height * _uniform(n_runs, device)
+        theta[:, 0, 2], theta[:, 1, 2] = 2 * shift_x, 2 * shift_y
+        grid = functional.affine_grid(theta, [n_runs, 1, size, size], align_corners=False).to(images.dtype)
+        warped = functional.grid_sample(
+            images.flatten(1, 2), grid, mode="bilinear", padding_mode="border", align_corners=False
+        )
+        return warped.unflatten(1, (n_frames, 3))
+
+
+def resize(images: Tensor, size: int) -> Tensor:
+    """(B, T, 3, H, W) -> (B, T, 3, size, size), bilinear."""
+    if images.shape[-2:] == (size, size):
+        return images
+    flat = functional.interpolate(images.flatten(0, 1), (size, size), mode="bilinear", align_corners=False)
+    return flat.unflatten(0, images.shape[:2])
+
+
+def _uniform(n: int, device: torch.device) -> Tensor:
+    return torch.empty(n, device=device).uniform_(-1, 1)

@@ -1,0 +1,268 @@
+"""Configuration of the policy `playbyear`."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType, NormalizationMode
+from lerobot.optim.optimizers import AdamConfig
+from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_STATE
+
+AUDIO_PREFIX = "observation.audio."
+
+
+@PreTrainedConfig.register_subclass("playbyear")
+@dataclass
+class PlaybyearConfig(PreTrainedConfig):
+    """The audio-visual LSTM of "Play it by Ear" (Du et al., RSS 2022). Defaults are the paper's unless a line says otherwise.
+
+    Every frame is encoded from the last `n_frame_stack` images of every camera, the last `audio_window_s` of every
+    microphone and the low-dimensional observations; an LSTM over the last `n_memory_steps` encodings gives the action.
+
+    Inputs:
+        fps: Frames per second of the dataset and the control loop [Hz]. Window lengths in frames follow from it.
+        sample_rate: Samples per second of every microphone [Hz]. None takes it from the dataset.
+        use_vision, use_audio: Off leaves that encoding out, which is what the paper's inputs of zeros amount to.
+        use_memory: Off encodes one frame with one image: the paper's ablation of memory.
+        n_frame_stack: Images stacked channel-wise before the vision encoder.
+        n_memory_steps: Encodings that the LSTM reads, H.
+        audio_window_s: Seconds of sound behind one encoding.
+        segment_s, hop_s: Length and step of the spectrogram's segments [s].
+        n_frequency_bins: Lowest bins of the spectrogram that are kept; a bin is 1 / segment_s wide.
+        image_size: Pixels, height and width, that the vision encoder sees. 84 trains about five times faster than 224.
+
+    Architecture:
+        vision_width: Channels of the ResNet-18's first stage; 64 is ResNet-18, and its embedding has 8 times as many.
+        audio_channels: Channels of the audio encoder's convolutions, all with kernel 7.
+        hidden_size: Of the two hidden layers in the fusion and in the head.
+        embedding_size: Of the fused encoding and of the LSTM, D.
+
+    Training:
+        n_supervised_steps: Windows, K, that a training item supervises: the windows that end on its last K frames. They
+            share the encodings of its K + H - 1 frames. 1 is the paper's; more is cheaper per window.
+        augmentation_*: Training only, one draw per item and camera. Crop: largest shift of a replicate-padded crop
+            [pixels of the original]; brightness: relative; hue: of the colour circle; degrees; translate: share of the
+            size; scale: either way.
+        audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]; None
+            mixes in none (the paper). Levels are drawn per item, uniformly from 20 dB below the floor up to this.
+        spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
+        optimizer_*: Adam, and the clip of the gradient's norm.
+        scheduler_*: Linear warm-up over this share of the steps, then a cosine down to this share of the rate. The paper's
+            rate is constant; the schedule is what lets thousands instead of a hundred thousand updates do.
+    """
+
+    # Inputs
+    fps: int = 20
+    sample_rate: int | None = None
+    use_vision: bool = True
+    use_audio: bool = True
+    use_memory: bool = True
+    n_frame_stack: int = 3
+    n_memory_steps: int = 10
+    audio_window_s: float = 2.0
+    segment_s: float = 0.040
+    hop_s: float = 0.035
+    n_frequency_bins: int = 160
+    image_size: int = 224
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "VISUAL": NormalizationMode.IDENTITY,
+            "STATE": NormalizationMode.MEAN_STD,
+            "ENV": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MIN_MAX,
+        }
+    )
+
+    # Architecture
+    vision_width: int = 64
+    audio_channels: tuple[int, ...] = (64, 32, 16, 8)
+    hidden_size: int = 1024
+    embedding_size: int = 50
+
+    # Training
+    n_supervised_steps: int = 8
+    augmentation_crop: float = 4.0
+    augmentation_brightness: float = 0.05
+    augmentation_hue: float = 0.05
+    augmentation_degrees: float = 5.0
+    augmentation_translate: float = 0.05
+    augmentation_scale: float = 0.05
+    audio_noise_db: float | None = None
+    spectrogram_momentum: float = 0.01
+    optimizer_lr: float = 1e-3
+    optimizer_weight_decay: float = 0.0
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_share: float = 0.03
+    scheduler_final_share: float = 0.01
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("fps", "n_frame_stack", "n_memory_steps", "n_supervised_steps", "vision_width", "image_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
+        if self.audio_window_s < self.segment_s or self.hop_s <= 0:
+            raise ValueError(
+                f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "
+                f"--policy.segment_s ({self.segment_s}), and --policy.hop_s ({self.hop_s}) must be positive."
+            )
+        if not (self.use_vision or self.use_audio or self.low_dimensional_keys or not self.input_features):
+            raise ValueError(
+                "use_vision and use_audio are both off and there is no other observation: nothing to learn from."
+            )
+
+    # Windows, in frames
+
+    @property
+    def memory_steps(self) -> int:
+        """Encodings that the LSTM reads: H, or 1 without memory."""
+        return self.n_memory_steps if self.use_memory else 1
+
+    @property
+    def frame_stack(self) -> int:
+        """Images per encoding, 1 without memory."""
+        return self.n_frame_stack if self.use_memory else 1
+
+    @property
+    def audio_frames(self) -> int:
+        """Frames whose sound one encoding hears."""
+        return math.ceil(round(self.audio_window_s * self.fps, 6))
+
+    @property
+    def n_run_frames(self) -> int:
+        """Frames that a training item encodes, R = K + H - 1."""
+        return self.n_supervised_steps + self.memory_steps - 1
+
+    @property
+    def n_image_frames(self) -> int:
+        """Images that a training item needs."""
+        return self.n_run_frames + self.frame_stack - 1
+
+    @property
+    def n_audio_frames(self) -> int:
+        """Frames of sound that a training item needs."""
+        return self.n_run_frames + self.audio_frames - 1
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        longest = max(self.n_image_frames, self.n_audio_frames if self.use_audio else 0)
+        return list(range(1 - longest, 1))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(1 - self.n_supervised_steps, 1))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    # Features
+
+    @property
+    def audio_keys(self) -> list[str]:
+        """One per microphone, sorted."""
+        return sorted(key for key in self.input_features or {} if key.startswith(AUDIO_PREFIX))
+
+    @property
+    def camera_keys(self) -> list[str]:
+        """One per camera, sorted."""
+        return sorted(self.image_features)
+
+    @property
+    def low_dimensional_keys(self) -> list[str]:
+        """Everything else that is observed, the state first."""
+        kinds = (FeatureType.STATE, FeatureType.ENV)
+        keys = [
+            key
+            for key, feature in (self.input_features or {}).items()
+            if feature.type in kinds and not key.startswith(AUDIO_PREFIX)
+        ]
+        return sorted(keys, key=lambda key: (key != OBS_STATE, key))
+
+    @property
+    def window_samples(self) -> int:
+        """Samples of one encoding's sound."""
+        assert self.sample_rate is not None
+        return round(self.audio_window_s * self.sample_rate)
+
+    def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
+        """Takes the sample rate from the dataset's features; LeRobot calls it before it builds the policy.
+
+        Raises:
+            ValueError: A microphone's rate or frame length is missing or differs from the configuration.
+        """
+        for key, feature in features.items():
+            if not key.startswith(AUDIO_PREFIX) or not self.use_audio:
+                continue
+            seen = (feature.get("info") or {}).get("sample_rate", self.sample_rate)
+            if seen is None:
+                raise ValueError(
+                    f"{key} has no info.sample_rate in the dataset: give it with --policy.sample_rate, or write it into "
+                    "the dataset's meta/info.json."
+                )
+            if self.sample_rate is not None and int(seen) != self.sample_rate:
+                raise ValueError(
+                    f"{key} was recorded at {seen} Hz, but the policy is configured for {self.sample_rate} Hz: set "
+                    f"--policy.sample_rate={seen}, or train a new policy for this dataset."
+                )
+            self.sample_rate = int(seen)
+            self._check_samples(key, int(feature["shape"][0]))
+
+    def validate_features(self) -> None:
+        """Checks that the features are ones that the policy can use.
+
+        Raises:
+            ValueError: Names what is missing or does not fit, and what to do.
+        """
+        keys = sorted(self.input_features or {})
+        if self.action_feature is None:
+            raise ValueError("The dataset has no 'action': a policy cannot be trained without.")
+        if self.use_vision and not self.camera_keys:
+            raise ValueError(
+                f"No camera among the observations {keys}: set --policy.use_vision=false to train without."
+            )
+        if not self.use_audio:
+            return
+        if not self.audio_keys:
+            raise ValueError(
+                f"No '{AUDIO_PREFIX}<microphone>' among the observations {keys}: record with sound, or set "
+                "--policy.use_audio=false to train a deaf policy."
+            )
+        if self.sample_rate is None:
+            raise ValueError(f"The sample rate of {self.audio_keys} is not known: set --policy.sample_rate.")
+        for key in self.audio_keys:
+            self._check_samples(key, int((self.input_features or {})[key].shape[0]))
+
+    def _check_samples(self, key: str, samples: int) -> None:
+        assert self.sample_rate is not None
+        if self.sample_rate % self.fps:
+            raise ValueError(
+                f"sample_rate {self.sample_rate} / fps {self.fps} is not an integer: {key} cannot hold whole frames. Set "
+                "--policy.fps to the dataset's."
+            )
+        if samples * self.fps != self.sample_rate:
+            raise ValueError(
+                f"{key} has {samples} samples per frame, which at {self.sample_rate} Hz means "
+                f"{self.sample_rate / samples:g} frames per second, but the policy is configured for fps={self.fps}: set "
+                f"--policy.fps={self.sample_rate / samples:g}."
+            )
+
+    # Training presets
+
+    def get_optimizer_preset(self) -> AdamConfig:
+        return AdamConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        # LeRobot shrinks both numbers together when a run is shorter than the decay.
+        steps = 10**6
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=max(1, round(self.scheduler_warmup_share * steps)),
+            num_decay_steps=steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_final_share * self.optimizer_lr,
+        )

@@ -1,0 +1,263 @@
+"""The policy `playbyear`: what LeRobot calls, and how observations become the network's inputs."""
+
+from collections import deque
+from typing import Any
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION
+from torch import Tensor, nn
+
+from lerobot_playbyear.augmentation import Augmentation, resize
+from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
+from lerobot_playbyear.spectrogram import LogSpectrogram, mix_in_noise, to_float_wave
+
+LOSS_WEIGHT = "loss_weight"
+
+
+class PlaybyearPolicy(PreTrainedPolicy):
+    """Audio-visual LSTM policy of "Play it by Ear" (Du et al., RSS 2022).
+
+    Training and rollout use one definition: z_i = fuse(vision(images i-2..i), sound(the 2 s up to i), state_i) and
+    a_t = head(LSTM(z_{t-9..t})). Before the episode's first frame its image and its z repeat, and the spectrogram is the
+    average sound.
+    """
+
+    config_class = PlaybyearConfig
+    name = "playbyear"
+
+    def __init__(self, config: PlaybyearConfig, dataset_stats: dict[str, Any] | None = None, **kwargs: Any):
+        super().__init__(config)
+        _check_fps(config)
+        config.validate_features()
+        self.config: PlaybyearConfig = config
+        self.model = PlaybyearNetwork(config)
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        return self.parameters()
+
+    def reset(self) -> None:
+        """Forgets the episode."""
+        self._images: dict[str, deque[Tensor]] = {}
+        self._sound: dict[str, Tensor] = {}
+        self._n_heard = 0
+        self._encodings: Tensor | None = None
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Mean squared error over the K windows of every item that end inside its episode.
+
+        Args:
+            batch: `<key>` (B, T, ...) and `<key>_is_pad` (B, T) with the newest frame last. T may differ between keys and
+                be longer than needed: images need `n_image_frames`, sound `n_audio_frames`, the rest `n_run_frames`,
+                the action the last K. An optional `loss_weight` (B, K) weighs the windows.
+
+        Returns:
+            The loss, and numbers for the log.
+
+        Raises:
+            ValueError: A key is missing or sound is not finite.
+        """
+        predicted = self.predict_run(batch)  # (B, K, n_actions)
+        n_windows = predicted.shape[1]
+        target = batch[ACTION][:, -n_windows:]
+        error = (predicted - target).square().mean(dim=-1)  # (B, K)
+        weight = torch.ones_like(error)
+        if f"{ACTION}_is_pad" in batch:
+            weight = weight * ~batch[f"{ACTION}_is_pad"][:, -n_windows:]
+        if LOSS_WEIGHT in batch:
+            weight = weight * batch[LOSS_WEIGHT]
+        loss = (error * weight).sum() / weight.sum().clamp(min=1e-8)
+        return loss, {"mse": loss.item()}
+
+    def predict_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
+        """Actions of the last `n_steps` (default K) frames of every item, (B, n_steps, n_actions), normalised."""
+        n_frames = (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1
+        encodings = self.model.encode_run(batch, n_frames)  # (B, R, D)
+        return self.model.memory_head(encodings)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """The action for the newest observation; only this frame is encoded.
+
+        Args:
+            batch: One frame of a batch of B episodes that began together: images (B, 3, H, W), sound (B, S), the rest (B, n).
+
+        Returns:
+            (B, n_actions), normalised.
+        """
+        self.eval()
+        config = self.config
+        encoding = self.model.encode_frame(self._remember(batch))  # (B, D)
+        steps = config.memory_steps
+        if self._encodings is None:
+            self._encodings = encoding.unsqueeze(1).repeat(1, steps, 1)
+        else:
+            self._encodings = torch.cat([self._encodings[:, 1:], encoding.unsqueeze(1)], dim=1)
+        return self.model.memory_head(self._encodings)[:, -1]
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """The action of `select_action` as a chunk of one, (B, 1, n_actions)."""
+        return self.select_action(batch).unsqueeze(1)
+
+    def _remember(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Puts the newest frame into the buffers; returns what one encoding needs, as a batch of runs of one frame."""
+        config = self.config
+        run: dict[str, Tensor] = {}
+        if config.use_vision:
+            for key in config.camera_keys:
+                image = batch[key]
+                buffer = self._images.setdefault(key, deque([image] * config.frame_stack, maxlen=config.frame_stack))
+                buffer.append(image)
+                run[key] = torch.stack(list(buffer), dim=1)  # (B, frame_stack, 3, H, W)
+        if config.use_audio:
+            for key in config.audio_keys:
+                sound = to_float_wave(batch[key].reshape(batch[key].shape[0], -1), key)  # (B, S)
+                earlier = self._sound.get(key)
+                if earlier is None:
+                    earlier = sound.new_zeros(sound.shape[0], sound.shape[1] * config.audio_frames)
+                self._sound[key] = torch.cat([earlier[:, sound.shape[1] :], sound], dim=1)
+                run[key] = self._sound[key].unflatten(1, (config.audio_frames, -1))
+            self._n_heard = min(self._n_heard + 1, config.audio_frames)
+            is_pad = torch.arange(config.audio_frames, device=sound.device) < config.audio_frames - self._n_heard
+            for key in config.audio_keys:
+                run[f"{key}_is_pad"] = is_pad.expand(sound.shape[0], -1)
+        for key in config.low_dimensional_keys:
+            run[key] = batch[key].unsqueeze(1)
+        return run
+
+
+class PlaybyearNetwork(nn.Module):
+    """All parameters of the policy, from observations to joint encodings, and from those to actions."""
+
+    def __init__(self, config: PlaybyearConfig):
+        super().__init__()
+        assert config.action_feature is not None
+        self.config = config
+        features = config.input_features or {}
+        self.augment = Augmentation(
+            config.augmentation_crop,
+            config.augmentation_brightness,
+            config.augmentation_hue,
+            config.augmentation_degrees,
+            config.augmentation_translate,
+            config.augmentation_scale,
+        )
+        cameras = config.camera_keys
+        microphones = config.audio_keys
+        n_fused = sum(features[key].shape[0] for key in config.low_dimensional_keys)
+        if config.use_vision:
+            self.vision = nn.ModuleDict(
+                {_module_name(key): VisionEncoder(config.frame_stack, config.vision_width) for key in cameras}
+            )
+            n_fused += len(cameras) * 8 * config.vision_width
+        if config.use_audio:
+            assert config.sample_rate is not None
+            spectrogram = (config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins)
+            self.spectrogram = nn.ModuleDict(
+                {_module_name(key): LogSpectrogram(*spectrogram, config.spectrogram_momentum) for key in microphones}
+            )
+            self.hearing = nn.ModuleDict({_module_name(key): self._audio_encoder() for key in microphones})
+            n_fused += sum(encoder.embedding_size for encoder in self.hearing.values())  # type: ignore[misc]
+        self.fusion = Fusion(n_fused, config)
+        self.memory_head = MemoryHead(config, config.action_feature.shape[0])
+
+    def encode_run(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
+        """Joint encodings of the last `n_frames` frames of every item, each encoded once: (B, n_frames, D).
+
+        Where the episode had not begun, the first frame's encoding repeats.
+        """
+        parts = [
+            *(self._see(batch, key, n_frames) for key in self.config.camera_keys if self.config.use_vision),
+            *(self._hear(batch, key, n_frames) for key in self.config.audio_keys if self.config.use_audio),
+            *(_newest(batch, key, n_frames).flatten(0, 1).float() for key in self.config.low_dimensional_keys),
+        ]
+        n_items = len(next(iter(batch[key] for key in batch if isinstance(batch[key], Tensor))))
+        encodings = self.fusion(parts).unflatten(0, (n_items, n_frames))
+        before = _n_before_episode(batch, self._padded_key(), n_frames)
+        if before is None:
+            return encodings
+        index = torch.maximum(torch.arange(n_frames, device=encodings.device), before.unsqueeze(1))  # (B, R)
+        return encodings.gather(1, index.unsqueeze(-1).expand(-1, -1, encodings.shape[-1]))
+
+    def encode_frame(self, run: dict[str, Tensor]) -> Tensor:
+        """Joint encoding of the newest frame: (B, D)."""
+        parts = [
+            *(self._see(run, key, 1) for key in self.config.camera_keys if self.config.use_vision),
+            *(self._hear(run, key, 1) for key in self.config.audio_keys if self.config.use_audio),
+            *(run[key][:, -1].float() for key in self.config.low_dimensional_keys),
+        ]
+        return self.fusion(parts)
+
+    def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        """One camera's embeddings, (B * n_frames, embedding size)."""
+        config = self.config
+        images = _newest(batch, key, n_frames + config.frame_stack - 1)  # (B, T, 3, H, W)
+        images = images.float() / 255 if images.dtype == torch.uint8 else images
+        images = self.augment(images, config.image_size) if self.training else resize(images, config.image_size)
+        stacks = torch.cat([images[:, i : i + n_frames] for i in range(config.frame_stack)], dim=2)
+        return self.vision[_module_name(key)](stacks.flatten(0, 1))
+
+    def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        """One microphone's embeddings, (B * n_frames, embedding size)."""
+        config = self.config
+        sound = _newest(batch, key, n_frames + config.audio_frames - 1)  # (B, T, S)
+        wave = to_float_wave(sound.flatten(1), key)
+        if self.training and config.audio_noise_db is not None:
+            wave = mix_in_noise(wave, config.audio_noise_db)
+        step = sound.shape[2]
+        windows = wave.unfold(1, config.audio_frames * step, step)  # (B, n_frames, samples)
+        windows = windows[..., -config.window_samples :].flatten(0, 1)
+        begun = torch.ones_like(windows, dtype=torch.bool)
+        if f"{key}_is_pad" in batch:
+            is_pad = batch[f"{key}_is_pad"][:, -sound.shape[1] :].repeat_interleave(step, dim=1)
+            begun = ~is_pad.unfold(1, config.audio_frames * step, step)[..., -config.window_samples :].flatten(0, 1)
+        name = _module_name(key)
+        return self.hearing[name](self.spectrogram[name](windows, begun))
+
+    def _padded_key(self) -> str:
+        """An observation that every batch has."""
+        config = self.config
+        keys = [*config.low_dimensional_keys, *(config.camera_keys if config.use_vision else []), *config.audio_keys]
+        return keys[0]
+
+    def _audio_encoder(self) -> AudioEncoder:
+        config = self.config
+        assert config.sample_rate is not None
+        segment, hop = round(config.segment_s * config.sample_rate), round(config.hop_s * config.sample_rate)
+        n_segments = (config.window_samples - segment) // hop + 1
+        return AudioEncoder(config.n_frequency_bins, n_segments, tuple(config.audio_channels))
+
+
+def _newest(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+    """The last `n_frames` frames of a key, (B, n_frames, ...)."""
+    if key not in batch:
+        raise ValueError(f"The batch has no '{key}', which the policy was built for; it has {sorted(batch)}.")
+    values = batch[key]
+    if values.dim() < 2 or values.shape[1] < n_frames:
+        raise ValueError(
+            f"'{key}' has shape {tuple(values.shape)}, but {n_frames} frames are needed along its second dimension."
+        )
+    return values[:, -n_frames:]
+
+
+def _n_before_episode(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor | None:
+    """How many of the last `n_frames` frames lie before the episode, (B,), or None when nothing says so."""
+    if f"{key}_is_pad" not in batch:
+        return None
+    return batch[f"{key}_is_pad"][:, -n_frames:].sum(dim=1).clamp(max=n_frames - 1)
+
+
+def _module_name(key: str) -> str:
+    return key.removeprefix("observation.").replace(".", "_")
+
+
+def _check_fps(config: PlaybyearConfig) -> None:
+    meta = getattr(config, "_runtime_dataset_meta", None)
+    if meta is not None and meta.fps != config.fps:
+        raise ValueError(
+            f"The dataset has fps={meta.fps}, but the policy is configured for fps={config.fps}: set --policy.fps={meta.fps}, "
+            "or train a new policy for this dataset."
+        )

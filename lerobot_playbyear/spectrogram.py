@@ -1,0 +1,108 @@
+"""The policy's ear: waveform in, normalised log-power spectrogram out."""
+
+import torch
+import torchaudio
+from torch import Tensor, nn
+
+_POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
+
+
+def to_float_wave(wave: Tensor, key: str) -> Tensor:
+    """Integers are PCM at full scale, floats are already in [-1, 1].
+
+    Raises:
+        ValueError: NaN or infinite samples, or floats far outside [-1, 1].
+    """
+    if not wave.dtype.is_floating_point:
+        return wave.float() / 32768.0
+    peak = wave.abs().amax() if wave.numel() else torch.zeros(())
+    if not torch.isfinite(peak):
+        raise ValueError(f"{key} holds NaN or infinite samples; wanted finite ones. Check the recording.")
+    if peak > 1.5:
+        raise ValueError(
+            f"{key} holds float samples up to {float(peak):.4g}; wanted floats in [-1, 1], or integers as PCM at full scale."
+        )
+    return wave.float()
+
+
+class LogSpectrogram(nn.Module):
+    """Log power of short segments, normalised per frequency bin with running statistics.
+
+    Segments and steps are given in seconds and levels relative to full scale, so that 16 kHz and 48 kHz recordings of the
+    same sound look the same (paper, appendix: 1,920 samples at 48 kHz, lowest 160 bins).
+
+    Args:
+        sample_rate: Of the waveform [Hz].
+        segment_s, hop_s: Length and step of the segments [s].
+        n_bins: Lowest frequency bins kept; bin b is at b / segment_s Hz.
+        momentum: Weight of the newest batch in the running statistics.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    n_batches: Tensor
+
+    def __init__(self, sample_rate: int, segment_s: float, hop_s: float, n_bins: int, momentum: float = 0.01):
+        super().__init__()
+        self.segment, self.hop = round(segment_s * sample_rate), round(hop_s * sample_rate)
+        if n_bins > self.segment // 2 + 1:
+            raise ValueError(
+                f"n_frequency_bins={n_bins} needs a sample rate of at least {2 * n_bins / segment_s:.0f} Hz, got {sample_rate}."
+            )
+        self.n_bins, self.momentum = n_bins, momentum
+        self.transform = torchaudio.transforms.Spectrogram(
+            n_fft=self.segment, hop_length=self.hop, center=False, power=2.0, normalized=False
+        )
+        # A full-scale sine has power 1 in its bin, whatever the segment's length.
+        self.scale = 4.0 / float(self.transform.window.sum()) ** 2
+        self.register_buffer("mean", torch.zeros(n_bins))
+        self.register_buffer("variance", torch.ones(n_bins))
+        self.register_buffer("n_batches", torch.zeros((), dtype=torch.long))
+
+    def log_power(self, wave: Tensor) -> Tensor:
+        """(B, samples) in [-1, 1] -> (B, n_bins, n_segments), in units of 10 dB re full scale."""
+        power = self.transform(wave)[:, : self.n_bins]
+        return torch.log10(power * self.scale + _POWER_FLOOR)
+
+    def forward(self, wave: Tensor, begun: Tensor) -> Tensor:
+        """Spectrograms in which what precedes the episode is the average sound: zero.
+
+        Args:
+            wave: (B, samples), in [-1, 1].
+            begun: (B, samples) bool, False where the episode had not begun.
+
+        Returns:
+            (B, n_bins, n_segments).
+        """
+        levels = self.log_power(wave)
+        # A segment counts if its first sample does: the episode, once begun, goes on.
+        real = begun[:, : wave.shape[1] - self.segment + 1 : self.hop].unsqueeze(1)  # (B, 1, n_segments)
+        if self.training:
+            self._update(levels.detach(), real)
+        levels = (levels - self.mean[:, None]) * torch.rsqrt(self.variance + 1e-5)[:, None]
+        return levels * real
+
+    def _update(self, levels: Tensor, real: Tensor) -> None:
+        weights = real.to(levels.dtype)
+        count = weights.sum()
+        if count < 2:
+            return
+        mean = (levels * weights).sum(dim=(0, 2)) / count
+        variance = ((levels - mean[:, None]).square() * weights).sum(dim=(0, 2)) / count
+        momentum = torch.where(self.n_batches == 0, 1.0, self.momentum)
+        self.mean.lerp_(mean, momentum)
+        self.variance.lerp_(variance, momentum)
+        self.n_batches += 1
+
+
+def mix_in_noise(wave: Tensor, max_db: float) -> Tensor:
+    """Adds noise to training sound, at a level drawn per item between 20 dB below its noise floor and `max_db` above it.
+
+    Args:
+        wave: (B, samples).
+        max_db: Loudest noise relative to the floor [dB].
+    """
+    blocks = wave[:, : wave.shape[1] // 16 * 16].unflatten(1, (16, -1))
+    floor = blocks.square().mean(dim=2).sqrt().quantile(0.25, dim=1)  # (B,)
+    level = torch.empty_like(floor).uniform_(-20.0, max_db)
+    return wave + (floor * 10 ** (level / 20)).unsqueeze(1) * torch.randn_like(wave)
