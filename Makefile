@@ -1,0 +1,45 @@
+# Everything a person needs to type. `make` alone says what there is.
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+
+BIN := .venv/bin
+export MUJOCO_GL ?= egl
+export HF_HUB_DISABLE_TELEMETRY ?= 1
+
+.PHONY: help install demo test test-slow lint bench lock clean
+
+help:  ## Says what there is
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+install: .venv/.installed  ## Makes .venv with pinned versions (PYTHON=... to choose the Python)
+
+.venv/.installed: constraints.txt pyproject.toml envs/pyproject.toml tools/setup.sh
+	PYTHON="$(PYTHON)" ./tools/setup.sh
+	@touch $@
+
+demo: install  ## Records, trains, evaluates and films, in about 20 minutes on two cores
+	PATH="$(CURDIR)/$(BIN):$$PATH" ./examples/demo.sh
+
+lint: install  ## Style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+test: lint  ## Style, types and tests
+	$(BIN)/pytest
+
+test-slow: install  ## The tests that take minutes
+	$(BIN)/pytest -m slow
+
+bench: install  ## Measures what the README states
+	set -e; for script in benchmarks/*.py; do echo "== $$script"; $(BIN)/python $$script; done
+
+lock: install  ## Writes the versions in .venv to constraints.txt
+	VIRTUAL_ENV=$(CURDIR)/.venv $$(command -v $(BIN)/uv || command -v uv) pip freeze --exclude-editable \
+	  | grep -E '^[A-Za-z0-9_.-]+==[^ ]+$$' > constraints.txt.new
+	mv constraints.txt.new constraints.txt
+
+clean:  ## Removes .venv, caches and outputs
+	rm -rf .venv outputs .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

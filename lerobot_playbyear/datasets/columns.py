@@ -1,0 +1,206 @@
+"""The columns of a LeRobotDataset as whole tensors, read once and in order.
+
+LeRobot reads row by row, and every row passes through Python lists. Here a parquet column becomes one numpy array
+through Arrow, an image column is decoded by a few threads, and a video is decoded from its first frame to its last.
+"""
+
+import io
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.video_utils import decode_video_frames
+from lerobot.utils.constants import HF_LEROBOT_HOME
+from PIL import Image
+from torch import Tensor
+
+Progress = Callable[[str, int], Any]
+"""Called with a key and the number of its frames that were just decoded."""
+
+
+def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
+    """A column of numbers or of fixed-length lists of numbers, as an array (N,) or (N, values per row).
+
+    Raises:
+        ValueError: If rows are missing or of different lengths.
+    """
+    parts = [_flat(chunk) for chunk in column.chunks]
+    flat = np.concatenate(parts) if parts else np.empty(0)
+    if not _is_list(column.type):
+        return flat
+    if len(column) == 0 or len(flat) % len(column):
+        raise ValueError(f"{len(flat)} values in {len(column)} rows: the rows differ in length, or some are missing")
+    return flat.reshape(len(column), -1)
+
+
+def read_values(dataset: LeRobotDataset, key: str) -> Tensor:
+    """A numeric column, (N,) or (N, *shape): floats as float32, integers and booleans as they are stored.
+
+    Raises:
+        ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values.
+    """
+    shape = tuple(dataset.meta.features[key]["shape"])
+    shape = () if shape == (1,) else shape  # LeRobot keeps one value per row as a scalar
+    column = dataset.hf_dataset.data.column(key)
+    try:
+        values = column_to_numpy(column).reshape(len(column), *shape)
+    except ValueError as error:
+        raise ValueError(
+            f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
+            "Record the damaged episodes again, or leave them out with --dataset.episodes."
+        ) from error
+    if np.issubdtype(values.dtype, np.floating):
+        check_finite(values, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
+        values = values.astype(np.float32, copy=False)
+    return torch.from_numpy(np.array(values, order="C"))
+
+
+def check_finite(values: np.ndarray, key: str, episode_index: np.ndarray) -> None:
+    """Refuse NaN and infinite values, naming the episodes that hold them.
+
+    Args:
+        values: (N, ...) floats.
+        key: The feature, for the message.
+        episode_index: (N,) the episode of each row, for the message.
+
+    Raises:
+        ValueError: If a value is not finite.
+    """
+    bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+    if bad.any():
+        episodes = np.unique(episode_index[bad]).tolist()
+        raise ValueError(
+            f"'{key}' holds NaN or infinite values in {int(bad.sum())} of {len(values)} frames (episodes "
+            f"{episodes[:10]}{'...' if len(episodes) > 10 else ''}); wanted finite numbers. Record these episodes "
+            "again, or leave them out with --dataset.episodes."
+        )
+
+
+def read_images(dataset: LeRobotDataset, key: str, progress: Progress | None = None) -> Tensor:
+    """All frames of an image column, (N, C, H, W) uint8.
+
+    Raises:
+        ValueError: If a frame has another size than the first, or is empty.
+    """
+    column = dataset.hf_dataset.data.column(key)
+    mode = "L" if 1 in _channel_candidates(dataset.meta.features[key]) else "RGB"
+    frames: Tensor | None = None
+    position = 0
+    with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
+        for chunk in column.chunks:
+            encoded = zip(chunk.field("bytes").to_pylist(), chunk.field("path").to_pylist(), strict=True)
+            for image in pool.map(lambda row: _decode_image(row, mode), encoded):
+                if frames is None:
+                    frames = torch.empty((len(column), *image.shape), dtype=torch.uint8)
+                if image.shape != frames.shape[1:]:
+                    raise ValueError(
+                        f"'{key}': frame {position} is {image.shape}, the first one {tuple(frames.shape[1:])} (C, H, W). "
+                        "All frames must have one size: record again, or resize the column."
+                    )
+                frames[position].numpy()[:] = image
+                position += 1
+                if progress:
+                    progress(key, 1)
+    if frames is None:
+        raise ValueError(f"'{key}' of dataset '{dataset.repo_id}' has no frames.")
+    return frames
+
+
+def read_videos(
+    dataset: LeRobotDataset, key: str, video_backend: str | None = None, progress: Progress | None = None
+) -> Tensor:
+    """All frames of a video feature, (N, C, H, W) uint8, decoded episode by episode as LeRobot decodes them.
+
+    Args:
+        dataset: The dataset.
+        key: The camera.
+        video_backend: LeRobot's decoder ("pyav", "torchcodec"); None takes its default.
+        progress: Told of every decoded episode.
+    """
+    episode_index = column_to_numpy(dataset.hf_dataset.data.column("episode_index"))
+    timestamps = column_to_numpy(dataset.hf_dataset.data.column("timestamp"))
+    frames: Tensor | None = None
+    for start, end in zip(*episode_bounds(episode_index), strict=True):
+        episode = int(episode_index[start])
+        path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
+        offset = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
+        decoded = decode_video_frames(
+            path,
+            [offset + float(timestamp) for timestamp in timestamps[start:end]],
+            dataset.tolerance_s,
+            video_backend,
+            return_uint8=True,
+        )  # (n, C, H, W)
+        if frames is None:
+            frames = torch.empty((len(episode_index), *decoded.shape[1:]), dtype=torch.uint8)
+        frames[start:end] = decoded
+        if progress:
+            progress(key, end - start)
+    if frames is None:
+        raise ValueError(f"'{key}' of dataset '{dataset.repo_id}' has no frames.")
+    return frames
+
+
+def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
+    """First row, and row after the last, of every episode, from the episode of each row (N,)."""
+    changes = np.flatnonzero(np.diff(episode_index)) + 1
+    starts = [0, *changes.tolist()]
+    return starts, [*starts[1:], len(episode_index)]
+
+
+def check_dataset_files(repo_id: str, root: str | Path | None = None) -> None:
+    """Refuse a local dataset that is empty or was cut off while it was written.
+
+    Does nothing where no local dataset is: LeRobot then fetches it from the Hub.
+
+    Args:
+        repo_id: The dataset's name.
+        root: Its folder; None means LeRobot's own place for `repo_id`.
+
+    Raises:
+        ValueError: Naming the file that cannot be read, or the folder without data.
+    """
+    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    if not (folder / "meta" / "info.json").is_file():
+        return
+    for path in sorted([*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]):
+        try:
+            pq.read_metadata(path)
+        except (pa.ArrowInvalid, OSError) as error:
+            raise ValueError(
+                f"'{path}' is truncated or not a parquet file ({error}). The recording was killed before "
+                "`dataset.finalize()`: delete the file's episodes and record them again."
+            ) from error
+    if not any(folder.glob("data/*/*.parquet")):
+        raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
+
+
+def _decode_image(row: tuple[bytes | None, str | None], mode: str) -> np.ndarray:
+    data, path = row
+    with Image.open(io.BytesIO(data) if data is not None else str(path)) as image:
+        pixels = np.asarray(image.convert(mode))
+    return pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)  # (C, H, W)
+
+
+def _channel_candidates(feature: dict[str, Any]) -> tuple[int, int]:
+    shape = tuple(feature["shape"])
+    return shape[0], shape[-1]  # declared (C, H, W) or (H, W, C)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return isinstance(kind, pa.BaseExtensionType) or pa.types.is_nested(kind)
+
+
+def _flat(chunk: pa.Array) -> np.ndarray:
+    while _is_list(chunk.type):
+        chunk = chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk.flatten()
+    if chunk.null_count:
+        raise ValueError(f"{chunk.null_count} values are missing")
+    return chunk.to_numpy(zero_copy_only=False)

@@ -1,0 +1,99 @@
+"""Named defaults for `playbyear-train`: `--preset=cpu` stands for the options listed here.
+
+Options on the command line win over the preset, and the preset wins over a configuration file.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from lerobot.configs import parser
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A recipe.
+
+    Attributes:
+        purpose: When to choose it, in one line.
+        network: Options that fix what the network looks like; they do not apply to `--policy.path`, where the
+            checkpoint says it.
+        training: Options for how it is trained.
+    """
+
+    purpose: str
+    network: dict[str, str] = field(default_factory=dict)
+    training: dict[str, str] = field(default_factory=dict)
+
+
+PRESETS = {
+    "cpu": Preset(
+        purpose="two CPU cores, within the hour",
+        network={
+            "policy.type": "playbyear",
+            "policy.device": "cpu",
+            "policy.image_size": "84",
+            "policy.vision_width": "16",
+        },
+        training={
+            "policy.n_supervised_steps": "4",
+            "policy.optimizer_lr": "1e-3",
+            "policy.optimizer_grad_clip_norm": "1.0",
+            "policy.push_to_hub": "false",
+            "batch_size": "32",
+            "steps": "6000",
+            "log_freq": "100",
+            "save_freq": "2000",
+            "env_eval_freq": "6000",
+        },
+    ),
+    "paper": Preset(
+        purpose="the published experiment: 1.6 million windows at 224 pixels, for a GPU",
+        network={
+            "policy.type": "playbyear",
+            "policy.image_size": "224",
+            "policy.vision_width": "64",
+        },
+        training={
+            "policy.n_supervised_steps": "1",
+            "policy.optimizer_lr": "1e-3",
+            "policy.push_to_hub": "false",
+            "batch_size": "16",
+            "steps": "100000",
+        },
+    ),
+}
+
+
+def apply_preset(args: Sequence[str]) -> list[str]:
+    """Put a preset's options before those of a command line, as far as that does not give them itself.
+
+    Args:
+        args: Command-line arguments; without `--preset` they are returned as they are. When a run is resumed, its
+            checkpoint holds all options and the preset changes nothing.
+
+    Raises:
+        ValueError: If there is no such preset, or the policy is of another type.
+    """
+    args = list(args)
+    name = parser.parse_arg("preset", args)
+    if name is None or (parser.parse_arg("resume", args) or "").lower() in ("true", "1", "yes"):
+        return args
+    if name not in PRESETS:
+        known = "; ".join(f"{key} ({preset.purpose})" for key, preset in PRESETS.items())
+        raise ValueError(f"--preset={name} is not known. The presets are: {known}.")
+    preset = PRESETS[name]
+    policy_type = parser.get_type_arg("policy", args)
+    if policy_type not in (None, preset.network["policy.type"]):
+        raise ValueError(
+            f"--preset={name} is for --policy.type={preset.network['policy.type']}, not for {policy_type}: "
+            "leave one of the two out."
+        )
+    from_checkpoint = parser.parse_arg("policy.path", args) is not None
+    options = preset.training if from_checkpoint else {**preset.network, **preset.training}
+    if _is_given("policy.repo_id", args):  # whoever names a place on the Hub wants it used
+        options = {key: value for key, value in options.items() if key != "policy.push_to_hub"}
+    return [f"--{key}={value}" for key, value in options.items() if not _is_given(key, args)] + args
+
+
+def _is_given(option: str, args: Sequence[str]) -> bool:
+    return any(arg == f"--{option}" or arg.startswith(f"--{option}=") for arg in args)

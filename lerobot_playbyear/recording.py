@@ -1,0 +1,273 @@
+"""`playbyear-record`: an environment's scripted expert becomes a LeRobotDataset with sound."""
+
+import itertools
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pyarrow.parquet as pq
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import (
+    ACTION,
+    DONE,
+    HF_LEROBOT_HOME,
+    OBS_ENV_STATE,
+    OBS_IMAGE,
+    OBS_IMAGES,
+    OBS_STATE,
+    OBS_STR,
+    REWARD,
+    SUCCESS,
+)
+from tqdm import tqdm
+
+from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
+from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, check_root
+from lerobot_playbyear.rollouts import EnvFacts, EnvSpec, Episode, Observation, RolloutError, RolloutPool
+
+INTERVENTION = "intervention"
+SEED = "seed"
+_MIN_ATTEMPTS_PER_SUCCESS = 20  # attempts in a row without one success after which recording gives up
+_STATE_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+
+
+class RecordError(RuntimeError):
+    """Recording cannot begin or go on; the message is for the person who asked for it."""
+
+
+@dataclass
+class RecordDatasetConfig:
+    """The dataset that is written.
+
+    Args:
+        repo_id: Its name, `user/name`.
+        root: Its folder. None: in LeRobot's own cache, under its name.
+        num_episodes: How many successful episodes it shall have.
+        video: Whether pictures are encoded as video; otherwise each is stored without loss.
+        push_to_hub: Whether to upload it when it is complete.
+        private: Whether the uploaded repository is private. None: as the account's default says.
+        tags: For its card on the Hub.
+    """
+
+    repo_id: str
+    root: str | None = None
+    num_episodes: int = 50
+    video: bool = False
+    push_to_hub: bool = False
+    private: bool | None = None
+    tags: list[str] | None = None
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.root) if self.root else HF_LEROBOT_HOME / self.repo_id
+
+
+@dataclass
+class RecordConfig:
+    """Options of `playbyear-record`.
+
+    Args:
+        env: The environment, `--env.type=playbyear --env.task=OccludedGrasp-v0`; it must have a scripted expert.
+        dataset: What is written, and where.
+        seed: The first attempt's seed; each further attempt takes the next one.
+        resume: Append to a dataset that is there already, up to `num_episodes`, with the seeds after its largest.
+        num_workers: Processes that roll out. 0: none but this one. None: as many as there are processor cores, at
+            most 8. The dataset does not depend on it.
+    """
+
+    env: EnvConfig
+    dataset: RecordDatasetConfig
+    seed: int = 0
+    resume: bool = False
+    num_workers: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.num_workers is None:
+            self.num_workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1, 8)
+
+
+def record(cfg: RecordConfig) -> Path:
+    """Records expert episodes until the dataset has as many as asked for; only successes are kept.
+
+    Args:
+        cfg: The options.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        RecordError: Bad options, a folder that cannot be written, an environment without an expert, a dataset that
+            does not fit, a full disk. Episodes saved before are safe.
+    """
+    root = cfg.dataset.folder
+    try:
+        _check_options(cfg)
+        check_root(root, resume=cfg.resume)
+        with RolloutPool(env_spec(cfg.env), cfg.num_workers or 0) as pool:
+            facts = pool.facts()
+            _check_facts(facts, cfg.env)
+            features = dataset_features(facts, cfg.dataset.video)
+            with DurableWriter(
+                cfg.dataset.repo_id, root, facts.fps, features, resume=cfg.resume, robot_type=cfg.env.type
+            ) as writer:
+                _record_episodes(cfg, pool, writer)
+                summary = f"{writer.num_episodes} episodes, {writer.num_frames} frames"
+    except (DatasetWriteError, RolloutError, FileExistsError, ValueError) as error:
+        raise RecordError(str(error)) from error
+    except OSError as error:
+        raise RecordError(f"Cannot write to {root}: {error}") from error
+    print(f"\nDataset: {root} ({summary})")
+    if cfg.dataset.push_to_hub:
+        _push(cfg, root)
+    print(
+        "Train on it: playbyear-train --policy.type=playbyear --policy.push_to_hub=false "
+        f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={root}"
+    )
+    return root
+
+
+def env_spec(env: EnvConfig) -> EnvSpec:
+    """How Gymnasium makes the environment that a LeRobot configuration describes."""
+    return EnvSpec(f"{env.package_name}:{env.gym_id}", dict(env.gym_kwargs))
+
+
+def dataset_features(facts: EnvFacts, video: bool = False) -> dict[str, dict[str, Any]]:
+    """The features of a dataset of expert episodes, as the raw observation space gives them.
+
+    Args:
+        facts: What the environment looks like.
+        video: Whether pictures become video.
+
+    Raises:
+        ValueError: An observation has no place in a LeRobotDataset.
+    """
+    features: dict[str, dict[str, Any]] = {}
+    for key, space in _observation_boxes(facts.observation_space).items():
+        if key.startswith((OBS_IMAGES, OBS_IMAGE)):
+            names = ["height", "width", "channel"]
+            features[key] = {"dtype": "video" if video else "image", "shape": space.shape, "names": names}
+        elif key.startswith(AUDIO_PREFIX):
+            features[key] = audio_feature(sample_rate=space.shape[0] * facts.fps, fps=facts.fps)
+        else:
+            features[key] = {"dtype": "float32", "shape": space.shape, "names": None}
+    features[ACTION] = {"dtype": "float32", "shape": facts.action_space.shape, "names": None}
+    for key, dtype in ((INTERVENTION, "bool"), (REWARD, "float32"), (SUCCESS, "bool"), (DONE, "bool"), (SEED, "int64")):
+        features[key] = {"dtype": dtype, "shape": (1,), "names": None}
+    return features
+
+
+def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """The T frames of an episode: frame t holds what was observed, the action taken then, and what came of it.
+
+    Args:
+        episode: An expert's episode.
+        features: From `dataset_features`.
+    """
+    frames = []
+    for t in range(len(episode)):
+        frame: dict[str, Any] = dict(_flat_observation(episode.observations[t]))
+        for key, value in frame.items():
+            if features[key]["dtype"] == "float32":
+                frame[key] = np.asarray(value, np.float32)
+        frame[ACTION] = episode.actions[t]
+        frame[INTERVENTION] = np.array([True])
+        frame[REWARD] = episode.rewards[t : t + 1]
+        frame[SUCCESS] = episode.successes[t : t + 1]
+        frame[DONE] = np.array([t == len(episode) - 1])
+        frame[SEED] = np.array([episode.seed], np.int64)
+        frame["task"] = episode.task
+        frames.append(frame)
+    return frames
+
+
+def next_seed(root: Path, seed: int) -> int:
+    """The seed after the largest in the dataset, so that no attempt is made twice.
+
+    Args:
+        root: The dataset's folder.
+        seed: What to begin with when that is larger, or when the dataset holds no seeds.
+    """
+    files = sorted(root.glob("data/*/*.parquet"))
+    used = [pq.read_table(path, columns=[SEED])[SEED].to_numpy().max() for path in files]
+    return max([seed, *(int(value) + 1 for value in used)])
+
+
+def _record_episodes(cfg: RecordConfig, pool: RolloutPool, writer: DurableWriter) -> None:
+    wanted = cfg.dataset.num_episodes
+    first_seed = next_seed(writer.root, cfg.seed)
+    attempts = successes = failures_in_a_row = 0
+    with tqdm(total=wanted, initial=writer.num_episodes, unit="episode", desc="Recording") as progress:
+        if writer.num_episodes >= wanted:
+            return
+        for episode in pool.episodes(itertools.count(first_seed)):
+            attempts += 1
+            failures_in_a_row = 0 if episode.success else failures_in_a_row + 1
+            if episode.success:
+                for frame in episode_frames(episode, writer.features):
+                    writer.add_frame(frame)
+                writer.save_episode()
+                successes += 1
+                progress.update()
+            progress.set_postfix_str(f"success rate {successes / attempts:.0%} of {attempts} attempts")
+            if failures_in_a_row >= _MIN_ATTEMPTS_PER_SUCCESS:
+                raise RecordError(
+                    f"The expert failed {failures_in_a_row} times in a row, up to seed {episode.seed}: something is "
+                    f"wrong with the task's options. {writer.num_episodes} episodes are saved in {writer.root}."
+                )
+            if writer.num_episodes >= wanted:
+                return
+
+
+def _check_options(cfg: RecordConfig) -> None:
+    if cfg.dataset.num_episodes < 1:
+        raise RecordError(f"dataset.num_episodes={cfg.dataset.num_episodes}: give at least 1.")
+    if cfg.seed < 0:
+        raise RecordError(f"seed={cfg.seed}: give 0 or more.")
+    if cfg.dataset.push_to_hub and "/" not in cfg.dataset.repo_id:
+        raise RecordError(f"dataset.repo_id={cfg.dataset.repo_id!r}: to push, give it as user/name.")
+
+
+def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:
+    if not facts.has_expert:
+        raise RecordError(
+            f"--env.type={env.type} --env.task={env.task} has no scripted expert, so there is nobody to record. "
+            "Record a person with lerobot-record instead."
+        )
+    if facts.fps != env.fps:
+        raise RecordError(f"--env.fps={env.fps}, but the environment runs at {facts.fps} steps per second: give that.")
+
+
+def _observation_boxes(space: gym.spaces.Dict) -> dict[str, gym.spaces.Box]:
+    boxes = _flat_observation(dict(space.spaces))
+    for key, box in boxes.items():
+        if not isinstance(box, gym.spaces.Box) or (key.startswith(AUDIO_PREFIX) and box.dtype != np.int16):
+            raise ValueError(f"The observation {key!r} cannot be recorded: its space is {box}.")
+    return boxes
+
+
+def _flat_observation(observation: Observation) -> dict[str, Any]:
+    """Names a raw observation's entries, or those of its space, as LeRobot's `preprocess_observation` does."""
+    flat: dict[str, Any] = {}
+    for key, value in observation.items():
+        if key != "pixels":
+            flat[_STATE_KEYS.get(key, f"{OBS_STR}.{key}")] = value
+        elif isinstance(value, dict | gym.spaces.Dict):
+            flat.update({f"{OBS_IMAGES}.{camera}": picture for camera, picture in value.items()})
+        else:
+            flat[OBS_IMAGE] = value
+    return flat
+
+
+def _push(cfg: RecordConfig, root: Path) -> None:
+    try:
+        dataset = LeRobotDataset(cfg.dataset.repo_id, root=root, video_backend="pyav")
+        dataset.push_to_hub(private=cfg.dataset.private, tags=cfg.dataset.tags)
+    except Exception as error:
+        raise RecordError(
+            f"The dataset is complete in {root}, but it could not be uploaded: {error}. "
+            "Try again with the same command and --resume=true."
+        ) from error

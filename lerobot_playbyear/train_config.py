@@ -1,0 +1,130 @@
+"""What `playbyear-train` can be told: all of `lerobot-train`'s options, and a few of its own."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.configs import parser
+from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
+
+OWN_CONFIG_NAME = "playbyear_train_config.json"
+"""File beside `train_config.json` that holds the options which lerobot-train does not know."""
+
+_OWN_FIELDS = ("preset", "sampling", "store")
+
+
+@dataclass
+class SamplingConfig:
+    """Which moments are learned from more often than others. Weights of 1 draw all frames alike.
+
+    Attributes:
+        start_weight: How many times as often the first frames of an episode are drawn; only they may show what
+            has to be remembered.
+        start_s: How long the first frames last [s].
+        loud_weight: How many times as often frames after a sudden sound are drawn.
+        loud_s: How long such a moment lasts [s].
+        loud_db: How far above the median a frame's power is when something sounds [dB].
+    """
+
+    start_weight: float = 1.0
+    start_s: float = 0.5
+    loud_weight: float = 1.0
+    loud_s: float = 0.5
+    loud_db: float = 12.0
+
+    def check(self) -> None:
+        """Raise a ValueError if a number is out of its range."""
+        for name in ("start_weight", "loud_weight"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"--sampling.{name} must be above 0, got {getattr(self, name)}.")
+        for name in ("start_s", "loud_s"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"--sampling.{name} must be at least 0 seconds, got {getattr(self, name)}.")
+
+
+@dataclass
+class StoreConfig:
+    """Where the dataset is kept in memory.
+
+    Attributes:
+        device: "cpu" or "cuda"; None means the GPU when at most half of its free memory is needed, otherwise the CPU.
+    """
+
+    device: str | None = None
+
+
+@dataclass
+class PlaybyearTrainConfig(TrainPipelineConfig):
+    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*` and `--store.*`.
+
+    A checkpoint keeps lerobot-train's options in its `train_config.json` and the others in a file of their own, so
+    that lerobot-train can resume what playbyear-train began, and the other way round.
+
+    Attributes:
+        preset: A named set of defaults, see `lerobot_playbyear.presets`.
+        sampling: Which moments are learned from more often.
+        store: Where the dataset is kept.
+    """
+
+    preset: str | None = None
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    store: StoreConfig = field(default_factory=StoreConfig)
+
+    def validate(self) -> None:
+        """As for lerobot-train; options that need its data loader are refused.
+
+        Raises:
+            ValueError: Naming the option and what to do instead.
+        """
+        refused = {
+            "--job.target": self.job.is_remote,
+            "--dataset.streaming": self.dataset.streaming,
+            "--dataset.image_transforms.enable": self.dataset.image_transforms.enable,
+            "--reward_model": self.is_reward_model_training,
+            "--peft": self.peft is not None,
+            "--sample_weighting": self.sample_weighting is not None,
+        }
+        for option, is_used in refused.items():
+            if is_used:
+                raise ValueError(f"{option} does not work in playbyear-train: leave it out, or use lerobot-train.")
+        self.sampling.check()
+        super().validate()
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        options = draccus.encode(self)
+        own = {name: options.pop(name) for name in _OWN_FIELDS}
+        for name, content in ((TRAIN_CONFIG_NAME, options), (OWN_CONFIG_NAME, own)):
+            (save_directory / name).write_text(json.dumps(content, indent=4))
+
+    @classmethod
+    def from_pretrained(  # type: ignore[override]
+        cls, pretrained_name_or_path: str | Path, **kwargs: Any
+    ) -> "PlaybyearTrainConfig":
+        """Read the options of a run, playbyear-train's or lerobot-train's.
+
+        Args:
+            pretrained_name_or_path: A `train_config.json`, its folder, or a model on the Hub. From the Hub only
+                lerobot-train's options are read.
+            **kwargs: As for `TrainPipelineConfig.from_pretrained`; `cli_args` win over what is read.
+        """
+        cli_args = list(kwargs.pop("cli_args", []))
+        path = Path(pretrained_name_or_path)
+        own = (path if path.is_dir() else path.parent) / OWN_CONFIG_NAME
+        if own.is_file():
+            saved = _flatten(json.loads(own.read_text()))
+            cli_args = [f"--{k}={v}" for k, v in saved.items() if parser.parse_arg(k, cli_args) is None] + cli_args
+        config = super().from_pretrained(pretrained_name_or_path, cli_args=cli_args, **kwargs)
+        return config  # type: ignore[return-value]
+
+
+def _flatten(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options with their names joined by dots; options that are None are left out."""
+    flat: dict[str, Any] = {}
+    for key, value in options.items():
+        if isinstance(value, dict):
+            flat.update(_flatten(value, f"{prefix}{key}."))
+        elif value is not None:
+            flat[f"{prefix}{key}"] = value
+    return flat

@@ -1,0 +1,199 @@
+"""Films with sound: pictures of an episode above the spectrogram of what was heard, and the sound itself."""
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from PIL import Image, ImageDraw
+
+_VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of FFmpeg has
+_AUDIO_CODECS = ("aac", "libmp3lame")
+_STRIP_HEIGHT = 120  # pixels
+_INSET_SHARE = 0.28  # of the picture's height
+_TOP_FREQUENCY = 8000  # Hz, upper edge of the strip
+_WINDOW_SECONDS = 0.032
+_DYNAMIC_RANGE_DB = 70.0
+_DIMMED = 0.4  # brightness of what has not been heard yet
+_LOUDEST = 0.7  # of full scale
+_MAX_GAIN = 100.0
+# Control points of a dark-to-bright colour scale whose lightness grows evenly.
+_COLOURS = np.array(
+    [(0, 0, 4), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (252, 255, 164)]
+)
+
+
+def episode_sound(blocks: np.ndarray) -> np.ndarray:
+    """The sound of an episode, in time with its pictures.
+
+    The block of frame t was heard before its picture was taken, so the film, which shows picture t from then on,
+    plays block t + 1 with it; silence goes with the last picture.
+
+    Args:
+        blocks: (T + 1, S) or (T + 1, S, n_microphones) int16, the block of each observation.
+
+    Returns:
+        ((T + 1) * S, n_microphones) int16.
+    """
+    blocks = blocks[..., None] if blocks.ndim == 2 else blocks
+    shifted = np.concatenate([blocks[1:], np.zeros_like(blocks[:1])])  # (T + 1, S, n_microphones)
+    return shifted.reshape(blocks.shape[0] * blocks.shape[1], blocks.shape[2])
+
+
+def amplify(samples: np.ndarray) -> np.ndarray:
+    """Makes the loudest sample 70 % of full scale, with a gain of at most 40 dB; int16 in, int16 out."""
+    peak = np.abs(samples.astype(np.int32)).max(initial=1) / 32768
+    return (samples * min(_LOUDEST / peak, _MAX_GAIN)).astype(np.int16)
+
+
+def spectrogram_strip(samples: np.ndarray, sample_rate: int, width: int, height: int) -> np.ndarray:
+    """Draws a whole episode's spectrogram.
+
+    Args:
+        samples: (n,) int16.
+        sample_rate: [Hz].
+        width, height: Of the drawing [pixels]: time runs from left to right, frequency from 0 at the bottom up to
+            8 kHz, or half the sample rate.
+
+    Returns:
+        (height, width, 3) uint8; 70 dB from the darkest to the brightest colour.
+    """
+    window = max(int(_WINDOW_SECONDS * sample_rate), 16)
+    padded = np.pad(samples.astype(np.float32) / 32768, window // 2 + 1)
+    starts = np.linspace(0, max(len(padded) - window, 0), width).astype(int)
+    columns = padded[starts[:, None] + np.arange(window)] * np.hanning(window)  # (width, window)
+    power = np.abs(np.fft.rfft(columns, axis=1)) ** 2  # (width, window // 2 + 1)
+    n_bins = min(power.shape[1], int(_TOP_FREQUENCY * window / sample_rate) + 1)
+    decibels = 10 * np.log10(power[:, :n_bins] + 1e-12)
+    level = np.clip(1 + (decibels - decibels.max()) / _DYNAMIC_RANGE_DB, 0, 1)
+    rows = np.linspace(n_bins - 1, 0, height).round().astype(int)
+    level = level[:, rows].T  # (height, width)
+    scale = np.linspace(0, 1, len(_COLOURS))
+    return np.stack([np.interp(level, scale, channel) for channel in _COLOURS.T], axis=-1).astype(np.uint8)
+
+
+def inset(picture: np.ndarray, view: np.ndarray, label: str = "policy's camera") -> np.ndarray:
+    """Puts what the policy's camera sees into the lower left corner of a picture for people.
+
+    Args:
+        picture: (H, W, 3) uint8.
+        view: (h, w, 3) uint8, any size.
+        label: Written above it.
+    """
+    height = int(picture.shape[0] * _INSET_SHARE)
+    size = (round(height * view.shape[1] / view.shape[0]), height)
+    framed = Image.fromarray(picture)
+    corner = (8, framed.height - height - 8)
+    framed.paste((255, 255, 255), (corner[0] - 1, corner[1] - 1, corner[0] + size[0] + 1, corner[1] + size[1] + 1))
+    framed.paste(Image.fromarray(view).resize(size, Image.Resampling.NEAREST), corner)
+    ImageDraw.Draw(framed).text((corner[0], corner[1] - 14), label, fill=(255, 255, 255))
+    return np.asarray(framed)
+
+
+def compose(pictures: Sequence[np.ndarray], sound: np.ndarray, sample_rate: int) -> Iterator[np.ndarray]:
+    """Puts each picture above the spectrogram strip, with a cursor at the picture's time.
+
+    Args:
+        pictures: T + 1 pictures (H, W, 3) uint8; H and W even.
+        sound: (n, n_microphones) int16, as long as the film. The strip shows the first microphone; without a
+            microphone there is no strip.
+        sample_rate: [Hz].
+
+    Returns:
+        The film's frames, (H + 120, W, 3) uint8.
+    """
+    width = pictures[0].shape[1]
+    if not sound.shape[1]:
+        yield from pictures
+        return
+    strip = spectrogram_strip(sound[:, 0], sample_rate, width, _STRIP_HEIGHT)
+    strip = _label(strip, f"{min(_TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz")
+    for index, picture in enumerate(pictures):
+        cursor = min(round(width * (index + 1) / len(pictures)), width - 1)
+        shown = strip.copy()
+        shown[:, cursor:] = (shown[:, cursor:] * _DIMMED).astype(np.uint8)
+        shown[:, max(cursor - 1, 0) : cursor + 1] = 255
+        yield np.concatenate([picture, shown])
+
+
+def write_film(path: str | Path, frames: Iterable[np.ndarray], fps: int, sound: np.ndarray, sample_rate: int) -> Path:
+    """Writes an mp4 that browsers and video players take (H.264 and AAC where FFmpeg has them).
+
+    Args:
+        path: Of the file; its folder is made.
+        frames: (H, W, 3) uint8, H and W even.
+        fps: Frames per second.
+        sound: (n, n_microphones) int16. One microphone is mono, two are left and right, of more only the first two
+            are heard; none makes a silent film.
+        sample_rate: [Hz].
+
+    Returns:
+        The path. The file is there only when it is complete.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    sound = sound[:, :2]
+    block = sample_rate // fps
+    try:
+        with av.open(str(partial), "w", options={"movflags": "+faststart"}) as film:
+            audio = _add_audio_stream(film, sample_rate, sound.shape[1]) if sound.shape[1] else None
+            video = None
+            for index, picture in enumerate(frames):
+                if video is None:
+                    video = _add_video_stream(film, fps, *picture.shape[:2])
+                film.mux(video.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+                if audio is not None:
+                    samples = sound[index * block : (index + 1) * block]
+                    film.mux(audio.encode(_audio_frame(samples, sample_rate, index * block)))
+            if video is None:
+                raise ValueError("A film needs at least one frame.")
+            for stream in (video, audio):
+                if stream is not None:
+                    film.mux(stream.encode(None))
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return path
+
+
+def _add_video_stream(film, fps: int, height: int, width: int):
+    stream = film.add_stream(_first_codec(_VIDEO_CODECS), rate=fps)
+    stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
+    if stream.codec_context.name == "libx264":
+        stream.options = {"crf": "20", "preset": "veryfast"}
+    else:
+        stream.bit_rate = 4_000_000
+    return stream
+
+
+def _add_audio_stream(film, sample_rate: int, n_channels: int):
+    stream = film.add_stream(_first_codec(_AUDIO_CODECS), rate=sample_rate)
+    stream.layout = "stereo" if n_channels == 2 else "mono"
+    stream.bit_rate = 96_000 * n_channels
+    return stream
+
+
+def _audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av.AudioFrame:
+    layout = "stereo" if samples.shape[1] == 2 else "mono"
+    frame = av.AudioFrame.from_ndarray(samples.astype(np.int16).reshape(1, -1), format="s16", layout=layout)
+    frame.sample_rate, frame.pts, frame.time_base = sample_rate, first_sample, Fraction(1, sample_rate)
+    return frame
+
+
+def _first_codec(names: Sequence[str]) -> str:
+    for name in names:
+        try:
+            av.codec.Codec(name, "w")
+        except av.FFmpegError:
+            continue
+        return name
+    raise RuntimeError(f"FFmpeg, as PyAV brings it, has none of the encoders {', '.join(names)}.")
+
+
+def _label(strip: np.ndarray, text: str) -> np.ndarray:
+    image = Image.fromarray(strip)
+    ImageDraw.Draw(image).text((4, 2), text, fill=(255, 255, 255))
+    return np.asarray(image)

@@ -1,0 +1,80 @@
+"""Small LeRobotDatasets for tests, made with LeRobot's own API."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_playbyear.datasets.audio_feature import audio_feature
+
+CAMERA = "observation.images.front"
+MICROPHONE = "observation.audio.gripper"
+TASK = "Grasp the hidden cube."
+
+
+def dataset_features(
+    fps: int = 20,
+    sample_rate: int = 16000,
+    image_size: int = 32,
+    use_videos: bool = False,
+    microphones: tuple[str, ...] = (MICROPHONE,),
+    cameras: tuple[str, ...] = (CAMERA,),
+    state_size: int = 7,
+    action_size: int = 4,
+) -> dict[str, dict[str, Any]]:
+    """The features of a dataset with sound."""
+    names = ["height", "width", "channels"]
+    camera = {"dtype": "video" if use_videos else "image", "shape": (image_size, image_size, 3), "names": names}
+    return {
+        **{key: dict(camera) for key in cameras},
+        **{key: audio_feature(sample_rate, fps) for key in microphones},
+        "observation.state": {"dtype": "float32", "shape": (state_size,), "names": None},
+        "action": {"dtype": "float32", "shape": (action_size,), "names": None},
+        "intervention": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
+    }
+
+
+def random_frame(features: dict[str, dict[str, Any]], rng: np.random.Generator) -> dict[str, Any]:
+    """One frame of noise; the action is a function of the state, so that there is something to learn."""
+    frame: dict[str, Any] = {}
+    for key, feature in features.items():
+        shape, dtype = feature["shape"], feature["dtype"]
+        if dtype in ("image", "video"):
+            frame[key] = rng.integers(0, 256, shape, dtype=np.uint8)
+        elif dtype == "bool":
+            frame[key] = rng.random(shape) < 0.5
+        elif dtype == "int16":
+            frame[key] = rng.normal(0, 300, shape).astype(np.int16)
+        else:
+            frame[key] = rng.normal(size=shape).astype(dtype)
+    size = features["action"]["shape"][0]
+    frame["action"] = np.tanh(np.resize(frame["observation.state"], size)).astype(np.float32)
+    return frame
+
+
+def make_dataset(
+    root: str | Path,
+    episode_lengths: tuple[int, ...] = (12, 17, 9),
+    fps: int = 20,
+    seed: int = 0,
+    features: dict[str, dict[str, Any]] | None = None,
+    repo_id: str = "tests/noise",
+    **kwargs: Any,
+) -> LeRobotDataset:
+    """Write episodes of noise to `root` and open them for reading; `kwargs` as for `dataset_features`."""
+    rng = np.random.default_rng(seed)
+    features = dataset_features(fps=fps, **kwargs) if features is None else features
+    use_videos = any(feature["dtype"] == "video" for feature in features.values())
+    encoder = RGBEncoderConfig(vcodec="h264") if use_videos else None
+    dataset = LeRobotDataset.create(
+        repo_id, fps, features, root=root, use_videos=use_videos, rgb_encoder=encoder, video_backend="pyav"
+    )
+    for length in episode_lengths:
+        for _ in range(length):
+            dataset.add_frame({**random_frame(features, rng), "task": TASK})
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset(repo_id, root=root, video_backend="pyav")

@@ -1,0 +1,154 @@
+"""`--env.type=playbyear`: what LeRobot's commands get from the environments."""
+
+import draccus
+import numpy as np
+import pytest
+import torch
+from draccus.utils import DecodingError
+from lerobot.configs import PreTrainedConfig
+from lerobot.envs import make_env, make_env_pre_post_processors, preprocess_observation
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.policies import make_policy_config
+from lerobot.processor import PolicyProcessorPipeline, ProcessorStepRegistry
+from lerobot.scripts.lerobot_eval import rollout
+from torch import nn
+
+from lerobot_env_playbyear import PcmToFloatProcessorStep, PlaybyearEnvConfig
+from lerobot_playbyear.recording import RecordConfig
+
+
+def vector_env(config: PlaybyearEnvConfig, n_envs: int = 1, use_async_envs: bool = False):
+    return make_env(config, n_envs=n_envs, use_async_envs=use_async_envs)["playbyear"][0]
+
+
+@pytest.fixture
+def policy_config() -> PreTrainedConfig:
+    return make_policy_config("act", device="cpu", push_to_hub=False)
+
+
+class ExpertPolicy(nn.Module):
+    """Asks each environment's scripted expert, so that LeRobot's rollout sees successes."""
+
+    def __init__(self, vec):
+        super().__init__()
+        self._vec = vec
+        self.seen: list[dict] = []
+
+    def reset(self):
+        self._experts = None
+
+    def select_action(self, observation):
+        self.seen.append(observation)
+        if self._experts is None:
+            self._experts = [env.unwrapped.scripted_expert() for env in self._vec.envs]
+        actions = [np.asarray(expert.act(), np.float32) for expert in self._experts]
+        return torch.from_numpy(np.stack(actions))
+
+
+@pytest.mark.parametrize(
+    ("options", "extra_keys"),
+    [
+        ({}, {"observation.audio.gripper"}),
+        (
+            {"microphones": ["gripper", "table"], "sample_rate": 48000},
+            {"observation.audio.gripper", "observation.audio.table"},
+        ),
+        ({"sound": "contact_force"}, {"observation.contact_force"}),
+        ({"sound": "none", "task": "OccludedPickPlace-v0"}, set()),
+    ],
+)
+def test_declared_features_are_what_an_observation_holds(options, extra_keys):
+    config = PlaybyearEnvConfig(**options)
+    vec = vector_env(config)
+    observation, _ = vec.reset(seed=0)
+    vec.close()
+    observed = {key: tuple(value.shape[1:]) for key, value in preprocess_observation(observation).items()}
+    declared = {key: feature.shape for key, feature in env_to_policy_features(config).items() if key != "action"}
+    assert observed == declared
+    assert set(observed) == {"observation.images.front", "observation.state"} | extra_keys
+
+
+def test_the_policy_receives_sound_between_minus_one_and_one(policy_config):
+    config = PlaybyearEnvConfig()
+    vec = vector_env(config)
+    raw, _ = vec.reset(seed=0)
+    vec.close()
+    preprocessor, _ = make_env_pre_post_processors(config, policy_config)
+    observation = preprocessor(preprocess_observation(raw))
+    pcm = raw["audio.gripper"]
+    assert pcm.dtype == np.int16
+    assert pcm.any()
+    np.testing.assert_array_equal(observation["observation.audio.gripper"].numpy(), pcm / np.float32(32768))
+    np.testing.assert_array_equal(observation["observation.state"].numpy(), raw["agent_pos"])
+
+
+def test_pcm_at_its_limits():
+    step = ProcessorStepRegistry.get("playbyear_pcm_to_float")()
+    assert isinstance(step, PcmToFloatProcessorStep)
+    pipeline = PolicyProcessorPipeline(steps=[step])
+    pcm = torch.tensor([[-32768.0, 0.0, 16384.0]])
+    result = pipeline({"observation.audio.table": pcm, "observation.state": pcm})
+    assert result["observation.audio.table"].tolist() == [[-1.0, 0.0, 0.5]]
+    assert result["observation.state"].tolist() == pcm.tolist()
+
+
+def test_lerobots_rollout_sees_the_experts_succeed(policy_config):
+    config = PlaybyearEnvConfig(visualization_width=64, visualization_height=64)
+    vec = vector_env(config, n_envs=2)
+    policy = ExpertPolicy(vec)
+    env_processors = make_env_pre_post_processors(config, policy_config)
+    nothing = PolicyProcessorPipeline(steps=[])
+    identity = PolicyProcessorPipeline(steps=[], to_transition=lambda x: x, to_output=lambda x: x)
+    result = rollout(vec, policy, *env_processors, nothing, identity, seeds=[0, 1])
+    assert result["success"].any(dim=1).tolist() == [True, True]
+    lengths = (~result["done"]).sum(dim=1) + 1
+    steps = [env.unwrapped._n_steps for env in vec.envs]
+    vec.close()
+    assert lengths.max() == result["done"].shape[1]
+    assert steps == lengths.tolist(), "an environment whose episode is over was simulated on"
+    assert policy.seen[0]["task"] == [vec.envs[0].unwrapped.task_description] * 2
+    assert all(observation["observation.audio.gripper"].abs().max() <= 1 for observation in policy.seen)
+
+
+def test_environments_in_processes_of_their_own_see_the_same():
+    config = PlaybyearEnvConfig()
+    observations = []
+    for use_async_envs in (False, True):
+        vec = vector_env(config, n_envs=2, use_async_envs=use_async_envs)
+        observation, _ = vec.reset(seed=[3, 4])
+        observations.append(observation)
+        vec.close()
+    alone, together = observations
+    np.testing.assert_array_equal(alone["pixels"]["front"], together["pixels"]["front"])
+    np.testing.assert_array_equal(alone["audio.gripper"], together["audio.gripper"])
+
+
+def test_options_reach_the_environment():
+    config = PlaybyearEnvConfig(episode_length=7, image_size=32, variant="paper", visualization_width=96,
+                                visualization_height=96)  # fmt: skip
+    vec = vector_env(config)
+    vec.reset(seed=0)
+    assert vec.call("_max_episode_steps") == (7,)
+    assert vec.call("render")[0].shape == (96, 96, 3)
+    assert vec.single_observation_space["pixels"]["front"].shape == (32, 32, 3)
+    vec.close()
+
+
+@pytest.mark.parametrize(
+    ("argument", "wanted"),
+    [
+        ("task=Nope-v0", "OccludedGrasp-v0, OccludedPickPlace-v0"),
+        ("sound=loud", "waveform, contact_force, none"),
+        ("variant=ours", "default, paper"),
+        ("sample_rate=16001", "a multiple of 20"),
+        ("fps=30", "20 Hz"),
+        ("microphones=[]", "at least one"),
+        ("visualization_width=100", "square"),
+    ],
+)
+def test_a_wrong_option_says_what_would_work(argument, wanted):
+    with pytest.raises(DecodingError) as error:
+        draccus.parse(RecordConfig, args=["--env.type=playbyear", f"--env.{argument}", "--dataset.repo_id=a/b"])
+    name = argument.split("=")[0]
+    assert f"env.{name}" in str(error.value)
+    assert wanted in str(error.value)

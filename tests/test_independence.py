@@ -1,0 +1,59 @@
+"""The two distributions do without each other: tasks without torch and LeRobot, the policy without MuJoCo."""
+
+import os
+import subprocess
+import sys
+
+_BLOCKER = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {blocked!r}:
+            raise ModuleNotFoundError(f"blocked: {{name}}")
+
+sys.meta_path.insert(0, Blocker())
+"""
+
+
+def _run_without(blocked: set[str], code: str) -> str:
+    script = _BLOCKER.format(blocked=blocked) + code
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "MUJOCO_GL": "egl"},
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def test_the_tasks_run_without_torch_and_lerobot():
+    code = """
+import gymnasium
+env = gymnasium.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0")
+env.reset(seed=0)
+observation, *_ = env.step(env.unwrapped.scripted_expert().act())
+print(sorted(observation))
+"""
+    blocked = {"torch", "torchaudio", "torchvision", "lerobot", "lerobot_playbyear", "lerobot_env_playbyear"}
+    assert _run_without(blocked, code).strip() == "['agent_pos', 'audio.gripper', 'pixels']"
+
+
+def test_every_module_of_the_policy_imports_without_mujoco_and_the_tasks():
+    code = """
+import importlib, pkgutil
+import lerobot_playbyear, lerobot_policy_playbyear
+for package in (lerobot_playbyear, lerobot_policy_playbyear):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(module.name)
+        print(module.name)
+"""
+    imported = _run_without({"mujoco", "gym_playbyear", "lerobot_env_playbyear"}, code).split()
+    assert {"lerobot_playbyear.recording", "lerobot_playbyear.scripts.record"} <= set(imported)
+
+
+def test_what_a_rollout_worker_imports_needs_neither_lerobot_nor_torch():
+    """Otherwise each worker takes half a minute to start on a slow machine."""
+    _run_without({"torch", "lerobot"}, "import lerobot_playbyear.rollouts, lerobot_playbyear.scripts.record")

@@ -1,0 +1,354 @@
+"""`playbyear-record` and the writer beneath it: what is on disk, and what survives."""
+
+import contextlib
+import multiprocessing
+import os
+import resource
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs import EnvConfig
+
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.datasets import durable
+from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
+from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, RecordError, env_spec, record
+from lerobot_playbyear.rollouts import RolloutError, RolloutPool
+
+FEATURES = {
+    "observation.images.front": {"dtype": "image", "shape": (16, 16, 3), "names": ["height", "width", "channel"]},
+    "observation.audio.gripper": {
+        "dtype": "int16",
+        "shape": (80,),
+        "names": None,
+        "info": {"sample_rate": 1600, "encoding": "pcm_s16"},
+    },
+    "action": {"dtype": "float32", "shape": (4,), "names": None},
+}
+
+
+def config(root: Path, num_episodes: int = 2, **options) -> RecordConfig:
+    env = options.pop("env", None) or PlaybyearEnvConfig()
+    dataset = RecordDatasetConfig("test/recorded", str(root), num_episodes, video=options.pop("video", False))
+    return RecordConfig(env, dataset, num_workers=options.pop("num_workers", 0), **options)
+
+
+def load(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("test/recorded", root=root, video_backend="pyav")
+
+
+def column(root: Path, key: str) -> np.ndarray:
+    return np.stack([np.asarray(value) for value in load(root).hf_dataset.with_format("numpy")[key]])
+
+
+def tables(root: Path) -> list[dict]:
+    return [pq.read_table(path).to_pylist() for path in sorted(root.glob("data/*/*.parquet"))]
+
+
+def frame(value: int) -> dict:
+    return {
+        "observation.images.front": np.full((16, 16, 3), value % 256, np.uint8),
+        "observation.audio.gripper": np.full(80, value, np.int16),
+        "action": np.full(4, value, np.float32),
+        "task": "test",
+    }
+
+
+def write_episode(writer: DurableWriter, value: int, length: int = 3) -> None:
+    for _ in range(length):
+        writer.add_frame(frame(value))
+    writer.save_episode()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """Three episodes in one go, by this process alone."""
+    return record(config(tmp_path_factory.mktemp("recorded") / "dataset", num_episodes=3))
+
+
+def test_the_dataset_holds_what_the_contract_says(recorded):
+    dataset = load(recorded)
+    own = {key: (f["dtype"], tuple(f["shape"])) for key, f in dataset.features.items()}
+    expected = {
+        "observation.images.front": ("image", (84, 84, 3)),
+        "observation.state": ("float32", (7,)),
+        "observation.audio.gripper": ("int16", (800,)),
+        "action": ("float32", (4,)),
+        "intervention": ("bool", (1,)),
+        "next.reward": ("float32", (1,)),
+        "next.success": ("bool", (1,)),
+        "next.done": ("bool", (1,)),
+        "seed": ("int64", (1,)),
+    }
+    assert {key: own[key] for key in expected} == expected
+    assert dataset.features["observation.audio.gripper"]["info"] == {"sample_rate": 16000, "encoding": "pcm_s16"}
+    assert dataset.num_episodes == 3
+    assert dataset.fps == 20
+    assert dataset[0]["task"]
+
+
+def test_frame_t_is_the_observation_at_t_and_the_action_taken_then(recorded):
+    """Playing the recorded actions from the recorded seed gives the recorded observations back, bit for bit."""
+    dataset = load(recorded)
+    end = dataset.meta.episodes[0]["dataset_to_index"]
+    rows = [dataset[i] for i in range(end)]
+    env = env_spec(PlaybyearEnvConfig()).make()
+    observation, _ = env.reset(seed=int(rows[0]["seed"]))
+    for i, row in enumerate(rows):
+        pixels = (row["observation.images.front"].permute(1, 2, 0) * 255).round().numpy().astype(np.uint8)
+        np.testing.assert_array_equal(pixels, observation["pixels"]["front"])
+        np.testing.assert_array_equal(row["observation.audio.gripper"].numpy(), observation["audio.gripper"])
+        np.testing.assert_array_equal(row["observation.state"].numpy(), observation["agent_pos"])
+        observation, reward, terminated, truncated, info = env.step(row["action"].numpy())
+        assert bool(row["next.success"]) == info["is_success"]
+        assert bool(row["next.done"]) == (terminated or truncated) == (i == end - 1)
+        assert float(row["next.reward"]) == pytest.approx(reward)
+        assert bool(row["intervention"])
+    env.close()
+    assert info["is_success"]
+
+
+def test_workers_and_resuming_do_not_change_the_dataset(recorded, tmp_path):
+    root = tmp_path / "dataset"
+    record(config(root, num_episodes=1, num_workers=2))
+    record(config(root, num_episodes=3, num_workers=2, resume=True))
+    assert tables(root) == tables(recorded)
+
+
+def test_resuming_a_complete_dataset_changes_nothing(recorded):
+    before = {path: path.stat().st_mtime_ns for path in recorded.rglob("*") if path.is_file()}
+    record(config(recorded, num_episodes=2, resume=True))
+    assert {path: path.stat().st_mtime_ns for path in recorded.rglob("*") if path.is_file()} == before
+
+
+def test_only_successes_are_kept_and_seeds_count_the_attempts(tmp_path):
+    """With a horizon that only quick episodes meet, the seeds of the others are missing."""
+    root = record(config(tmp_path / "dataset", num_episodes=3, env=PlaybyearEnvConfig(episode_length=66)))
+    dataset = load(root)
+    seeds = sorted(set(column(root, "seed").ravel().tolist()))
+    assert len(seeds) == 3
+    assert seeds != [0, 1, 2]
+    ends = [row["dataset_to_index"] - 1 for row in dataset.meta.episodes]
+    assert all(bool(dataset[end]["next.success"]) for end in ends)
+
+
+def test_video_and_two_microphones(tmp_path):
+    env = PlaybyearEnvConfig(microphones=["gripper", "table"], sample_rate=48000)
+    root = record(config(tmp_path / "dataset", num_episodes=2, env=env, video=True))
+    dataset = load(root)
+    item = dataset[len(dataset) - 1]
+    assert item["observation.images.front"].shape == (3, 84, 84)
+    assert item["observation.audio.table"].shape == (2400,)
+    assert dataset.features["observation.audio.table"]["info"]["sample_rate"] == 48000
+
+
+# What goes wrong, each with one clear error
+
+
+def test_an_existing_dataset_is_not_touched_without_resume(recorded):
+    with pytest.raises(RecordError, match=r"already holds a dataset.*resume=true"):
+        record(config(recorded))
+
+
+def test_resuming_with_other_settings_names_the_difference(recorded):
+    with pytest.raises(RecordError, match=r"observation\.audio\.gripper is int16 \(800,\) at 16000 Hz there and"):
+        record(config(recorded, 4, resume=True, env=PlaybyearEnvConfig(sample_rate=48000)))
+    with pytest.raises(ValueError, match="fps is 20 there and 30 here"):
+        DurableWriter("test/recorded", recorded, 30, FEATURES, resume=True)
+
+
+def test_a_folder_with_other_files_is_refused(tmp_path):
+    (tmp_path / "thesis.tex").write_text("")
+    with pytest.raises(RecordError, match="is not empty and holds no dataset"):
+        record(config(tmp_path, resume=True))
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordError, match="Cannot write"):
+        record(config(tmp_path / "file" / "dataset"))
+
+
+def test_an_expert_that_never_succeeds(tmp_path):
+    with pytest.raises(RecordError, match="failed 20 times in a row"):
+        record(config(tmp_path / "dataset", env=PlaybyearEnvConfig(episode_length=3)))
+
+
+def test_an_environment_that_does_not_start_says_why(tmp_path):
+    env = PlaybyearEnvConfig(microphones=["ceiling"])
+    with pytest.raises(RecordError, match=r"does not start.*ceiling"):
+        record(config(tmp_path / "dataset", env=env, num_workers=1))
+
+
+def test_without_an_opengl_library_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "glfw")  # in the worker: needs a display
+    for display in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(display, raising=False)
+    with pytest.raises(RecordError, match=r"No OpenGL context.*libegl1"):
+        record(config(tmp_path / "dataset", num_workers=1))
+    assert not (tmp_path / "dataset").exists()
+
+
+def test_a_dead_worker_is_reported():
+    others = set(multiprocessing.active_children())
+    with RolloutPool(env_spec(PlaybyearEnvConfig()), num_workers=1) as pool:
+        pool.facts()
+        (worker,) = set(multiprocessing.active_children()) - others
+        worker.kill()
+        with pytest.raises(RolloutError, match="worker died"):
+            next(pool.episodes([0]))
+
+
+@EnvConfig.register_subclass("without_expert")
+@dataclass
+class WithoutExpertConfig(EnvConfig):
+    task: str | None = "Nothing-v0"
+    fps: int = 20
+
+    @property
+    def package_name(self) -> str:
+        return "gymnasium"
+
+    @property
+    def gym_id(self) -> str:
+        return str(self.task)
+
+    @property
+    def gym_kwargs(self) -> dict:
+        return {}
+
+
+class WithoutExpert(gym.Env):
+    observation_space = gym.spaces.Dict({"agent_pos": gym.spaces.Box(-1, 1, (2,), np.float32)})
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    metadata = {"render_fps": 20}  # noqa: RUF012
+
+
+def test_an_environment_without_an_expert(tmp_path):
+    gym.register("Nothing-v0", WithoutExpert)
+    with pytest.raises(RecordError, match="has no scripted expert"):
+        record(config(tmp_path / "dataset", env=WithoutExpertConfig()))
+    assert not (tmp_path / "dataset").exists()
+
+
+def test_the_command_prints_one_line_for_an_unknown_task(tmp_path):
+    command = [sys.executable, "-m", "lerobot_playbyear.scripts.record", "--env.type=playbyear", "--env.task=Nope-v0"]
+    command += ["--dataset.repo_id=a/b", f"--dataset.root={tmp_path}"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode != 0
+    assert "OccludedGrasp-v0, OccludedPickPlace-v0" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+# Durability
+
+
+class PowerCut(BaseException):
+    """Stops the process at a chosen moment, so that no clean-up of ours runs."""
+
+
+@pytest.mark.parametrize("moves_before", range(7))
+def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, monkeypatch, moves_before):
+    """At every move: the dataset loads before and after recovery, and recording goes on."""
+    root = tmp_path / "dataset"
+    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
+        write_episode(writer, 0)
+    writer = DurableWriter("test/recorded", root, 20, FEATURES, resume=True)
+    moves = iter(range(100))
+    real_replace = os.replace
+
+    def replace(source, target):
+        if next(moves) == moves_before:
+            raise PowerCut
+        real_replace(source, target)
+
+    monkeypatch.setattr(durable.os, "replace", replace)
+    with contextlib.suppress(PowerCut):  # the largest number of moves is more than there are
+        write_episode(writer, 1)
+    monkeypatch.undo()
+    writer._lock.release()
+
+    crashed = load(root)
+    assert [int(crashed[i]["observation.audio.gripper"][0]) for i in range(3)] == [0, 0, 0]
+    with DurableWriter("test/recorded", root, 20, FEATURES, resume=True) as writer:
+        survived = writer.num_episodes
+        assert survived == (1 if moves_before == 0 else 2)  # the journal is the first move, and the point of no return
+        write_episode(writer, 2)
+    values = column(root, "observation.audio.gripper")[:, 0].tolist()
+    assert values == [0] * 3 + [1] * 3 * (survived - 1) + [2] * 3
+    stats = load(root).meta.stats["action"]
+    assert int(stats["count"][0]) == len(values)
+    assert stats["mean"] == pytest.approx(np.full(4, np.mean(values)))
+
+
+_WRITE_FOREVER = """
+import sys
+sys.path.insert(0, {tests!r})
+from test_record import FEATURES, write_episode
+from lerobot_playbyear.datasets.durable import DurableWriter
+writer = DurableWriter("test/recorded", {root!r}, 20, FEATURES, resume=True)
+while True:
+    write_episode(writer, writer.num_episodes)
+    print(writer.num_episodes, flush=True)
+"""
+
+
+def test_episodes_survive_sigkill(tmp_path):
+    root = tmp_path / "dataset"
+    saved = 0
+    script = _WRITE_FOREVER.format(tests=str(Path(__file__).parent), root=str(root))
+    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    while saved < 4:
+        saved = int(process.stdout.readline())
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert load(root).num_episodes >= saved
+    values = column(root, "observation.audio.gripper")[:, 0]
+    assert values[: 3 * saved].tolist() == np.repeat(np.arange(saved), 3).tolist()
+    with DurableWriter("test/recorded", root, 20, FEATURES, resume=True) as writer:
+        write_episode(writer, 99)
+    assert column(root, "observation.audio.gripper")[-1, 0] == 99
+
+
+def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path):
+    root = tmp_path / "dataset"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
+        write_episode(writer, 0)
+        noise = np.random.default_rng(0)
+        for _ in range(60):
+            noisy = {**frame(1), "observation.images.front": noise.integers(0, 255, (16, 16, 3), np.uint8)}
+            writer.add_frame(noisy)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (16384, limits[1]))
+            with pytest.raises(DatasetWriteError, match=r"Episode 1 could not be written.*1 episodes before it"):
+                writer.save_episode()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert load(root).num_episodes == 1
+    assert len(column(root, "action")) == 3
+
+
+def test_two_processes_cannot_write_to_one_dataset(tmp_path):
+    root = tmp_path / "dataset"
+    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
+        write_episode(writer, 0)
+        with pytest.raises(DatasetWriteError, match="Another process is writing"):
+            DurableWriter("test/recorded", root, 20, FEATURES, resume=True)
+
+
+def test_nothing_but_the_dataset_stays_on_disk(tmp_path):
+    root = tmp_path / "dataset"
+    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
+        write_episode(writer, 0)
+        writer.add_frame(frame(1))
+    assert {path.name for path in root.iterdir()} == {"data", "meta"}

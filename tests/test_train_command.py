@@ -1,0 +1,288 @@
+"""playbyear-train learns what lerobot-train learns, and either continues the other's checkpoints."""
+
+import json
+import sys
+
+import pytest
+import torch
+from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
+from lerobot.scripts import lerobot_train
+from lerobot.utils.import_utils import register_third_party_plugins
+from safetensors.torch import load_file
+from torch.utils.data import default_collate
+
+from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.presets import PRESETS, apply_preset
+from lerobot_playbyear.scripts import train as train_script
+from lerobot_playbyear.scripts.train import TrainError, frame_weights, train
+from lerobot_playbyear.train_config import PlaybyearTrainConfig, SamplingConfig
+from lerobot_playbyear.training import PolicyWindows
+
+FPS = 20
+TINY = (
+    "--policy.type=playbyear",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+    "--policy.image_size=32",
+    "--policy.vision_width=8",
+    "--policy.audio_window_s=0.9",
+    "--policy.n_memory_steps=3",
+    "--policy.hidden_size=64",
+    "--num_workers=0",
+    "--batch_size=4",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plugins():
+    register_third_party_plugins()
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data") / "noise"
+    make_dataset(root, (12, 17, 9, 14), image_size=16)
+    return root
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Runs a training script in this process, as the command line would."""
+
+    def run(function, *arguments):
+        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
+        return function()
+
+    return run
+
+
+def data(root):
+    return "--dataset.repo_id=tests/noise", f"--dataset.root={root}"
+
+
+def config_of(checkpoint):
+    return checkpoint / "pretrained_model" / "train_config.json"
+
+
+def step_of(checkpoint):
+    return json.loads((checkpoint / "training_state" / "training_step.json").read_text())["step"]
+
+
+def weights_of(checkpoint):
+    return load_file(checkpoint / "pretrained_model" / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def trained(root, tmp_path_factory):
+    """The output folder of a run of six updates with checkpoints every three."""
+    output = tmp_path_factory.mktemp("run") / "out"
+    options = ("--steps=6", "--save_freq=3", "--log_freq=2", "--sampling.start_weight=2", "--sampling.start_s=0.1")
+    validation = ("--dataset.eval_split=0.25", "--eval_steps=3", "--policy.n_supervised_steps=4")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train", *TINY, *data(root), *options, *validation, f"--output_dir={output}"])
+        train()
+    return output
+
+
+def test_a_run_leaves_lerobots_checkpoints_and_its_figures(trained):
+    checkpoints = trained / "checkpoints"
+    lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+
+    assert sorted(path.name for path in checkpoints.iterdir()) == ["000003", "000006", "last"]
+    assert (checkpoints / "last").resolve().name == "000006"
+    assert [(line["kind"], line["step"]) for line in lines] == [
+        ("train", 2),
+        ("validation", 3),
+        ("train", 4),
+        ("train", 6),
+        ("validation", 6),
+    ]
+    assert all(torch.isfinite(torch.tensor(line["loss"])) for line in lines)
+    PlaybyearPolicy.from_pretrained(checkpoints / "last" / "pretrained_model")
+
+
+def test_its_options_are_kept_where_lerobot_does_not_stumble_over_them(trained):
+    path = config_of(trained / "checkpoints" / "last")
+
+    stock = TrainPipelineConfig.from_pretrained(path)
+    ours = PlaybyearTrainConfig.from_pretrained(path, cli_args=["--sampling.start_s=0.3"])
+
+    assert (stock.steps, stock.policy.type) == (6, "playbyear")
+    assert ours.sampling == SamplingConfig(start_weight=2, start_s=0.3)
+
+
+def test_a_resumed_run_ends_where_an_uninterrupted_one_does(trained, command, tmp_path):
+    half = trained / "checkpoints" / "000003"
+
+    command(train, "--resume=true", f"--config_path={config_of(half)}", f"--output_dir={tmp_path}")
+
+    resumed = weights_of(tmp_path / "checkpoints" / "last")
+    expected = weights_of(trained / "checkpoints" / "last")
+    assert all(torch.equal(resumed[key], expected[key]) for key in expected)
+
+
+def test_lerobot_train_and_playbyear_train_continue_each_other(trained, command, tmp_path):
+    ours = trained / "checkpoints" / "last"
+
+    command(
+        lerobot_train.train,
+        "--resume=true",
+        f"--config_path={config_of(ours)}",
+        "--steps=7",
+        f"--output_dir={tmp_path}",
+    )
+    theirs = tmp_path / "checkpoints" / "last"
+    assert step_of(theirs.resolve()) == 7
+    command(train, "--resume=true", f"--config_path={config_of(theirs)}", "--steps=8")
+
+    assert step_of(theirs.resolve()) == 8
+
+
+def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(trained, root, command, tmp_path):
+    policy = trained / "checkpoints" / "last" / "pretrained_model"
+    options = ("--preset=cpu", "--steps=1", "--batch_size=2", f"--output_dir={tmp_path / 'out'}")
+
+    command(train_script.main, f"--policy.path={policy}", *data(root), *options)
+
+    tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
+    assert (tuned["image_size"], tuned["vision_width"]) == (32, 8)
+    assert tuned["n_supervised_steps"] == int(PRESETS["cpu"].training["policy.n_supervised_steps"])
+
+
+def test_its_batches_give_the_loss_of_lerobots(trained, root):
+    policy = PlaybyearPolicy.from_pretrained(trained / "checkpoints" / "last" / "pretrained_model")
+    config = policy.config
+    preprocessor, _ = make_pre_post_processors(config, str(trained / "checkpoints" / "last" / "pretrained_model"))
+    timestamps = {key: [i / FPS for i in config.observation_delta_indices] for key in config.input_features}
+    timestamps["action"] = [i / FPS for i in config.action_delta_indices]
+    stock = LeRobotDataset("tests/noise", root, delta_timestamps=timestamps)
+    windows = PolicyWindows(config, stock.meta)
+    store = EpisodeStore.from_dataset(stock, windows.keys, device="cpu")
+    frames = [0, 1, 5, 12, 28, 51]
+
+    batch = windows.batch(store, torch.tensor(frames))
+    theirs, _ = policy(preprocessor(default_collate([stock[i] for i in frames])))
+    ours, _ = policy(preprocessor(batch))
+
+    assert (batch[CAMERA].dtype, batch[MICROPHONE].dtype) == (torch.uint8, torch.int16)
+    assert batch["observation.state"].shape[1] == config.n_run_frames
+    assert torch.allclose(ours, theirs, rtol=0, atol=1e-6)
+
+
+def test_it_reaches_the_loss_of_lerobot_train(root, command, tmp_path):
+    options = ("--steps=40", "--batch_size=8", "--log_freq=0", "--policy.n_supervised_steps=1", "--save_freq=0")
+
+    command(train, *TINY, *data(root), *options, f"--output_dir={tmp_path / 'ours'}")
+    command(lerobot_train.train, *TINY, *data(root), *options, f"--output_dir={tmp_path / 'theirs'}")
+
+    losses = [loss_of(tmp_path / name / "checkpoints/last/pretrained_model", root) for name in ("ours", "theirs")]
+    assert max(losses) < 0.25  # untrained: 0.4
+    assert losses[0] == pytest.approx(losses[1], rel=0.35)
+
+
+def loss_of(path, root):
+    policy = PlaybyearPolicy.from_pretrained(path)
+    preprocessor, _ = make_pre_post_processors(policy.config, str(path))
+    dataset = LeRobotDataset("tests/noise", root)
+    windows = PolicyWindows(policy.config, dataset.meta)
+    store = EpisodeStore.from_dataset(dataset, windows.keys, device="cpu")
+    with torch.no_grad():
+        loss, _ = policy(preprocessor(windows.batch(store, torch.arange(len(store)))))
+    return loss.item()
+
+
+def test_another_policy_trains_from_memory_too(root, command, tmp_path):
+    act = ("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=32")
+    small = ("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.chunk_size=5", "--policy.n_action_steps=5")
+    scratch = ("--policy.pretrained_backbone_weights=null", "--steps=1", "--batch_size=2")
+
+    command(train, *act, *small, *scratch, *data(root), f"--output_dir={tmp_path / 'out'}")
+
+    assert step_of(tmp_path / "out/checkpoints/000001") == 1
+
+
+@pytest.mark.parametrize(
+    ("features", "options", "message"),
+    [
+        ({"fps": 10}, (), "10 frames per second, and the policy is configured for 20.*--policy.fps=10"),
+        ({}, ("--policy.sample_rate=48000",), "16000.*48000"),
+        ({"microphones": ()}, (), "sound.*--policy.use_audio=false"),
+        ({}, ("--dataset.image_transforms.enable=true",), "image_transforms.enable does not work in playbyear-train"),
+        ({}, ("--sampling.start_weight=0",), "sampling.start_weight must be above 0"),
+    ],
+    ids=["fps", "sample rate", "no microphone", "image transforms", "weight"],
+)
+def test_bad_input_is_refused_before_any_work(features, options, message, command, tmp_path):
+    fps = features.get("fps", FPS)
+    make_dataset(tmp_path / "data", (3,), fps, features=dataset_features(image_size=8, **features))
+
+    with pytest.raises((ValueError, SystemExit), match=message):
+        command(train, *TINY, *data(tmp_path / "data"), *options, f"--output_dir={tmp_path / 'out'}")
+
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_truncated_dataset_and_an_existing_output_are_refused(command, tmp_path):
+    make_dataset(tmp_path / "data", (3,), image_size=8)
+    (tmp_path / "out").mkdir()
+
+    with pytest.raises(TrainError, match="already exists"):
+        command(train, *TINY, *data(tmp_path / "data"), f"--output_dir={tmp_path / 'out'}")
+    path = next((tmp_path / "data" / "data").glob("*/*.parquet"))
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(TrainError, match="is truncated"):
+        command(train, *TINY, *data(tmp_path / "data"), f"--output_dir={tmp_path / 'new'}")
+
+
+def test_the_command_says_in_one_line_what_is_wrong(command):
+    with pytest.raises(SystemExit, match=r"^error: --preset=gpu is not known. The presets are: cpu .*; paper "):
+        command(train_script.main, "--preset=gpu")
+
+
+def test_moments_that_matter_weigh_more():
+    sound = torch.ones(40, 100, dtype=torch.int16)
+    sound[20] = 3000
+    store = EpisodeStore({"action": torch.zeros(40, 1), MICROPHONE: sound}, [0], [40], FPS)
+
+    weights = frame_weights(store, SamplingConfig(start_weight=3, start_s=0.2, loud_weight=2, loud_s=0.1))
+
+    assert weights.tolist() == [3] * 4 + [1] * 16 + [2] * 2 + [1] * 18
+
+
+def test_a_preset_gives_way_to_the_command_line():
+    args = apply_preset(["--preset=cpu", "--steps=10", "--policy.image_size", "64"])
+
+    assert "--policy.vision_width=16" in args
+    assert [arg for arg in args if arg.startswith(("--steps", "--policy.image_size"))] == [
+        "--steps=10",
+        "--policy.image_size",
+    ]
+
+
+def test_a_preset_leaves_checkpoints_and_the_hub_alone():
+    tuned = apply_preset(["--preset=cpu", "--policy.path=somewhere"])
+    resumed = apply_preset(["--preset=cpu", "--resume=true"])
+    shared = apply_preset(["--preset=cpu", "--policy.repo_id=me/policy"])
+
+    assert not any(arg.startswith(("--policy.type", "--policy.vision_width")) for arg in tuned)
+    assert "--batch_size=32" in tuned
+    assert resumed == ["--preset=cpu", "--resume=true"]
+    assert "--policy.push_to_hub=false" not in shared
+    with pytest.raises(ValueError, match=r"is for --policy.type=playbyear, not for act"):
+        apply_preset(["--preset=paper", "--policy.type=act"])
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_presets_are_options_that_exist(name, command, monkeypatch, root):
+    seen = []
+    monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
+
+    with pytest.raises(ZeroDivisionError):
+        command(train_script.main, f"--preset={name}", *data(root))
+
+    assert seen[0].policy.type == "playbyear"
+    assert seen[0].steps == int(PRESETS[name].training["steps"])

@@ -1,0 +1,127 @@
+"""Films: pictures and sound in time with each other, in a file that players take."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from lerobot.envs.utils import env_to_policy_features
+from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.rollouts import RolloutError
+from lerobot_playbyear.scripts.video import VideoConfig, film
+from lerobot_playbyear.video import amplify, compose, episode_sound, spectrogram_strip, write_film
+
+FPS, SAMPLE_RATE = 20, 16000
+BLOCK = SAMPLE_RATE // FPS
+
+
+def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """All pictures (n, H, W, 3) and all sound (n_channels, n) of a film."""
+    with av.open(str(path)) as container:
+        pictures = [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
+    with av.open(str(path)) as container:
+        sound = [block.to_ndarray() for block in container.decode(audio=0)]
+    return np.stack(pictures), np.concatenate(sound, axis=1)
+
+
+def small_env(**options) -> PlaybyearEnvConfig:
+    return PlaybyearEnvConfig(visualization_width=128, visualization_height=128, **options)
+
+
+def test_an_experts_film_has_every_step_and_its_sound(tmp_path, capsys):
+    path = film(VideoConfig(small_env(), output=tmp_path / "film.mp4", seed=0))
+    pictures, sound = decode(path)
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        assert container.streams.audio[0].codec_context.name == "aac"
+        assert container.streams.video[0].average_rate == FPS
+    assert pictures.shape[1:] == (248, 128, 3)  # picture and strip
+    assert sound.shape[1] / SAMPLE_RATE == pytest.approx(len(pictures) / FPS, abs=0.2)
+    assert np.abs(sound).max() > 0.5
+    assert "success" in capsys.readouterr().out
+
+
+def test_a_click_is_heard_when_it_is_seen(tmp_path):
+    """The block of frame t was heard before picture t: a click at its end belongs to picture t."""
+    blocks = np.zeros((40, BLOCK), np.int16)
+    blocks[20, -10:] = 20000
+    pictures = [np.zeros((32, 32, 3), np.uint8)] * 40
+    sound = episode_sound(blocks)
+    assert sound.shape == (40 * BLOCK, 1)
+    path = write_film(tmp_path / "click.mp4", compose(pictures, sound, SAMPLE_RATE), FPS, sound, SAMPLE_RATE)
+    _, heard = decode(path)
+    assert np.abs(heard[0]).argmax() / SAMPLE_RATE == pytest.approx(20 / FPS, abs=0.01)
+
+
+def test_two_microphones_are_left_and_right(tmp_path):
+    sound = np.zeros((40 * BLOCK, 2), np.int16)
+    sound[:, 1] = (10000 * np.sin(2 * np.pi * 440 / SAMPLE_RATE * np.arange(len(sound)))).astype(np.int16)
+    pictures = [np.zeros((32, 32, 3), np.uint8)] * 40
+    _, heard = decode(write_film(tmp_path / "stereo.mp4", pictures, FPS, sound, SAMPLE_RATE))
+    left, right = np.abs(heard).mean(axis=1)
+    assert right > 0.1
+    assert left < 0.01
+
+
+def test_the_strip_shows_a_tone_at_its_height():
+    samples = (10000 * np.sin(2 * np.pi * 2000 / SAMPLE_RATE * np.arange(SAMPLE_RATE))).astype(np.int16)
+    strip = spectrogram_strip(samples, SAMPLE_RATE, width=200, height=120)
+    brightest = strip[:, 100].astype(int).sum(axis=1).argmax()
+    assert strip.shape == (120, 200, 3)
+    assert brightest == pytest.approx(0.75 * 120, abs=2)  # 2 of 8 kHz, from the bottom
+
+
+def test_quiet_sound_is_made_audible_and_silence_stays_silent():
+    quiet = np.array([[0], [-1000]], np.int16)
+    assert amplify(quiet).min() == pytest.approx(-0.7 * 32768, rel=0.01)
+    assert not amplify(np.zeros((10, 1), np.int16)).any()
+
+
+def test_a_film_without_microphones_is_silent(tmp_path):
+    path = film(VideoConfig(small_env(sound="none", episode_length=5), output=tmp_path / "film.mp4"))
+    with av.open(str(path)) as container:
+        assert not container.streams.audio
+        assert container.streams.video[0].frames == 6
+
+
+def test_a_blind_baseline_can_be_filmed_and_an_unknown_one_is_named(tmp_path):
+    env = small_env(episode_length=5)
+    assert film(VideoConfig(env, output=tmp_path / "blind.mp4", baseline="search")).exists()
+    with pytest.raises(RolloutError, match=r"no blind baseline 'deaf'; there are: .*search"):
+        film(VideoConfig(env, output=tmp_path / "film.mp4", baseline="deaf"))
+
+
+def test_any_lerobot_policy_can_be_filmed(tmp_path):
+    env = small_env(episode_length=5)
+    features = env_to_policy_features(env)
+    config = make_policy_config(
+        "act",
+        device="cpu",
+        push_to_hub=False,
+        pretrained_backbone_weights=None,
+        dim_model=32,
+        n_heads=2,
+        dim_feedforward=32,
+        input_features={key: features[key] for key in ("observation.state", "observation.images.front")},
+        output_features={"action": features["action"]},
+    )
+    make_policy(config, env_cfg=env).save_pretrained(tmp_path)
+    for processor in make_pre_post_processors(config, dataset_stats={}):
+        processor.save_pretrained(tmp_path)
+    config.pretrained_path = tmp_path
+    path = film(VideoConfig(env, policy=config, output=tmp_path / "policy.mp4"))
+    pictures, sound = decode(path)
+    assert len(pictures) == 6
+    assert sound.any()
+
+
+def test_an_interrupted_film_leaves_no_file(tmp_path):
+    def pictures():
+        yield np.zeros((32, 32, 3), np.uint8)
+        raise RuntimeError("the camera broke")
+
+    with pytest.raises(RuntimeError, match="camera broke"):
+        write_film(tmp_path / "film.mp4", pictures(), FPS, np.zeros((BLOCK, 1), np.int16), SAMPLE_RATE)
+    assert not list(tmp_path.iterdir())
