@@ -51,7 +51,7 @@ class LogSpectrogram(nn.Module):
             )
         self.n_bins, self.momentum = n_bins, momentum
         self.transform = torchaudio.transforms.Spectrogram(
-            n_fft=self.segment, hop_length=self.hop, center=False, power=2.0, normalized=False
+            n_fft=self.segment, hop_length=self.hop, center=False, power=None, normalized=False
         )
         # A full-scale sine has power 1 in its bin, whatever the segment's length.
         self.scale = 4.0 / float(self.transform.window.sum()) ** 2
@@ -61,7 +61,8 @@ class LogSpectrogram(nn.Module):
 
     def log_power(self, wave: Tensor) -> Tensor:
         """(B, samples) in [-1, 1] -> (B, n_bins, n_segments), in units of 10 dB re full scale."""
-        power = self.transform(wave)[:, : self.n_bins]
+        spectrum = torch.view_as_real(self.transform(wave)[:, : self.n_bins])
+        power = spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
         return torch.log10(power * self.scale + _POWER_FLOOR)
 
     def forward(self, wave: Tensor, begun: Tensor) -> Tensor:

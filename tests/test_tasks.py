@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 from gym_playbyear import TASKS
 from gym_playbyear.baselines import EXPERT, success_rates
-from gym_playbyear.experts import BLIND_STRATEGIES
+from gym_playbyear.blind import BLIND_STRATEGIES
 
 
 def make(task: str, **options):

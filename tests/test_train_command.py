@@ -38,8 +38,13 @@ TINY = (
 
 
 @pytest.fixture(scope="module", autouse=True)
-def plugins():
+def one_thread():
+    """Networks this small only lose by waking threads."""
     register_third_party_plugins()
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture(scope="module")

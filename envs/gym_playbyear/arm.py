@@ -195,7 +195,8 @@ class CartesianController:
         self.n_substeps = round(1 / (control_hz * PHYSICS_TIMESTEP))
         self._cooldown_steps = round(config.gripper_cooldown * control_hz)
         self._finger_step = _FINGER_SPEED * PHYSICS_TIMESTEP
-        xml = f"""<mujoco><compiler angle="radian"/><default>{ARM_DEFAULT_XML}</default><worldbody>{arm_body_xml(config)}</worldbody></mujoco>"""
+        xml = f"""<mujoco><compiler angle="radian"/><default>{ARM_DEFAULT_XML}</default>
+            <worldbody>{arm_body_xml(config)}</worldbody></mujoco>"""
         self._model = mujoco.MjModel.from_xml_string(xml)
         self._data = mujoco.MjData(self._model)
         self._site = self._model.site("tcp").id
@@ -204,8 +205,8 @@ class CartesianController:
         self._upper = self._model.jnt_range[:N_JOINTS, 1] - 0.02
         self._orientation = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # hand pointing down, fingers open along y
         self._workspace = np.array(config.workspace)
-        self.joints = HOME_JOINTS.copy()
-        self.target = np.zeros(3)
+        self.joints: np.ndarray = HOME_JOINTS.copy()
+        self.target: np.ndarray = np.zeros(3)
         self.finger_target = config.max_opening / 2
         self._closed = False
         self._steps_since_change = self._cooldown_steps

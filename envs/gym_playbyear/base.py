@@ -79,7 +79,10 @@ class PlayByEarEnv(gym.Env):
     Subclasses define `VARIANTS`, `task`, `task_description`, `_scene_xml`, `_scene_bodies`, `_place` and `_is_success`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": CONTROL_HZ}
+    metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
+        "render_modes": ["rgb_array", "human"],
+        "render_fps": CONTROL_HZ,
+    }
     VARIANTS: ClassVar[dict[str, Any]]
     task: str
     task_description: str
@@ -333,6 +336,7 @@ class PlayByEarEnv(gym.Env):
   </visual>
   <statistic extent="1.5" center="0 0 0.9"/>
   <default>{ARM_DEFAULT_XML}</default>
+  <asset><texture type="skybox" builtin="gradient" rgb1="0.85 0.88 0.92" rgb2="0.45 0.5 0.56" width="32" height="192"/></asset>
   <worldbody>{arm_body_xml(self.variant.arm)}{table_xml()}{self._scene_xml()}
     {cube_xml(self.variant.cube_density, self.variant.cube_friction)}
   </worldbody>

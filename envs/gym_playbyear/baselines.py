@@ -2,11 +2,12 @@
 
 import argparse
 import json
+from typing import Any
 
 import gymnasium as gym
 
 import gym_playbyear
-from gym_playbyear.experts import BLIND_STRATEGIES
+from gym_playbyear.blind import BLIND_STRATEGIES
 
 EXPERT = "expert"
 
@@ -21,7 +22,7 @@ def success_rates(task: str, strategies: tuple[str, ...], seeds: range, **option
         options: For `gymnasium.make`.
     """
     env = gym.make(f"gym_playbyear/{task}", sound="none", **options)
-    task_env = env.unwrapped
+    task_env: Any = env.unwrapped
     rates = {}
     for strategy in strategies:
         successes = 0

@@ -1,4 +1,4 @@
-"""Scripted experts, which feel contact, and blind baselines, which know all that the camera shows and feel nothing.
+"""Scripted experts: they feel contact and know where the cube is.
 
 The phases follow the authors' scripts (reference figures in the documentation): approach, sweep until contact, rise, hop over
 the cube, descend, close, lift, and in Pick and Place carry and release. Speeds, pauses and dwell times are drawn anew for
@@ -7,7 +7,6 @@ is when the sound comes.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -57,7 +56,8 @@ class GraspExpert:
         self.config = config or ExpertConfig()
         self.rng: np.random.Generator = env.expert_rng
         self.phase = "approach"
-        self.contact_y: float | None = None
+        self.contact_y = np.nan  # where the hand was when it felt the cube
+        self.lift_drift: np.ndarray = np.zeros(2)
         self._wait = 0
         self._begin()
 
@@ -218,72 +218,3 @@ class PickPlaceExpert(GraspExpert):
         goal = self.env.bin_position + np.array([0, 0, self.release_height])
         low = self.env.eef_position[2] < goal[2] + 0.006
         return self._towards(goal), not low
-
-
-class _Blind:
-    """Makes an expert blind: it chooses by itself when to stop sweeping and where to grasp."""
-
-    def __init__(self, env, strategy: str):
-        self.strategy = strategy
-        self.attempt = 0
-        super().__init__(env)  # type: ignore[call-arg]
-
-    def _begin(self) -> None:
-        super()._begin()  # type: ignore[misc]
-        lower, upper = self.env.hidden_range  # type: ignore[attr-defined]
-        match self.strategy:
-            case "middle":
-                self.guess = (lower + upper) / 2
-            case "random":
-                self.guess = self.rng.uniform(lower, upper)  # type: ignore[attr-defined]
-            case "search":  # from one end to the other, as many attempts as the horizon allows
-                step = self.env.variant.arm.max_opening - 2 * CUBE_HALF_SIZE  # type: ignore[attr-defined]
-                n_places = max(1, int(np.ceil((upper - lower) / step)))
-                self.guess = lower + (0.5 + self.attempt % n_places) * (upper - lower) / n_places
-            case "push":  # the cube is shoved to the end of its range, where it must then be
-                self.guess = upper + CUBE_HALF_SIZE
-        self.attempt += 1
-        self.phase = "approach" if self.strategy == "push" else "hop"
-
-    def _feels_contact(self) -> bool:
-        return bool(self.env.eef_position[1] + self.reach > self.guess)  # type: ignore[attr-defined]
-
-    def _grasp_y(self) -> float:
-        return self.guess
-
-    def _grasp(self):
-        # Proprioception alone: fully closed fingers hold nothing.
-        opening = self.env.finger_positions.sum()  # type: ignore[attr-defined]
-        self._closing_steps = getattr(self, "_closing_steps", 0) + 1
-        if opening < CUBE_HALF_SIZE:
-            self._closing_steps = 0
-            self._begin()
-        elif self._closing_steps > 14:
-            self._closing_steps = 0
-            self.phase = "lift"
-            self.lift_drift = np.zeros(2)
-        return np.zeros(3), True
-
-    def _dropped(self) -> bool:
-        return bool(self.env.finger_positions.sum() < CUBE_HALF_SIZE)  # type: ignore[attr-defined]
-
-
-class BlindGrasp(_Blind, GraspExpert):
-    """A grasp without any sense of contact."""
-
-
-class BlindPickPlace(_Blind, PickPlaceExpert):
-    """Pick and place without any sense of contact."""
-
-
-BLIND_STRATEGIES = ("middle", "random", "search", "push")
-
-
-def blind_grasps(env) -> dict[str, Any]:
-    """The blind baselines of Occluded Grasp, by name."""
-    return {strategy: BlindGrasp(env, strategy) for strategy in BLIND_STRATEGIES}
-
-
-def blind_pick_places(env) -> dict[str, Any]:
-    """The blind baselines of Occluded Pick and Place, by name."""
-    return {strategy: BlindPickPlace(env, strategy) for strategy in BLIND_STRATEGIES}

@@ -8,7 +8,8 @@ import numpy as np
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.base import PlayByEarEnv, SensorNoise, Variant
-from gym_playbyear.experts import GraspExpert, blind_grasps
+from gym_playbyear.blind import blind_grasps
+from gym_playbyear.experts import GraspExpert
 
 WALL_HALF_SIZE = (0.02, 0.40, 0.30)  # m
 WALL_CENTRE = (0.20, 0.0, 0.775)  # m: its top is 0.275 m above the table

@@ -8,7 +8,8 @@ import numpy as np
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml, tray_xml
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.base import PlayByEarEnv, SensorNoise, Variant
-from gym_playbyear.experts import PickPlaceExpert, blind_pick_places
+from gym_playbyear.blind import blind_pick_places
+from gym_playbyear.experts import PickPlaceExpert
 
 WALL_HALF_SIZE = (0.02, 0.20, 0.18)  # m
 WALL_CENTRE = (0.10, 0.20, 0.80)  # m

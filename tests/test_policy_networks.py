@@ -1,0 +1,119 @@
+"""Shapes and sizes of every block, as in the paper, and augmentation."""
+
+import pytest
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from torch import nn
+from torchvision.models import resnet18
+
+from lerobot_playbyear.augmentation import Augmentation, resize
+from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.networks import VisionEncoder
+
+STRENGTHS = {"crop": 4.0, "brightness": 0.05, "hue": 0.05, "degrees": 5.0, "translate": 0.05, "scale": 0.05}
+
+
+def count(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+@pytest.fixture(scope="module")
+def policy() -> PlaybyearPolicy:
+    """The policy with the defaults, that is the paper's sizes, on the simulation's observations."""
+    config = PlaybyearConfig(
+        input_features={
+            "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 84, 84)),
+            "observation.audio.gripper": PolicyFeature(FeatureType.STATE, (800,)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (7,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
+        sample_rate=16000,
+        device="cpu",
+    )
+    return PlaybyearPolicy(config).eval()
+
+
+def test_the_vision_encoder_is_resnet18_with_nine_channels_and_no_classifier(policy):
+    reference = resnet18()
+    reference.conv1 = nn.Conv2d(9, 64, 7, stride=2, padding=3, bias=False)
+    reference.fc = nn.Identity()
+    encoder = policy.model.vision["images_front"]
+    assert count(encoder) == count(reference) == 11_195_328
+    reference.load_state_dict(encoder.network.state_dict())
+    images = torch.rand(2, 9, 64, 64)
+    assert encoder(torch.rand(1, 9, 224, 224)).shape == (1, 512)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            encoder(images), reference.eval()((images - encoder.mean) / encoder.std), rtol=1e-4, atol=1e-4
+        )
+
+
+def test_a_quarter_of_the_width_is_a_sixteenth_of_the_weights():
+    encoder = VisionEncoder(3, 16)
+    assert encoder(torch.rand(2, 9, 84, 84)).shape == (2, 128)
+    assert count(encoder) < 11_195_328 / 15
+
+
+def test_the_audio_encoder_is_four_convolutions_of_kernel_seven_over_time(policy):
+    encoder = policy.model.hearing["audio_gripper"]
+    shapes = []
+    value = torch.rand(2, 160, 57)
+    for layer in encoder.layers:
+        value = layer(value)
+        shapes.append(tuple(value.shape[1:]))
+    assert shapes[::2] == [(64, 51), (32, 45), (16, 39), (8, 33)]
+    assert all(isinstance(layer, nn.ReLU) for layer in list(encoder.layers)[1::2])
+    assert encoder(torch.rand(2, 160, 57)).shape == (2, 264)
+    assert count(encoder) == 71_744 + 14_368 + 3_600 + 904
+
+
+def test_fusion_memory_and_head_have_the_papers_sizes(policy):
+    assert [layer.weight.shape for layer in policy.model.fusion.layers if isinstance(layer, nn.Linear)] == [
+        (1024, 512 + 264 + 7),
+        (1024, 1024),
+        (50, 1024),
+    ]
+    assert count(policy.model.fusion) == 1_903_666
+    memory = policy.model.memory_head
+    assert (memory.lstm.num_layers, memory.lstm.hidden_size, memory.lstm.bidirectional) == (1, 50, False)
+    assert count(memory.lstm) == 20_400
+    assert count(memory.head) == 1_105_924
+    actions = memory(100 * torch.randn(3, 17, 50))
+    assert actions.shape == (3, 8, 4)
+    assert actions.abs().max() <= 1
+
+
+def test_the_paper_sized_policy_trains_on_a_batch_in_every_layout(policy):
+    config = policy.config
+    assert (config.n_run_frames, config.n_image_frames, config.n_audio_frames) == (17, 19, 56)
+    assert config.observation_delta_indices == list(range(-55, 1))
+    assert config.action_delta_indices == list(range(-7, 1))
+
+
+def test_all_frames_of_a_run_share_one_draw_and_runs_differ():
+    torch.manual_seed(0)
+    image = torch.rand(1, 1, 3, 40, 40)
+    augmented = Augmentation(**STRENGTHS)(image.expand(2, 6, 3, 40, 40), 32)
+    assert augmented.shape == (2, 6, 3, 32, 32)
+    assert (augmented == augmented[:, :1]).all()
+    assert not torch.allclose(augmented[0], augmented[1], atol=1e-3)
+    assert augmented.min() >= 0
+    assert augmented.max() <= 1
+
+
+@pytest.mark.parametrize("size", [40, 90])
+def test_augmentation_without_strength_is_resizing(size):
+    images = torch.rand(2, 3, 3, 40, 40)
+    plain = Augmentation(**dict.fromkeys(STRENGTHS, 0.0))(images, size)
+    torch.testing.assert_close(plain, resize(images, size), rtol=0, atol=1e-4)
+
+
+def test_brightness_and_hue_leave_grey_grey():
+    grey = torch.full((4, 2, 3, 20, 20), 0.5)
+    colours = {**dict.fromkeys(STRENGTHS, 0.0), "brightness": 0.05, "hue": 0.05}
+    augmented = Augmentation(**colours)(grey, 20)
+    torch.testing.assert_close(augmented[:, :, 0], augmented[:, :, 2], rtol=0, atol=5e-3)
+    levels = augmented[:, 0, 0, 0, 0]
+    assert ((levels > 0.5 * 0.94) & (levels < 0.5 * 1.06)).all()
+    assert levels.std() > 0
