@@ -55,11 +55,15 @@ class Augmentation:
         scale = 1 / (1 + self.scale * _uniform(n_runs, device))
         theta = torch.zeros(n_runs, 2, 3, device=device)
         theta[:, 0, 0] = theta[:, 1, 1] = scale * angle.cos()
-        theta[:, 0, 1], theta[:, 1, 0] = -scale * angle.sin(), scale * angle.sin()
+        # In pixels a rotation, in coordinates from -1 to 1 only where the image is square.
+        theta[:, 0, 1] = -scale * angle.sin() * height / width
+        theta[:, 1, 0] = scale * angle.sin() * width / height
         # Coordinates run from -1 to 1: a shift of the whole size is 2.
         shift_x = self.translate * _uniform(n_runs, device) + self.crop / width * _uniform(n_runs, device)
         shift_y = self.translate * _uniform(n_runs, device) + self.crop / height * _uniform(n_runs, device)
         theta[:, 0, 2], theta[:, 1, 2] = 2 * shift_x, 2 * shift_y
+        if height > size or width > size:
+            images = resize(images, size)
         grid = functional.affine_grid(theta, [n_runs, 1, size, size], align_corners=False).to(images.dtype)
         warped = functional.grid_sample(
             images.flatten(1, 2), grid, mode="bilinear", padding_mode="border", align_corners=False
@@ -68,10 +72,16 @@ class Augmentation:
 
 
 def resize(images: Tensor, size: int) -> Tensor:
-    """(B, T, 3, H, W) -> (B, T, 3, size, size), bilinear."""
+    """(B, T, 3, H, W) -> (B, T, 3, size, size), bilinear, averaging where it shrinks."""
     if images.shape[-2:] == (size, size):
         return images
-    flat = functional.interpolate(images.flatten(0, 1), (size, size), mode="bilinear", align_corners=False)
+    flat = functional.interpolate(
+        images.flatten(0, 1),
+        (size, size),
+        mode="bilinear",
+        align_corners=False,
+        antialias=max(images.shape[-2:]) > size,
+    )
     return flat.unflatten(0, images.shape[:2])
 
 

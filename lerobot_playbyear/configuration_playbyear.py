@@ -180,6 +180,10 @@ class PlaybyearConfig(PreTrainedConfig):
         ]
         return sorted(keys, key=lambda key: (key != OBS_STATE, key))
 
+    def feature_shape(self, key: str) -> tuple[int, ...]:
+        """Shape of one frame of an observation."""
+        return tuple((self.input_features or {})[key].shape)
+
     @property
     def window_samples(self) -> int:
         """Samples of one encoding's sound."""
@@ -190,8 +194,14 @@ class PlaybyearConfig(PreTrainedConfig):
         """Takes the sample rate from the dataset's features; LeRobot calls it before it builds the policy.
 
         Raises:
-            ValueError: A microphone's rate or frame length is missing or differs from the configuration.
+            ValueError: There is no sound, or a microphone's rate or frame length is missing or differs from the
+                configuration.
         """
+        if self.use_audio and not any(key.startswith(AUDIO_PREFIX) for key in features):
+            raise ValueError(
+                f"No '{AUDIO_PREFIX}<microphone>' among the dataset's features {sorted(features)}: record with sound, "
+                "or set --policy.use_audio=false to train a deaf policy."
+            )
         for key, feature in features.items():
             if not key.startswith(AUDIO_PREFIX) or not self.use_audio:
                 continue

@@ -1,17 +1,20 @@
 """The policy `playbyear`: what LeRobot calls, and how observations become the network's inputs."""
 
+import math
 from collections import deque
 from typing import Any
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, OBS_PREFIX
+from lerobot.utils.device_utils import resolve_safetensors_device
+from safetensors.torch import load_model
 from torch import Tensor, nn
 
 from lerobot_playbyear.augmentation import Augmentation, resize
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
-from lerobot_playbyear.spectrogram import LogSpectrogram, mix_in_noise, to_float_wave
+from lerobot_playbyear.spectrogram import LogSpectrogram, mix_in_noise, segment_and_hop, to_float_wave
 
 LOSS_WEIGHT = "loss_weight"
 
@@ -28,6 +31,11 @@ class PlaybyearPolicy(PreTrainedPolicy):
     name = "playbyear"
 
     def __init__(self, config: PlaybyearConfig, dataset_stats: dict[str, Any] | None = None, **kwargs: Any):
+        if not isinstance(config, PlaybyearConfig):
+            raise ValueError(
+                f"This is a checkpoint of the policy type '{config.type}', wanted '{self.name}': give the folder "
+                "`pretrained_model` of a playbyear policy."
+            )
         super().__init__(config)
         _check_fps(config)
         config.validate_features()
@@ -38,6 +46,22 @@ class PlaybyearPolicy(PreTrainedPolicy):
     def get_optim_params(self) -> Any:
         return self.parameters()
 
+    @classmethod
+    def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
+        """Loads a checkpoint. LeRobot's own leaves weights that it lacks at random; here that is an error."""
+        hint = "Use the configuration, with the sizes and the inputs, that the checkpoint was trained with."
+        try:
+            device = resolve_safetensors_device(map_location)
+            missing, unexpected = load_model(model, model_file, strict=False, device=device)
+        except RuntimeError as error:
+            raise ValueError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
+        if missing or (strict and unexpected):
+            raise ValueError(
+                f"{model_file} does not fit the policy: it lacks {sorted(missing)[:3]} and has {sorted(unexpected)[:3]} "
+                f"too many, of {len(missing)} and {len(unexpected)}. {hint}"
+            )
+        return model
+
     def reset(self) -> None:
         """Forgets the episode."""
         self._images: dict[str, deque[Tensor]] = {}
@@ -45,13 +69,15 @@ class PlaybyearPolicy(PreTrainedPolicy):
         self._n_heard = 0
         self._encodings: Tensor | None = None
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Mean squared error over the K windows of every item that end inside its episode.
 
         Args:
             batch: `<key>` (B, T, ...) and `<key>_is_pad` (B, T) with the newest frame last. T may differ between keys and
                 be longer than needed: images need `n_image_frames`, sound `n_audio_frames`, the rest `n_run_frames`,
-                the action the last K. An optional `loss_weight` (B, K) weighs the windows.
+                the action the last K. An optional `loss_weight` (B, K) weighs the windows; LeRobot's pre-processor
+                drops it, so it is added afterwards.
+            reduction: "mean" for one loss, "none" for one of every item, (B,), as LeRobot's sample weights want it.
 
         Returns:
             The loss, and numbers for the log.
@@ -61,13 +87,16 @@ class PlaybyearPolicy(PreTrainedPolicy):
         """
         predicted = self.predict_run(batch)  # (B, K, n_actions)
         n_windows = predicted.shape[1]
-        target = batch[ACTION][:, -n_windows:]
+        target = _newest(batch, ACTION, n_windows, predicted.shape[-1:])
         error = (predicted - target).square().mean(dim=-1)  # (B, K)
         weight = torch.ones_like(error)
         if f"{ACTION}_is_pad" in batch:
             weight = weight * ~batch[f"{ACTION}_is_pad"][:, -n_windows:]
         if LOSS_WEIGHT in batch:
             weight = weight * batch[LOSS_WEIGHT]
+        if reduction == "none":
+            losses = (error * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)  # (B,)
+            return losses, {"mse": losses.mean().item()}
         loss = (error * weight).sum() / weight.sum().clamp(min=1e-8)
         return loss, {"mse": loss.item()}
 
@@ -114,7 +143,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
                 run[key] = torch.stack(list(buffer), dim=1)  # (B, frame_stack, 3, H, W)
         if config.use_audio:
             for key in config.audio_keys:
-                sound = to_float_wave(batch[key].reshape(batch[key].shape[0], -1), key)  # (B, S)
+                sound = _newest({key: batch[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)
+                sound = to_float_wave(sound, key)  # (B, S)
                 earlier = self._sound.get(key)
                 if earlier is None:
                     earlier = sound.new_zeros(sound.shape[0], sound.shape[1] * config.audio_frames)
@@ -147,7 +177,7 @@ class PlaybyearNetwork(nn.Module):
         )
         cameras = config.camera_keys
         microphones = config.audio_keys
-        n_fused = sum(features[key].shape[0] for key in config.low_dimensional_keys)
+        n_fused = sum(math.prod(features[key].shape) for key in config.low_dimensional_keys)
         if config.use_vision:
             self.vision = nn.ModuleDict(
                 {_module_name(key): VisionEncoder(config.frame_stack, config.vision_width) for key in cameras}
@@ -172,13 +202,14 @@ class PlaybyearNetwork(nn.Module):
         parts = [
             *(self._see(batch, key, n_frames) for key in self.config.camera_keys if self.config.use_vision),
             *(self._hear(batch, key, n_frames) for key in self.config.audio_keys if self.config.use_audio),
-            *(_newest(batch, key, n_frames).flatten(0, 1).float() for key in self.config.low_dimensional_keys),
+            *(self._feel(batch, key, n_frames) for key in self.config.low_dimensional_keys),
         ]
         n_items = len(next(iter(batch[key] for key in batch if isinstance(batch[key], Tensor))))
         encodings = self.fusion(parts).unflatten(0, (n_items, n_frames))
-        before = _n_before_episode(batch, self._padded_key(), n_frames)
-        if before is None:
+        is_pad = _before_episode(batch, self._padded_key(), n_frames)
+        if is_pad is None:
             return encodings
+        before = is_pad.sum(dim=1).clamp(max=n_frames - 1)  # (B,)
         index = torch.maximum(torch.arange(n_frames, device=encodings.device), before.unsqueeze(1))  # (B, R)
         return encodings.gather(1, index.unsqueeze(-1).expand(-1, -1, encodings.shape[-1]))
 
@@ -187,9 +218,14 @@ class PlaybyearNetwork(nn.Module):
         parts = [
             *(self._see(run, key, 1) for key in self.config.camera_keys if self.config.use_vision),
             *(self._hear(run, key, 1) for key in self.config.audio_keys if self.config.use_audio),
-            *(run[key][:, -1].float() for key in self.config.low_dimensional_keys),
+            *(self._feel(run, key, 1) for key in self.config.low_dimensional_keys),
         ]
         return self.fusion(parts)
+
+    def _feel(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        """One low-dimensional observation, (B * n_frames, n)."""
+        values = _newest(batch, key, n_frames, self.config.feature_shape(key))
+        return values.flatten(0, 1).flatten(1).float()
 
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n_frames, embedding size)."""
@@ -203,7 +239,8 @@ class PlaybyearNetwork(nn.Module):
     def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One microphone's embeddings, (B * n_frames, embedding size)."""
         config = self.config
-        sound = _newest(batch, key, n_frames + config.audio_frames - 1)  # (B, T, S)
+        n_heard = n_frames + config.audio_frames - 1
+        sound = _newest(batch, key, n_heard, config.feature_shape(key))  # (B, T, S)
         wave = to_float_wave(sound.flatten(1), key)
         if self.training and config.audio_noise_db is not None:
             wave = mix_in_noise(wave, config.audio_noise_db)
@@ -211,8 +248,9 @@ class PlaybyearNetwork(nn.Module):
         windows = wave.unfold(1, config.audio_frames * step, step)  # (B, n_frames, samples)
         windows = windows[..., -config.window_samples :].flatten(0, 1)
         begun = torch.ones_like(windows, dtype=torch.bool)
-        if f"{key}_is_pad" in batch:
-            is_pad = batch[f"{key}_is_pad"][:, -sound.shape[1] :].repeat_interleave(step, dim=1)
+        is_pad = _before_episode(batch, key, n_heard)
+        if is_pad is not None:
+            is_pad = is_pad.repeat_interleave(step, dim=1)
             begun = ~is_pad.unfold(1, config.audio_frames * step, step)[..., -config.window_samples :].flatten(0, 1)
         name = _module_name(key)
         return self.hearing[name](self.spectrogram[name](windows, begun))
@@ -226,13 +264,13 @@ class PlaybyearNetwork(nn.Module):
     def _audio_encoder(self) -> AudioEncoder:
         config = self.config
         assert config.sample_rate is not None
-        segment, hop = round(config.segment_s * config.sample_rate), round(config.hop_s * config.sample_rate)
+        segment, hop = segment_and_hop(config.sample_rate, config.segment_s, config.hop_s)
         n_segments = (config.window_samples - segment) // hop + 1
         return AudioEncoder(config.n_frequency_bins, n_segments, tuple(config.audio_channels))
 
 
-def _newest(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
-    """The last `n_frames` frames of a key, (B, n_frames, ...)."""
+def _newest(batch: dict[str, Tensor], key: str, n_frames: int, shape: tuple[int, ...] | None = None) -> Tensor:
+    """The last `n_frames` frames of a key, (B, n_frames, ...), each of the given shape."""
     if key not in batch:
         raise ValueError(f"The batch has no '{key}', which the policy was built for; it has {sorted(batch)}.")
     values = batch[key]
@@ -240,14 +278,25 @@ def _newest(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         raise ValueError(
             f"'{key}' has shape {tuple(values.shape)}, but {n_frames} frames are needed along its second dimension."
         )
-    return values[:, -n_frames:]
+    values = values[:, -n_frames:]
+    if shape == (1,) and values.dim() == 2:  # LeRobot reads a column of single numbers as scalars
+        values = values.unsqueeze(-1)
+    if shape is not None and values.shape[2:] != shape:
+        raise ValueError(
+            f"'{key}' has shape {tuple(values.shape[2:])} per frame, but the policy was made for {tuple(shape)}: use "
+            "the sensor, the sample rate and the frame rate that it was trained with."
+        )
+    return values
 
 
-def _n_before_episode(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor | None:
-    """How many of the last `n_frames` frames lie before the episode, (B,), or None when nothing says so."""
-    if f"{key}_is_pad" not in batch:
-        return None
-    return batch[f"{key}_is_pad"][:, -n_frames:].sum(dim=1).clamp(max=n_frames - 1)
+def _before_episode(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor | None:
+    """Which of the last `n_frames` frames lie before the episode, (B, n_frames), or None when nothing says so.
+
+    All keys end at the same frame, so another key's flags do where a renamed key has lost its own.
+    """
+    flags = [batch[f"{key}_is_pad"]] if f"{key}_is_pad" in batch else []
+    flags += [batch[name] for name in batch if name.startswith(OBS_PREFIX) and name.endswith("_is_pad")]
+    return next((is_pad[:, -n_frames:] for is_pad in flags if is_pad.shape[1] >= n_frames), None)
 
 
 def _module_name(key: str) -> str:

@@ -27,11 +27,11 @@ class VisionEncoder(nn.Module):
         self.network = _SlimResNet(3 * n_stacked, width)
         self.register_buffer("mean", torch.tensor(_IMAGE_MEAN).repeat(n_stacked)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(_IMAGE_STD).repeat(n_stacked)[:, None, None], persistent=False)
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, stacks: Tensor) -> Tensor:
         """(N, 3 * n_stacked, size, size) in [0, 1] -> (N, embedding_size)."""
         stacks = (stacks - self.mean) / self.std
+        # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
         return self.network(stacks.contiguous(memory_format=torch.channels_last))
 
 

@@ -1,5 +1,7 @@
 """The policy's ear: waveform in, normalised log-power spectrogram out."""
 
+import math
+
 import torch
 import torchaudio
 from torch import Tensor, nn
@@ -25,6 +27,14 @@ def to_float_wave(wave: Tensor, key: str) -> Tensor:
     return wave.float()
 
 
+def segment_and_hop(sample_rate: int, segment_s: float, hop_s: float) -> tuple[int, int]:
+    """Samples of a segment and of a step.
+
+    The step is rounded down, so that a window holds as many segments at every sample rate.
+    """
+    return round(segment_s * sample_rate), math.floor(hop_s * sample_rate + 1e-6)
+
+
 class LogSpectrogram(nn.Module):
     """Log power of short segments, normalised per frequency bin with running statistics.
 
@@ -44,7 +54,7 @@ class LogSpectrogram(nn.Module):
 
     def __init__(self, sample_rate: int, segment_s: float, hop_s: float, n_bins: int, momentum: float = 0.01):
         super().__init__()
-        self.segment, self.hop = round(segment_s * sample_rate), round(hop_s * sample_rate)
+        self.segment, self.hop = segment_and_hop(sample_rate, segment_s, hop_s)
         if n_bins > self.segment // 2 + 1:
             raise ValueError(
                 f"n_frequency_bins={n_bins} needs a sample rate of at least {2 * n_bins / segment_s:.0f} Hz, got {sample_rate}."
@@ -53,6 +63,8 @@ class LogSpectrogram(nn.Module):
         self.transform = torchaudio.transforms.Spectrogram(
             n_fft=self.segment, hop_length=self.hop, center=False, power=None, normalized=False
         )
+        # Not part of a checkpoint, and in storage of its own: torch's is a slice, which safetensors refuses to save.
+        self.transform.register_buffer("window", self.transform.window.clone(), persistent=False)
         # A full-scale sine has power 1 in its bin, whatever the segment's length.
         self.scale = 4.0 / float(self.transform.window.sum()) ** 2
         self.register_buffer("mean", torch.zeros(n_bins))

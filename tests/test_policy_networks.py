@@ -84,7 +84,7 @@ def test_fusion_memory_and_head_have_the_papers_sizes(policy):
     assert actions.abs().max() <= 1
 
 
-def test_the_paper_sized_policy_trains_on_a_batch_in_every_layout(policy):
+def test_a_training_item_has_as_many_frames_as_its_windows_reach_back(policy):
     config = policy.config
     assert (config.n_run_frames, config.n_image_frames, config.n_audio_frames) == (17, 19, 56)
     assert config.observation_delta_indices == list(range(-55, 1))
@@ -102,9 +102,38 @@ def test_all_frames_of_a_run_share_one_draw_and_runs_differ():
     assert augmented.max() <= 1
 
 
-@pytest.mark.parametrize("size", [40, 90])
-def test_augmentation_without_strength_is_resizing(size):
-    images = torch.rand(2, 3, 3, 40, 40)
+def test_a_rotated_wide_image_keeps_its_right_angles():
+    """Three corners of a square in the middle of a 2:1 image, followed through a rotation."""
+    torch.manual_seed(3)
+    images = torch.zeros(1, 1, 3, 60, 120)
+    corners = [(20, 50), (20, 70), (40, 50)]
+    turned = {**dict.fromkeys(STRENGTHS, 0.0), "degrees": 30.0}
+    found = []
+    for row, column in corners:
+        torch.manual_seed(3)
+        dot = images.clone()
+        dot[..., row - 1 : row + 2, column - 1 : column + 2] = 1.0
+        dot = Augmentation(**turned)(dot, 120)[0, 0, 0]
+        grid = torch.arange(120.0)
+        # Back to pixels of the original: the height was stretched by two.
+        found.append(torch.stack([(dot.sum(1) @ grid) / dot.sum() / 2, (dot.sum(0) @ grid) / dot.sum()]))
+    across, down = found[1] - found[0], found[2] - found[0]
+    assert abs(across[0]) > 1  # it was turned
+    assert abs(across @ down) / 20**2 < 0.02
+    torch.testing.assert_close(across.norm(), torch.tensor(20.0), rtol=0.02, atol=0)
+
+
+def test_shrinking_averages_instead_of_skipping_pixels():
+    stripes = torch.zeros(1, 1, 3, 96, 96)
+    stripes[..., ::2] = 1.0
+    plain = Augmentation(**dict.fromkeys(STRENGTHS, 0.0))
+    for shrunk in (resize(stripes, 32), plain(stripes, 32)):
+        torch.testing.assert_close(shrunk, torch.full_like(shrunk, 0.5), rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize(("height", "size"), [(40, 40), (40, 90), (60, 32)])
+def test_augmentation_without_strength_is_resizing(height, size):
+    images = torch.rand(2, 3, 3, height, 40)
     plain = Augmentation(**dict.fromkeys(STRENGTHS, 0.0))(images, size)
     torch.testing.assert_close(plain, resize(images, size), rtol=0, atol=1e-4)
 

@@ -144,13 +144,34 @@ def test_a_sense_that_is_switched_off_does_not_matter(option, prefix):
 
 
 def test_without_memory_only_the_newest_image_and_embedding_count():
-    policy = make_policy(use_memory=False, n_supervised_steps=1)
+    policy = make_policy(use_memory=False, n_supervised_steps=1, image_size=64)
     batch = batch_of(policy)
     with torch.no_grad():
         before = policy.predict_run(batch)
         batch["observation.images.front"][:, :-1] = 0
         batch["observation.state"][:, :-1] = 0
         torch.testing.assert_close(policy.predict_run(batch), before, rtol=0, atol=0)
+
+
+def test_a_renamed_observation_that_lost_its_padding_flags_is_still_padded():
+    """`--rename_map` renames an observation but not its flags."""
+    policy = make_policy(n_supervised_steps=2)
+    batch = batch_of(policy, lasts=(3, 30))
+    with torch.no_grad():
+        expected = policy.predict_run(batch)
+        renamed = {key: value for key, value in batch.items() if key not in (f"{MICROPHONE}_is_pad",)}
+        del renamed["observation.state_is_pad"]
+        torch.testing.assert_close(policy.predict_run(renamed), expected, rtol=0, atol=0)
+
+
+def test_sample_weights_get_one_loss_per_item():
+    policy = make_policy(n_supervised_steps=3)
+    batch = batch_of(policy, lasts=(1, 30))
+    with torch.no_grad():
+        losses, _ = policy.forward(batch, reduction="none")
+        for item, loss in enumerate(losses):
+            alone = {key: value[item : item + 1] for key, value in batch.items()}
+            torch.testing.assert_close(policy.forward(alone)[0], loss)
 
 
 def test_window_weights_weigh_the_loss():
