@@ -38,6 +38,10 @@ class PlaybyearConfig(PreTrainedConfig):
         audio_channels: Channels of the audio encoder's convolutions, all with kernel 7.
         hidden_size: Of the two hidden layers in the fusion and in the head.
         embedding_size: Of the fused encoding and of the LSTM, D.
+        normalize_encodings: Bring every camera's and microphone's encoding to the same size before the fusion (a layer norm
+            without parameters). Off is the paper's plain concatenation.
+        low_dimensional_gain: Factor on the normalised low-dimensional observations before the fusion. With 1, the paper's, the
+            seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
 
     Training:
         n_supervised_steps: Windows, K, that a training item supervises: the windows that end on its last K frames. They
@@ -80,6 +84,8 @@ class PlaybyearConfig(PreTrainedConfig):
     audio_channels: tuple[int, ...] = (64, 32, 16, 8)
     hidden_size: int = 1024
     embedding_size: int = 50
+    normalize_encodings: bool = True
+    low_dimensional_gain: float = 4.0
 
     # Training
     n_supervised_steps: int = 8

@@ -10,6 +10,7 @@ from lerobot.utils.constants import ACTION, OBS_PREFIX
 from lerobot.utils.device_utils import resolve_safetensors_device
 from safetensors.torch import load_model
 from torch import Tensor, nn
+from torch.nn import functional
 
 from lerobot_playbyear.augmentation import Augmentation, resize
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
@@ -17,6 +18,7 @@ from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionE
 from lerobot_playbyear.spectrogram import LogSpectrogram, mix_in_noise, segment_and_hop, to_float_wave
 
 LOSS_WEIGHT = "loss_weight"
+_ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
 
 
 class PlaybyearPolicy(PreTrainedPolicy):
@@ -225,7 +227,7 @@ class PlaybyearNetwork(nn.Module):
     def _feel(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One low-dimensional observation, (B * n_frames, n)."""
         values = _newest(batch, key, n_frames, self.config.feature_shape(key))
-        return values.flatten(0, 1).flatten(1).float()
+        return self.config.low_dimensional_gain * values.flatten(0, 1).flatten(1).float()
 
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n_frames, embedding size)."""
@@ -234,7 +236,7 @@ class PlaybyearNetwork(nn.Module):
         images = images.float() / 255 if images.dtype == torch.uint8 else images
         images = self.augment(images, config.image_size) if self.training else resize(images, config.image_size)
         stacks = torch.cat([images[:, i : i + n_frames] for i in range(config.frame_stack)], dim=2)
-        return self.vision[_module_name(key)](stacks.flatten(0, 1))
+        return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
     def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One microphone's embeddings, (B * n_frames, embedding size)."""
@@ -253,7 +255,12 @@ class PlaybyearNetwork(nn.Module):
             is_pad = is_pad.repeat_interleave(step, dim=1)
             begun = ~is_pad.unfold(1, config.audio_frames * step, step)[..., -config.window_samples :].flatten(0, 1)
         name = _module_name(key)
-        return self.hearing[name](self.spectrogram[name](windows, begun))
+        return self._normalize(self.hearing[name](self.spectrogram[name](windows, begun)))
+
+    def _normalize(self, encodings: Tensor) -> Tensor:
+        if not self.config.normalize_encodings:
+            return encodings
+        return _ENCODING_SIZE * functional.layer_norm(encodings, encodings.shape[1:])
 
     def _padded_key(self) -> str:
         """An observation that every batch has."""

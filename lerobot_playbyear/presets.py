@@ -31,19 +31,19 @@ PRESETS = {
         network={
             "policy.type": "playbyear",
             "policy.device": "cpu",
-            "policy.image_size": "84",
+            "policy.image_size": "48",
             "policy.vision_width": "16",
         },
         training={
-            "policy.n_supervised_steps": "4",
+            "policy.n_supervised_steps": "8",
             "policy.optimizer_lr": "1e-3",
             "policy.optimizer_grad_clip_norm": "1.0",
             "policy.push_to_hub": "false",
-            "batch_size": "32",
-            "steps": "6000",
+            "batch_size": "24",
+            "steps": "8000",
             "log_freq": "100",
             "save_freq": "2000",
-            "env_eval_freq": "6000",
+            "env_eval_freq": "8000",
         },
     ),
     "paper": Preset(
@@ -52,6 +52,8 @@ PRESETS = {
             "policy.type": "playbyear",
             "policy.image_size": "224",
             "policy.vision_width": "64",
+            "policy.normalize_encodings": "false",
+            "policy.low_dimensional_gain": "1",
         },
         training={
             "policy.n_supervised_steps": "1",

@@ -73,6 +73,7 @@ def step_through(policy, episodes):
     [
         {"n_supervised_steps": 1},
         {"n_supervised_steps": 6},
+        {"normalize_encodings": False, "low_dimensional_gain": 1.0},
         {"use_audio": False},
         {"use_vision": False},
         {"use_memory": False},
