@@ -41,7 +41,7 @@ run lerobot-eval --policy.path="$checkpoint" --env.type=playbyear --env.task="$T
   --seed="$EVAL_SEED" --output_dir="$DEMO_DIR/eval"
 
 step "4/5 What the best of those who cannot hear does on the same seeds"
-run python examples/blind_floor.py --task="$TASK" --seed="$EVAL_SEED" --episodes="$EVAL_EPISODES" \
+run python -m gym_playbyear.baselines --task "$TASK" --seed="$EVAL_SEED" --n_episodes="$EVAL_EPISODES" \
   --output="$DEMO_DIR/blind_floor.json"
 
 step "5/5 Film an episode with its sound"
@@ -55,10 +55,12 @@ from pathlib import Path
 
 folder = Path(sys.argv[1])
 policy = json.loads((folder / "eval/eval_info.json").read_text())["overall"]
-blind = json.loads((folder / "blind_floor.json").read_text())
+blind = json.loads((folder / "blind_floor.json").read_text())[0]["success"]
+expert = blind.pop("expert")
 name, rate = max(blind.items(), key=lambda item: item[1])
 print(f"Success of the policy, {policy['n_episodes']} unseen seeds: {policy['pc_success']:.0f} %")
 print(f"Success of the best blind script ({name}):     {100 * rate:.0f} %")
+print(f"Success of the expert, who feels contact:    {100 * expert:.0f} %")
 print(f"Film with sound: {(folder / 'rollout.mp4').resolve()}")
 PY
 printf '\nThe commands, to go on from here:\n'

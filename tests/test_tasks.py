@@ -190,3 +190,47 @@ def test_absent_gl_is_explained():
     result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert result.returncode != 0
     assert "MUJOCO_GL=egl" in result.stderr
+
+
+def sound_of_touch(
+    env, seed: int, pair: str, way_points: list[tuple[float, float, float]], cube_y: float
+) -> np.ndarray:
+    """Drives the arm from point to point [m, world] until `pair` touches; the sound of that frame and the next, as PCM."""
+    env.reset(seed=seed, options={"cube_position": (0.0, cube_y)})
+    task = env.unwrapped
+    speed = np.random.default_rng(seed).uniform(0.008, 0.02)
+    for goal in way_points:
+        for _ in range(60):
+            way = np.array(goal) - task.eef_position
+            if np.linalg.norm(way) < 0.005:
+                break
+            move = way * min(1.0, speed / np.linalg.norm(way)) / 0.05
+            observation = env.step(np.append(move, -1.0))[0]
+            if task.contact_forces[pair] > 0.2:
+                following = env.step(np.array([0.0, 0.0, 0.0, -1.0]))[0]
+                return np.concatenate([observation["audio.gripper"], following["audio.gripper"]])
+    raise AssertionError(f"{pair} never touched")
+
+
+def test_touches_of_cube_wall_and_table_are_told_apart_by_their_spectra():
+    env = make("OccludedGrasp-v0")
+    touches: dict[str, tuple[list[tuple[float, float, float]], float]] = {
+        "gripper-cube": ([(0.0, 0.0, 0.88), (0.0, 0.0, 0.822), (0.0, 0.2, 0.822)], 0.1),
+        "gripper-wall": ([(0.05, 0.0, 0.95), (0.16, 0.0, 0.95)], 0.2),
+        "gripper-table": ([(-0.1, 0.0, 0.85), (-0.1, 0.0, 0.80)], 0.2),
+    }
+    spectra, labels = [], []
+    for label, (pair, (way_points, cube_y)) in enumerate(touches.items()):
+        for seed in range(24):
+            sound = sound_of_touch(env, seed, pair, way_points, cube_y)
+            spectra.append(np.log10(np.abs(np.fft.rfft(sound / 32768.0 * np.hanning(len(sound)))[:320]) + 1e-6))
+            labels.append(label)
+    env.close()
+    features = np.stack(spectra).reshape(len(spectra), 40, 8).mean(axis=2)
+    features = np.column_stack([(features - features.mean(axis=0)) / features.std(axis=0), np.ones(len(features))])
+    targets = np.eye(3)[labels]
+    held_out = np.arange(len(labels)) % 3 == 0
+    x, y = features[~held_out], targets[~held_out]
+    weights = np.linalg.solve(x.T @ x + 1.0 * np.eye(x.shape[1]), x.T @ y)
+    guessed = (features[held_out] @ weights).argmax(axis=1)
+    assert (guessed == np.array(labels)[held_out]).mean() >= 0.9

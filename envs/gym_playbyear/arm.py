@@ -49,7 +49,7 @@ class ArmConfig:
     grip_force: float = 40.0
     gripper_cooldown: float = 2.0
     workspace: tuple[tuple[float, float, float], tuple[float, float, float]] = (
-        (-0.25, -0.39, 0.812),
+        (-0.25, -0.39, 0.803),
         (0.155, 0.40, 1.15),
     )
     max_lead: float = 0.06

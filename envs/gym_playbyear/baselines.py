@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -45,12 +46,17 @@ def main() -> None:
     parser.add_argument("--task", nargs="+", default=list(gym_playbyear.TASKS))
     parser.add_argument("--variant", default="default")
     parser.add_argument("--n_episodes", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1000, help="of the first episode")
+    parser.add_argument("--output", type=Path, help="a JSON file for the rates")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.n_episodes)
+    results = []
     for task in arguments.task:
         rates = success_rates(task, (EXPERT, *BLIND_STRATEGIES), seeds, variant=arguments.variant)
-        print(json.dumps({"task": task, "variant": arguments.variant, "seeds": [seeds[0], seeds[-1]], **rates}))
+        results.append({"task": task, "variant": arguments.variant, "seeds": [seeds[0], seeds[-1]], "success": rates})
+        print(json.dumps(results[-1]), flush=True)
+    if arguments.output:
+        arguments.output.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

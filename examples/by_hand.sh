@@ -1,0 +1,17 @@
+#!/usr/bin/env bash
+# The main job with LeRobot's own commands, small enough to watch: four demonstrations, twenty updates, four episodes.
+# Enough to see that everything works, far too little to learn; `make demo` is the real thing.
+set -euo pipefail
+export MUJOCO_GL=${MUJOCO_GL:-egl}
+folder=${1:-outputs/by_hand}
+
+playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v0 \
+  --dataset.repo_id=me/occluded --dataset.root="$folder/dataset" --dataset.num_episodes=4 --seed=0 --resume=true
+
+lerobot-train --policy.type=playbyear --policy.push_to_hub=false --policy.device=cpu \
+  --policy.image_size=48 --policy.vision_width=8 \
+  --dataset.repo_id=me/occluded --dataset.root="$folder/dataset" --dataset.video_backend=pyav \
+  --batch_size=4 --steps=20 --num_workers=0 --output_dir="$folder/train"
+
+lerobot-eval --policy.path="$folder/train/checkpoints/last/pretrained_model" \
+  --env.type=playbyear --env.task=OccludedGrasp-v0 --eval.n_episodes=4 --eval.batch_size=2 --output_dir="$folder/eval"
