@@ -51,6 +51,8 @@ class PlaybyearConfig(PreTrainedConfig):
             size; scale: either way.
         audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]; None
             mixes in none (the paper). Levels are drawn per item, uniformly from 20 dB below the floor up to this.
+        low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
+            normalisation. The paper has none; without it a few dozen demonstrations are learned by heart.
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
         optimizer_*: Adam, and the clip of the gradient's norm.
         scheduler_*: Linear warm-up over this share of the steps, then a cosine down to this share of the rate. The paper's
@@ -96,6 +98,7 @@ class PlaybyearConfig(PreTrainedConfig):
     augmentation_translate: float = 0.05
     augmentation_scale: float = 0.05
     audio_noise_db: float | None = None
+    low_dimensional_noise: float = 0.0
     spectrogram_momentum: float = 0.01
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.0

@@ -227,7 +227,10 @@ class PlaybyearNetwork(nn.Module):
     def _feel(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One low-dimensional observation, (B * n_frames, n)."""
         values = _newest(batch, key, n_frames, self.config.feature_shape(key))
-        return self.config.low_dimensional_gain * values.flatten(0, 1).flatten(1).float()
+        values = values.flatten(0, 1).flatten(1).float()
+        if self.training and self.config.low_dimensional_noise > 0:
+            values = values + self.config.low_dimensional_noise * torch.randn_like(values)
+        return self.config.low_dimensional_gain * values
 
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n_frames, embedding size)."""

@@ -37,6 +37,8 @@ PRESETS = {
         training={
             "policy.n_supervised_steps": "8",
             "policy.optimizer_lr": "1e-3",
+            "policy.low_dimensional_noise": "0.03",
+            "policy.audio_noise_db": "0",
             "policy.optimizer_grad_clip_norm": "1.0",
             "policy.push_to_hub": "false",
             "batch_size": "24",

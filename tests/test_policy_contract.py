@@ -147,3 +147,12 @@ def test_windows_before_the_episode_are_not_supervised():
     assert policy.forward(batch)[0] == loss
     batch["action"][:, 3:] += 7.0
     assert policy.forward(batch)[0] > loss
+
+
+def test_noise_on_low_dimensional_observations_is_for_training_alone():
+    policy = make_policy(low_dimensional_noise=0.5, use_vision=False, use_audio=False)
+    batch = run_ending_at(make_episode(seed=10, config=policy.config), 30, policy.config)
+    with torch.no_grad():
+        torch.testing.assert_close(policy.predict_run(batch), policy.predict_run(batch), atol=0, rtol=0)
+        policy.train()
+        assert not torch.equal(policy.predict_run(batch), policy.predict_run(batch))
