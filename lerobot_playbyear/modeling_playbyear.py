@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import ACTION, OBS_PREFIX
+from lerobot.utils.constants import ACTION
 from lerobot.utils.device_utils import resolve_safetensors_device
 from safetensors.torch import load_model
 from torch import Tensor, nn
@@ -15,6 +15,7 @@ from torch.nn import functional
 from lerobot_playbyear.augmentation import Augmentation, resize
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
+from lerobot_playbyear.runs import before_episode, newest
 from lerobot_playbyear.spectrogram import LogSpectrogram, mix_in_noise, segment_and_hop, to_float_wave
 
 LOSS_WEIGHT = "loss_weight"
@@ -89,7 +90,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         """
         predicted = self.predict_run(batch)  # (B, K, n_actions)
         n_windows = predicted.shape[1]
-        target = _newest(batch, ACTION, n_windows, predicted.shape[-1:])
+        target = newest(batch, ACTION, n_windows, predicted.shape[-1:])
         error = (predicted - target).square().mean(dim=-1)  # (B, K)
         weight = torch.ones_like(error)
         if f"{ACTION}_is_pad" in batch:
@@ -145,7 +146,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
                 run[key] = torch.stack(list(buffer), dim=1)  # (B, frame_stack, 3, H, W)
         if config.use_audio:
             for key in config.audio_keys:
-                sound = _newest({key: batch[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)
+                sound = newest({key: batch[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)
                 sound = to_float_wave(sound, key)  # (B, S)
                 earlier = self._sound.get(key)
                 if earlier is None:
@@ -208,7 +209,7 @@ class PlaybyearNetwork(nn.Module):
         ]
         n_items = len(next(iter(batch[key] for key in batch if isinstance(batch[key], Tensor))))
         encodings = self.fusion(parts).unflatten(0, (n_items, n_frames))
-        is_pad = _before_episode(batch, self._padded_key(), n_frames)
+        is_pad = before_episode(batch, self._padded_key(), n_frames)
         if is_pad is None:
             return encodings
         before = is_pad.sum(dim=1).clamp(max=n_frames - 1)  # (B,)
@@ -226,7 +227,7 @@ class PlaybyearNetwork(nn.Module):
 
     def _feel(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One low-dimensional observation, (B * n_frames, n)."""
-        values = _newest(batch, key, n_frames, self.config.feature_shape(key))
+        values = newest(batch, key, n_frames, self.config.feature_shape(key))
         values = values.flatten(0, 1).flatten(1).float()
         if self.training and self.config.low_dimensional_noise > 0:
             values = values + self.config.low_dimensional_noise * torch.randn_like(values)
@@ -235,7 +236,7 @@ class PlaybyearNetwork(nn.Module):
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n_frames, embedding size)."""
         config = self.config
-        images = _newest(batch, key, n_frames + config.frame_stack - 1)  # (B, T, 3, H, W)
+        images = newest(batch, key, n_frames + config.frame_stack - 1)  # (B, T, 3, H, W)
         images = images.float() / 255 if images.dtype == torch.uint8 else images
         images = self.augment(images, config.image_size) if self.training else resize(images, config.image_size)
         stacks = torch.cat([images[:, i : i + n_frames] for i in range(config.frame_stack)], dim=2)
@@ -245,7 +246,7 @@ class PlaybyearNetwork(nn.Module):
         """One microphone's embeddings, (B * n_frames, embedding size)."""
         config = self.config
         n_heard = n_frames + config.audio_frames - 1
-        sound = _newest(batch, key, n_heard, config.feature_shape(key))  # (B, T, S)
+        sound = newest(batch, key, n_heard, config.feature_shape(key))  # (B, T, S)
         wave = to_float_wave(sound.flatten(1), key)
         if self.training and config.audio_noise_db is not None:
             wave = mix_in_noise(wave, config.audio_noise_db)
@@ -253,7 +254,7 @@ class PlaybyearNetwork(nn.Module):
         windows = wave.unfold(1, config.audio_frames * step, step)  # (B, n_frames, samples)
         windows = windows[..., -config.window_samples :].flatten(0, 1)
         begun = torch.ones_like(windows, dtype=torch.bool)
-        is_pad = _before_episode(batch, key, n_heard)
+        is_pad = before_episode(batch, key, n_heard)
         if is_pad is not None:
             is_pad = is_pad.repeat_interleave(step, dim=1)
             begun = ~is_pad.unfold(1, config.audio_frames * step, step)[..., -config.window_samples :].flatten(0, 1)
@@ -277,36 +278,6 @@ class PlaybyearNetwork(nn.Module):
         segment, hop = segment_and_hop(config.sample_rate, config.segment_s, config.hop_s)
         n_segments = (config.window_samples - segment) // hop + 1
         return AudioEncoder(config.n_frequency_bins, n_segments, tuple(config.audio_channels))
-
-
-def _newest(batch: dict[str, Tensor], key: str, n_frames: int, shape: tuple[int, ...] | None = None) -> Tensor:
-    """The last `n_frames` frames of a key, (B, n_frames, ...), each of the given shape."""
-    if key not in batch:
-        raise ValueError(f"The batch has no '{key}', which the policy was built for; it has {sorted(batch)}.")
-    values = batch[key]
-    if values.dim() < 2 or values.shape[1] < n_frames:
-        raise ValueError(
-            f"'{key}' has shape {tuple(values.shape)}, but {n_frames} frames are needed along its second dimension."
-        )
-    values = values[:, -n_frames:]
-    if shape == (1,) and values.dim() == 2:  # LeRobot reads a column of single numbers as scalars
-        values = values.unsqueeze(-1)
-    if shape is not None and values.shape[2:] != shape:
-        raise ValueError(
-            f"'{key}' has shape {tuple(values.shape[2:])} per frame, but the policy was made for {tuple(shape)}: use "
-            "the sensor, the sample rate and the frame rate that it was trained with."
-        )
-    return values
-
-
-def _before_episode(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor | None:
-    """Which of the last `n_frames` frames lie before the episode, (B, n_frames), or None when nothing says so.
-
-    All keys end at the same frame, so another key's flags do where a renamed key has lost its own.
-    """
-    flags = [batch[f"{key}_is_pad"]] if f"{key}_is_pad" in batch else []
-    flags += [batch[name] for name in batch if name.startswith(OBS_PREFIX) and name.endswith("_is_pad")]
-    return next((is_pad[:, -n_frames:] for is_pad in flags if is_pad.shape[1] >= n_frames), None)
 
 
 def _module_name(key: str) -> str:
