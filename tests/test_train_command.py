@@ -289,7 +289,7 @@ def test_a_preset_leaves_checkpoints_and_the_hub_alone():
     shared = apply_preset(["--preset=cpu", "--policy.repo_id=me/policy"])
 
     assert not any(arg.startswith(("--policy.type", "--policy.vision_width")) for arg in tuned)
-    assert "--batch_size=32" in tuned
+    assert f"--batch_size={PRESETS['cpu'].training['batch_size']}" in tuned
     assert resumed == ["--preset=cpu", "--resume=true"]
     assert "--policy.push_to_hub=false" not in shared
     with pytest.raises(ValueError, match=r"is for --policy.type=playbyear, not for act"):

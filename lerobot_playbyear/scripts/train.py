@@ -37,6 +37,7 @@ from lerobot_playbyear.datasets import (
     run_weights,
     start_frames,
 )
+from lerobot_playbyear.memory import keep_freed_memory
 from lerobot_playbyear.presets import apply_preset
 from lerobot_playbyear.train_config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training import PolicyWindows, TrainingParts, make_training_parts
@@ -268,6 +269,7 @@ def _print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
 
 def main() -> None:
     """The command."""
+    keep_freed_memory()
     register_third_party_plugins()
     try:
         with _errors_of_input():
