@@ -1,4 +1,4 @@
-"""Makes the README's moving picture from a film: `python tools/film_to_gif.py outputs/demo/rollout.mp4 docs/media/rollout.gif`."""
+"""Makes a small moving picture: `python tools/film_to_gif.py outputs/demo/rollout.mp4 docs/media/rollout.gif`."""
 
 import sys
 
