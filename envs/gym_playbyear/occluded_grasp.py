@@ -77,7 +77,7 @@ class OccludedGraspEnv(PlayByEarEnv):
             cube_density=2000,
             cube_friction=0.4,
             max_shove=0.03,
-            horizon=120,
+            horizon=102,
         ),
         "paper": Variant(
             cube_x=(0.0, 0.0),
