@@ -33,7 +33,7 @@ def box_xml(name: str, half_size, position, rgba: str, *, solid: bool = True) ->
 
 
 def tray_xml(name: str, half_width: float, half_height: float) -> str:
-    """An open tray: a floor and four walls. The body is placed at the start of each episode (a mocap body)."""
+    """An open tray: a floor and four walls. A task places it at the start of each episode."""
     thickness = 0.004
     walls = ""
     for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
@@ -45,7 +45,7 @@ def tray_xml(name: str, half_width: float, half_height: float) -> str:
             f'{_SCENE} rgba="0.2 0.55 0.3 1"/>'
         )
     return f"""
-    <body name="{name}" mocap="true">
+    <body name="{name}">
       <geom type="box" size="{half_width} {half_width} 0.002" pos="0 0 0.002" {_SCENE} rgba="0.25 0.65 0.35 1"/>{walls}
     </body>"""
 
