@@ -16,7 +16,7 @@ from lerobot_playbyear.augmentation import Augmentation, resize
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
 from lerobot_playbyear.runs import before_episode, newest
-from lerobot_playbyear.spectrogram import LogSpectrogram, mix_in_noise, segment_and_hop, to_float_wave
+from lerobot_playbyear.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, segment_and_hop, to_float_wave
 
 LOSS_WEIGHT = "loss_weight"
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
@@ -250,16 +250,15 @@ class PlaybyearNetwork(nn.Module):
         wave = to_float_wave(sound.flatten(1), key)
         if self.training and config.audio_noise_db is not None:
             wave = mix_in_noise(wave, config.audio_noise_db)
-        step = sound.shape[2]
-        windows = wave.unfold(1, config.audio_frames * step, step)  # (B, n_frames, samples)
-        windows = windows[..., -config.window_samples :].flatten(0, 1)
-        begun = torch.ones_like(windows, dtype=torch.bool)
+        begun = torch.ones_like(wave, dtype=torch.bool)
         is_pad = before_episode(batch, key, n_heard)
         if is_pad is not None:
-            is_pad = is_pad.repeat_interleave(step, dim=1)
-            begun = ~is_pad.unfold(1, config.audio_frames * step, step)[..., -config.window_samples :].flatten(0, 1)
-        name = _module_name(key)
-        return self._normalize(self.hearing[name](self.spectrogram[name](windows, begun)))
+            begun = ~is_pad.repeat_interleave(sound.shape[2], dim=1)
+        spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
+        assert isinstance(spectrogram, LogSpectrogram) and isinstance(encoder, AudioEncoder)
+        shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
+        levels = spectrogram(shared.stretches(wave), shared.stretches(begun))
+        return self._normalize(shared.windows(encoder(levels), encoder.length).flatten(1))
 
     def _normalize(self, encodings: Tensor) -> Tensor:
         if not self.config.normalize_encodings:

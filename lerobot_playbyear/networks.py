@@ -54,7 +54,7 @@ class _SlimResNet(ResNet):
 
 
 class AudioEncoder(nn.Module):
-    """Convolutions over time, frequency bins as channels; the result is flattened.
+    """Convolutions over time, frequency bins as channels.
 
     Args:
         n_bins: Frequency bins.
@@ -74,11 +74,14 @@ class AudioEncoder(nn.Module):
         for n_in, n_out in zip((n_bins, *channels), channels, strict=False):
             layers += [nn.Conv1d(n_in, n_out, _AUDIO_KERNEL), nn.ReLU()]
         self.layers = nn.Sequential(*layers)
-        self.embedding_size = channels[-1] * length
+        self.length, self.embedding_size = length, channels[-1] * length
 
     def forward(self, spectrogram: Tensor) -> Tensor:
-        """(N, n_bins, n_segments) -> (N, embedding_size)."""
-        return self.layers(spectrogram).flatten(1)
+        """(N, n_bins, n_segments + extra) -> (N, channels[-1], length + extra), embeddings before they are flattened.
+
+        Extra segments belong to later windows of the same sound; their embeddings are slices of the result.
+        """
+        return self.layers(spectrogram)
 
 
 def _mlp(n_in: int, hidden: int, n_out: int) -> nn.Sequential:

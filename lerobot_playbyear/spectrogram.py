@@ -1,10 +1,12 @@
 """The policy's ear: waveform in, normalised log-power spectrogram out."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 import torchaudio
 from torch import Tensor, nn
+from torch.nn import functional
 
 _POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
 
@@ -33,6 +35,63 @@ def segment_and_hop(sample_rate: int, segment_s: float, hop_s: float) -> tuple[i
     The step is rounded down, so that a window holds as many segments at every sample rate.
     """
     return round(segment_s * sample_rate), math.floor(hop_s * sample_rate + 1e-6)
+
+
+@dataclass(frozen=True)
+class SharedStretches:
+    """Windows of sound that end one frame apart, as a few stretches whose segments they share.
+
+    A window's segments begin at multiples of the hop from the window's own start, so that a frame's and the next frame's
+    differ. But every `period` frames they coincide: those windows are slices of one spectrogram, which is computed, and
+    convolved, once.
+
+    Attributes:
+        n_windows: Windows wanted, the last one at the end of the sound.
+        step: Between the windows' ends [samples].
+        length: Of a window [samples].
+        hop: Between the segments' starts [samples].
+    """
+
+    n_windows: int
+    step: int
+    length: int
+    hop: int
+
+    @property
+    def period(self) -> int:
+        """Frames after which windows have segments in common."""
+        return self.hop // math.gcd(self.step, self.hop)
+
+    @property
+    def n_stretches(self) -> int:
+        return min(self.period, self.n_windows)
+
+    @property
+    def windows_per_stretch(self) -> int:
+        return math.ceil(self.n_windows / self.period)
+
+    def stretches(self, sound: Tensor) -> Tensor:
+        """(B, samples) -> (B * n_stretches, samples of a stretch); zeros, or False, where one reaches past the end."""
+        stretch = self.length + (self.windows_per_stretch - 1) * self.period * self.step
+        start = sound.shape[1] - self.length - (self.n_windows - 1) * self.step
+        end = start + (self.n_stretches - 1) * self.step + stretch
+        padded = functional.pad(sound[:, start:], (0, end - sound.shape[1]))
+        return padded.unfold(1, stretch, self.step).flatten(0, 1)
+
+    def windows(self, columns: Tensor, n_columns: int) -> Tensor:
+        """The windows' parts of what was computed from the stretches' segments.
+
+        Args:
+            columns: (B * n_stretches, C, n), a column per segment, perhaps fewer at the edges.
+            n_columns: Of one window.
+
+        Returns:
+            (B * n_windows, C, n_columns).
+        """
+        shift = self.period * self.step // self.hop
+        parts = columns.unfold(2, n_columns, shift)  # (B * n_stretches, C, windows_per_stretch, n_columns)
+        parts = parts.unflatten(0, (-1, self.n_stretches)).permute(0, 3, 1, 2, 4)
+        return parts.flatten(1, 2)[:, : self.n_windows].flatten(0, 1)
 
 
 class LogSpectrogram(nn.Module):

@@ -64,7 +64,8 @@ def test_the_audio_encoder_is_four_convolutions_of_kernel_seven_over_time(policy
         shapes.append(tuple(value.shape[1:]))
     assert shapes[::2] == [(64, 51), (32, 45), (16, 39), (8, 33)]
     assert all(isinstance(layer, nn.ReLU) for layer in list(encoder.layers)[1::2])
-    assert encoder(torch.rand(2, 160, 57)).shape == (2, 264)
+    assert encoder(torch.rand(2, 160, 57)).shape == (2, 8, 33)
+    assert encoder.embedding_size == 264
     assert count(encoder) == 71_744 + 14_368 + 3_600 + 904
 
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 from torchaudio.functional import resample
 
-from lerobot_playbyear.spectrogram import LogSpectrogram, to_float_wave
+from lerobot_playbyear.networks import AudioEncoder
+from lerobot_playbyear.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
 
 SEGMENT_S, HOP_S, N_BINS, WINDOW_S = 0.040, 0.035, 160, 2.0
 
@@ -96,3 +97,25 @@ def test_sound_that_cannot_be_is_refused_with_its_key(value, message):
 def test_a_sample_rate_too_low_for_the_bins_is_refused():
     with pytest.raises(ValueError, match="at least 8000 Hz, got 6000"):
         make_spectrogram(6000)
+
+
+@pytest.mark.parametrize(("sample_rate", "fps"), [(16000, 20), (48000, 30), (16000, 5), (16000, 40)])
+@pytest.mark.parametrize("n_windows", [1, 4, 17, 41])
+def test_windows_that_share_segments_are_encoded_as_each_alone(sample_rate, fps, n_windows):
+    step, length = sample_rate // fps, round(WINDOW_S * sample_rate)
+    spectrogram, encoder = make_spectrogram(sample_rate).eval(), AudioEncoder(N_BINS, 57, (8, 6, 4, 2))
+    wave = noise(2, length + (n_windows - 1) * step + 11)
+    begun = torch.arange(wave.shape[1]).expand(2, -1) >= torch.tensor([[0], [length]])
+    shared = SharedStretches(n_windows, step, length, spectrogram.hop)
+
+    together = shared.windows(encoder(spectrogram(shared.stretches(wave), shared.stretches(begun))), encoder.length)
+
+    alone = [part[:, 11:].unfold(1, length, step).flatten(0, 1) for part in (wave, begun)]
+    torch.testing.assert_close(together, encoder(spectrogram(*alone)), rtol=1e-5, atol=1e-5)
+
+
+def test_seventeen_frames_at_20_hz_cost_half_the_segments():
+    shared = SharedStretches(17, step=800, length=32000, hop=560)
+    assert (shared.period, shared.n_stretches, shared.windows_per_stretch) == (7, 7, 3)
+    segments = shared.n_stretches * ((32000 + 2 * 7 * 800 - 640) // 560 + 1)
+    assert segments < 17 * 57 * 0.56
