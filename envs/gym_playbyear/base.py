@@ -165,6 +165,10 @@ class PlayByEarEnv(gym.Env):
         """An expert for the current episode, with privileged knowledge: `act()` gives an action (4,). Make it after `reset`."""
         raise NotImplementedError
 
+    def intervention_gate(self):
+        """The expert beside a policy in this episode: `wants_control(policy_action)` and `act()`. Make it after `reset`."""
+        raise NotImplementedError
+
     def blind_baselines(self) -> dict[str, Any]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""
         raise NotImplementedError

@@ -43,6 +43,12 @@ class ExpertConfig:
     back_off: float = 0.004
 
 
+CORRECTING_EXPERT = ExpertConfig(
+    sweep_step=(0.008, 0.011), pause_probability=0.0, dwell=(0, 1), rise_step=(0.013, 0.018), hover=(0, 1)
+)
+"""An expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
+
+
 class GraspExpert:
     """Grasps the hidden cube by touch and lifts it.
 
@@ -72,6 +78,13 @@ class GraspExpert:
         self.rise_step = rng.uniform(*config.rise_step)
         self.phase = "approach"
 
+    def begin_at(self, phase: str) -> None:
+        """Starts a new attempt in the middle: from where the hand is now, in `phase`."""
+        self._begin()
+        self.phase = phase
+        self._wait = 0
+        self.contact_y = float(self.env.eef_position[1]) + self.config.back_off
+
     def _sweep_range(self) -> tuple[float, float]:
         lower, upper = self.env.hidden_range
         margin = self.config.margin + self.rng.uniform(0, 0.02)
@@ -85,6 +98,12 @@ class GraspExpert:
         return np.append(np.clip(move, -1, 1), 1.0 if close else -1.0).astype(np.float32)
 
     # One method per phase: it returns the displacement (3,) [m] and whether the fingers shall close.
+
+    def _retreat(self):
+        goal = np.array([*self.env.eef_position[:2], TABLE_TOP + self.config.travel_height])
+        if self._near(goal, 0.02):
+            self.phase = "approach"
+        return self._towards(goal), False
 
     def _approach(self):
         goal = np.array([self.x, self.sweep_start, TABLE_TOP + self.config.travel_height])

@@ -9,7 +9,8 @@ from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.base import PlayByEarEnv, SensorNoise, Variant
 from gym_playbyear.blind import blind_grasps
-from gym_playbyear.experts import GraspExpert
+from gym_playbyear.experts import CORRECTING_EXPERT, GraspExpert
+from gym_playbyear.gates import InterventionGate
 
 WALL_HALF_SIZE = (0.02, 0.40, 0.30)  # m
 WALL_CENTRE = (0.20, 0.0, 0.775)  # m: its top is 0.275 m above the table
@@ -120,6 +121,9 @@ class OccludedGraspEnv(PlayByEarEnv):
 
     def scripted_expert(self) -> GraspExpert:
         return GraspExpert(self)
+
+    def intervention_gate(self) -> InterventionGate:
+        return InterventionGate(self, GraspExpert(self, CORRECTING_EXPERT))
 
     def blind_baselines(self) -> dict[str, Any]:
         return blind_grasps(self)

@@ -9,7 +9,8 @@ from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml, tray_xml
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.base import PlayByEarEnv, SensorNoise, Variant
 from gym_playbyear.blind import blind_pick_places
-from gym_playbyear.experts import PickPlaceExpert
+from gym_playbyear.experts import CORRECTING_EXPERT, PickPlaceExpert
+from gym_playbyear.gates import InterventionGate
 
 WALL_HALF_SIZE = (0.02, 0.20, 0.18)  # m
 WALL_CENTRE = (0.10, 0.20, 0.80)  # m
@@ -121,6 +122,9 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
 
     def scripted_expert(self) -> PickPlaceExpert:
         return PickPlaceExpert(self)
+
+    def intervention_gate(self) -> InterventionGate:
+        return InterventionGate(self, PickPlaceExpert(self, CORRECTING_EXPERT))
 
     def blind_baselines(self) -> dict[str, Any]:
         return blind_pick_places(self)

@@ -1,0 +1,300 @@
+"""When the scripted expert takes over from a policy, what it does then, and when it hands back.
+
+The rules are the authors' (missed and moved on, late and hovering, dropped after lifting), and a few that come before a
+mistake is final: in our tasks a cube shoved over 3 cm ends the attempt, and fingers closed beside the cube stay closed for
+2 s. A gate looks at the state behind the scenes, and at the action that the policy is about to take.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from gym_playbyear.arena import TABLE_TOP
+from gym_playbyear.base import ACTION_SCALE
+from gym_playbyear.experts import GraspExpert
+
+SEARCH, GRASP, LIFT, CARRY = range(4)
+_STAGES = {
+    **dict.fromkeys(("retreat", "approach", "lower", "sweep"), SEARCH),
+    **dict.fromkeys(("dwell", "rise", "hover", "hop", "descend", "grasp"), GRASP),
+    "lift": LIFT,
+    **dict.fromkeys(("carry", "release"), CARRY),
+}
+
+
+@dataclass(frozen=True)
+class GateConfig:
+    """When the expert takes over. Lengths in metres, durations in control steps, shares of the episode's steps.
+
+    Attributes:
+        missed_height: The hand is this far above the table after it touched the cube, without it: it missed and moved on.
+        search_share: From this share on, the same height without a touch counts as well.
+        hover_share, hover_distance, hover_change: From this share on, open fingers this near the cube that hardly change the
+            policy's action.
+        still_steps, still_distance: The hand moved less than this in so many steps.
+        shove_share, push_step: The cube was shoved by this share of what ends the attempt, and the policy goes on pushing by
+            at least this much.
+        grasp_reach, grasp_height: Fingers may close when the cube is this near to their middle along the table, and their tips
+            this low.
+        release_reach: Fingers may open when the held cube is this near to the tray's middle.
+        drop_distance: A cube that was held and is this far from the hand was dropped.
+        stray_x, stray_y: How far a hand that searches on the table may be beside the line of the sweep, and before its start.
+        hop_past: How far a hand that rose after the touch may go past the cube.
+        memory_steps: How long after a touch the expert may act on it; the policy hears 2 s. Later it searches anew.
+        search_step, travel_step: What the expert covers per step in the sweep and elsewhere, for what follows.
+        grasp_steps, lift_steps, place_steps: What it needs from the touch until the fingers hold, to lift, and to release.
+        slack_steps: It takes over when it has only so many steps more than it needs.
+    """
+
+    missed_height: float = 0.12
+    search_share: float = 0.35
+    hover_share: float = 0.8
+    hover_distance: float = 0.05
+    hover_change: float = 0.05
+    still_steps: int = 24
+    still_distance: float = 0.005
+    shove_share: float = 0.35
+    push_step: float = 0.003
+    grasp_reach: float = 0.012
+    grasp_height: float = 0.034
+    release_reach: float = 0.02
+    drop_distance: float = 0.04
+    stray_x: float = 0.03
+    stray_y: float = 0.12
+    hop_past: float = 0.03
+    memory_steps: int = 40
+    search_step: float = 0.0085
+    travel_step: float = 0.016
+    grasp_steps: int = 25
+    lift_steps: int = 5
+    place_steps: int = 30
+    slack_steps: int = 3
+
+
+class InterventionGate:
+    """The scripted expert beside a policy: says at every step who acts, and acts.
+
+    Args:
+        env: The unwrapped environment, after `reset`.
+        expert: Made for this episode; its phase is set anew whenever it takes over.
+        config: The thresholds.
+
+    Attributes:
+        reason: Why the expert is in control, in one word; None while the policy is.
+    """
+
+    def __init__(self, env, expert: GraspExpert, config: GateConfig | None = None):
+        self.env, self.expert, self.config = env, expert, config or GateConfig()
+        self.reason: str | None = None
+        self._stage = SEARCH
+        self._n_steps = 0
+        self._touched_at: int | None = None
+        self._was_held = False
+        self._first_cube = env.cube_position
+        self._positions: deque[np.ndarray] = deque(maxlen=self.config.still_steps + 1)
+        self._last_action: np.ndarray | None = None
+
+    def wants_control(self, policy_action: np.ndarray) -> bool:
+        """Whether the expert acts in this step. Call it once per step, before the step.
+
+        Args:
+            policy_action: (4,) what the policy would do.
+        """
+        action = np.asarray(policy_action, dtype=float)
+        self._look()
+        if self.reason is not None and self._has_advanced():
+            self.reason = None
+        if self.reason is None:
+            self.reason = self._find_reason(action)
+            if self.reason is not None:
+                self._take_over()
+        self._stage = _STAGES[self.expert.phase]
+        self._last_action = action
+        self._n_steps += 1
+        return self.reason is not None
+
+    def act(self) -> np.ndarray:
+        """The expert's action (4,) for the present state."""
+        if self.expert.phase == "descend" and not self._is_open():
+            self.expert.phase = "hop"  # fingers that the policy closed take their time to open: wait above the cube
+        return self.expert.act()
+
+    # What there is to see
+
+    def _look(self) -> None:
+        if self.env.contact_forces["gripper-cube"] > self.expert.config.contact_force:
+            self._touched_at = self._n_steps
+        self._was_held |= self._holds() and self._cube_height() > 0.01
+        self._positions.append(self.env.eef_position)
+
+    def _has_advanced(self) -> bool:
+        """Whether the expert went from searching to grasping, from grasping to lifting, or from lifting to carrying."""
+        return _STAGES[self.expert.phase] > self._stage
+
+    def _height(self) -> float:
+        """Of the fingertips' middle above the table [m]."""
+        return float(self.env.eef_position[2] - TABLE_TOP)
+
+    def _cube_height(self) -> float:
+        """How far the cube was lifted [m]."""
+        return float(self.env.cube_position[2] - self._first_cube[2])
+
+    def _offset(self) -> np.ndarray:
+        """(3,) from the hand to the cube [m]."""
+        return self.env.cube_position - self.env.eef_position
+
+    def _is_between(self) -> bool:
+        """Whether fingers that close now would take the cube."""
+        near = np.abs(self._offset()[:2]).max() < self.config.grasp_reach
+        return bool(near and (self._height() < self.config.grasp_height or self._cube_height() > 0.01))
+
+    def _is_open(self) -> bool:
+        return bool(self.env.finger_positions.sum() > self.env.variant.arm.max_opening - 0.004)
+
+    def _holds(self) -> bool:
+        squeezed = self.env.contact_forces["gripper-cube"] > 0.5 * self.expert.config.squeeze_force
+        return bool(squeezed and not self._is_open() and np.abs(self._offset()).max() < 0.03)
+
+    def _touches(self) -> bool:
+        return self._touched_at is not None and self._n_steps - self._touched_at < 3
+
+    def _knows(self) -> bool:
+        """Whether the last touch is recent enough to act on."""
+        return self._touched_at is not None and self._n_steps - self._touched_at <= self.config.memory_steps
+
+    def _is_over_tray(self) -> bool:
+        tray = getattr(self.env, "bin_position", None)
+        if tray is None:
+            return False
+        return bool(np.abs(self.env.cube_position - tray)[:2].max() < self.config.release_reach)
+
+    def _before_cube(self) -> bool:
+        """Whether a sweep from here can still touch the cube."""
+        return self._offset()[1] > self.expert.reach - 0.003
+
+    # When to take over
+
+    def _find_reason(self, action: np.ndarray) -> str | None:
+        if self._was_held and self._is_over_tray():
+            return "still" if self._is_still() else None
+        holds = self._holds()
+        checks = {
+            "pushes": not holds and self._pushes(action),
+            "closes": not holds and action[3] > 0 and self._is_open() and not self._is_between(),
+            "opens": holds and action[3] <= 0,
+            "dropped": not holds and self._was_held and np.linalg.norm(self._offset()) > self.config.drop_distance,
+            "missed": not holds and not self._was_held and self._missed(),
+            "strayed": not holds and self._strayed(),
+            "hovers": not holds and self._hovers(action),
+            "still": self._is_still(),
+            "late": self._is_late(),
+        }
+        return next((reason for reason, applies in checks.items() if applies), None)
+
+    def _pushes(self, action: np.ndarray) -> bool:
+        """Goes on pushing a cube that it has touched."""
+        moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
+        offset = self._offset()
+        towards = action[1] * ACTION_SCALE * np.sign(offset[1]) > self.config.push_step
+        limit = self.config.shove_share * self.env.variant.max_shove
+        return bool(self._touches() and towards and not self._is_between() and moved > limit)
+
+    def _missed(self) -> bool:
+        """High above the table without the cube, although it was touched or should have been."""
+        has_searched = self._n_steps > self.config.search_share * self.env._max_episode_steps
+        past = self._touched_at is not None and self._offset()[1] < -self.config.hop_past
+        high = self._height() > self.config.missed_height
+        return past or (high and (self._touched_at is not None or has_searched))
+
+    def _strayed(self) -> bool:
+        """Searches where the cube cannot be."""
+        if self._touched_at is not None or self._height() > 0.05:
+            return False
+        x, y, _ = self.env.eef_position
+        beside = abs(x - self.expert.x) > self.config.stray_x
+        return bool(beside or not self._before_cube() or y < self.expert.sweep_start - self.config.stray_y)
+
+    def _hovers(self, action: np.ndarray) -> bool:
+        """Late, close to the cube, and does not know what to do."""
+        is_late = self._n_steps > self.config.hover_share * self.env._max_episode_steps
+        near = np.linalg.norm(self._offset()) < self.config.hover_distance
+        if not (is_late and near and self._is_open()) or self._last_action is None:
+            return False
+        return bool(np.abs(action - self._last_action).max() < self.config.hover_change)
+
+    def _is_still(self) -> bool:
+        full = len(self._positions) == self._positions.maxlen
+        return bool(full and np.linalg.norm(self._positions[-1] - self._positions[0]) < self.config.still_distance)
+
+    def _is_late(self) -> bool:
+        left = self.env._max_episode_steps - self._n_steps
+        return left <= self._steps_needed() + self.config.slack_steps
+
+    def _steps_needed(self) -> float:
+        """How many steps the expert needs from here, roughly."""
+        config, expert, tray = self.config, self.expert, getattr(self.env, "bin_position", None)
+        needed = float(config.lift_steps)
+        if tray is not None:
+            needed += config.place_steps + abs(self.env.cube_position - tray)[1] / config.travel_step
+        if self._holds():
+            return needed
+        if self._knows():
+            return needed + config.grasp_steps * self._share_of_grasp_left()
+        needed += config.grasp_steps
+        start = np.array([expert.x, expert.sweep_start, TABLE_TOP + expert.config.sweep_height])
+        sweeps_from = expert.sweep_start
+        if self._can_sweep():
+            sweeps_from = self.env.eef_position[1]
+        else:
+            needed += np.abs(start - self.env.eef_position).sum() / config.travel_step
+        return needed + max(0.0, self.env.cube_position[1] - expert.reach - sweeps_from) / config.search_step
+
+    def _share_of_grasp_left(self) -> float:
+        if self._is_between():
+            return 0.25
+        if np.abs(self._offset()[:2]).max() < self.config.grasp_reach:
+            return 0.5
+        return 0.75 if self._height() > self.expert.config.clear_height - 0.01 else 1.0
+
+    # Where to begin
+
+    def _take_over(self) -> None:
+        """Starts the expert in the phase that fits what the hand is doing."""
+        self._positions.clear()
+        self._was_held = self._holds()
+        self.expert.begin_at(self._fitting_phase())
+
+    def _fitting_phase(self) -> str:
+        config = self.expert.config
+        if self._holds():
+            high = self._height() > getattr(self.expert, "carry_height", np.inf) - 0.01
+            return "release" if self._is_over_tray() else "carry" if high else "lift"
+        if not self._knows():
+            return self._fitting_search_phase()
+        if self._is_between():
+            return "grasp"
+        if self._touches() and self._is_low():
+            return "dwell"
+        if self._height() < config.clear_height - config.tolerance:
+            return "descend" if abs(self._offset()[1]) < config.tolerance and self._is_open() else "rise"
+        return "hop"
+
+    def _fitting_search_phase(self) -> str:
+        config = self.expert.config
+        start = np.array([self.expert.x, self.expert.sweep_start])
+        if self._can_sweep():
+            return "sweep"
+        if np.linalg.norm(self.env.eef_position[:2] - start) < 0.02:
+            return "lower"
+        is_low = self._height() < config.travel_height - 0.02
+        return "retreat" if is_low and not self._before_cube() else "approach"
+
+    def _can_sweep(self) -> bool:
+        """Whether the hand is on the line of the sweep, before the cube."""
+        x, y, _ = self.env.eef_position
+        on_line = abs(x - self.expert.x) < 0.015 and y > self.expert.sweep_start - self.config.stray_y
+        return bool(on_line and self._is_low() and self._before_cube())
+
+    def _is_low(self) -> bool:
+        return self._height() < self.expert.config.sweep_height + 0.012

@@ -1,0 +1,196 @@
+"""The scripted expert beside a policy: when it takes over, what it rescues, when it hands back."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from gym_playbyear import TASKS
+from gym_playbyear.experts import GraspExpert
+from gym_playbyear.gates import GateConfig, InterventionGate
+
+STAY = np.array([0.0, 0.0, 0.0, -1.0])
+
+
+def make(task: str, **options):
+    return gym.make(f"gym_playbyear:gym_playbyear/{task}", sound="none", **options)
+
+
+class Still:
+    """A policy that does nothing."""
+
+    def act(self):
+        return STAY
+
+
+class Restless:
+    """A policy whose actions are noise."""
+
+    def __init__(self, seed: int):
+        self.rng = np.random.default_rng(seed)
+
+    def act(self):
+        return np.append(self.rng.uniform(-0.5, 0.5, 3), self.rng.choice([-1.0, 1.0]))
+
+
+def make_policy(task_env, name: str, seed: int):
+    match name:
+        case "expert":
+            return task_env.scripted_expert()
+        case "still":
+            return Still()
+        case "restless":
+            return Restless(seed)
+    return task_env.blind_baselines()[name]
+
+
+def roll_out(env, seed: int, name: str):
+    """One episode: whether it was solved, who acted in each step (T,), and the gate's reasons in their order."""
+    env.reset(seed=seed)
+    task_env = env.unwrapped
+    policy, gate = make_policy(task_env, name, seed), task_env.intervention_gate()
+    by_expert, reasons, done = [], [], False
+    while not done:
+        before, action = gate.reason, policy.act()
+        by_expert.append(gate.wants_control(action))
+        if gate.reason is not None and gate.reason != before:
+            reasons.append(gate.reason)
+        _, terminated, truncated, info = task_env.advance(gate.act() if by_expert[-1] else action)
+        done = terminated or truncated
+    return info["is_success"], np.array(by_expert), reasons
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_policy_as_good_as_the_expert_is_left_alone(task):
+    env = make(task)
+    episodes = [roll_out(env, seed, "expert") for seed in range(3000, 3020)]
+    env.close()
+    assert all(success for success, _, _ in episodes)
+    assert np.mean([by_expert.any() for _, by_expert, _ in episodes]) <= 0.2
+    assert np.mean(np.concatenate([by_expert for _, by_expert, _ in episodes])) <= 0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "rescued"), [("middle", 10), ("search", 10), ("push", 8), ("still", 10), ("restless", 5)]
+)
+@pytest.mark.parametrize("task", TASKS)
+def test_a_bad_policy_is_rescued(task, name, rescued):
+    """Alone these policies solve 0 to 2 of 10 episodes (`test_tasks.py` has the blind ones)."""
+    env = make(task)
+    episodes = [roll_out(env, seed, name) for seed in range(3000, 3010)]
+    env.close()
+    assert sum(success for success, _, _ in episodes) >= rescued
+    assert sum(by_expert.any() for _, by_expert, _ in episodes) >= 9
+
+
+def test_the_expert_hands_back_when_it_has_found_the_cube_and_when_it_holds_it():
+    """A policy that stands still gets the control back after the search, and again once the fingers hold."""
+    env = make("OccludedGrasp-v0", horizon=300)
+    task_env = env.unwrapped
+    env.reset(seed=0)
+    gate, stages, done = task_env.intervention_gate(), [], False
+    while not done:
+        before = gate.reason
+        by_expert = gate.wants_control(STAY)
+        if before is not None and gate.reason != before:
+            stages.append(gate.expert.phase)
+        _, terminated, truncated, _ = task_env.advance(gate.act() if by_expert else STAY)
+        done = terminated or truncated
+    env.close()
+    assert stages[0] in ("dwell", "rise")
+    assert stages[1] == "lift"
+
+
+def until(env, gate, expert, phase: str) -> None:
+    """Lets an expert act as the policy, until it is in `phase`; the gate looks on."""
+    while expert.phase != phase:
+        action = expert.act()
+        gate.wants_control(action)
+        env.unwrapped.advance(action)
+
+
+def at_phase(task: str, phase: str, seed: int = 1, config: GateConfig | None = None):
+    env = make(task)
+    env.reset(seed=seed)
+    expert = env.unwrapped.scripted_expert()
+    gate = InterventionGate(env.unwrapped, env.unwrapped.scripted_expert(), config)
+    until(env, gate, expert, phase)
+    assert gate.reason is None
+    return env, gate
+
+
+@pytest.mark.parametrize(
+    ("task", "phase", "action", "reason", "fitting"),
+    [
+        ("OccludedGrasp-v0", "sweep", [0, 0, 0, 1], "closes", "sweep"),
+        ("OccludedGrasp-v0", "hop", [0, 0, 0, 1], "closes", "hop"),
+        ("OccludedGrasp-v0", "lift", [0, 0, 0, -1], "opens", "lift"),
+        ("OccludedPickPlace-v0", "approach", [0, 0, 0, 1], "closes", "approach"),
+        ("OccludedPickPlace-v0", "carry", [0, 0, 0, -1], "opens", "carry"),
+    ],
+)
+def test_before_a_mistake_is_final_the_expert_goes_on_where_the_policy_is(task, phase, action, reason, fitting):
+    env, gate = at_phase(task, phase)
+    assert gate.wants_control(np.array(action, float))
+    assert (gate.reason, gate.expert.phase) == (reason, fitting)
+    env.close()
+
+
+def test_a_hand_that_pushes_on_after_the_touch_is_stopped_in_time():
+    env, gate = at_phase("OccludedGrasp-v0", "dwell")
+    push = np.array([0.0, 0.2, 0.0, -1.0])
+    taken_over, terminated = [], False
+    for _ in range(20):
+        taken_over.append(gate.wants_control(push))
+        _, terminated, _, _ = env.unwrapped.advance(gate.act() if taken_over[-1] else push)
+        if taken_over[-1]:
+            break
+    assert gate.reason == "pushes"
+    assert not taken_over[0]
+    assert not terminated
+    env.close()
+
+
+def test_a_dropped_cube_brings_the_expert():
+    env, gate = at_phase("OccludedPickPlace-v0", "carry", config=GateConfig(still_steps=100))
+    close, open_ = np.array([0, 0, 0, 1.0]), np.array([0, 0, 0, -1.0])
+    for _ in range(60):  # the gate hears of a policy that holds on, and the hand lets go
+        if gate.wants_control(close):
+            break
+        env.unwrapped.advance(open_)
+    assert gate.reason == "dropped"
+    env.close()
+
+
+def test_a_hand_that_rises_without_the_cube_brings_the_expert():
+    env, gate = at_phase("OccludedGrasp-v0", "hop")
+    up = np.array([0, 0, 0.4, -1.0])
+    for _ in range(10):
+        if gate.wants_control(up):
+            break
+        env.unwrapped.advance(up)
+    assert gate.reason == "missed"
+    assert env.unwrapped.eef_position[2] > 0.8 + GateConfig().missed_height
+    env.close()
+
+
+def test_thresholds_are_settings():
+    patient = replace(GateConfig(), still_steps=60, slack_steps=-100)
+    for config, expected in ((GateConfig(), True), (patient, False)):
+        env = make("OccludedGrasp-v0")
+        env.reset(seed=0)
+        gate = InterventionGate(env.unwrapped, GraspExpert(env.unwrapped), config)
+        for _ in range(30):
+            gate.wants_control(STAY)
+            env.unwrapped.advance(STAY)
+        assert (gate.reason == "still") is expected
+        env.close()
+
+
+def test_the_same_seed_gives_the_same_interventions():
+    env = make("OccludedPickPlace-v0")
+    first, again = (roll_out(env, 5, "middle") for _ in range(2))
+    env.close()
+    np.testing.assert_array_equal(first[1], again[1])
+    assert first[2] == again[2]
