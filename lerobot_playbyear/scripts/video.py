@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig, parser
-from lerobot.envs import EnvConfig, close_envs, make_env, make_env_pre_post_processors
-from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.envs import EnvConfig, close_envs, make_env
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_IMAGE, OBS_STR
 from lerobot.utils.import_utils import register_third_party_plugins
 
+from lerobot_playbyear.acting import load_for_rollout
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.recording import env_spec
 from lerobot_playbyear.rollouts import RolloutError, roll_out
@@ -122,25 +122,14 @@ def _policy_takes(cfg: VideoConfig) -> Generator[Take]:
     assert cfg.policy is not None
     envs = make_env(cfg.env, n_envs=1)
     vec = next(iter(next(iter(envs.values())).values()))
-    policy = make_policy(cfg=cfg.policy, env_cfg=cfg.env)
-    policy.eval()
-    preprocessor, postprocessor = make_pre_post_processors(
-        policy_cfg=cfg.policy,
-        pretrained_path=str(cfg.policy.pretrained_path),
-        preprocessor_overrides={"device_processor": {"device": str(policy.config.device)}},
-    )
-    env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg=cfg.env, policy_cfg=cfg.policy)
+    parts = load_for_rollout(cfg.policy, cfg.env)
     try:
         for seed in range(cfg.seed, cfg.seed + cfg.attempts):
             pictures: list[np.ndarray] = []
             with torch.no_grad():
                 result = rollout(
                     vec,
-                    policy,
-                    env_preprocessor,
-                    env_postprocessor,
-                    preprocessor,
-                    postprocessor,
+                    *parts.in_order(),
                     seeds=[seed],
                     return_observations=True,
                     render_callback=lambda env, kept=pictures: kept.append(env.call("render")[0]),

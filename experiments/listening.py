@@ -1,0 +1,104 @@
+"""Is it the sound that the policy acts on? Play it a contact that is none, and mute one that is.
+
+    python -m experiments.listening
+
+takes the full policies that `experiments.ablations` trained. For every one, episodes of Occluded Grasp in which
+
+- "false": in mid-sweep, at least 8 cm from the cube, it hears 0.2 s of the contact of another episode;
+- "control": nothing is swapped at that moment;
+- "muted": from the first touch on it hears another episode's quiet sweep.
+
+A reaction is a stop of the sweep within 10 steps: three actions in a row whose y is below a third of what it was. The
+figures do not depend on whether the episode would have succeeded.
+"""
+
+import argparse
+import json
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from experiments.ablations import STUDY
+from experiments.protocol import DONOR_SEEDS, EVALUATION_SEEDS, N_DEMONSTRATIONS, RESULTS, STEPS, TRAINING_SEEDS
+from experiments.sound_probe import REACTION_STEPS, Donor, SoundProbe, Trial, make_donors
+from experiments.training import Job
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.acting import load_for_rollout
+from lerobot_playbyear.recording import env_spec
+
+TASK = "OccludedGrasp-v0"
+MODES = ("false", "control", "muted")
+_BATCH = 25
+
+
+def listen(policy_path: Path, mode: str, seeds: range, donors: list[Donor]) -> list[Trial]:
+    """What a policy does when its sound is swapped, one trial per seed."""
+    env_cfg = PlaybyearEnvConfig(task=TASK)
+    policy_cfg = PreTrainedConfig.from_pretrained(policy_path)
+    policy_cfg.pretrained_path = policy_path
+    parts = load_for_rollout(policy_cfg, env_cfg)
+    spec = env_spec(env_cfg)
+    make = partial(_make_probe, spec.id, spec.kwargs, mode, donors)
+    envs = SyncVectorEnv([freeze_after_episode_end(make)] * _BATCH, autoreset_mode=AutoresetMode.SAME_STEP)
+    trials: list[Trial] = []
+    try:
+        for start in range(seeds.start, seeds.stop, _BATCH):
+            with torch.no_grad():
+                rollout(envs, *parts.in_order(), seeds=list(range(start, start + _BATCH)))
+            trials += [env.get_wrapper_attr("trial") for env in envs.envs]
+    finally:
+        envs.close()
+    return trials
+
+
+def _make_probe(env_id: str, kwargs: dict, mode: str, donors: list[Donor]) -> gym.Env:
+    return SoundProbe(gym.make(env_id, disable_env_checker=True, **kwargs), mode, donors)
+
+
+def summary(trials: list[Trial]) -> dict[str, float | int | None]:
+    """The trials in which the moment came, as counts."""
+    swapped = [trial for trial in trials if trial.swapped_at is not None]
+    delays = sorted(trial.reacted_after for trial in swapped if trial.reacted_after is not None)
+    return {
+        "n_episodes": len(trials),
+        "n_trials": len(swapped),
+        "n_reacted": sum(delay <= REACTION_STEPS for delay in delays),
+        "n_closed_there": sum(trial.closed_there for trial in swapped),
+        "median_steps_to_stop": delays[len(delays) // 2] if delays else None,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", nargs="+", type=int, default=TRAINING_SEEDS, help="of the policies' training")
+    parser.add_argument("--policy", type=Path, help="another policy's folder instead of the ablations'")
+    parser.add_argument("--n_episodes", type=int, default=len(EVALUATION_SEEDS))
+    parser.add_argument("--first_seed", type=int, default=EVALUATION_SEEDS.start)
+    options = parser.parse_args()
+    register_third_party_plugins()
+
+    env = env_spec(PlaybyearEnvConfig(task=TASK)).make()
+    donors = make_donors(env, DONOR_SEEDS)
+    env.close()
+    episodes = range(options.first_seed, options.first_seed + options.n_episodes)
+    policies = {"policy": options.policy} if options.policy else {}
+    for seed in () if options.policy else options.seeds:
+        policies[f"seed{seed}"] = Job(STUDY, TASK, "full", seed, N_DEMONSTRATIONS, STEPS[TASK]).checkpoint
+    for name, path in policies.items():
+        report = {mode: summary(listen(path, mode, episodes, donors)) for mode in MODES}
+        print(name, json.dumps(report), flush=True)
+        if not options.policy:
+            output = RESULTS / "listening" / f"{TASK}-{name}.json"
+            output.parent.mkdir(parents=True, exist_ok=True)
+            output.write_text(json.dumps({"first_seed": episodes.start, **report}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
