@@ -234,3 +234,26 @@ def test_touches_of_cube_wall_and_table_are_told_apart_by_their_spectra():
     weights = np.linalg.solve(x.T @ x + 1.0 * np.eye(x.shape[1]), x.T @ y)
     guessed = (features[held_out] @ weights).argmax(axis=1)
     assert (guessed == np.array(labels)[held_out]).mean() >= 0.9
+
+
+def test_a_cube_of_another_material_moves_alike_and_sounds_different():
+    heard = {}
+    for material in ("cube", "glass"):
+        env = make("OccludedGrasp-v0", cube_material=material)
+        frames, _ = roll_out(env, seed=0)
+        env.close()
+        touched = next(i for i, (_, _, forces) in enumerate(frames) if forces["gripper-cube"] > 0)
+        heard[material] = (touched, frames[touched - 1][0], frames[touched][0], frames[touched][2])
+    (wood_at, wood_before, wood, wood_forces), (glass_at, glass_before, glass, glass_forces) = heard.values()
+    assert (wood_at, wood_forces) == (glass_at, glass_forces)
+    np.testing.assert_array_equal(wood_before["audio.gripper"], glass_before["audio.gripper"])
+    spectra = [np.abs(np.fft.rfft(block["audio.gripper"])) ** 2 for block in (wood, glass)]
+    bins = np.fft.rfftfreq(800, 1 / 16000)
+    pitch = [np.average(bins[bins < 5000], weights=power[bins < 5000]) for power in spectra]
+    assert pitch[1] > pitch[0] + 200
+    assert abs(level(wood["audio.gripper"]) - level(glass["audio.gripper"])) < 6
+
+
+def test_an_unknown_cube_material_is_refused():
+    with pytest.raises(ValueError, match="cube_material='jelly' is not known"):
+        make("OccludedGrasp-v0", cube_material="jelly")

@@ -28,6 +28,7 @@ from gym_playbyear.arm import (
     arm_actuator_xml,
     arm_body_xml,
 )
+from gym_playbyear.materials import CUBE_MATERIALS
 from gym_playbyear.rendering import SceneRenderer, Window
 from gym_playbyear.sound import ContactPair, ContactSound
 
@@ -97,6 +98,7 @@ class PlayByEarEnv(gym.Env):
         sample_rate: int = 16000,
         sound: str = "waveform",
         noise_level: float = 1.0,
+        cube_material: str = "cube",
         microphones: tuple[str, ...] = ("gripper",),
         horizon: int | None = None,
         variant: str = "default",
@@ -105,6 +107,7 @@ class PlayByEarEnv(gym.Env):
     ):
         _check_option("sound", sound, SOUND_MODES)
         _check_option("variant", variant, tuple(self.VARIANTS))
+        _check_option("cube_material", cube_material, CUBE_MATERIALS)
         _check_option("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         if image_size < 8:
             raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
@@ -121,7 +124,11 @@ class PlayByEarEnv(gym.Env):
         self._controller = CartesianController(self.variant.arm, CONTROL_HZ)
         self._sound: ContactSound | None = None
         if sound == "waveform":
-            pairs = [ContactPair(name=f"{a}-{b}", materials=(a, b), bodies=(a, b)) for a, b in self.pairs]
+            made_of = {"cube": cube_material}
+            pairs = [
+                ContactPair(name=f"{a}-{b}", materials=(made_of.get(a, a), made_of.get(b, b)), bodies=(a, b))
+                for a, b in self.pairs
+            ]
             self._sound = ContactSound(
                 pairs, tuple(microphones), sample_rate, CONTROL_HZ, PHYSICS_TIMESTEP, noise_level
             )

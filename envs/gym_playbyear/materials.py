@@ -59,8 +59,17 @@ MATERIALS: dict[str, Material] = {
         Material("bin", (870.0, 1320.0, 1740.0, 3300.0), (80.0, 100.0, 120.0, 170.0), (0.6, 0.8, 1.0, 0.7)),
         # Aluminium links.
         Material("arm", (520.0, 730.0, 1240.0, 2160.0), (60.0, 70.0, 90.0, 120.0), (1.0, 0.8, 0.6, 0.4)),
+        # What the cube can be made of instead, for testing what a policy makes of sounds that it has not heard.
+        Material("glass", (1460.0, 2310.0, 3150.0, 3880.0), (40.0, 55.0, 70.0, 90.0), (1.0, 0.8, 0.6, 0.4)),
+        Material(
+            "tin", (850.0, 1370.0, 2050.0, 2760.0, 3480.0), (50.0, 60.0, 70.0, 90.0, 110.0), (0.7, 1.0, 0.9, 0.7, 0.5)
+        ),
+        Material("cardboard", (210.0, 340.0, 560.0), (220.0, 260.0, 320.0), (1.0, 0.8, 0.4)),
+        Material("rubber", (90.0, 150.0, 260.0), (160.0, 200.0, 260.0), (1.0, 0.6, 0.3)),
     )
 }
+
+CUBE_MATERIALS = ("cube", "glass", "tin", "cardboard", "rubber")
 
 # Bodies that move freely. They carry sound to whatever they press against.
 LOOSE_BODIES = frozenset({"cube"})

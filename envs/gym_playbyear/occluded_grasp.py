@@ -58,6 +58,7 @@ class OccludedGraspEnv(PlayByEarEnv):
     - `sample_rate=16000`: samples per second; a multiple of 20.
     - `sound="waveform"`: or `"contact_force"` (the paper's stand-in for sound), or `"none"`.
     - `noise_level=1.0`: scales background noise and motor hum.
+    - `cube_material="cube"`: what the cube sounds like: wood, or `"glass"`, `"tin"`, `"cardboard"`, `"rubber"`.
     - `microphones=("gripper",)`: `"table"` is the other one.
     - `horizon=None`: steps of an episode; None is the variant's.
     - `variant="default"`: or `"paper"`, the numbers of the paper and its code, in which a blind gripper often succeeds.

@@ -13,6 +13,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
+from gym_playbyear.materials import CUBE_MATERIALS
 from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
 SOUND_MODES = ("waveform", "contact_force", "none")
@@ -35,6 +36,7 @@ class PlaybyearEnvConfig(EnvConfig):
         sound: `waveform` (int16 PCM per microphone), `contact_force` (the paper's proxy, 6 numbers), or `none`.
         microphones: Names of the microphones that are on, with `sound=waveform`: `gripper`, `table`.
         noise_level: Multiplies the background noise and the arm's own hum. 1 is the task as published, 0 silence.
+        cube_material: What the cube sounds like: `cube` (wood), `glass`, `tin`, `cardboard` or `rubber`.
         variant: `default`, or `paper` for the paper's values where ours differ.
         visualization_width, visualization_height: Of the picture that `render()` gives people; the same number twice [pixels].
         render_mode: `rgb_array` (for videos), or `human` for a window.
@@ -53,6 +55,7 @@ class PlaybyearEnvConfig(EnvConfig):
     microphones: list[str] = field(default_factory=lambda: ["gripper"])
     noise_level: float = 1.0
     # Task
+    cube_material: str = "cube"
     variant: str = "default"
     # For people
     visualization_width: int = 480
@@ -92,6 +95,7 @@ class PlaybyearEnvConfig(EnvConfig):
             "noise_level": self.noise_level,
             "microphones": tuple(self.microphones),
             "horizon": self.episode_length,
+            "cube_material": self.cube_material,
             "variant": self.variant,
             "render_mode": self.render_mode,
             "render_size": self.visualization_width,
@@ -138,6 +142,7 @@ class PlaybyearEnvConfig(EnvConfig):
         _check_choice("task", self.task, tasks)
         _check_choice("sound", self.sound, SOUND_MODES)
         _check_choice("variant", self.variant, VARIANTS)
+        _check_choice("cube_material", self.cube_material, CUBE_MATERIALS)
         if self.fps != CONTROL_HZ:
             raise _error("fps", self.fps, f"the tasks are controlled at {CONTROL_HZ} Hz, give {CONTROL_HZ}")
         if self.sample_rate <= 0 or self.sample_rate % self.fps:
