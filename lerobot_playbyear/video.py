@@ -1,7 +1,7 @@
 """Films with sound: pictures of an episode above the spectrogram of what was heard, and the sound itself."""
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -118,7 +118,14 @@ def compose(pictures: Sequence[np.ndarray], sound: np.ndarray, sample_rate: int)
         yield np.concatenate([picture, shown])
 
 
-def write_film(path: str | Path, frames: Iterable[np.ndarray], fps: int, sound: np.ndarray, sample_rate: int) -> Path:
+def write_film(
+    path: str | Path,
+    frames: Iterable[np.ndarray],
+    fps: int,
+    sound: np.ndarray,
+    sample_rate: int,
+    x264_options: Mapping[str, str] | None = None,
+) -> Path:
     """Writes an mp4 that browsers and video players take (H.264 and AAC where FFmpeg has them).
 
     Args:
@@ -128,6 +135,7 @@ def write_film(path: str | Path, frames: Iterable[np.ndarray], fps: int, sound: 
         sound: (n, n_microphones) int16. One microphone is mono, two are left and right, of more only the first two
             are heard; none makes a silent film.
         sample_rate: [Hz].
+        x264_options: Of the H.264 encoder, besides its preset; by default constant quality 20.
 
     Returns:
         The path. The file is there only when it is complete.
@@ -136,18 +144,19 @@ def write_film(path: str | Path, frames: Iterable[np.ndarray], fps: int, sound: 
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     sound = sound[:, :2]
-    block = sample_rate // fps
     try:
         with av.open(str(partial), "w", options={"movflags": "+faststart"}) as film:
             audio = _add_audio_stream(film, sample_rate, sound.shape[1]) if sound.shape[1] else None
             video = None
             for index, picture in enumerate(frames):
                 if video is None:
-                    video = _add_video_stream(film, fps, *picture.shape[:2])
+                    height, width = picture.shape[:2]
+                    video = _add_video_stream(film, fps, height, width, x264_options or {})
                 film.mux(video.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
                 if audio is not None:
-                    samples = sound[index * block : (index + 1) * block]
-                    film.mux(audio.encode(_audio_frame(samples, sample_rate, index * block)))
+                    first, end = (round(i * sample_rate / fps) for i in (index, index + 1))
+                    if first < len(sound):
+                        film.mux(audio.encode(_audio_frame(sound[first:end], sample_rate, first)))
             if video is None:
                 raise ValueError("A film needs at least one frame.")
             for stream in (video, audio):
@@ -159,11 +168,11 @@ def write_film(path: str | Path, frames: Iterable[np.ndarray], fps: int, sound: 
     return path
 
 
-def _add_video_stream(film, fps: int, height: int, width: int):
+def _add_video_stream(film, fps: int, height: int, width: int, x264_options: Mapping[str, str]):
     stream = film.add_stream(_first_codec(_VIDEO_CODECS), rate=fps)
     stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
     if stream.codec_context.name == "libx264":
-        stream.options = {"crf": "20", "preset": "veryfast"}
+        stream.options = {"crf": "20", "preset": "veryfast", **x264_options}
     else:
         stream.bit_rate = 4_000_000
     return stream

@@ -1,0 +1,203 @@
+"""What the page draws of an episode besides its film: sound as pictures, curves, spans and moments."""
+
+import base64
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR, REWARD
+from PIL import Image
+
+from lerobot_playbyear.inspection.control_checks import intervention_spans
+from lerobot_playbyear.inspection.onsets import sudden_sounds
+from lerobot_playbyear.inspection.sound_checks import FULL_SCALE, steps
+from lerobot_playbyear.inspection.source import INTERVENTION, DatasetSource, Episode
+
+_WINDOW_S = 0.032
+_SHORTEST_HOP_S = 0.005
+_MAX_COLUMNS = 1200  # of a spectrogram or waveform: more than a screen shows
+_TOP_FREQUENCY = 8000.0  # Hz
+_GREY_LEVELS = 64  # of a spectrogram's picture; more cannot be told apart, and cost space
+_DARKEST_SHARE = 0.4  # of the levels have the darkest colour: of the background, just something is seen
+_LARGEST_RANGE_DB = 100.0
+_SAMPLED_EPISODES = 12  # that the range of levels is taken from
+_LOUDEST = 0.7  # of full scale, when played
+_MAX_GAIN = 100.0
+_MAX_CURVES = 32  # of one feature
+_PREVIEW_COLUMNS = 60
+_PREVIEW_RANGE_DB = 45.0
+_POWER_FLOOR = 1e-12
+
+
+@dataclass(frozen=True)
+class Microphone:
+    """How a microphone is drawn, the same in all episodes.
+
+    Args:
+        key: Its feature.
+        sample_rate: [Hz].
+        peak: Loudest sample of the dataset, as a share of full scale.
+        top_db: Level of the brightest colour [dBFS].
+        bottom_db: Level of the darkest colour [dBFS].
+        top_hz: Highest frequency drawn.
+    """
+
+    key: str
+    sample_rate: int
+    peak: float
+    top_db: float
+    bottom_db: float
+    top_hz: float
+
+
+class EpisodeData:
+    """Prepares the drawings of one episode after another.
+
+    Args:
+        source: The dataset; its microphones must be in the format's shape.
+        microphones: The keys to draw.
+    """
+
+    def __init__(self, source: DatasetSource, microphones: Sequence[str]) -> None:
+        self._source = source
+        self.microphones = [self._measure(key) for key in microphones]
+
+    @cached_property
+    def gain(self) -> float:
+        """By how much sound is amplified when it is played, the same in all episodes."""
+        peak = max((microphone.peak for microphone in self.microphones), default=1.0)
+        return min(_LOUDEST / max(peak, 1e-6), _MAX_GAIN)
+
+    @cached_property
+    def curves(self) -> list[dict[str, Any]]:
+        """The features that are drawn as curves, with the range of each dimension in the dataset."""
+        wanted = [OBS_STATE, *(key for key in self._source.numbers if key.startswith(OBS_STR)), ACTION]
+        if REWARD in self._source.numbers and len(np.unique(self._source.values(REWARD))) > 2:
+            wanted.append(REWARD)  # one of 0 and 1 says no more than the mark of success
+        curves = []
+        for key in dict.fromkeys(key for key in wanted if key in self._source.numbers):
+            values = self._source.values(key).reshape(len(self._source), -1)[:, :_MAX_CURVES].astype(np.float64)
+            finite = np.where(np.isfinite(values), values, 0)
+            curves.append(
+                {
+                    "key": key,
+                    "names": _dimension_names(self._source.features[key], values.shape[1]),
+                    "unit": str((self._source.features[key].get("info") or {}).get("unit", "")),
+                    "low": finite.min(axis=0).tolist(),
+                    "high": finite.max(axis=0).tolist(),
+                    "held": key == ACTION,  # until the next frame, so drawn as steps
+                }
+            )
+        return curves
+
+    def blocks(self, episode: Episode) -> list[np.ndarray]:
+        """The sound of each microphone, (n, S) in steps of 16-bit PCM."""
+        return [steps(self._source.sound(microphone.key)[episode.rows]) for microphone in self.microphones]
+
+    def draw(self, episode: Episode) -> dict[str, Any]:
+        """Everything but the film, for JSON."""
+        source = self._source
+        tagged = source.values(INTERVENTION)[episode.rows].astype(bool) if INTERVENTION in source.numbers else None
+        return {
+            "microphones": [
+                self._draw_sound(m, b) for m, b in zip(self.microphones, self.blocks(episode), strict=True)
+            ],
+            "curves": [_base64(self._curve(curve["key"], episode)) for curve in self.curves],
+            "interventions": None if tagged is None else intervention_spans(tagged),
+        }
+
+    def preview(self, episode: Episode) -> list[int]:
+        """The level of the first microphone over the episode, 0 to 99 of its loudest, for the list of episodes."""
+        if not self.microphones:
+            return []
+        blocks = steps(self._source.sound(self.microphones[0].key)[episode.rows]) / FULL_SCALE
+        blocks -= blocks.mean()
+        level = 10 * np.log10(np.square(blocks).mean(axis=1) + _POWER_FLOOR)
+        edges = np.linspace(0, len(level), min(_PREVIEW_COLUMNS, len(level)) + 1).astype(int)
+        level = np.maximum.reduceat(level, edges[:-1])
+        share = 1 + (level - level.max()) / _PREVIEW_RANGE_DB
+        return np.clip(99 * share, 0, 99).astype(int).tolist()
+
+    def _measure(self, key: str) -> Microphone:
+        sound = self._source.sound(key)
+        rate = sound.shape[1] * self._source.fps
+        episodes = self._source.episodes[:: max(len(self._source.episodes) // _SAMPLED_EPISODES, 1)]
+        levels = np.concatenate([_levels(steps(sound[e.rows]).reshape(-1), rate)[0] for e in episodes])
+        peak = max(float(np.abs(steps(sound[e.rows])).max()) for e in self._source.episodes) / FULL_SCALE
+        top = float(np.ceil(levels.max() / 5) * 5)
+        bottom = float(np.floor(np.quantile(levels, _DARKEST_SHARE) / 5) * 5)
+        return Microphone(
+            key=key,
+            sample_rate=rate,
+            peak=peak,
+            top_db=top,
+            bottom_db=min(max(bottom, top - _LARGEST_RANGE_DB), top - 5),
+            top_hz=min(_TOP_FREQUENCY, rate / 2),
+        )
+
+    def _draw_sound(self, microphone: Microphone, blocks: np.ndarray) -> dict[str, Any]:
+        samples = blocks.reshape(-1)
+        levels, hop_s = _levels(samples, microphone.sample_rate)  # (columns, bins)
+        share = (levels - microphone.bottom_db) / (microphone.top_db - microphone.bottom_db)
+        grey = np.clip(np.round(share * (_GREY_LEVELS - 1)), 0, _GREY_LEVELS - 1) * (255 // (_GREY_LEVELS - 1))
+        onsets = sudden_sounds(samples, microphone.sample_rate)
+        frame_s = 1 / self._source.fps  # the first block was heard before the first picture
+        return {
+            "spectrogram": _png(grey.astype(np.uint8).T[::-1]),
+            "hop": hop_s,
+            "wave": _base64(_envelope(samples / max(microphone.peak * FULL_SCALE, 1.0))),
+            "onsets": [round(float(time) - frame_s, 4) for time in onsets],
+        }
+
+    def _curve(self, key: str, episode: Episode) -> np.ndarray:
+        """(n * D,) float32."""
+        values = self._source.values(key)[episode.rows].reshape(len(episode), -1)[:, :_MAX_CURVES]
+        return values.astype("<f4").reshape(-1)
+
+
+def _levels(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, float]:
+    """Level in frequency bins from 0 Hz to at most 8 kHz, (columns, bins) [dBFS], and the seconds between columns.
+
+    Column j is about the moment (j + 1/2) * hop.
+    """
+    window = max(round(_WINDOW_S * sample_rate), 16)
+    hop = max(round(_SHORTEST_HOP_S * sample_rate), -(-len(samples) // _MAX_COLUMNS), 1)
+    n_columns = max(len(samples) // hop, 1)
+    padded = np.pad(samples / FULL_SCALE, window)
+    starts = window + hop // 2 - window // 2 + hop * np.arange(n_columns)
+    taper = np.hanning(window)
+    columns = padded[starts[:, None] + np.arange(window)] * taper  # (columns, window)
+    power = np.square(np.abs(np.fft.rfft(columns, axis=1))) * (4 / taper.sum() ** 2)  # a full-scale sine has 1
+    n_bins = min(power.shape[1], int(_TOP_FREQUENCY * window / sample_rate) + 1)
+    return 10 * np.log10(power[:, :n_bins] + _POWER_FLOOR), hop / sample_rate
+
+
+def _envelope(samples: np.ndarray) -> np.ndarray:
+    """Lowest and highest sample of each column, (columns * 2,) int8, of samples in [-1, 1]."""
+    edges = np.linspace(0, len(samples), min(_MAX_COLUMNS, len(samples)) + 1).astype(int)[:-1]
+    extremes = np.stack([np.minimum.reduceat(samples, edges), np.maximum.reduceat(samples, edges)], axis=1)
+    return np.clip(np.round(127 * extremes), -127, 127).astype(np.int8).reshape(-1)
+
+
+def _dimension_names(feature: dict[str, Any], size: int) -> list[str]:
+    names = feature.get("names")
+    while isinstance(names, dict) and len(names) == 1:
+        names = next(iter(names.values()))
+    if isinstance(names, dict):
+        names = list(names)
+    if isinstance(names, Sequence) and not isinstance(names, str) and len(names) >= size:
+        return [str(name) for name in names[:size]]
+    return [f"[{i}]" for i in range(size)]
+
+
+def _png(grey: np.ndarray) -> str:
+    file = io.BytesIO()
+    Image.fromarray(np.ascontiguousarray(grey)).save(file, "PNG", optimize=True)
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def _base64(values: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()

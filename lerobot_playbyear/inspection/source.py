@@ -1,0 +1,197 @@
+"""A dataset as the checks and the page read it: whole columns at once, pictures episode by episode.
+
+Unlike training, inspection has to read what is wrong: NaN is a finding here, not an error.
+"""
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.language import LANGUAGE_COLUMNS
+from lerobot.datasets.video_utils import decode_video_frames
+from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
+from PIL import Image
+
+from lerobot_playbyear.datasets.audio_feature import audio_keys
+from lerobot_playbyear.datasets.columns import check_dataset_files, column_to_numpy, episode_bounds
+
+SUCCESS = "next.success"
+INTERVENTION = "intervention"
+
+
+class InspectionError(RuntimeError):
+    """The dataset cannot be opened at all; the message is for the person who asked."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Where an episode is.
+
+    Args:
+        index: Its number in the dataset.
+        start: Its first row.
+        stop: The row after its last.
+    """
+
+    index: int
+    start: int
+    stop: int
+
+    def __len__(self) -> int:
+        return self.stop - self.start
+
+    @property
+    def rows(self) -> slice:
+        return slice(self.start, self.stop)
+
+
+class DatasetSource:
+    """Reads an opened LeRobotDataset, with or without sound, ours or another tool's.
+
+    Args:
+        dataset: Opened; the episodes it was opened with are inspected.
+        video_backend: LeRobot's decoder ("pyav", "torchcodec"); None takes its default.
+
+    Attributes:
+        dataset: The dataset.
+        fps: Frames per second [Hz].
+        features: Every feature, as `dataset.meta.features`.
+        cameras: The keys of all colour cameras.
+        microphones: The keys of all microphones.
+        numbers: The keys of all other numeric features of one dimension, without LeRobot's index columns.
+    """
+
+    def __init__(self, dataset: LeRobotDataset, video_backend: str | None = "pyav") -> None:
+        self.dataset = dataset
+        self.fps = int(dataset.fps)
+        self.features: dict[str, dict[str, Any]] = dataset.meta.features
+        self._video_backend = video_backend
+        self._table = dataset.hf_dataset.data
+        self._values: dict[str, np.ndarray] = {}
+        self.cameras = [key for key in dataset.meta.camera_keys if key not in dataset.meta.depth_keys]
+        self.microphones = audio_keys(self.features)
+        self.numbers = [key for key, feature in self.features.items() if self._is_number(key, feature)]
+
+    @classmethod
+    def open(
+        cls,
+        repo_id: str,
+        root: str | Path | None = None,
+        episodes: list[int] | None = None,
+        video_backend: str | None = "pyav",
+    ) -> "DatasetSource":
+        """Open a dataset from its folder, or by its name from LeRobot's cache or the Hub.
+
+        Raises:
+            InspectionError: If there is none, or LeRobot cannot read it.
+        """
+        folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+        if root is not None and not (folder / "meta" / "info.json").is_file():
+            found = "it does not exist" if not folder.exists() else "it has no meta/info.json"
+            raise InspectionError(f"There is no LeRobotDataset in '{folder}': {found}. Check --dataset.root.")
+        try:
+            check_dataset_files(repo_id, root)
+            dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, video_backend=video_backend)
+            source = cls(dataset, video_backend)
+            n_episodes = len(source.episodes)
+        except Exception as error:
+            where = f"in '{folder}'" if root is not None else f"'{repo_id}' (neither in '{folder}' nor from the Hub)"
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InspectionError(f"The dataset {where} cannot be opened: {reason}") from error
+        if n_episodes == 0:
+            raise InspectionError(f"The dataset in '{dataset.root}' is empty: it has no frames.")
+        return source
+
+    def __len__(self) -> int:
+        """The number of frames, N."""
+        return int(self._table.num_rows)
+
+    @cached_property
+    def episodes(self) -> list[Episode]:
+        """The episodes in the order of their rows."""
+        index = self.values("episode_index")
+        if len(index) == 0:
+            return []
+        return [Episode(int(index[start]), start, stop) for start, stop in zip(*episode_bounds(index), strict=True)]
+
+    def values(self, key: str) -> np.ndarray:
+        """A numeric column as stored, (N,) for one value per row and (N, D) for more; read once.
+
+        Raises:
+            ValueError: If values are missing, or rows differ in length.
+        """
+        if key not in self._values:
+            values = column_to_numpy(self._table.column(key))
+            self._values[key] = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
+        return self._values[key]
+
+    def sound(self, key: str) -> np.ndarray:
+        """A microphone's column, (N, S), as stored.
+
+        Raises:
+            ValueError: If values are missing, or rows differ in length.
+        """
+        values = self.values(key)
+        return values.reshape(len(values), -1)
+
+    def task(self, episode: Episode) -> str:
+        """The episode's task in words; empty if it has none."""
+        tasks = self.dataset.meta.tasks
+        if tasks is None or "task_index" not in self.features:
+            return ""
+        position = int(self.values("task_index")[episode.start])
+        return str(tasks.index[position]) if 0 <= position < len(tasks) else ""
+
+    def succeeded(self, episode: Episode) -> int | None:
+        """The first frame, counted from the episode's start, with success; -1 without success, None if not recorded."""
+        if SUCCESS not in self.numbers:
+            return None
+        frames = np.flatnonzero(self.values(SUCCESS)[episode.rows])
+        return int(frames[0]) if len(frames) else -1
+
+    def pictures(self, episode: Episode, camera: str) -> Iterator[np.ndarray]:
+        """The episode's frames of one camera, each (H, W, 3) uint8.
+
+        Raises:
+            Exception: Whatever the decoder raises on a damaged picture or video.
+        """
+        if self.features[camera]["dtype"] == "video":
+            yield from self._video(episode, camera)
+            return
+        column = self._table.column(camera).slice(episode.start, len(episode))
+        for chunk in column.chunks:
+            for row in chunk.to_pylist():
+                with Image.open(io.BytesIO(row["bytes"]) if row["bytes"] is not None else row["path"]) as image:
+                    yield np.asarray(image.convert("RGB"))
+
+    def _video(self, episode: Episode, camera: str) -> Iterator[np.ndarray]:
+        meta = self.dataset.meta
+        path = Path(self.dataset.root) / meta.get_video_file_path(episode.index, camera)
+        offset = meta.episodes[episode.index][f"videos/{camera}/from_timestamp"]
+        times = [offset + float(time) for time in self.values("timestamp")[episode.rows]]
+        for first in range(0, len(times), _PICTURES_AT_ONCE):
+            frames = decode_video_frames(
+                path,
+                times[first : first + _PICTURES_AT_ONCE],
+                self.dataset.tolerance_s,
+                self._video_backend,
+                return_uint8=True,
+            )  # (n, C, H, W)
+            yield from frames.permute(0, 2, 3, 1).numpy()
+
+    def _is_number(self, key: str, feature: dict[str, Any]) -> bool:
+        return (
+            key not in DEFAULT_FEATURES
+            and key not in self.microphones
+            and key not in LANGUAGE_COLUMNS
+            and feature["dtype"] not in ("image", "video", "string")
+            and len(feature["shape"]) <= 1
+        )
+
+
+_PICTURES_AT_ONCE = 256  # decoded together; bounds the memory for long episodes

@@ -1,0 +1,148 @@
+"""Checks of a dataset's shape: rows, times, lengths, sample rates, numbers and their statistics."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lerobot_playbyear.datasets.audio_feature import check_audio_features
+from lerobot_playbyear.inspection.source import DatasetSource, Episode
+from lerobot_playbyear.inspection.verdict import Verdict, name_episodes
+
+_TIME_TOLERANCE_S = 1e-3
+_LENGTH_FACTOR = 4.0  # an episode this much longer or shorter than the median is named
+_STATS_TOLERANCE = 0.02  # of a value's range; LeRobot sums statistics in float32, episode by episode
+
+
+def check_rows(source: DatasetSource) -> Iterator[Verdict]:
+    """Every episode has frames 0 to n - 1, n / fps apart, and as many as the metadata says."""
+    frame_index, timestamps = source.values("frame_index"), source.values("timestamp")
+    incomplete, untimely = [], []
+    for episode in source.episodes:
+        expected = np.arange(len(episode))
+        if not np.array_equal(frame_index[episode.rows], expected) or not _is_whole(source, episode):
+            incomplete.append(episode.index)
+        elif np.abs(timestamps[episode.rows] - expected / source.fps).max() > _TIME_TOLERANCE_S:
+            untimely.append(episode.index)
+    total = source.dataset.meta.total_frames
+    if incomplete:
+        message = f"{name_episodes(incomplete)}: frames are missing, or are not those that the metadata names"
+        yield Verdict("rows", "error", message, episodes=incomplete)
+    elif len(source.episodes) == source.dataset.meta.total_episodes and len(source) != total:
+        yield Verdict("rows", "error", f"{len(source):,} frames, but meta/info.json says {total:,}")
+    else:
+        message = f"{len(source.episodes)} episodes, {len(source):,} frames, none missing"
+        yield Verdict("rows", "ok", message, figures={"episodes": len(source.episodes), "frames": len(source)})
+    if untimely:
+        message = f"{name_episodes(untimely)}: timestamps are not frame / fps at {source.fps} frames per second"
+        yield Verdict("times", "error", message, episodes=untimely)
+    else:
+        yield Verdict("times", "ok", f"frames are 1/{source.fps} s apart in every episode")
+
+
+def check_lengths(source: DatasetSource) -> Iterator[Verdict]:
+    """Episodes are of a usable and comparable length."""
+    lengths = np.array([len(episode) for episode in source.episodes])
+    seconds = lengths / source.fps
+    median = float(np.median(lengths))
+    figures = {
+        "shortest_s": float(seconds.min()),
+        "median_s": median / source.fps,
+        "longest_s": float(seconds.max()),
+        "total_s": float(seconds.sum()),
+    }
+    text = f"{seconds.min():.4g} to {seconds.max():.4g} s, median {median / source.fps:.4g} s"
+    single = [e.index for e in source.episodes if len(e) < 2]
+    odd = [e.index for e in source.episodes if not median / _LENGTH_FACTOR <= len(e) <= median * _LENGTH_FACTOR]
+    if single:
+        message = f"{name_episodes(single)}: a single frame; {text}"
+        yield Verdict("episode lengths", "warning", message, episodes=single, figures=figures)
+    elif odd:
+        message = f"{name_episodes(odd)}: over {_LENGTH_FACTOR:g} times shorter or longer than the median; {text}"
+        yield Verdict("episode lengths", "warning", message, episodes=odd, figures=figures)
+    else:
+        yield Verdict("episode lengths", "ok", text, figures=figures)
+
+
+def check_sample_rates(source: DatasetSource) -> Iterator[Verdict]:
+    """Each microphone's rows hold sample_rate / fps samples."""
+    if not source.microphones:
+        yield Verdict("sound", "info", "no sound: no key starts with observation.audio.")
+    for key in source.microphones:
+        try:
+            rate = check_audio_features({key: source.features[key]}, source.fps)[key]
+            held, wanted = source.sound(key).shape[1], rate // source.fps
+            if held != wanted:
+                raise ValueError(f"rows hold {held} samples; {rate} Hz / {source.fps} Hz = {wanted}")
+        except ValueError as error:
+            yield Verdict("sample rate", "error", str(error), key)
+        else:
+            message = f"{rate:,} Hz / {source.fps} Hz = {wanted} samples per frame"
+            yield Verdict("sample rate", "ok", message, key, figures={"sample_rate": rate, "samples_per_frame": wanted})
+
+
+def check_finite_numbers(source: DatasetSource) -> Iterator[Verdict]:
+    """No NaN and no infinite value in any column of floats."""
+    n_columns = 0
+    for key in [*source.numbers, *source.microphones, "timestamp"]:
+        values = source.values(key)
+        if not np.issubdtype(values.dtype, np.floating):
+            continue
+        n_columns += 1
+        bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        if bad.any():
+            episodes = [episode.index for episode in source.episodes if bad[episode.rows].any()]
+            message = f"NaN or infinite in {int(bad.sum())} frames ({name_episodes(episodes)})"
+            yield Verdict("finite numbers", "error", message, key, episodes, {"frames": int(bad.sum())})
+            n_columns = -len(source.features)
+    if n_columns >= 0:
+        yield Verdict("finite numbers", "ok", f"no NaN and no infinite value in {n_columns} columns of floats")
+
+
+def check_statistics(source: DatasetSource) -> Iterator[Verdict]:
+    """meta/stats.json, with which training normalises, describes the data that is there."""
+    stats = source.dataset.meta.stats or {}
+    if len(source.episodes) != source.dataset.meta.total_episodes:
+        yield Verdict("statistics", "info", "not compared: only some of the episodes were opened")
+        return
+    wrong, missing, n_compared = [], [], 0
+    for key in [*source.numbers, *source.microphones]:
+        if key not in stats:
+            missing.append(key)
+            continue
+        difference = _stats_difference(source.values(key), stats[key])
+        n_compared += 1
+        if difference:
+            wrong.append(f"{key} ({difference})")
+    remedy = "Recompute: lerobot-edit-dataset --operation.type recompute_stats"
+    if wrong:
+        yield Verdict("statistics", "error", f"meta/stats.json does not fit the data: {'; '.join(wrong)}. {remedy}")
+    if missing:
+        yield Verdict("statistics", "warning", f"meta/stats.json lacks {', '.join(missing)}. {remedy}")
+    if not wrong and not missing:
+        yield Verdict("statistics", "ok", f"meta/stats.json fits the data of {n_compared} columns")
+
+
+def _is_whole(source: DatasetSource, episode: Episode) -> bool:
+    table = source.dataset.meta.episodes
+    return episode.index < len(table) and int(table[episode.index]["length"]) == len(episode)
+
+
+def _stats_difference(values: np.ndarray, stats: dict[str, np.ndarray]) -> str | None:
+    """What differs, in words; statistics per element, or one number for all elements, are both compared."""
+    values = values.reshape(len(values), -1).astype(np.float64)  # (N, D)
+    if not np.isfinite(values).all():
+        return None  # a finding of its own
+    for name, compute in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
+        if name not in stats:
+            return f"no {name}"
+        stored = np.asarray(stats[name], np.float64).reshape(-1)
+        axis = 0 if stored.size == values.shape[1] else None
+        if axis is None and stored.size != 1:
+            return f"{name} has {stored.size} values for {values.shape[1]} elements"
+        actual = np.atleast_1d(compute(values, axis=axis))
+        scale = np.atleast_1d(values.max(axis=axis) - values.min(axis=axis))
+        off = np.abs(stored - actual) > _STATS_TOLERANCE * scale + 1e-6 * (1 + np.abs(actual))
+        if off.any():
+            element = int(np.flatnonzero(off)[0])
+            return f"{name}[{element}] is {stored[element]:.4g} there, {actual[element]:.4g} in the data"
+    return None
