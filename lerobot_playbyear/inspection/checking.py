@@ -12,6 +12,7 @@ from lerobot_playbyear.inspection.structure_checks import (
     check_rows,
     check_sample_rates,
     check_statistics,
+    fit_microphones,
 )
 from lerobot_playbyear.inspection.verdict import Verdict
 
@@ -31,11 +32,10 @@ def check_numbers(source: DatasetSource, action_range: Sequence[float] | None = 
     verdicts += _guarded("actions", lambda s: check_actions(s, action_range), source)
     verdicts += _guarded("interventions", check_interventions, source)
     verdicts += _guarded("success", check_success, source)
-    rates = _guarded("sample rate", check_sample_rates, source)
-    verdicts += rates
-    if all(verdict.level != "error" for verdict in rates):  # otherwise there are no seconds to speak of
-        verdicts += _guarded("sound", check_sound, source)
-        verdicts += _guarded("sound and motion", check_alignment, source)
+    verdicts += _guarded("sample rate", check_sample_rates, source)
+    microphones = fit_microphones(source)
+    verdicts += _guarded("sound", lambda s: check_sound(s, microphones), source)
+    verdicts += _guarded("sound and motion", lambda s: check_alignment(s, microphones), source)
     return verdicts
 
 

@@ -25,7 +25,7 @@ def check_actions(source: DatasetSource, bounds: Sequence[float] | None = None) 
     actions = source.values(ACTION).reshape(len(source), -1)
     finite: np.ndarray = np.where(np.isfinite(actions), actions, 0)  # (N, D)
     low, high = bounds if bounds is not None else (-1.0, 1.0)
-    outside: np.ndarray = ((finite < low) | (finite > high)).any(axis=1)  # (N,)
+    outside = np.abs(finite - np.clip(finite, low, high)).max(axis=1) > 0  # (N,)
     normalised = bool((np.abs(finite) <= 1).mean() >= _NORMALISED_SHARE)
     seen = f"{finite.min():.4g} to {finite.max():.4g}"
     figures = {"min": float(finite.min()), "max": float(finite.max()), "frames_outside": int(outside.sum())}

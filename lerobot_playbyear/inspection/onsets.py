@@ -10,7 +10,7 @@ than chance would have it; a command that is heard later (a hand that takes time
 information, not a verdict: whether the motion must be heard is the task's business.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from lerobot.utils.constants import ACTION, OBS_STATE
@@ -44,13 +44,13 @@ def sudden_sounds(samples: np.ndarray, sample_rate: float) -> np.ndarray:
     return np.flatnonzero(loud & (recent == 0)) * _step(sample_rate) / sample_rate
 
 
-def check_alignment(source: DatasetSource) -> Iterator[Verdict]:
-    """How often sudden sounds and changes of motion coincide, per microphone."""
+def check_alignment(source: DatasetSource, microphones: Sequence[str]) -> Iterator[Verdict]:
+    """How often sudden sounds and changes of motion coincide, for each of these microphones."""
     motion_key = next((key for key in (OBS_STATE, ACTION) if key in source.numbers), None)
     if motion_key is None:
         return
     motion = _motion_changes(source, motion_key)
-    for key in source.microphones:
+    for key in microphones:
         onsets = [_onset_frames(source, key, episode) for episode in source.episodes]
         n_onsets = sum(len(frames) for frames in onsets)
         if n_onsets < _MIN_ONSETS:

@@ -17,6 +17,7 @@ from lerobot_playbyear.inspection.episode_data import EpisodeData
 from lerobot_playbyear.inspection.film import encode, tile
 from lerobot_playbyear.inspection.report import dataset_facts, summary
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
+from lerobot_playbyear.inspection.structure_checks import fit_microphones
 from lerobot_playbyear.inspection.verdict import Verdict, worst
 
 _SCRIPTS = ("data.js", "timeline.js", "panels.js", "player.js", "app.js")
@@ -29,19 +30,16 @@ class PageWriter:
     Args:
         path: The file to write; its folder is made.
         source: The dataset.
-        microphones: The microphones to draw and to hear, those in the format's shape.
         picture_height: Of the film [pixels], at most.
 
     Raises:
         OSError: If the file cannot be written.
     """
 
-    def __init__(
-        self, path: Path, source: DatasetSource, microphones: Sequence[str], picture_height: int = 240
-    ) -> None:
+    def __init__(self, path: Path, source: DatasetSource, picture_height: int = 240) -> None:
         self.path = path
         self._source = source
-        self._data = EpisodeData(source, microphones)
+        self._data = EpisodeData(source, fit_microphones(source))
         self._picture_height = picture_height
         self._index: list[dict[str, Any]] = []
         self._partial = path.with_name(f".{path.name}.partial")

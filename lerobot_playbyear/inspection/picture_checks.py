@@ -11,6 +11,7 @@ from lerobot_playbyear.inspection.verdict import Level, Verdict, name_episodes
 
 _BLANK_SPREAD = 2.0  # grey levels, standard deviation within a picture
 _FREEZE_S = 1.0  # a camera that stands still for so long while the arm moves is an error
+_MOVING_SHARE = 0.25  # of a still span; by definition the arm "moves" in half of all frames
 _TOLERATED_SHARE = 0.01  # of the pictures taken while the arm moves
 
 
@@ -43,15 +44,16 @@ class PictureChecks:
         """Passes an episode's pictures (H, W, 3) on; one that cannot be read ends them, and is noted."""
         found, moves = self._cameras[camera], self._moves[episode.rows]
         before: np.ndarray | None = None
-        n = n_blank = n_repeated = freeze = longest = 0
+        n = n_blank = n_repeated = still = still_moving = longest = 0
         try:
             for picture in pictures:
                 n_blank += picture.std() < _BLANK_SPREAD
                 repeated = before is not None and np.array_equal(picture, before)
                 n_repeated += repeated and bool(moves[n])
                 found.n_moving += bool(moves[n])
-                freeze = freeze + bool(moves[n]) if repeated else 0
-                longest = max(longest, freeze)
+                still, still_moving = (still + 1, still_moving + bool(moves[n])) if repeated else (0, 0)
+                if still_moving >= _MOVING_SHARE * still:
+                    longest = max(longest, still)
                 before = picture
                 n += 1
                 yield picture
@@ -95,7 +97,7 @@ class PictureChecks:
             f"{found.n_repeated} pictures equal the one before while the arm moves ({share:.1%} of those), for up to "
             f"{freeze_s:.3g} s; {name_episodes(found.repeating)}"
         )
-        return Verdict("frames that repeat", level, message, key, found.frozen or found.repeating, figures)
+        return Verdict("frames that repeat", level, message, key, found.repeating, figures)
 
     def _judge_blank(self, key: str, found: _Camera) -> Verdict:
         if found.blank:

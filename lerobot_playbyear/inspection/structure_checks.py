@@ -69,15 +69,18 @@ def check_sample_rates(source: DatasetSource) -> Iterator[Verdict]:
         yield Verdict("sound", "info", "no sound: no key starts with observation.audio.")
     for key in source.microphones:
         try:
-            rate = check_audio_features({key: source.features[key]}, source.fps)[key]
-            held, wanted = source.sound(key).shape[1], rate // source.fps
-            if held != wanted:
-                raise ValueError(f"rows hold {held} samples; {rate} Hz / {source.fps} Hz = {wanted}")
+            rate = _sample_rate(source, key)
         except ValueError as error:
-            yield Verdict("sample rate", "error", str(error), key)
+            yield Verdict("sample rate", "error", str(error).removeprefix(f"'{key}' "), key)
         else:
-            message = f"{rate:,} Hz / {source.fps} Hz = {wanted} samples per frame"
-            yield Verdict("sample rate", "ok", message, key, figures={"sample_rate": rate, "samples_per_frame": wanted})
+            block = rate // source.fps
+            message = f"{rate:,} Hz / {source.fps} Hz = {block} samples per frame"
+            yield Verdict("sample rate", "ok", message, key, figures={"sample_rate": rate, "samples_per_frame": block})
+
+
+def fit_microphones(source: DatasetSource) -> list[str]:
+    """The microphones whose rows are what their sample rate says; of the others no moment in time is known."""
+    return [key for key in source.microphones if _fits(source, key)]
 
 
 def check_finite_numbers(source: DatasetSource) -> Iterator[Verdict]:
@@ -120,6 +123,21 @@ def check_statistics(source: DatasetSource) -> Iterator[Verdict]:
         yield Verdict("statistics", "warning", f"meta/stats.json lacks {', '.join(missing)}. {remedy}")
     if not wrong and not missing:
         yield Verdict("statistics", "ok", f"meta/stats.json fits the data of {n_compared} columns")
+
+
+def _sample_rate(source: DatasetSource, key: str) -> int:
+    rate = check_audio_features({key: source.features[key]}, source.fps)[key]
+    held = source.sound(key).shape[1]
+    if held != rate // source.fps:
+        raise ValueError(f"rows hold {held} samples, but {rate} Hz / {source.fps} Hz = {rate // source.fps}")
+    return rate
+
+
+def _fits(source: DatasetSource, key: str) -> bool:
+    try:
+        return _sample_rate(source, key) > 0
+    except ValueError:
+        return False
 
 
 def _is_whole(source: DatasetSource, episode: Episode) -> bool:

@@ -11,6 +11,7 @@ import json as json_module
 import logging
 import sys
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,27 +94,20 @@ def inspect(cfg: InspectConfig) -> list[Verdict]:
 def _watch_pictures(cfg: InspectConfig, source: DatasetSource, verdicts: list[Verdict]) -> list[Verdict]:
     """Reads every picture once, for the checks and for the page."""
     checks = PictureChecks(source)
-    page = _open_page(cfg, source, verdicts) if cfg.html is not None else None
-    for episode in tqdm(source.episodes, desc="Looking", unit="episode", disable=None):
-        pictures: dict[str, Iterator[np.ndarray]] = {
-            camera: checks.watch(episode, camera, source.pictures(episode, camera)) for camera in source.cameras
-        }
+    with PageWriter(cfg.html, source, cfg.picture_height) if cfg.html is not None else nullcontext() as page:
+        for episode in tqdm(source.episodes, desc="Looking", unit="episode", disable=None):
+            pictures: dict[str, Iterator[np.ndarray]] = {
+                camera: checks.watch(episode, camera, source.pictures(episode, camera)) for camera in source.cameras
+            }
+            if page is not None:
+                page.add(episode, pictures)
+            for stream in pictures.values():
+                for _ in stream:
+                    pass
+        verdicts = [*verdicts, *checks.verdicts()]
         if page is not None:
-            page.add(episode, pictures)
-        for stream in pictures.values():
-            for _ in stream:
-                pass
-    verdicts = [*verdicts, *checks.verdicts()]
-    if page is not None:
-        page.finish(verdicts)
+            page.finish(verdicts)
     return verdicts
-
-
-def _open_page(cfg: InspectConfig, source: DatasetSource, verdicts: list[Verdict]) -> PageWriter:
-    assert cfg.html is not None
-    unfit = {verdict.feature for verdict in verdicts if verdict.check == "sample rate" and verdict.level == "error"}
-    microphones = [key for key in source.microphones if key not in unfit]
-    return PageWriter(cfg.html, source, microphones, cfg.picture_height)
 
 
 def _check_options(cfg: InspectConfig) -> None:

@@ -1,0 +1,395 @@
+"""`playbyear-inspect`: every fault is found where it is, and a sound dataset has none."""
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_playbyear.datasets.audio_feature import audio_feature
+from lerobot_playbyear.inspection import InspectionError, Verdict
+from lerobot_playbyear.inspection.onsets import sudden_sounds
+from lerobot_playbyear.inspection.sound_checks import flat_tops, gaps, repeats
+from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect, main
+
+FPS, SAMPLE_RATE, SIZE = 20, 16000, 32
+BLOCK = SAMPLE_RATE // FPS
+EPISODES, LENGTH = 3, 40
+TOUCH = 25  # the frame in which the arm touches something
+CAMERA, MICROPHONE = "observation.images.front", "observation.audio.gripper"
+
+Arrays = dict[str, np.ndarray]
+
+
+def features(sound: bool = True) -> dict[str, dict[str, Any]]:
+    scalar = {"shape": (1,), "names": None}
+    return {
+        CAMERA: {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]},
+        **({MICROPHONE: audio_feature(SAMPLE_RATE, FPS)} if sound else {}),
+        "observation.state": {"dtype": "float32", "shape": (3,), "names": ["x", "y", "z"]},
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+        "intervention": {"dtype": "bool", **scalar},
+        "next.success": {"dtype": "bool", **scalar},
+    }
+
+
+def clean_episode(rng: np.random.Generator) -> Arrays:
+    """An arm that moves, touches something (which is heard and stops it), and moves on; what it sees moves with it."""
+    sound = rng.normal(0, 30, LENGTH * BLOCK)
+    touch = TOUCH * BLOCK + 100
+    sound[touch : touch + 800] += rng.normal(0, 6000, 800) * np.exp(-np.arange(800) / 200)
+    speed = np.full(LENGTH, 0.02)
+    speed[TOUCH] = -0.2
+    state = np.cumsum(speed)[:, None] * [1.0, 0.5, -1.0] + rng.normal(0, 1e-4, (LENGTH, 3))
+    pictures = np.full((LENGTH, SIZE, SIZE, 3), 90, np.uint8)
+    for t in range(LENGTH):
+        pictures[t, :, t % SIZE] = 250
+        pictures[t, t // SIZE, :, 0] = 10
+    return {
+        CAMERA: pictures,
+        MICROPHONE: sound.clip(-32768, 32767).astype(np.int16).reshape(LENGTH, BLOCK),
+        "observation.state": state.astype(np.float32),
+        "action": rng.uniform(-1, 1, (LENGTH, 2)).astype(np.float32),
+        "intervention": np.ones((LENGTH, 1), bool),
+        "next.success": (np.arange(LENGTH) == LENGTH - 1)[:, None],
+    }
+
+
+def write(root: Path, episodes: list[Arrays], keys: dict[str, dict[str, Any]] | None = None) -> Path:
+    """A dataset of these episodes."""
+    keys = keys or features()
+    dataset = LeRobotDataset.create("tests/inspected", FPS, keys, root=root, use_videos=False, video_backend="pyav")
+    for arrays in episodes:
+        for t in range(len(arrays["action"])):
+            dataset.add_frame({**{key: arrays[key][t] for key in keys}, "task": "touch it"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+def clean_episodes(n: int) -> list[Arrays]:
+    rng = np.random.default_rng(0)
+    return [clean_episode(rng) for _ in range(n)]
+
+
+def look(root: Path, **options: Any) -> list[Verdict]:
+    return inspect(InspectConfig(InspectDatasetConfig("tests/inspected", str(root)), **options))
+
+
+def found(verdicts: list[Verdict]) -> dict[str, Verdict]:
+    """All warnings and errors, by check."""
+    return {verdict.check: verdict for verdict in verdicts if verdict.level in ("warning", "error")}
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory) -> Path:
+    return write(tmp_path_factory.mktemp("clean") / "dataset", clean_episodes(EPISODES))
+
+
+def test_a_sound_dataset_passes_every_check(clean, capsys):
+    verdicts = look(clean)
+    assert found(verdicts) == {}
+    printed = capsys.readouterr().out
+    for check in ("rows", "times", "statistics", "sample rate", "clipping", "drop-outs", "frames that repeat"):
+        assert any(line.startswith("ok") and f" {check} " in line for line in printed.splitlines()), check
+    assert "tests/inspected" in printed
+    assert f"{EPISODES} episodes, {EPISODES * LENGTH} frames" in printed
+
+
+# One fault each
+
+
+def dead_microphone(a: Arrays) -> None:
+    a[MICROPHONE][:] = 0
+
+
+def quiet_microphone(a: Arrays) -> None:
+    a[MICROPHONE][:] = a[MICROPHONE] % 2
+
+
+def clipped(a: Arrays) -> None:
+    a[MICROPHONE][:] = (a[MICROPHONE].astype(int) * 12).clip(-32768, 32767)
+
+
+def overloaded_before_full_scale(a: Arrays) -> None:
+    a[MICROPHONE][:] = a[MICROPHONE].clip(-3000, 3000)
+
+
+def offset(a: Arrays) -> None:
+    a[MICROPHONE] += 1000
+
+
+def dropped_out(a: Arrays) -> None:
+    a[MICROPHONE][10, 200:300] = 0
+
+
+def stale_block(a: Arrays) -> None:
+    a[MICROPHONE][12] = a[MICROPHONE][11]
+
+
+def stale_driver_block(a: Arrays) -> None:
+    wave = a[MICROPHONE].reshape(-1)
+    wave[5000 + 256 : 5000 + 512] = wave[5000 : 5000 + 256]
+
+
+def frozen_camera(a: Arrays) -> None:
+    a[CAMERA][5:30] = a[CAMERA][5]
+
+
+def blank_picture(a: Arrays) -> None:
+    a[CAMERA][7] = 0
+
+
+def large_action(a: Arrays) -> None:
+    a["action"][9, 1] = 1.5
+
+
+FAULTS: dict[Callable[[Arrays], None], tuple[str, str]] = {
+    dead_microphone: ("silence", "error"),
+    quiet_microphone: ("silence", "warning"),
+    clipped: ("clipping", "warning"),
+    overloaded_before_full_scale: ("clipping", "warning"),
+    offset: ("DC offset", "warning"),
+    dropped_out: ("drop-outs", "warning"),
+    stale_block: ("repeated blocks", "warning"),
+    stale_driver_block: ("repeated blocks", "warning"),
+    frozen_camera: ("frames that repeat", "error"),
+    blank_picture: ("blank pictures", "warning"),
+    large_action: ("action range", "warning"),
+}
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory) -> list[Verdict]:
+    """What is said of a dataset whose episode i has the i-th fault."""
+    episodes = clean_episodes(len(FAULTS) + 1)
+    for spoil, arrays in zip(FAULTS, episodes, strict=False):
+        spoil(arrays)
+    return look(write(tmp_path_factory.mktemp("faulty") / "dataset", episodes))
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
+def test_a_fault_is_found_in_its_episode(faulty, fault):
+    check, level = FAULTS[fault]
+    episode = list(FAULTS).index(fault)
+    assert [v.level for v in faulty if v.check == check and episode in v.episodes] == [level]
+
+
+def test_nothing_is_found_where_there_is_no_fault(faulty):
+    said = {(verdict.check, episode) for verdict in faulty for episode in verdict.episodes}
+    assert said == {(check, episode) for episode, (check, _) in enumerate(FAULTS.values())}
+
+
+def test_many_faults_are_errors_where_few_are_warnings(tmp_path):
+    episodes = clean_episodes(2)
+    episodes[1][MICROPHONE][10:20, 200:300] = 0
+    episodes[1][CAMERA][1::2] = episodes[1][CAMERA][0::2]
+    episodes[0]["action"][:, 0] = episodes[1]["action"][:, 0] = 0.25
+    levels = {check: verdict.level for check, verdict in found(look(write(tmp_path / "dataset", episodes))).items()}
+    assert levels == {"drop-outs": "error", "frames that repeat": "warning", "actions used": "warning"}
+
+
+def edit(root: Path, change: Callable[[dict[str, Any]], None], name: str = "info.json") -> None:
+    path = root / "meta" / name
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def test_a_sample_rate_that_does_not_fit_is_an_error_and_stops_the_checks_of_sound(clean, tmp_path):
+    root = copy(clean, tmp_path)
+    edit(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate=48000))
+    verdicts = look(root)
+    assert list(found(verdicts)) == ["sample rate"]
+    assert "48000 Hz and 20 frames per second it must be (2400,)" in found(verdicts)["sample rate"].message
+    assert not any(verdict.check == "clipping" for verdict in verdicts)
+
+
+def test_statistics_of_other_data_are_an_error(clean, tmp_path):
+    root = copy(clean, tmp_path)
+    edit(root, lambda stats: stats["action"].update(mean=[0.5, 0.5]), "stats.json")
+    verdict = found(look(root))["statistics"]
+    assert verdict.level == "error"
+    assert "action (mean[0] is 0.5 there" in verdict.message
+    assert "recompute_stats" in verdict.message
+
+
+def test_frames_that_the_metadata_does_not_know_of_are_an_error(clean, tmp_path):
+    root = copy(clean, tmp_path)
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    pq.write_table(table.filter(pc.not_equal(table["index"], LENGTH + 7)), path)
+    verdict = found(look(root))["rows"]
+    assert (verdict.level, list(verdict.episodes)) == ("error", [1])
+
+
+def test_nan_is_named_and_the_other_checks_go_on(tmp_path):
+    episodes = clean_episodes(2)
+    root = write(tmp_path / "dataset", episodes)
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    states = table["observation.state"].to_pylist()
+    states[LENGTH + 3][1] = float("nan")
+    position = table.schema.get_field_index("observation.state")
+    column = pa.array(states, type=table.schema.field(position).type)
+    pq.write_table(table.set_column(position, table.schema.field(position), column), path)
+    verdicts = look(root, html=tmp_path / "page.html")
+    faults = found(verdicts)
+    assert list(faults) == ["finite numbers"]
+    assert (faults["finite numbers"].level, faults["finite numbers"].feature) == ("error", "observation.state")
+    assert list(faults["finite numbers"].episodes) == [1]
+    assert len(verdicts) == len(look(root))
+
+
+def test_a_damaged_picture_is_an_error_and_the_page_is_written_all_the_same(clean, tmp_path):
+    root = copy(clean, tmp_path)
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    rows = table[CAMERA].to_pylist()
+    rows[LENGTH + 30]["bytes"] = rows[LENGTH + 30]["bytes"][:60]
+    position = table.schema.get_field_index(CAMERA)
+    column = pa.array(rows, type=table.schema.field(position).type)
+    pq.write_table(table.set_column(position, table.schema.field(position), column), path)
+    verdict = found(look(root, html=tmp_path / "page.html"))["pictures"]
+    assert (verdict.level, list(verdict.episodes)) == ("error", [1])
+    assert (tmp_path / "page.html").stat().st_size > 10_000
+
+
+def test_interventions_and_success_are_counted(tmp_path):
+    episodes = clean_episodes(2)
+    for arrays in episodes:
+        arrays["intervention"][:] = False
+    episodes[0]["intervention"][5:10] = episodes[0]["intervention"][30:35] = True
+    episodes[1]["next.success"][:] = False
+    verdicts = {verdict.check: verdict for verdict in look(write(tmp_path / "dataset", episodes))}
+    assert verdicts["interventions"].figures == {"share": 10 / 80, "spans": 2, "episodes_without": 1}
+    assert verdicts["success"].figures == {"succeeded": 1, "episodes": 2}
+    assert list(verdicts["success"].episodes) == [1]
+
+
+def test_actions_are_held_to_the_range_given(clean):
+    verdict = found(look(clean, action_range=[-0.5, 1.0]))["action range"]
+    assert verdict.level == "error"
+    assert verdict.figures["frames_outside"] > 10
+    with pytest.raises(InspectionError, match=r"action_range=\[1, -1\]"):
+        look(clean, action_range=[1, -1])
+
+
+def test_a_dataset_without_sound_or_cameras_says_so(tmp_path):
+    keys = {key: feature for key, feature in features(sound=False).items() if key != CAMERA}
+    verdicts = look(write(tmp_path / "dataset", clean_episodes(2), keys))
+    assert found(verdicts) == {}
+    messages = {verdict.check: verdict.message for verdict in verdicts}
+    assert messages["sound"].startswith("no sound")
+    assert messages["pictures"] == "no camera"
+
+
+# Sound and motion
+
+
+def test_a_sudden_sound_is_placed_to_a_few_milliseconds():
+    rng = np.random.default_rng(1)
+    samples = rng.normal(0, 20, 2 * SAMPLE_RATE)
+    for second in (0.5, 1.25):
+        samples[int(second * SAMPLE_RATE) :][:2000] += rng.normal(0, 3000, 2000) * np.exp(-np.arange(2000) / 300)
+    assert sudden_sounds(samples, SAMPLE_RATE) == pytest.approx([0.5, 1.25], abs=0.005)
+    assert len(sudden_sounds(rng.normal(0, 3000, SAMPLE_RATE), SAMPLE_RATE)) == 0
+
+
+@pytest.mark.parametrize("shift", [0, -6])
+def test_sound_that_was_recorded_too_early_shows_as_a_lag(tmp_path, shift):
+    episodes = clean_episodes(6)
+    for arrays in episodes:
+        arrays[MICROPHONE] = np.roll(arrays[MICROPHONE], shift, axis=0)
+    figures = next(v for v in look(write(tmp_path / "dataset", episodes)) if v.check == "sound and motion").figures
+    assert figures["sudden_sounds"] == 6
+    if shift == 0:
+        assert figures["coincide"] == 1
+        assert figures["by_chance"] < 0.5
+    else:
+        assert figures["coincide"] == 0
+        assert figures["best_lag_s"] == pytest.approx(shift / FPS, abs=2 / FPS)
+
+
+# The detectors, on sound that is hard to judge
+
+
+def test_quiet_sound_of_few_steps_is_neither_cut_nor_lost():
+    samples = np.round(np.random.default_rng(0).normal(0, 0.6, 5 * SAMPLE_RATE))  # half of the samples are 0
+    assert gaps(samples, SAMPLE_RATE) == flat_tops(samples) == repeats(samples, BLOCK) == []
+
+
+def test_silence_before_and_after_the_sound_is_no_gap():
+    samples = np.zeros(SAMPLE_RATE)
+    samples[4000:8000] = np.random.default_rng(0).normal(0, 500, 4000).round()
+    assert gaps(samples, SAMPLE_RATE) == []
+    samples[6000:6064] = 0
+    assert gaps(samples, SAMPLE_RATE) == [(6000, 6064)]
+
+
+def test_the_length_of_a_repeated_block_is_measured():
+    samples = np.random.default_rng(0).normal(0, 500, SAMPLE_RATE).round()
+    samples[3000:3512] = samples[2488:3000]
+    assert repeats(samples, BLOCK) == [(3000, 3512)]
+
+
+# The command
+
+
+def run(monkeypatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["playbyear-inspect", "--dataset.repo_id=tests/inspected", *arguments])
+    with pytest.raises(SystemExit) as exit_:
+        main()
+    return int(exit_.value.code or 0)
+
+
+def test_the_command_prints_json_and_nothing_else(clean, monkeypatch, capsys):
+    assert run(monkeypatch, f"--dataset.root={clean}", "--json") == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["worst"] in ("ok", "info")
+    assert printed["dataset"]["microphones"] == {MICROPHONE: SAMPLE_RATE}
+    assert {"check", "level", "message", "feature", "episodes", "figures"} == set(printed["verdicts"][0])
+
+
+def test_the_commands_status_says_whether_there_is_an_error(clean, monkeypatch, capsys):
+    assert run(monkeypatch, f"--dataset.root={clean}", "--dataset.episodes=[1]") == 0
+    assert run(monkeypatch, f"--dataset.root={clean}", "--action_range=[-0.5, 0.5]") == 1
+    assert "error    action range" in capsys.readouterr().out
+
+
+def test_a_wrong_path_is_one_clear_line(tmp_path, monkeypatch, capsys):
+    assert run(monkeypatch, f"--dataset.root={tmp_path / 'nowhere'}") == 2
+    assert capsys.readouterr().err == (
+        f"error: There is no LeRobotDataset in '{tmp_path / 'nowhere'}': it does not exist. Check --dataset.root.\n"
+    )
+    assert run(monkeypatch, f"--dataset.root={tmp_path}") == 2
+    assert "it has no meta/info.json" in capsys.readouterr().err
+
+
+def test_a_truncated_file_is_one_clear_line(clean, tmp_path, monkeypatch, capsys):
+    root = copy(clean, tmp_path)
+    (path,) = root.glob("data/*/*.parquet")
+    path.write_bytes(path.read_bytes()[:1000])
+    assert run(monkeypatch, f"--dataset.root={root}") == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith("error: The dataset in ")
+    assert "truncated" in printed
+    assert len(printed.splitlines()) == 1
+
+
+def test_a_page_that_cannot_be_written_is_one_clear_line(clean, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("")
+    assert run(monkeypatch, f"--dataset.root={clean}", f"--html={tmp_path / 'file' / 'page.html'}") == 2
+    assert "The page cannot be written" in capsys.readouterr().err
+
+
+def copy(root: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(root, tmp_path / "copy"))
