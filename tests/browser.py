@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,8 @@ class Browser:
         self.messages: list[str] = []
         self._ids = itertools.count(1)
         self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        self._socket = self._attach(profile)
+        self._resources = ExitStack()
+        self._socket = self._resources.enter_context(self._attach(profile))
         for domain in ("Page", "Network", "Runtime"):
             self.call(f"{domain}.enable")
         metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
@@ -66,7 +68,7 @@ class Browser:
     def close(self) -> None:
         """Ends the browser."""
         try:
-            self._socket.close()
+            self._resources.close()
         finally:
             self._process.terminate()
             self._process.wait(timeout=20)
@@ -127,8 +129,7 @@ class Browser:
             assert time.monotonic() < deadline, "Chromium did not start"
             time.sleep(0.05)
         port = int(port_file.read_text().split()[0])
-        root = connect(f"ws://127.0.0.1:{port}{port_file.read_text().split()[1]}", max_size=None, proxy=None)
-        with root:
+        with connect(f"ws://127.0.0.1:{port}{port_file.read_text().split()[1]}", max_size=None, proxy=None) as root:
             root.send(json.dumps({"id": 1, "method": "Target.getTargets"}))
             targets = json.loads(root.recv(timeout=60))["result"]["targetInfos"]
         page = next(target["targetId"] for target in targets if target["type"] == "page")

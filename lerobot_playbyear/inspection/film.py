@@ -1,5 +1,6 @@
 """An episode as a film with sound in memory, in the formats that every browser plays: H.264 and AAC."""
 
+import itertools
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -29,18 +30,18 @@ def tile(
     Returns:
         The width of each camera's tile [pixels], and the n tiled pictures (height, sum of widths, 3) uint8.
     """
+    if not pictures:
+        blank = np.zeros((_EMPTY_SIZE, _EMPTY_SIZE, 3), np.uint8)
+        return [], itertools.repeat(blank, n_frames)
     first = {camera: next(stream, None) for camera, stream in pictures.items()}
     shapes = [picture.shape[:2] if picture is not None else (1, 1) for picture in first.values()]
-    tallest = max((_fitted(shape[0], height) for shape in shapes), default=_EMPTY_SIZE)
-    sizes = [(_even(shape[1] * tallest / shape[0]), tallest) for shape in shapes] or [(_EMPTY_SIZE, tallest)]
+    tallest = max(_fitted(shape[0], height) for shape in shapes)
+    sizes = [(_even(shape[1] * tallest / shape[0]), tallest) for shape in shapes]
 
     def frames() -> Iterator[np.ndarray]:
         for index in range(n_frames):
-            tiles = []
-            for (camera, stream), size in zip(pictures.items(), sizes, strict=True):
-                picture = first[camera] if index == 0 else next(stream, None)
-                tiles.append(_resize(picture, size))
-            yield np.concatenate(tiles, axis=1) if tiles else np.zeros((_EMPTY_SIZE, _EMPTY_SIZE, 3), np.uint8)
+            shown = [first[camera] if index == 0 else next(stream, None) for camera, stream in pictures.items()]
+            yield np.concatenate([_resize(*pair) for pair in zip(shown, sizes, strict=True)], axis=1)
         for stream in pictures.values():
             next(stream, None)  # lets the streams come to their end
 

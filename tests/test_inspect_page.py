@@ -1,0 +1,351 @@
+"""The page of `playbyear-inspect --html` in a real browser: it plays, in time, and asks the network for nothing."""
+
+import http.server
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import Browser, find_chromium
+from dataset_factory import make_dataset
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.datasets.audio_feature import audio_feature
+from lerobot_playbyear.inspection import DatasetSource, check_numbers
+from lerobot_playbyear.inspection.page_writer import PageWriter
+from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect
+
+pytestmark = pytest.mark.skipif(
+    find_chromium() is None, reason="needs Chromium (Debian, Ubuntu: apt-get install chromium)"
+)
+
+FPS, SAMPLE_RATE, SIZE = 20, 16000, 64
+BLOCK = SAMPLE_RATE // FPS
+LENGTHS = (60, 40, 50)
+CLICK = 31  # the frame at whose end a click is heard
+TASK = "Touch </script><script>document.title = 'broken'</script> & <b>listen</b>"
+READY = "document.querySelector('html[data-ready]') !== null"
+
+# The film as a canvas sees it: how bright the picture shown is, 0 to 255.
+BRIGHTNESS = """(() => {
+  const canvas = document.createElement("canvas");
+  canvas.width = canvas.height = 1;
+  const context = canvas.getContext("2d");
+  context.drawImage(document.getElementById("video"), 0, 0, 1, 1);
+  return context.getImageData(0, 0, 1, 1).data[0];
+})()"""
+
+# When the film of the first episode is loudest, in seconds, as the browser's own decoder has it.
+LOUDEST = """(async () => {
+  const text = atob(document.getElementById("film-0").textContent);
+  const bytes = Uint8Array.from(text, (letter) => letter.charCodeAt(0));
+  const sound = await new OfflineAudioContext(1, 1, 48000).decodeAudioData(bytes.buffer);
+  const samples = sound.getChannelData(0);
+  let loudest = 0;
+  for (let i = 0; i < samples.length; i++) if (Math.abs(samples[i]) > Math.abs(samples[loudest])) loudest = i;
+  return [loudest / sound.sampleRate, Math.abs(samples[loudest])];
+})()"""
+
+
+def brightness(frame: int) -> int:
+    return 30 + 3 * frame
+
+
+def write_marked_dataset(root: Path) -> Path:
+    """Every picture's brightness tells its frame; one click; the expert acts now and then; one failure."""
+    names = ["height", "width", "channels"]
+    features: dict[str, dict[str, Any]] = {
+        "observation.images.front": {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": names},
+        "observation.audio.gripper": audio_feature(SAMPLE_RATE, FPS),
+        "observation.state": {"dtype": "float32", "shape": (2,), "names": ["height", "speed"]},
+        "action": {"dtype": "float32", "shape": (9,), "names": None},
+        "intervention": {"dtype": "bool", "shape": (1,), "names": None},
+        "next.success": {"dtype": "bool", "shape": (1,), "names": None},
+    }
+    dataset = LeRobotDataset.create("tests/page", FPS, features, root=root, use_videos=False, video_backend="pyav")
+    rng = np.random.default_rng(0)
+    for episode, length in enumerate(LENGTHS):
+        for t in range(length):
+            sound = rng.normal(0, 10, BLOCK)
+            sound[-10:] += 20000 * (t == CLICK)
+            frame = {
+                "observation.images.front": np.full((SIZE, SIZE, 3), brightness(t), np.uint8),
+                "observation.audio.gripper": sound.astype(np.int16),
+                "observation.state": np.array([0.01 * t, 5.0], np.float32),
+                "action": np.sin(np.arange(9) + t / 5).astype(np.float32),
+                "intervention": np.array([10 <= t < 20]),
+                "next.success": np.array([t == length - 1 and episode != 1]),
+            }
+            dataset.add_frame({**frame, "task": TASK})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory) -> Iterator[Browser]:
+    browser = Browser(tmp_path_factory.mktemp("browser"))
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("marked")
+    dataset = InspectDatasetConfig("tests/page", str(write_marked_dataset(folder / "dataset")))
+    inspect(InspectConfig(dataset, html=folder / "page.html"))
+    return folder / "page.html"
+
+
+@pytest.fixture
+def page(browser, written) -> Browser:
+    return show(browser, written)
+
+
+def show(browser: Browser, path: Path, place: str = "") -> Browser:
+    browser.open("about:blank")
+    browser.open(path.as_uri() + place)
+    browser.wait(READY)
+    assert browser.messages == []
+    return browser
+
+
+def text(page: Browser, selector: str) -> str:
+    return page.evaluate(f"document.querySelector({selector!r}).innerText")
+
+
+def frame(page: Browser) -> int:
+    return int(text(page, "#time").split("frame ")[1].split(" of ")[0])
+
+
+def cursor(page: Browser) -> float:
+    """Where the cursor stands [pixels]."""
+    return page.evaluate("document.getElementById('cursor').getBoundingClientRect().left")
+
+
+def test_space_plays_picture_and_sound_and_moves_the_cursor(page):
+    start = cursor(page)
+    page.press(" ")
+    page.wait("document.getElementById('video').currentTime > 0.5")
+    assert page.evaluate("document.getElementById('video').webkitAudioDecodedByteCount") > 0
+    assert page.evaluate("document.getElementById('video').muted") is False
+    first, first_brightness = cursor(page), page.evaluate(BRIGHTNESS)
+    time.sleep(0.3)
+    assert cursor(page) > first > start
+    assert page.evaluate(BRIGHTNESS) > first_brightness
+    page.press(" ")
+    page.wait("document.getElementById('video').paused")
+    stopped = frame(page)
+    time.sleep(0.2)
+    assert frame(page) == stopped > 10
+
+
+def test_it_plays_to_the_end_and_from_the_start_again(page):
+    page.press("End")
+    assert frame(page) == LENGTHS[0] - 1
+    page.press(" ")
+    page.wait("!document.getElementById('video').paused && document.getElementById('video').currentTime < 1")
+    page.evaluate("document.getElementById('video').playbackRate = 8")
+    page.wait("document.getElementById('video').ended")
+    assert frame(page) == LENGTHS[0] - 1
+    assert page.evaluate("document.getElementById('play').className") == ""
+
+
+def test_the_arrows_step_through_the_very_frames(page):
+    keys = ["ArrowRight"] * 3 + ["ArrowLeft"]
+    for key, expected in zip(keys, (1, 2, 3, 2), strict=True):
+        page.press(key)
+        assert frame(page) == expected
+    page.press("ArrowRight", shift=True)
+    for at, key in ((12, None), (LENGTHS[0] - 1, "End"), (LENGTHS[0] - 2, "ArrowLeft"), (0, "Home")):
+        if key:
+            page.press(key)
+        assert frame(page) == at
+        page.wait("!document.getElementById('video').seeking")
+        page.wait(f"Math.abs({BRIGHTNESS} - {brightness(at)}) <= 1")  # one frame is 3 apart
+
+
+def test_the_cursor_stands_at_the_time_of_the_frame(page):
+    page.press("End")
+    canvas = page.evaluate(
+        "(({left, width}) => [left, width])(document.querySelector('.panel canvas').getBoundingClientRect())"
+    )
+    duration = LENGTHS[0] / FPS
+    start, end = canvas[0] + 62, canvas[0] + canvas[1] - 8  # the plots' edges
+    share = (duration - 1 / FPS + 1 / FPS) / (duration + 1 / FPS)  # the sound begins a frame before the pictures
+    assert cursor(page) == pytest.approx(start + share * (end - start), abs=1.5)
+
+
+def test_up_and_down_change_the_episode(page):
+    page.press("ArrowDown")
+    page.wait("document.documentElement.dataset.episode == '1'")
+    assert text(page, "#episode-title") == "Episode 1"
+    assert text(page, "#time").endswith(f"of {LENGTHS[1] - 1}")
+    for key in ("ArrowDown", "ArrowDown", "ArrowDown"):  # faster than films load; beyond the last nothing happens
+        page.press(key)
+    page.wait("document.documentElement.dataset.episode == '2'")
+    page.press("ArrowUp")
+    page.press("ArrowUp")
+    page.wait("document.documentElement.dataset.episode == '0'")
+    assert page.evaluate("document.querySelector('#episodes [aria-selected=true] b').innerText") == "0"
+
+
+def test_o_goes_to_the_sudden_sound_that_was_recorded(page):
+    page.press("o")
+    assert frame(page) == CLICK - 1  # it is heard between this picture and the next
+
+
+def test_a_click_in_the_timeline_seeks(page):
+    left, top, width = page.evaluate(
+        "(({left, top, width}) => [left, top, width])(document.querySelectorAll('.panel > canvas')[3].getBoundingClientRect())"
+    )
+    page.click(left + width / 2, top + 20)
+    assert frame(page) == pytest.approx(LENGTHS[0] / 2, abs=3)
+
+
+def test_other_keys_do_what_the_help_says(page):
+    page.press("?")
+    page.wait("document.getElementById('keys').open")
+    page.press(" ")
+    assert page.evaluate("document.getElementById('video').paused")
+    page.evaluate("document.getElementById('keys').close()")
+    theme = page.evaluate("document.documentElement.dataset.theme")
+    page.press("t")
+    assert page.evaluate("document.documentElement.dataset.theme") != theme
+    page.press("m")
+    assert page.evaluate("document.getElementById('video').muted")
+    page.press(".")
+    assert page.evaluate("document.getElementById('video').playbackRate") == 2
+    page.press("c")
+    assert page.evaluate("document.getElementById('checks').hidden")
+    page.press("s")
+    assert "own scales" in text(page, "#panels")
+
+
+def test_the_sound_is_in_time_with_the_pictures(page):
+    """The click at the end of block 31 was heard as picture 31 was taken."""
+    loudest, level = page.evaluate(LOUDEST)
+    assert loudest == pytest.approx(CLICK / FPS, abs=0.01)
+    assert level > 0.3
+
+
+def test_what_is_shown_is_what_was_recorded(page):
+    assert text(page, "#task") == TASK  # and is no markup
+    assert page.evaluate("document.title") == "tests/page"
+    assert "17 %, 1 span" in text(page, "#episode-facts")
+    assert text(page, "#episodes").count("✓") == 2
+    assert text(page, "#episodes").count("✕") == 1
+    page.press("End")
+    assert f"{0.01 * (LENGTHS[0] - 1):.3g}" in text(page, "#panels")  # the state's value at the cursor
+    assert "height" in text(page, "#panels")
+
+
+def test_no_request_leaves_the_page(page, written):
+    for key in (" ", "ArrowDown", "t", "ArrowUp", "End"):
+        page.press(key)
+        time.sleep(0.1)
+    addresses = {address.split(":")[0] for address in page.requests}
+    assert addresses <= {"file", "data", "blob", "about"}
+    assert [address for address in page.requests if address.startswith("file")] == [written.as_uri()]
+
+
+def test_a_request_could_not_leave_the_page(page):
+    """Its policy forbids it: a server that is there hears nothing."""
+    heard: list[str] = []
+
+    class Listener(http.server.BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            heard.append(self.path)
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Listener)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    address = f"http://127.0.0.1:{server.server_port}"
+    for attempt in (
+        f"fetch('{address}/fetch', {{mode: 'no-cors'}})",
+        f"new Promise((done, fail) => Object.assign(new Image(), {{onload: done, onerror: fail, src: '{address}/image'}}))",
+        f"import('{address}/module')",
+    ):
+        assert page.evaluate(f"{attempt}.then(() => 'allowed', () => 'refused')") == "refused"
+    page.open(f"{address}/open")  # the listener does hear what is asked for
+    time.sleep(0.5)
+    server.shutdown()
+    assert heard[0] == "/open"
+
+
+def test_an_address_names_episode_and_frame(browser, written):
+    page = show(browser, written, "#episode=2&frame=7")
+    assert text(page, "#episode-title") == "Episode 2"
+    assert frame(page) == 7
+
+
+def test_a_video_dataset_of_two_cameras_and_two_microphones_at_an_odd_rate(browser, tmp_path):
+    cameras = ("observation.images.front", "observation.images.wrist")
+    microphones = ("observation.audio.left", "observation.audio.right")
+    options: dict[str, Any] = {"use_videos": True, "cameras": cameras, "microphones": microphones}
+    make_dataset(tmp_path / "dataset", (30, 25), fps=30, sample_rate=19200, image_size=64, **options)
+    dataset = InspectDatasetConfig("tests/noise", str(tmp_path / "dataset"))
+    inspect(InspectConfig(dataset, html=tmp_path / "page.html", picture_height=48))
+    page = show(browser, tmp_path / "page.html")
+    size = page.evaluate("[document.getElementById('video').videoWidth, document.getElementById('video').videoHeight]")
+    assert size == [96, 48]
+    assert text(page, "#cameras").split() == ["front", "wrist"]
+    assert "left left, right right" in text(page, "#heard")
+    assert len(page.evaluate("[...document.querySelectorAll('.scale')].map((scale) => scale.width)")) == 2
+    assert page.evaluate("document.getElementById('video').duration") == pytest.approx(1, abs=0.1)
+
+
+def test_a_dataset_without_sound_and_cameras_is_shown_by_its_curves(browser, tmp_path):
+    features = {key: {"dtype": "float32", "shape": (3,), "names": None} for key in ("observation.state", "action")}
+    make_dataset(tmp_path / "dataset", (30,), features=features)
+    dataset = InspectDatasetConfig("tests/noise", str(tmp_path / "dataset"))
+    inspect(InspectConfig(dataset, html=tmp_path / "page.html"))
+    page = show(browser, tmp_path / "page.html")
+    assert page.evaluate("document.getElementById('screen').hidden")
+    assert "no sound" in text(page, "header")
+    assert page.evaluate("document.querySelectorAll('.panel').length") == 4
+    page.press(" ")
+    page.wait("document.getElementById('video').currentTime > 0.3")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """Expert episodes with contact sound."""
+    dataset = RecordDatasetConfig("tests/recorded", str(tmp_path_factory.mktemp("recorded") / "dataset"), 2)
+    return record(RecordConfig(PlaybyearEnvConfig(), dataset, num_workers=0))
+
+
+def test_a_page_of_fifty_episodes_opens_in_two_seconds_and_is_small(browser, recorded, tmp_path):
+    source = DatasetSource.open("tests/recorded", recorded)
+    with PageWriter(tmp_path / "page.html", source) as writer:
+        for i in range(50):
+            episode = source.episodes[i % 2]
+            writer.add(episode, {camera: source.pictures(episode, camera) for camera in source.cameras})
+        path = writer.finish(check_numbers(source))
+    assert path.stat().st_size < 30e6
+    browser.open("about:blank")
+    start = time.monotonic()
+    show(browser, path)
+    assert time.monotonic() - start < 2
+    assert browser.evaluate("document.getElementById('episodes').children.length") == 50
+
+
+def test_an_interrupted_page_leaves_no_file(written, tmp_path):
+    source = DatasetSource.open("tests/page", written.parent / "dataset")
+
+    def pictures() -> Iterator[np.ndarray]:
+        yield np.zeros((SIZE, SIZE, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), PageWriter(tmp_path / "page.html", source) as writer:
+        writer.add(source.episodes[0], {"observation.images.front": pictures()})
+    assert list(tmp_path.iterdir()) == []
