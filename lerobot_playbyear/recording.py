@@ -164,9 +164,10 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
     """The T frames of an episode: frame t holds what was observed, the action taken then, and what came of it.
 
     Args:
-        episode: An expert's episode.
+        episode: An episode of an expert, or of a policy that an expert corrected.
         features: From `dataset_features`.
     """
+    by_expert = np.ones(len(episode), bool) if episode.interventions is None else episode.interventions
     frames = []
     for t in range(len(episode)):
         frame: dict[str, Any] = dict(_flat_observation(episode.observations[t]))
@@ -174,7 +175,7 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
             if features[key]["dtype"] == "float32":
                 frame[key] = np.asarray(value, np.float32)
         frame[ACTION] = episode.actions[t]
-        frame[INTERVENTION] = np.array([True])
+        frame[INTERVENTION] = by_expert[t : t + 1]
         frame[REWARD] = episode.rewards[t : t + 1]
         frame[SUCCESS] = episode.successes[t : t + 1]
         frame[DONE] = np.array([t == len(episode) - 1])

@@ -81,6 +81,7 @@ class Episode:
         rewards: (T,) float32.
         successes: (T,) bool, `info["is_success"]` after each action.
         pictures: T + 1 pictures (H, W, 3) uint8 from `env.render()` if they were asked for, otherwise none.
+        interventions: (T,) bool, whether an expert chose the action; None stands for all of them.
     """
 
     seed: int
@@ -90,6 +91,7 @@ class Episode:
     rewards: np.ndarray
     successes: np.ndarray
     pictures: list[np.ndarray] = field(default_factory=list)
+    interventions: np.ndarray | None = None
 
     @property
     def success(self) -> bool:

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
+from lerobot_playbyear.modeling_playbyear import LOSS_WEIGHT
 from lerobot_playbyear.train_config import PlaybyearTrainConfig
 
 _DTYPES = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}
@@ -129,7 +130,7 @@ class TrainingParts:
         metrics, _ = update_policy(
             metrics,
             self.policy,
-            self.preprocessor(dict(batch)),
+            self._prepared(batch),
             self.optimizer,
             grad_clip_norm,
             accelerator=self.accelerator,
@@ -143,13 +144,28 @@ class TrainingParts:
         """The policy's loss on a batch, as it would be in a rollout: no augmentation, no dropout."""
         self.policy.eval()
         with self.accelerator.autocast():
-            loss, _ = self.policy.forward(self.preprocessor(dict(batch)))
+            loss, _ = self.policy.forward(self._prepared(batch))
         self.policy.train()
         return float(loss)
+
+    def _prepared(self, batch: Mapping[str, Any]) -> dict[str, Any]:
+        """The batch as the policy takes it; the windows' weights pass by LeRobot's preprocessor, which drops them."""
+        prepared = self.preprocessor(dict(batch))
+        if LOSS_WEIGHT in batch:
+            prepared[LOSS_WEIGHT] = batch[LOSS_WEIGHT].to(self.accelerator.device)
+        return prepared
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
         """Write a checkpoint where lerobot-train would, and return its folder."""
         folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
+        self.write_checkpoint(folder, cfg)
+        update_last_checkpoint(folder)
+        if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
+            push_checkpoint_to_hub(folder, cfg.policy.repo_id, private=cfg.policy.private)
+        return folder
+
+    def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:
+        """Write LeRobot's checkpoint into a folder."""
         save_checkpoint(
             checkpoint_dir=folder,
             step=self.step,
@@ -162,12 +178,8 @@ class TrainingParts:
             num_processes=1,
             batch_size=cfg.batch_size,
         )
-        update_last_checkpoint(folder)
-        if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
-            push_checkpoint_to_hub(folder, cfg.policy.repo_id, private=cfg.policy.private)
-        return folder
 
-    def evaluate(self, cfg: PlaybyearTrainConfig) -> dict[str, Any]:
+    def evaluate(self, cfg: PlaybyearTrainConfig, n_videos: int = 4) -> dict[str, Any]:
         """Roll the policy out in the run's environment through LeRobot's `eval_policy_all`, and return its report."""
         if cfg.env is None:
             raise ValueError("An evaluation needs an environment: give --env.type and --env.task.")
@@ -186,7 +198,7 @@ class TrainingParts:
                     videos_dir=Path(str(cfg.output_dir))
                     / "eval"
                     / f"videos_step_{get_step_identifier(self.step, cfg.steps)}",
-                    max_episodes_rendered=4,
+                    max_episodes_rendered=n_videos,
                     start_seed=cfg.seed,
                     max_parallel_tasks=cfg.env.max_parallel_tasks,
                 )
@@ -195,8 +207,15 @@ class TrainingParts:
             self.policy.train()
 
 
-def make_training_parts(cfg: PlaybyearTrainConfig, meta: LeRobotDatasetMetadata) -> TrainingParts:
+def make_training_parts(
+    cfg: PlaybyearTrainConfig, meta: LeRobotDatasetMetadata, keep_normalization: bool = False
+) -> TrainingParts:
     """Make policy, processors, optimizer and schedule for a dataset; where the run is resumed, from its checkpoint.
+
+    Args:
+        cfg: The options of the run.
+        meta: The dataset's metadata.
+        keep_normalization: Whether a checkpoint's statistics stay as they are; otherwise the dataset's take their place.
 
     Raises:
         ValueError: If the dataset does not suit the policy, before the policy is made.
@@ -207,7 +226,8 @@ def make_training_parts(cfg: PlaybyearTrainConfig, meta: LeRobotDatasetMetadata)
     check_dataset_suits(policy_cfg, meta, cfg.rename_map)
     accelerator = make_accelerator(policy_cfg)
     policy = make_policy(cfg=policy_cfg, ds_meta=meta, rename_map=cfg.rename_map)
-    preprocessor, postprocessor = _make_processors(cfg, policy, meta, accelerator.device)
+    stats = None if cfg.resume or keep_normalization else meta.stats
+    preprocessor, postprocessor = _make_processors(cfg, policy, stats, accelerator.device)
     optimizer, scheduler = make_optimizer_and_scheduler(cfg, policy)
     step = 0
     if cfg.resume and cfg.checkpoint_path is not None:
@@ -241,15 +261,15 @@ def check_dataset_suits(
 
 
 def _make_processors(
-    cfg: PlaybyearTrainConfig, policy: PreTrainedPolicy, meta: LeRobotDatasetMetadata, device: torch.device
+    cfg: PlaybyearTrainConfig, policy: PreTrainedPolicy, dataset_stats: Any, device: torch.device
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """Pre- and postprocessor: new ones, or a checkpoint's with the new dataset's statistics.
+    """Pre- and postprocessor: new ones, or a checkpoint's with new statistics.
 
-    A resumed run keeps the statistics of its checkpoint, as in lerobot-train.
+    Without statistics those of the checkpoint stay; so does a resumed run in lerobot-train.
     """
     config = policy.config
-    stats = {} if cfg.resume else {"stats": meta.stats}
-    kwargs: dict[str, Any] = {} if cfg.resume else {"dataset_stats": meta.stats}
+    stats = {} if dataset_stats is None else {"stats": dataset_stats}
+    kwargs: dict[str, Any] = {} if dataset_stats is None else {"dataset_stats": dataset_stats}
     if config.pretrained_path:
         features = {**config.input_features, **config.output_features}
         norm_map = config.normalization_mapping

@@ -22,7 +22,6 @@ from lerobot.common.wandb_utils import WandBLogger
 from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset, make_train_eval_datasets
 from lerobot.utils.import_utils import register_third_party_plugins
-from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
 from torch import Tensor
@@ -39,11 +38,9 @@ from lerobot_playbyear.datasets import (
 )
 from lerobot_playbyear.memory import keep_freed_memory
 from lerobot_playbyear.presets import apply_preset
+from lerobot_playbyear.tracking import METRICS_NAME, make_tracker
 from lerobot_playbyear.train_config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training import PolicyWindows, TrainingParts, make_training_parts
-
-METRICS_NAME = "metrics.jsonl"
-"""File in the output folder with one JSON object per line: training, validation and evaluation figures by step."""
 
 
 class TrainError(ValueError):
@@ -152,16 +149,7 @@ class _Report:
         )
         self._began, self._first_step = time.perf_counter(), parts.step
         self.last_success: float | None = None
-        meters = {
-            "loss": AverageMeter("loss", ":.3f"),
-            "grad_norm": AverageMeter("grdn", ":.3f"),
-            "lr": AverageMeter("lr", ":0.1e"),
-            "update_s": AverageMeter("updt_s", ":.3f"),
-            "dataloading_s": AverageMeter("data_s", ":.3f"),
-        }
-        if torch.cuda.is_available():
-            meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
-        self.metrics = MetricsTracker(cfg.batch_size, len(store), store.n_episodes, meters, initial_step=parts.step)
+        self.metrics = make_tracker(cfg.batch_size, store, parts.step)
 
     def __enter__(self) -> "_Report":
         self._redirect.__enter__()

@@ -1,0 +1,16 @@
+"""HG-DAgger: an expert corrects a policy while it works, and the policy learns from the corrections."""
+
+from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
+from lerobot_playbyear.dagger.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig, Verdict
+from lerobot_playbyear.dagger.run import run_dagger
+
+__all__ = [
+    "DaggerConfig",
+    "DaggerError",
+    "Expert",
+    "ExpertConfig",
+    "ExpertError",
+    "ScriptedExpertConfig",
+    "Verdict",
+    "run_dagger",
+]

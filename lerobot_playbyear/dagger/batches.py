@@ -1,0 +1,155 @@
+"""Balanced batches: half of the windows from demonstrations, half from moments in which an expert was in control.
+
+A training item is a run of K windows that share encodings (`RunSampler`). An expert's stretch of control rarely begins or
+ends where a run does, so windows are masked one by one: as many demonstration windows are supervised as there are windows
+that end on an intervention frame, and all weigh the same.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
+from lerobot_playbyear.modeling_playbyear import LOSS_WEIGHT
+from lerobot_playbyear.recording import INTERVENTION
+from lerobot_playbyear.training import PolicyWindows
+
+
+class BalancedBatches:
+    """Draws batches from two stores.
+
+    Each batch has random numbers of its own, seeded with the seed and its number: resuming needs that number alone.
+
+    Args:
+        windows: Cuts the policy's windows.
+        demonstrations: All of whose frames are learned from.
+        interventions: Whole attempts, with the column `intervention`; only what the expert chose is learned from. None
+            while there are none.
+        batch_size: Runs per batch, even: half of them from each store.
+        seed: Of the random numbers.
+
+    Raises:
+        ValueError: The batch size is odd, or no frame of `interventions` is an intervention.
+    """
+
+    def __init__(
+        self,
+        windows: PolicyWindows,
+        demonstrations: EpisodeStore,
+        interventions: EpisodeStore | None,
+        batch_size: int,
+        seed: int = 0,
+    ) -> None:
+        if batch_size < 2 or batch_size % 2:
+            raise ValueError(
+                f"--batch_size={batch_size} must be even: half of each batch comes from the demonstrations."
+            )
+        self._windows, self._seed, self._n_half = windows, seed, batch_size // 2
+        self._demonstrations, self._interventions = demonstrations, interventions
+        self._deltas = {INTERVENTION: list(range(1 - windows.n_windows, 1))}
+        self._from_demonstrations = RunSampler(run_weights(demonstrations, windows.n_windows), seed)
+        self._from_interventions: RunSampler | None = None
+        if interventions is not None:
+            self.set_interventions(interventions)
+
+    def set_interventions(self, interventions: EpisodeStore) -> None:
+        """Take in a store, or the episodes that were appended to it since the last time.
+
+        Raises:
+            ValueError: No frame is an intervention.
+        """
+        weights = intervention_run_weights(interventions, self._windows.n_windows)
+        if not weights.any():
+            raise ValueError(
+                f"None of the {len(interventions)} frames of the intervention dataset has '{INTERVENTION}' set: there is "
+                "nothing to learn from an expert. Give a dataset of corrections, or collect some with --episodes."
+            )
+        self._interventions = interventions
+        if self._from_interventions is None:
+            self._from_interventions = RunSampler(weights, self._seed + 1)
+        else:
+            self._from_interventions.set_weights(weights)
+
+    def batch(self, number: int) -> dict[str, Any]:
+        """The batch of that number, counted from 0: the first half are demonstrations.
+
+        Returns:
+            What `PolicyWindows.batch` gives, and with more than one window per run `loss_weight` (B, K), 0 or 1.
+        """
+        assert self._interventions is not None
+        assert self._from_interventions is not None
+        lasts = [
+            _draw(sampler, number, self._n_half) for sampler in (self._from_demonstrations, self._from_interventions)
+        ]
+        demonstrations = self._windows.batch(self._demonstrations, lasts[0])
+        interventions = self._windows.batch(self._interventions, lasts[1])
+        if self._windows.n_windows > 1:
+            by_expert = self._by_expert(self._interventions, lasts[1])  # (B/2, K)
+            is_learned = ~demonstrations[f"{ACTION}_is_pad"]
+            n, generator = int(min(is_learned.sum(), by_expert.sum())), self._generator(number)
+            demonstrations[LOSS_WEIGHT] = _keep(is_learned, n, generator).float()
+            interventions[LOSS_WEIGHT] = _keep(by_expert, n, generator).float()
+        common = [key for key in demonstrations if key in interventions]
+        return {key: _concatenate(demonstrations[key], interventions[key]) for key in common}
+
+    def halves(self, number: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """A batch of demonstrations and one of interventions, to tell their losses apart."""
+        batch = self.batch(number)
+        return ({k: v[: self._n_half] for k, v in batch.items()}, {k: v[self._n_half :] for k, v in batch.items()})
+
+    def _by_expert(self, store: EpisodeStore, last: Tensor) -> Tensor:
+        """Which of the K windows of each run end on an intervention frame inside their episode, (B/2, K) bool."""
+        flags = store.windows(last, self._deltas)
+        return flags[INTERVENTION].flatten(1) & ~flags[f"{INTERVENTION}_is_pad"]
+
+    def _generator(self, number: int) -> torch.Generator:
+        seed = np.random.SeedSequence([self._seed + 2, number]).generate_state(1, np.uint64)[0]
+        return torch.Generator().manual_seed(int(seed))
+
+
+def intervention_run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
+    """How often to draw the run that ends at each frame, so that every intervention frame is learned from alike.
+
+    Where the expert was in control for K frames or longer, runs lie inside; shorter stretches have one run that holds
+    them whole.
+
+    Args:
+        store: Attempts with the column `intervention`.
+        n_windows: K, the windows per run.
+
+    Returns:
+        (N,) float64, 0 for frames at which no run ends.
+    """
+    by_expert = store.column(INTERVENTION).reshape(len(store), -1)[:, 0].cpu().numpy().astype(bool)
+    weights = np.zeros(len(store))
+    for start, end in zip(store.starts, store.ends, strict=True):
+        changes = np.flatnonzero(np.diff(np.concatenate([[False], by_expert[start:end], [False]])))
+        for first, after in (changes + start).reshape(-1, 2):
+            length = after - first
+            if length < n_windows:
+                weights[min(max(after, start + n_windows), end) - 1] += n_windows
+                continue
+            weights[first + n_windows - 1 : after] += 1
+            weights[[first + n_windows - 1, after - 1]] += (n_windows - 1) / 2  # see `run_weights`
+    return torch.from_numpy(weights)
+
+
+def _draw(sampler: RunSampler, number: int, n: int) -> Tensor:
+    sampler.load_state_dict({**sampler.state_dict(), "n_batches": number})
+    return sampler.draw(n)
+
+
+def _keep(mask: Tensor, n: int, generator: torch.Generator) -> Tensor:
+    """`mask` with only n of its True left, chosen at random; all if there are fewer."""
+    chosen = mask.flatten().nonzero().squeeze(1)
+    chosen = chosen[torch.randperm(len(chosen), generator=generator)[:n].to(chosen.device)]
+    kept = torch.zeros_like(mask.flatten())
+    kept[chosen] = True
+    return kept.view_as(mask)
+
+
+def _concatenate(first: Any, second: Any) -> Any:
+    return torch.cat([first, second]) if isinstance(first, Tensor) else [*first, *second]

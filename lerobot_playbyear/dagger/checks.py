@@ -1,0 +1,93 @@
+"""Whether policy, demonstrations, corrections and environment go together; before any work is done."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from lerobot.configs import FeatureType, PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION
+
+from lerobot_playbyear.dagger.config import DaggerError
+from lerobot_playbyear.recording import INTERVENTION
+from lerobot_playbyear.training import check_dataset_suits, dataset_names
+
+Features = Mapping[str, Mapping[str, Any]]
+
+
+def check_dataset(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]) -> None:
+    """Refuse a dataset that the policy was not made for.
+
+    Raises:
+        ValueError: Frames per second, a missing feature, a shape, or a sample rate; what was seen and what is wanted.
+    """
+    check_dataset_suits(policy, meta, rename_map)
+    names = dataset_names(policy, rename_map)
+    rate = getattr(policy, "sample_rate", None)
+    for name in names.values():
+        seen_rate = (meta.features[name].get("info") or {}).get("sample_rate")
+        if rate is not None and seen_rate is not None and int(seen_rate) != int(rate):
+            raise DaggerError(
+                f"'{name}' was recorded at {seen_rate} Hz in the dataset '{meta.repo_id}', and the policy was trained with "
+                f"{rate} Hz: use data recorded at {rate} Hz, or train a policy for {seen_rate} Hz first."
+            )
+
+    for key, feature in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
+        name = names.get(key, key)
+        if name not in meta.features:
+            raise DaggerError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
+        seen = tuple(meta.features[name]["shape"])
+        wanted = tuple(feature.shape)
+        same = sorted(seen) == sorted(wanted) if feature.type is FeatureType.VISUAL else seen == wanted
+        if not same:
+            raise DaggerError(
+                f"'{name}' has shape {seen} in the dataset '{meta.repo_id}', and the policy was trained with {wanted}: use "
+                "the data that it was trained with, or data recorded alike."
+            )
+
+
+def check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, other: Features, fps: int, what: str) -> None:
+    """Refuse what cannot share a batch with the demonstrations.
+
+    Args:
+        keys: The observations that matter; the action always does.
+        demos: The demonstrations' metadata.
+        other: Features of a dataset, or of what the environment would write.
+        fps: Their frames per second.
+        what: What `other` is, for the message.
+
+    Raises:
+        DaggerError: With every difference.
+    """
+    differences = [f"fps is {demos.fps} there and {fps} here"] if demos.fps != fps else []
+    for key in (*keys, ACTION):
+        there, here = (
+            _signature(features[key]) if key in features else "absent" for features in (demos.features, other)
+        )
+        if there != here:
+            differences.append(f"'{key}' is {there} there and {here} here")
+    if differences:
+        raise DaggerError(
+            f"The demonstrations '{demos.repo_id}' and {what} differ: {'; '.join(differences)}. Record with the same "
+            "settings, or choose the environment's options (--env.*) as they were in the demonstrations."
+        )
+
+
+def check_corrections(meta: LeRobotDatasetMetadata) -> None:
+    """Refuse a dataset without the feature `intervention`.
+
+    Raises:
+        DaggerError: It is missing or not a bool of shape (1,).
+    """
+    feature = meta.features.get(INTERVENTION)
+    if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
+        seen = "no such feature" if feature is None else f"{feature['dtype']} {tuple(feature['shape'])}"
+        raise DaggerError(
+            f"The dataset '{meta.repo_id}' does not say which frames an expert chose: wanted '{INTERVENTION}', bool (1,), and "
+            f"there is {seen}. Give one that playbyear-dagger or lerobot-rollout --strategy.type=dagger wrote."
+        )
+
+
+def _signature(feature: Mapping[str, Any]) -> str:
+    kind = "picture" if feature["dtype"] in ("image", "video") else feature["dtype"]
+    rate = (feature.get("info") or {}).get("sample_rate")
+    return f"{kind} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")

@@ -1,0 +1,218 @@
+"""What `playbyear-dagger` can be told."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import draccus
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.default import DatasetConfig, EvalConfig, WandBConfig
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import HF_LEROBOT_HOME
+
+from lerobot_playbyear.dagger.expert import ExpertConfig, ScriptedExpertConfig
+from lerobot_playbyear.train_config import PlaybyearTrainConfig, StoreConfig
+
+CONFIG_NAME = "dagger_config.json"
+"""File in the output folder with the options of the run."""
+
+
+class DaggerError(ValueError):
+    """What a person asked for cannot be done, or not go on; the message says why, and what to do."""
+
+
+@dataclass
+class DatasetSource:
+    """A dataset on disk, or for reading also on the Hub.
+
+    Attributes:
+        repo_id: Its name, `user/name`.
+        root: Its folder. None: in LeRobot's own cache, under its name.
+        video_backend: LeRobot's decoder for cameras that are stored as video.
+    """
+
+    repo_id: str
+    root: str | None = None
+    video_backend: str = "pyav"
+
+    @property
+    def folder(self) -> Path:
+        return Path(self.root) if self.root else HF_LEROBOT_HOME / self.repo_id
+
+    def is_on_disk(self) -> bool:
+        """Whether the folder holds a dataset."""
+        return (self.folder / "meta" / "info.json").is_file()
+
+
+@dataclass
+class DaggerEvalConfig(EvalConfig):
+    """LeRobot's options of an evaluation, with defaults that suit one that is repeated often."""
+
+    batch_size: int = 10
+    use_async_envs: bool = False
+
+
+@dataclass
+class DaggerConfig:
+    """Options of `playbyear-dagger`.
+
+    Attributes:
+        demos: Demonstrations, which half of each batch comes from: those that the policy was trained on.
+        interventions: Where attempts with corrections are kept; created, or appended to.
+        policy: What is improved, `--policy.path`; its normalisation stays as it is. `--policy.push_to_hub` and
+            `--policy.repo_id` as in lerobot-train.
+        env: Where it acts, as in lerobot-eval.
+        expert: Who corrects it, `--expert.type=scripted` or another registered one.
+        episodes: Attempts that the intervention dataset shall hold in the end. 0: none are collected and no environment is
+            needed, see `updates`.
+        updates_per_episode: Updates after each kept attempt.
+        warmup_episodes: Attempts that the dataset holds before the first updates.
+        updates: With `episodes=0`, how many updates to make from the corrections that are there.
+        batch_size: Runs of windows per update, half of them from the demonstrations.
+        learning_rate: Of Adam, constant. The schedule that the policy was trained with has ended.
+        seed: Of the random numbers of training, and of the first evaluation episode, as in lerobot-train.
+        episode_seed: Of the first attempt; further ones take the next, but none of the evaluation's.
+        max_attempts: Attempts in a row without one to keep, after which the run ends.
+        eval_every: Rounds between two evaluations; there is one before the first round and one after the last. 0: none.
+        eval: Size of an evaluation, as in lerobot-eval.
+        eval_videos: Episodes of each evaluation that are filmed.
+        save_every: Rounds between two checkpoints that are kept for good. 0: the last and those that were evaluated.
+        output_dir: Folder of checkpoints, figures and options.
+        resume: Go on with the run in `output_dir`, or begin it if there is none; options that are not given again stay.
+        job_name: For wandb.
+        store: Where the datasets are kept in memory.
+        rename_map: The datasets' names of observations, with what the policy calls them.
+        wandb: As in lerobot-train.
+    """
+
+    demos: DatasetSource
+    interventions: DatasetSource
+    policy: PreTrainedConfig | None = None
+    env: EnvConfig | None = None
+    expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
+    episodes: int = 25
+    updates_per_episode: int = 100
+    warmup_episodes: int = 5
+    updates: int = 0
+    batch_size: int = 24
+    learning_rate: float = 1e-4
+    seed: int = 1000
+    episode_seed: int = 10_000
+    max_attempts: int = 50
+    eval_every: int = 5
+    eval: DaggerEvalConfig = field(default_factory=DaggerEvalConfig)
+    eval_videos: int = 0
+    save_every: int = 0
+    output_dir: Path = Path("outputs/dagger")
+    resume: bool = False
+    job_name: str = "dagger"
+    store: StoreConfig = field(default_factory=StoreConfig)
+    rename_map: dict[str, str] = field(default_factory=dict)
+    wandb: WandBConfig = field(default_factory=WandBConfig)
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """For LeRobot's parser: the fields that take `.path`."""
+        return ["policy"]
+
+    @property
+    def is_online(self) -> bool:
+        """Whether attempts are collected."""
+        return self.episodes > 0
+
+    @property
+    def eval_seeds(self) -> range:
+        """Of all evaluation episodes, those included that only fill the last batch of environments."""
+        n_batches = -(-self.eval.n_episodes // self.eval.batch_size)
+        return range(self.seed, self.seed + n_batches * self.eval.batch_size)
+
+    def check(self) -> None:
+        """Raise a DaggerError if a number is out of its range or an option is missing."""
+        least = {
+            "episodes": 0,
+            "updates_per_episode": 0,
+            "warmup_episodes": 1,
+            "updates": 0,
+            "episode_seed": 0,
+            "seed": 0,
+        }
+        for name, value in {**least, "max_attempts": 1, "eval_every": 0, "save_every": 0, "eval_videos": 0}.items():
+            if getattr(self, name) < value:
+                raise DaggerError(f"--{name}={getattr(self, name)}: give at least {value}.")
+        if not self.learning_rate > 0:
+            raise DaggerError(f"--learning_rate={self.learning_rate} must be above 0.")
+        if self.batch_size < 2 or self.batch_size % 2:
+            raise DaggerError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
+        if self.is_online and self.updates:
+            raise DaggerError("--updates is for --episodes=0; with episodes give --updates_per_episode.")
+        if not self.is_online and not self.updates:
+            raise DaggerError("--episodes=0 collects nothing: give --updates, how many to make from what is there.")
+        if self.is_online and self.env is None:
+            raise DaggerError(
+                "No environment: give --env.type and --env.task, or --episodes=0 --updates=N to learn from recorded "
+                "corrections alone."
+            )
+
+    def training(self) -> PlaybyearTrainConfig:
+        """The same as options of playbyear-train, for what HG-DAgger shares with it."""
+        assert self.policy is not None
+        optimizer = self.policy.get_optimizer_preset()
+        optimizer.lr = self.learning_rate
+        source = self.demos
+        return PlaybyearTrainConfig(
+            dataset=DatasetConfig(source.repo_id, root=source.root, video_backend=source.video_backend),
+            env=self.env,
+            policy=self.policy,
+            output_dir=self.output_dir,
+            job_name=self.job_name,
+            resume=self.resume,
+            seed=self.seed,
+            batch_size=self.batch_size,
+            steps=self.updates or max(self.episodes - self.warmup_episodes + 1, 1) * self.updates_per_episode,
+            num_workers=0,
+            env_eval_freq=0,
+            optimizer=optimizer,
+            eval=self.eval,
+            wandb=self.wandb,
+            rename_map=self.rename_map,
+            store=self.store,
+        )
+
+    def options(self) -> dict[str, Any]:
+        """What is kept in `dagger_config.json`; the policy is kept in the checkpoints."""
+        encoded: dict[str, Any] = draccus.encode(self)
+        return {key: value for key, value in encoded.items() if key not in ("policy", "resume")}
+
+
+def with_saved_options(args: Sequence[str]) -> list[str]:
+    """The command line of a resumed run, with the options that its output folder holds underneath.
+
+    Args:
+        args: Command-line arguments; without `--resume` they are returned as they are.
+    """
+    args = list(args)
+    is_resumed = (parser.parse_arg("resume", args) or "").lower() in ("true", "1", "yes")
+    folder = Path(parser.parse_arg("output_dir", args) or DaggerConfig.output_dir)
+    if is_resumed and parser.parse_arg("config_path", args) is None and (folder / CONFIG_NAME).is_file():
+        return [f"--config_path={folder / CONFIG_NAME}", *args]
+    return args
+
+
+def differences(folder: Path, cfg: DaggerConfig) -> list[str]:
+    """What tells a run apart from the one in an output folder: another task, other data, another expert."""
+    saved = json.loads((folder / CONFIG_NAME).read_text())
+    options = json.loads(json.dumps(cfg.options()))
+    names = ("demos", "interventions", "env", "expert", "seed", "episode_seed", "warmup_episodes", "rename_map")
+    return [
+        f"--{name} was {_brief(saved.get(name))} and is {_brief(options.get(name))}"
+        for name in names
+        if saved.get(name) != options.get(name)
+    ]
+
+
+def _brief(value: Any) -> str:
+    if not isinstance(value, dict):
+        return str(value)
+    return str({key: item for key, item in value.items() if key not in ("features", "features_map", "video_backend")})

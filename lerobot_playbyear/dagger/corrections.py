@@ -1,0 +1,118 @@
+"""The intervention dataset, on disk and in memory at once."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import torch
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+
+from lerobot_playbyear.dagger.checks import check_corrections
+from lerobot_playbyear.dagger.collector import Attempt
+from lerobot_playbyear.dagger.config import DaggerError, DatasetSource
+from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.recording import INTERVENTION, SEED, episode_frames
+
+
+class Corrections:
+    """Whole attempts with corrections; each is on disk for good before it is learned from.
+
+    Args:
+        source: Where they are kept.
+
+    Attributes:
+        store: The attempts in memory; None while there are none.
+    """
+
+    def __init__(self, source: DatasetSource) -> None:
+        self._source = source
+        self._writer: DurableWriter | None = None
+        self._keys: list[str] | None = None
+        self._device: torch.device | None = None
+        self.store: EpisodeStore | None = None
+
+    @cached_property
+    def meta(self) -> LeRobotDatasetMetadata:
+        """Of the dataset, on disk or on the Hub.
+
+        Raises:
+            DaggerError: It does not say which frames an expert chose.
+            ValueError: It is empty or damaged.
+        """
+        check_dataset_files(self._source.repo_id, self._source.root)
+        meta = LeRobotDatasetMetadata(self._source.repo_id, root=self._source.root)
+        check_corrections(meta)
+        return meta
+
+    def open_for_writing(self, fps: int, features: dict[str, dict[str, Any]], robot_type: str) -> None:
+        """Create the dataset, or take it up where it ended.
+
+        Args:
+            fps: Frames per second.
+            features: Of what is appended, from `dataset_features`.
+            robot_type: Noted in a new dataset's metadata.
+
+        Raises:
+            ValueError: It holds other features.
+            DatasetWriteError: It cannot be written, or another process writes to it.
+        """
+        folder = self._source.folder
+        self._writer = DurableWriter(self._source.repo_id, folder, fps, features, resume=True, robot_type=robot_type)
+
+    def read(self, keys: Sequence[str] | None, device: torch.device) -> None:
+        """Take what the dataset holds into memory; nothing while it is empty.
+
+        Args:
+            keys: The features that the policy's windows are cut from; None for all.
+            device: Where the store is kept.
+
+        Raises:
+            ValueError: It is damaged.
+        """
+        self._keys = None if keys is None else [*keys, INTERVENTION]
+        self._device = device
+        if self.n_episodes:
+            self._read()
+
+    def _read(self) -> None:
+        backend = self._source.video_backend
+        dataset = LeRobotDataset(self._source.repo_id, root=self._source.root, video_backend=backend)
+        has_seeds = SEED in dataset.meta.features
+        keys = self._keys and [*self._keys, *([SEED] if has_seeds else [])]
+        self.store = EpisodeStore.from_dataset(dataset, keys, self._device, backend)
+
+    @property
+    def n_episodes(self) -> int:
+        """Attempts in the dataset."""
+        return self._writer.num_episodes if self._writer is not None else self.meta.total_episodes
+
+    def append(self, attempt: Attempt) -> None:
+        """Write an attempt to disk, then take it into memory.
+
+        Raises:
+            DatasetWriteError: It could not be written; the dataset is as it was before.
+        """
+        assert self._writer is not None
+        frames = episode_frames(attempt.episode, self._writer.features)
+        for frame in frames:
+            self._writer.add_frame(frame)
+        self._writer.save_episode()
+        if self.store is None:
+            self._read()
+        else:
+            self.store.append_episode(frames)
+
+    def last(self) -> dict[str, Any]:
+        """Figures of the last attempt: its seed, its length and how much of it the expert chose."""
+        if self.store is None:
+            raise DaggerError(f"The intervention dataset in {self._source.folder} is empty.")
+        start, end = self.store.starts[-1], self.store.ends[-1]
+        share = self.store.column(INTERVENTION)[start:end].float().mean()
+        seed = self.store.column(SEED)[end - 1]
+        return {"seed": int(seed), "n_frames": end - start, "intervention_share": round(float(share), 4)}
+
+    def close(self) -> None:
+        """Nothing is appended any more."""
+        if self._writer is not None:
+            self._writer.close()

@@ -1,0 +1,232 @@
+"""The output folder of a run: options, checkpoints, figures and counters that survive being killed at any moment.
+
+`dagger_state.json` is the truth: it is replaced as a whole after every attempt, and names the checkpoint that belongs to
+it. A checkpoint is written beside its place, put on the disk and renamed before the state names it; what no state names is
+removed when the run goes on.
+"""
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
+from safetensors import SafetensorError
+
+from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError
+from lerobot_playbyear.tracking import METRICS_NAME
+
+STATE_NAME = "dagger_state.json"
+"""File in the output folder with the counters of the run and the name of its checkpoint."""
+
+_PARTIAL = ".partial"
+
+
+@dataclass
+class RunState:
+    """How far a run is.
+
+    Attributes:
+        policy_path: The policy that the run began with.
+        policy_overrides: Its options on the command line.
+        first_episodes: Attempts that the intervention dataset held when the run began; None before.
+        round: Rounds done: a kept attempt and the updates after it, or, without collecting, only updates.
+        step: Updates done.
+        attempts: Attempts made.
+        kept, failed, unneeded, discarded: What became of them: solved with the expert's help; not solved; solved without
+            it; ended by the expert as void.
+        next_seed: Of the next attempt.
+        evaluated_round: The round after which the last evaluation took place; -1 for none.
+        success: What it gave [%].
+        checkpoint: Folder of the newest weights; None before the first update.
+        milestones: Checkpoints that are kept for good.
+        wandb_run_id: To go on with the same run there.
+    """
+
+    policy_path: str
+    policy_overrides: list[str] = field(default_factory=list)
+    first_episodes: int | None = None
+    round: int = 0
+    step: int = 0
+    attempts: int = 0
+    kept: int = 0
+    failed: int = 0
+    unneeded: int = 0
+    discarded: int = 0
+    next_seed: int = 0
+    evaluated_round: int = -1
+    success: float | None = None
+    checkpoint: str | None = None
+    milestones: list[str] = field(default_factory=list)
+    wandb_run_id: str | None = None
+
+
+class RunFolder:
+    """Reads and writes the output folder.
+
+    Args:
+        path: The folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.checkpoints = self.path / CHECKPOINTS_DIR
+
+    def claim(self, resume: bool) -> RunState | None:
+        """Find out whether there is a run to go on with.
+
+        Args:
+            resume: Whether that is wanted.
+
+        Returns:
+            The state of the run, or None when a new one begins.
+
+        Raises:
+            DaggerError: The folder holds a run and `resume` is off, or it holds something else.
+        """
+        is_run = (self.path / CONFIG_NAME).is_file()
+        if not self.path.exists() or not any(self.path.iterdir()):
+            return None
+        if not is_run:
+            raise DaggerError(
+                f"--output_dir={self.path} holds files, but no run of playbyear-dagger (no {CONFIG_NAME}): choose another."
+            )
+        if not resume:
+            raise DaggerError(
+                f"--output_dir={self.path} holds a run already: go on with it with --resume=true, or choose another folder."
+            )
+        state = self.path / STATE_NAME
+        return RunState(**json.loads(state.read_text())) if state.is_file() else None
+
+    def begin(self, cfg: DaggerConfig, state: RunState) -> None:
+        """Make the folder of a new run; or note the options of one that goes on, and remove what was in progress."""
+        with _errors_of_writing(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            _replace(self.path / CONFIG_NAME, json.dumps(cfg.options(), indent=1))
+        self.commit(state)
+        self.clean(state)
+        self._forget_metrics(state)
+
+    def commit(self, state: RunState) -> None:
+        """Make `state` the truth.
+
+        Raises:
+            DaggerError: It cannot be written. The state before is unharmed.
+        """
+        with _errors_of_writing(self.path):
+            _replace(self.path / STATE_NAME, json.dumps(asdict(state), indent=1))
+
+    def checkpoint(self, state: RunState) -> Path | None:
+        """The folder of the newest weights, None before the first update.
+
+        Raises:
+            DaggerError: It is not there any more.
+        """
+        if state.checkpoint is None:
+            return None
+        folder = self.checkpoints / state.checkpoint
+        if not folder.is_dir():
+            raise DaggerError(f"{folder} is missing: the run cannot go on without its last checkpoint.")
+        return folder
+
+    def save_checkpoint(self, name: str, write: Callable[[Path], Any]) -> None:
+        """Write a checkpoint as a whole: it is at its place and on the disk, or not there at all.
+
+        Args:
+            name: Of its folder.
+            write: Writes the files into the folder it is given.
+
+        Raises:
+            DaggerError: It cannot be written; those before are unharmed.
+        """
+        partial, folder = self.checkpoints / (name + _PARTIAL), self.checkpoints / name
+        shutil.rmtree(partial, ignore_errors=True)
+        with _errors_of_writing(self.path, partial):
+            write(partial)
+            for path in [*partial.rglob("*"), partial]:
+                _flush(path)
+            if folder.exists():  # from a round that was not completed
+                shutil.rmtree(folder)
+            os.replace(partial, folder)
+            _flush(self.checkpoints)
+
+    def clean(self, state: RunState) -> None:
+        """Remove checkpoints that are neither the newest nor milestones, and let `last` name the newest."""
+        if not self.checkpoints.is_dir():
+            return
+        wanted = {*state.milestones, state.checkpoint}
+        for path in self.checkpoints.iterdir():
+            if path.is_dir() and not path.is_symlink() and path.name not in wanted:
+                shutil.rmtree(path, ignore_errors=True)
+        if state.checkpoint is not None:
+            link = self.checkpoints / (LAST_CHECKPOINT_LINK + _PARTIAL)
+            link.unlink(missing_ok=True)
+            link.symlink_to(state.checkpoint)
+            os.replace(link, self.checkpoints / LAST_CHECKPOINT_LINK)
+
+    # Figures
+
+    def append_metrics(self, line: dict[str, Any]) -> None:
+        """Add a line to the figures. It holds only once a state that knows of it was committed."""
+        with _errors_of_writing(self.path), (self.path / METRICS_NAME).open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def _forget_metrics(self, state: RunState) -> None:
+        """Drop lines of what was in progress when the run was killed; it is done again."""
+        path = self.path / METRICS_NAME
+        if not path.is_file():
+            return
+        done = {"attempt": state.attempts, "round": state.round, "eval": state.evaluated_round}
+        kept = []
+        for text in path.read_text().splitlines():
+            line = _parsed(text)
+            if line is not None and line["attempt" if line["kind"] == "attempt" else "round"] <= done[line["kind"]]:
+                kept.append(text + "\n")
+        with _errors_of_writing(self.path):
+            _replace(path, "".join(kept))
+
+
+def _parsed(text: str) -> dict[str, Any] | None:
+    """A line of figures; None if it was cut off."""
+    try:
+        line: dict[str, Any] = json.loads(text)
+    except json.JSONDecodeError:
+        return None
+    return line
+
+
+def _replace(path: Path, content: str) -> None:
+    """Write a file so that at every moment the old or the new one is there."""
+    partial = path.with_name(path.name + _PARTIAL)
+    partial.write_text(content)
+    _flush(partial)
+    os.replace(partial, path)
+    _flush(path.parent)
+
+
+def _flush(path: Path) -> None:
+    """Ask the operating system to put a file, or the entries of a folder, on the disk itself."""
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _errors_of_writing(folder: Path, partial: Path | None = None) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, SafetensorError) as error:
+        if partial is not None:
+            shutil.rmtree(partial, ignore_errors=True)
+        raise DaggerError(
+            f"Cannot write to {folder}: {error}. What was saved before is complete; once there is room, go on with "
+            "--resume=true."
+        ) from error

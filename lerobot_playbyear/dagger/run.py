@@ -1,0 +1,209 @@
+"""A run of HG-DAgger from its options: what it needs is made and checked, then `Loop` runs."""
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import gymnasium as gym
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot.utils.utils import init_logging, inside_slurm
+
+from lerobot_playbyear.dagger.batches import BalancedBatches
+from lerobot_playbyear.dagger.checks import check_alike, check_dataset
+from lerobot_playbyear.dagger.collector import PolicyActor
+from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError, differences
+from lerobot_playbyear.dagger.corrections import Corrections
+from lerobot_playbyear.dagger.folder import RunFolder, RunState
+from lerobot_playbyear.dagger.loop import Loop
+from lerobot_playbyear.dagger.report import Report
+from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
+from lerobot_playbyear.datasets.durable import DatasetWriteError
+from lerobot_playbyear.recording import dataset_features, env_spec, next_seed
+from lerobot_playbyear.rollouts import RolloutError, env_facts
+from lerobot_playbyear.tracking import METRICS_NAME
+from lerobot_playbyear.train_config import PlaybyearTrainConfig
+from lerobot_playbyear.training import PolicyWindows, TrainingParts, dataset_names, make_training_parts
+
+
+def run_dagger(cfg: DaggerConfig) -> Path:
+    """Improve a policy with an expert's corrections.
+
+    Args:
+        cfg: The options.
+
+    Returns:
+        The output folder.
+
+    Raises:
+        DaggerError: If options, policy, data and environment do not go together, before any work is done; or if the
+            run cannot go on. What was saved before is safe.
+    """
+    init_logging()
+    logging.getLogger("lerobot.configs.video").setLevel(
+        logging.WARNING
+    )  # it has a line for every attempt that is saved
+    with _errors_of_input():
+        cfg.check()
+        folder = RunFolder(cfg.output_dir)
+        state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
+        with ExitStack() as stack:
+            _run(cfg, folder, state, stack)
+    _print_results(cfg, folder, state)
+    return folder.path
+
+
+def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None) -> RunState:
+    """The state of a run that goes on, or of a new one; and the policy's configuration, which goes into `cfg`."""
+    given = parser.get_path_arg("policy")
+    if given is None and cfg.policy is not None and cfg.policy.pretrained_path:
+        given = str(cfg.policy.pretrained_path)
+    overrides = list(parser.get_cli_overrides("policy") or [])
+    if state is None:
+        if given is None:
+            raise DaggerError(
+                "HG-DAgger improves a trained policy: give its folder or its name on the Hub, --policy.path."
+            )
+        if (folder.path / CONFIG_NAME).is_file():
+            logging.info(f"{folder.path}: the run was ended before its first attempt and begins anew.")
+        state = RunState(policy_path=given, policy_overrides=overrides, first_episodes=None)
+    else:
+        changed = differences(folder.path, cfg)
+        if given is not None and given != state.policy_path:
+            changed.append(f"--policy.path was {state.policy_path} and is {given}")
+        if changed:
+            raise DaggerError(
+                f"--output_dir={folder.path} holds another run: {'; '.join(changed)}. Leave these options out to go on "
+                "with it, or choose another folder."
+            )
+    checkpoint = folder.checkpoint(state)
+    source = state.policy_path if checkpoint is None else str(checkpoint / PRETRAINED_MODEL_DIR)
+    if checkpoint is None and not overrides:
+        overrides = state.policy_overrides
+    cfg.policy = PreTrainedConfig.from_pretrained(source, cli_overrides=overrides)
+    cfg.policy.pretrained_path = source  # type: ignore[assignment]
+    if cfg.policy.push_to_hub and not cfg.policy.repo_id:
+        raise DaggerError(
+            "--policy.push_to_hub=true needs a name: give --policy.repo_id, or --policy.push_to_hub=false."
+        )
+    return state
+
+
+def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack) -> None:
+    assert cfg.policy is not None
+    check_dataset_files(cfg.demos.repo_id, cfg.demos.root)
+    demos = LeRobotDataset(cfg.demos.repo_id, root=cfg.demos.root, video_backend=cfg.demos.video_backend)
+    check_dataset(cfg.policy, demos.meta, cfg.rename_map)
+    env = _make_env(cfg, stack) if cfg.is_online else None
+    expert = cfg.expert.make(env) if env is not None else None
+    if expert is not None:
+        stack.callback(expert.close)
+    corrections = Corrections(cfg.interventions)
+    stack.callback(corrections.close)
+    observed = list(dataset_names(cfg.policy, cfg.rename_map).values())
+    if env is not None and cfg.env is not None:
+        facts = env_facts(env)
+        features = dataset_features(facts)
+        check_alike(observed, demos.meta, features, facts.fps, f"--env.type={cfg.env.type}")
+        corrections.open_for_writing(facts.fps, features, cfg.env.type)
+    else:
+        check_alike(observed, demos.meta, corrections.meta.features, corrections.meta.fps, "the corrections")
+    if state.first_episodes is None:
+        state.first_episodes = corrections.n_episodes
+        state.next_seed = next_seed(cfg.interventions.folder, cfg.episode_seed) if cfg.is_online else 0
+    _check_there_is_something_to_do(cfg, state, corrections)
+
+    training = cfg.training()
+    training.resume, training.checkpoint_path = state.checkpoint is not None, folder.checkpoint(state)
+    parts = make_training_parts(training, demos.meta, keep_normalization=True)
+    windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
+    demonstrations = _read(demos, windows, cfg)
+    corrections.read(windows.keys, demonstrations.device)
+    batches = BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed)
+
+    folder.begin(cfg, state)
+    report = stack.enter_context(_make_report(cfg, folder, state, training))
+    scene = None
+    if env is not None and cfg.env is not None and expert is not None:
+        policy = parts.accelerator.unwrap_model(parts.policy)
+        actor = PolicyActor(policy, cfg.env, parts.preprocessor, parts.postprocessor, parts.accelerator.autocast)
+        scene = (env, actor, expert)
+    Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, report, scene).run()
+    if cfg.policy.push_to_hub:
+        _push(training, parts, demos)
+
+
+def _make_env(cfg: DaggerConfig, stack: ExitStack) -> gym.Env:
+    assert cfg.env is not None
+    env = env_spec(cfg.env).make()
+    stack.callback(env.close)
+    return env
+
+
+def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, corrections: Corrections) -> None:
+    if not cfg.is_online and corrections.n_episodes == 0:
+        raise DaggerError(
+            f"The intervention dataset '{cfg.interventions.repo_id}' is empty: collect attempts with --episodes, or give one "
+            "that holds some."
+        )
+    if cfg.is_online and state.kept == 0 and corrections.n_episodes >= cfg.episodes:
+        raise DaggerError(
+            f"The intervention dataset holds {corrections.n_episodes} attempts already, and --episodes={cfg.episodes} asks for "
+            "no more: give a larger number, or --episodes=0 --updates=N to learn from what is there."
+        )
+
+
+def _read(dataset: LeRobotDataset, windows: PolicyWindows, cfg: DaggerConfig) -> EpisodeStore:
+    start = time.perf_counter()
+    backend = cfg.demos.video_backend
+    store = EpisodeStore.from_dataset(dataset, windows.keys, cfg.store.device, backend, progress=not inside_slurm())
+    logging.info(f"{store.n_episodes} demonstrations in memory after {time.perf_counter() - start:.1f} s")
+    return store
+
+
+def _make_report(cfg: DaggerConfig, folder: RunFolder, state: RunState, training: PlaybyearTrainConfig) -> Report:
+    training.resume, training.wandb.run_id = state.wandb_run_id is not None, state.wandb_run_id
+    total, unit = (cfg.episodes, "episode") if cfg.is_online else (cfg.updates, "update")
+    report = Report(folder, state, training, total, unit)
+    state.wandb_run_id = training.wandb.run_id = report.wandb_run_id
+    training.resume = False  # checkpoints of a resumed run are those of one that was not
+    return report
+
+
+def _push(training: PlaybyearTrainConfig, parts: TrainingParts, demos: LeRobotDataset) -> None:
+    policy = parts.accelerator.unwrap_model(parts.policy)
+    policy.push_model_to_hub(training, dataset_meta=demos.meta)
+    for processor in (parts.preprocessor, parts.postprocessor):
+        processor.push_to_hub(policy.config.repo_id)
+
+
+@contextmanager
+def _errors_of_input() -> Iterator[None]:
+    try:
+        yield
+    except DaggerError:
+        raise
+    except (ValueError, FileExistsError, FileNotFoundError, MemoryError, RolloutError, DatasetWriteError) as error:
+        raise DaggerError(str(error)) from error
+
+
+def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> None:
+    print(f"\nFigures:     {folder.path / METRICS_NAME}")
+    if cfg.is_online:
+        print(
+            f"Attempts:    {state.attempts}: {state.kept} kept in {cfg.interventions.folder}, {state.failed} failed, "
+            f"{state.unneeded} needed no help"
+        )
+    if state.success is not None:
+        print(f"Success:     {state.success:.1f} % of {cfg.eval.n_episodes} episodes")
+    if state.checkpoint is None:
+        print("No update was made: --warmup_episodes is larger than what was collected.")
+        return
+    policy = folder.checkpoints / "last" / PRETRAINED_MODEL_DIR
+    env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."
+    print(f"Policy:      {policy}")
+    print(f"Evaluate:    lerobot-eval --policy.path={policy}{env}")
+    print(f"Go on:       playbyear-dagger --resume=true --output_dir={folder.path} --episodes=...")
