@@ -27,6 +27,7 @@ lint: install  ## Style and types
 	$(BIN)/mypy
 
 test: lint  ## Style, types and tests
+	./tools/browser.sh
 	$(BIN)/pytest
 
 test-slow: install  ## The tests that take minutes

@@ -3,6 +3,7 @@
 import base64
 import itertools
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -57,7 +58,8 @@ class Browser:
         self.requests: list[str] = []
         self.messages: list[str] = []
         self._ids = itertools.count(1)
-        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        environment = {**os.environ, "TMPDIR": str(profile)}  # what it leaves goes with the profile
+        self._process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         self._resources = ExitStack()
         self._socket = self._resources.enter_context(self._attach(profile))
         for domain in ("Page", "Network", "Runtime"):

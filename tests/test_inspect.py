@@ -222,6 +222,17 @@ def test_statistics_of_other_data_are_an_error(clean, tmp_path):
     assert "recompute_stats" in verdict.message
 
 
+def test_one_statistic_for_all_samples_of_a_microphone_is_understood(clean, tmp_path):
+    root = copy(clean, tmp_path)
+    samples = pq.read_table(root / "data")[MICROPHONE].combine_chunks().flatten().to_numpy().astype(float)
+    one = {"min": samples.min(), "max": samples.max(), "mean": samples.mean(), "std": samples.std()}
+    repeated = {name: [value] * BLOCK for name, value in one.items()}
+    edit(root, lambda stats: stats[MICROPHONE].update(repeated), "stats.json")
+    assert found(look(root)) == {}
+    edit(root, lambda stats: stats[MICROPHONE].update(max=[samples.max() * 2] * BLOCK), "stats.json")
+    assert list(found(look(root))) == ["statistics"]
+
+
 def test_frames_that_the_metadata_does_not_know_of_are_an_error(clean, tmp_path):
     root = copy(clean, tmp_path)
     (path,) = root.glob("data/*/*.parquet")

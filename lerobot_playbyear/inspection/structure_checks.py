@@ -146,7 +146,10 @@ def _is_whole(source: DatasetSource, episode: Episode) -> bool:
 
 
 def _stats_difference(values: np.ndarray, stats: dict[str, np.ndarray]) -> str | None:
-    """What differs, in words; statistics per element, or one number for all elements, are both compared."""
+    """What differs, in words.
+
+    Statistics are per element, or one number for all elements of a row, given once or repeated for each.
+    """
     values = values.reshape(len(values), -1).astype(np.float64)  # (N, D)
     if not np.isfinite(values).all():
         return None  # a finding of its own
@@ -154,7 +157,9 @@ def _stats_difference(values: np.ndarray, stats: dict[str, np.ndarray]) -> str |
         if name not in stats:
             return f"no {name}"
         stored = np.asarray(stats[name], np.float64).reshape(-1)
-        axis = 0 if stored.size == values.shape[1] else None
+        if stored.size > 1 and (stored == stored[0]).all():
+            stored = stored[:1]
+        axis = 0 if stored.size == values.shape[1] > 1 else None
         if axis is None and stored.size != 1:
             return f"{name} has {stored.size} values for {values.shape[1]} elements"
         actual = np.atleast_1d(compute(values, axis=axis))
