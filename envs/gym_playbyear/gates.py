@@ -54,7 +54,7 @@ class GateConfig:
     hover_change: float = 0.05
     still_steps: int = 24
     still_distance: float = 0.005
-    shove_share: float = 0.35
+    shove_share: float = 0.3
     push_step: float = 0.003
     grasp_reach: float = 0.012
     grasp_height: float = 0.034
@@ -103,8 +103,8 @@ class InterventionGate:
         """
         action = np.asarray(policy_action, dtype=float)
         self._look()
-        if self.reason is not None and self._has_advanced():
-            self.reason = None
+        if self.reason is not None and _STAGES[self.expert.phase] > self._stage:
+            self.reason = None  # found, held or lifted: the policy may go on
         if self.reason is None:
             self.reason = self._find_reason(action)
             if self.reason is not None:
@@ -127,10 +127,6 @@ class InterventionGate:
             self._touched_at = self._n_steps
         self._was_held |= self._holds() and self._cube_height() > 0.01
         self._positions.append(self.env.eef_position)
-
-    def _has_advanced(self) -> bool:
-        """Whether the expert went from searching to grasping, from grasping to lifting, or from lifting to carrying."""
-        return _STAGES[self.expert.phase] > self._stage
 
     def _height(self) -> float:
         """Of the fingertips' middle above the table [m]."""
@@ -165,9 +161,7 @@ class InterventionGate:
 
     def _is_over_tray(self) -> bool:
         tray = getattr(self.env, "bin_position", None)
-        if tray is None:
-            return False
-        return bool(np.abs(self.env.cube_position - tray)[:2].max() < self.config.release_reach)
+        return tray is not None and bool(np.abs(self.env.cube_position - tray)[:2].max() < self.config.release_reach)
 
     def _before_cube(self) -> bool:
         """Whether a sweep from here can still touch the cube."""
@@ -180,7 +174,7 @@ class InterventionGate:
             return "still" if self._is_still() else None
         holds = self._holds()
         checks = {
-            "pushes": not holds and self._pushes(action),
+            "pushes": self._drags(action) if holds else self._pushes(action),
             "closes": not holds and action[3] > 0 and self._is_open() and not self._is_between(),
             "opens": holds and action[3] <= 0,
             "dropped": not holds and self._was_held and np.linalg.norm(self._offset()) > self.config.drop_distance,
@@ -188,17 +182,24 @@ class InterventionGate:
             "strayed": not holds and self._strayed(),
             "hovers": not holds and self._hovers(action),
             "still": self._is_still(),
-            "late": self._is_late(),
+            "late": self.env._max_episode_steps - self._n_steps <= self._steps_needed() + self.config.slack_steps,
         }
         return next((reason for reason, applies in checks.items() if applies), None)
 
     def _pushes(self, action: np.ndarray) -> bool:
         """Goes on pushing a cube that it has touched."""
+        towards = action[1] * ACTION_SCALE * np.sign(self._offset()[1]) > self.config.push_step
+        return bool(self._touches() and towards and not self._is_between() and self._is_shoved())
+
+    def _drags(self, action: np.ndarray) -> bool:
+        """Holds the cube and does not lift it, but moves it along the table."""
+        along, up = np.linalg.norm(action[:2]) * ACTION_SCALE, action[2] * ACTION_SCALE
+        lifts = self._cube_height() > 0.01 or up > self.config.push_step
+        return bool(along > 1.5 * self.config.push_step and not lifts and self._is_shoved())
+
+    def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
-        offset = self._offset()
-        towards = action[1] * ACTION_SCALE * np.sign(offset[1]) > self.config.push_step
-        limit = self.config.shove_share * self.env.variant.max_shove
-        return bool(self._touches() and towards and not self._is_between() and moved > limit)
+        return bool(moved > self.config.shove_share * self.env.variant.max_shove)
 
     def _missed(self) -> bool:
         """High above the table without the cube, although it was touched or should have been."""
@@ -224,12 +225,9 @@ class InterventionGate:
         return bool(np.abs(action - self._last_action).max() < self.config.hover_change)
 
     def _is_still(self) -> bool:
+        first, last = self._positions[0], self._positions[-1]
         full = len(self._positions) == self._positions.maxlen
-        return bool(full and np.linalg.norm(self._positions[-1] - self._positions[0]) < self.config.still_distance)
-
-    def _is_late(self) -> bool:
-        left = self.env._max_episode_steps - self._n_steps
-        return left <= self._steps_needed() + self.config.slack_steps
+        return bool(full and np.linalg.norm(last - first) < self.config.still_distance)
 
     def _steps_needed(self) -> float:
         """How many steps the expert needs from here, roughly."""
@@ -276,9 +274,9 @@ class InterventionGate:
             return "grasp"
         if self._touches() and self._is_low():
             return "dwell"
-        if self._height() < config.clear_height - config.tolerance:
-            return "descend" if abs(self._offset()[1]) < config.tolerance and self._is_open() else "rise"
-        return "hop"
+        if self._height() > config.clear_height - config.tolerance:
+            return "hop"
+        return "descend" if abs(self._offset()[1]) < config.tolerance and self._is_open() else "rise"
 
     def _fitting_search_phase(self) -> str:
         config = self.expert.config
