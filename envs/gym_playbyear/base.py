@@ -44,7 +44,9 @@ _LIFTED_SILENCE_HEIGHT = 0.84  # m: above it the paper's force proxy is silent (
 class SensorNoise:
     """Standard deviation and quantum of what the arm measures of itself, as on a real one. Zero switches noise off.
 
-    position: end effector [m]; finger: finger positions [m]; finger_velocity: [m/s]; quantum_*: rounding step.
+    position: end effector [m]; finger: finger positions [m]; finger_velocity: [m/s]; quantum_*: rounding step;
+    differentiated: finger velocities are differences of the measured positions over a step, as from a hand that reports
+    its width alone; otherwise they are the fingers' own at the moment, in which every touch rings.
     """
 
     position: float = 0.0003
@@ -52,6 +54,7 @@ class SensorNoise:
     finger_velocity: float = 0.002
     quantum_position: float = 0.0001
     quantum_velocity: float = 0.001
+    differentiated: bool = True
 
 
 @dataclass(frozen=True)
@@ -319,6 +322,10 @@ class PlayByEarEnv(gym.Env):
         quantum = np.repeat([noise.quantum_position, noise.quantum_velocity], (5, 2))
         coarse = quantum > 0
         values[coarse] = np.round(values[coarse] / quantum[coarse]) * quantum[coarse]
+        if noise.differentiated:
+            before = values[3:5] if self._n_steps == 0 else self._measured_fingers
+            self._measured_fingers = values[3:5].copy()
+            values[5:] = (values[3:5] - before) * CONTROL_HZ
         return values.astype(np.float32)
 
     def _front_camera(self) -> SceneRenderer:

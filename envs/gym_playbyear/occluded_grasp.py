@@ -89,7 +89,7 @@ class OccludedGraspEnv(PlayByEarEnv):
             cube_friction=5,
             horizon=250,
             arm=replace(ArmConfig(), max_opening=0.08, gripper_cooldown=0.0),
-            sensors=SensorNoise(0, 0, 0, 0, 0),
+            sensors=SensorNoise(0, 0, 0, 0, 0, differentiated=False),
         ),
     }
 

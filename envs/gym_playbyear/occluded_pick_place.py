@@ -92,7 +92,7 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
             cube_friction=5,
             horizon=400,
             arm=replace(ArmConfig(), max_opening=0.08, gripper_cooldown=0.0),
-            sensors=SensorNoise(0, 0, 0, 0, 0),
+            sensors=SensorNoise(0, 0, 0, 0, 0, differentiated=False),
         ),
     }
 

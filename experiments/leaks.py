@@ -1,0 +1,126 @@
+"""What does the arm's state tell of a touch? A classifier looks for contact in what a deaf policy observes.
+
+    python -m experiments.leaks
+
+A hand sweeps as the expert does, but feels nothing and goes on until the cube was shoved too far; a twin with the same
+random numbers sweeps where no cube is. From the last ten observations of the arm's state, a small network has to tell the
+frames in contact from the twin's same frames; its area under the curve on held-out episodes is 0.5 where nothing leaks.
+Rows are sensors, columns what the network is shown.
+"""
+
+import argparse
+import json
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gym_playbyear.base import SensorNoise
+from gym_playbyear.experts import ExpertConfig, GraspExpert
+from torch import nn
+
+from experiments.protocol import RESULTS
+
+TASK = "OccludedGrasp-v0"
+_ASIDE = -0.15  # x of a cube that is not in the way [m]
+_HISTORY = 10  # frames, as long as the policy's memory
+_PARTS = {"all": range(7), "hand": range(3), "fingers": (3, 4), "finger velocities": (5, 6)}
+_SENSORS = {
+    "the simulator's own state": SensorNoise(0, 0, 0, 0, 0, differentiated=False),
+    "noise, velocities of their own": SensorNoise(differentiated=False),
+    "noise, velocities from widths": SensorNoise(),
+}
+
+
+def twin_sweeps(sensors: SensorNoise, seeds: range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames in which a hand that feels nothing touches the cube, and the same frames of twins without a cube in the way.
+
+    Returns:
+        States (N, 10, 7), the hand's relative to the newest; whether the cube was touched (N,); the seeds (N,).
+    """
+    env = gym.make(f"gym_playbyear:gym_playbyear/{TASK}", image_size=8, sound="none", disable_env_checker=True)
+    task = env.unwrapped
+    task.variant = replace(task.variant, sensors=sensors)
+    windows, touched, of_seed = [], [], []
+    for seed in seeds:
+        states, contacts = _sweep(env, seed, None)
+        without, _ = _sweep(env, seed, (_ASIDE, float(task.cube_position[1])))
+        for t in (t for t in contacts if _HISTORY <= t + 1 <= len(without)):
+            for episode, label in ((states, True), (without, False)):
+                window = np.stack(episode[t + 1 - _HISTORY : t + 1])
+                window[:, :3] -= window[-1, :3]
+                windows.append(window)
+                touched.append(label)
+                of_seed.append(seed)
+    env.close()
+    return np.stack(windows), np.array(touched), np.array(of_seed)
+
+
+def _sweep(env: gym.Env, seed: int, cube: tuple[float, float] | None) -> tuple[list[np.ndarray], list[int]]:
+    """The observed states of a numb sweep, and in which of them the cube is touched."""
+    observation, _ = env.reset(seed=seed, options={} if cube is None else {"cube_position": cube})
+    task = env.unwrapped
+    numb = GraspExpert(task, ExpertConfig(contact_force=np.inf))
+    states, contacts, ended = [observation["agent_pos"]], [], False
+    while not ended:
+        sweeping = numb.phase == "sweep"
+        observation, _, terminated, truncated, _ = env.step(numb.act())
+        states.append(observation["agent_pos"])
+        if sweeping and task.contact_forces["gripper-cube"] > 0:
+            contacts.append(len(states) - 1)
+        ended = terminated or truncated
+    return states, contacts
+
+
+def area_under_curve(scores: np.ndarray, positive: np.ndarray) -> float:
+    """The probability that a positive scores above a negative (Mann and Whitney, 1947)."""
+    ranks = np.argsort(np.argsort(scores)) + 1
+    n = int(positive.sum())
+    return float((ranks[positive].sum() - n * (n + 1) / 2) / (n * (len(scores) - n)))
+
+
+def contact_auc(windows: np.ndarray, touched: np.ndarray, held_out: np.ndarray, dims: list[int]) -> float:
+    """How well a network with two hidden layers tells contact from free sweep on held-out episodes."""
+    torch.manual_seed(0)
+    inputs = torch.tensor(windows[:, :, dims].reshape(len(windows), -1), dtype=torch.float32)
+    train = torch.tensor(~held_out)
+    inputs = (inputs - inputs[train].mean(0)) / (inputs[train].std(0) + 1e-6)
+    labels = torch.tensor(touched, dtype=torch.float32)
+    network = nn.Sequential(
+        nn.Linear(inputs.shape[1], 64), nn.ReLU(), nn.Dropout(0.3), nn.Linear(64, 64), nn.ReLU(), nn.Linear(64, 1)
+    )
+    optimizer = torch.optim.AdamW(network.parameters(), 1e-3, weight_decay=0.01)
+    weight = (~touched & ~held_out).sum() / (touched & ~held_out).sum()
+    loss_of = nn.BCEWithLogitsLoss(pos_weight=torch.tensor(float(weight)))
+    frames = train.nonzero().squeeze(1)
+    for _ in range(2000):
+        batch = frames[torch.randint(len(frames), (256,))]
+        loss = loss_of(network(inputs[batch]).squeeze(1), labels[batch])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    network.eval()
+    with torch.no_grad():
+        scores = network(inputs[~train]).squeeze(1).numpy()
+    return area_under_curve(scores, touched[held_out])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--n_episodes", type=int, default=200)
+    n_episodes = parser.parse_args().n_episodes
+    report = {}
+    for name, sensors in _SENSORS.items():
+        windows, touched, seeds = twin_sweeps(sensors, range(3000, 3000 + n_episodes))
+        held_out = seeds % 4 == 0
+        report[name] = {
+            part: round(contact_auc(windows, touched, held_out, list(dims)), 3) for part, dims in _PARTS.items()
+        }
+        print(name, f"{touched.sum()} of {len(touched)} frames in contact", json.dumps(report[name]), flush=True)
+    output = RESULTS / "leaks.json"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
