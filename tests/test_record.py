@@ -1,10 +1,7 @@
-"""`playbyear-record` and the writer beneath it: what is on disk, and what survives."""
+"""`playbyear-record`: what is on disk, and what is said when it cannot be."""
 
-import contextlib
 import multiprocessing
 import os
-import resource
-import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -16,23 +13,12 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
+from recording_factory import FEATURES
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.datasets import durable
-from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
+from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, RecordError, env_spec, record
 from lerobot_playbyear.rollouts import RolloutError, RolloutPool
-
-FEATURES = {
-    "observation.images.front": {"dtype": "image", "shape": (16, 16, 3), "names": ["height", "width", "channel"]},
-    "observation.audio.gripper": {
-        "dtype": "int16",
-        "shape": (80,),
-        "names": None,
-        "info": {"sample_rate": 1600, "encoding": "pcm_s16"},
-    },
-    "action": {"dtype": "float32", "shape": (4,), "names": None},
-}
 
 
 def config(root: Path, num_episodes: int = 2, **options) -> RecordConfig:
@@ -51,21 +37,6 @@ def column(root: Path, key: str) -> np.ndarray:
 
 def tables(root: Path) -> list[dict]:
     return [pq.read_table(path).to_pylist() for path in sorted(root.glob("data/*/*.parquet"))]
-
-
-def frame(value: int) -> dict:
-    return {
-        "observation.images.front": np.full((16, 16, 3), value % 256, np.uint8),
-        "observation.audio.gripper": np.full(80, value, np.int16),
-        "action": np.full(4, value, np.float32),
-        "task": "test",
-    }
-
-
-def write_episode(writer: DurableWriter, value: int, length: int = 3) -> None:
-    for _ in range(length):
-        writer.add_frame(frame(value))
-    writer.save_episode()
 
 
 @pytest.fixture(scope="module")
@@ -246,109 +217,3 @@ def test_the_command_prints_one_line_for_an_unknown_task(tmp_path):
     assert result.returncode != 0
     assert "OccludedGrasp-v0, OccludedPickPlace-v0" in result.stderr
     assert "Traceback" not in result.stderr
-
-
-# Durability
-
-
-class PowerCut(BaseException):
-    """Stops the process at a chosen moment, so that no clean-up of ours runs."""
-
-
-@pytest.mark.parametrize("moves_before", range(7))
-def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, monkeypatch, moves_before):
-    """At every move: the dataset loads before and after recovery, and recording goes on."""
-    root = tmp_path / "dataset"
-    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
-        write_episode(writer, 0)
-    writer = DurableWriter("test/recorded", root, 20, FEATURES, resume=True)
-    moves = iter(range(100))
-    real_replace = os.replace
-
-    def replace(source, target):
-        if next(moves) == moves_before:
-            raise PowerCut
-        real_replace(source, target)
-
-    monkeypatch.setattr(durable.os, "replace", replace)
-    with contextlib.suppress(PowerCut):  # the largest number of moves is more than there are
-        write_episode(writer, 1)
-    monkeypatch.undo()
-    writer._lock.release()
-
-    crashed = load(root)
-    assert [int(crashed[i]["observation.audio.gripper"][0]) for i in range(3)] == [0, 0, 0]
-    with DurableWriter("test/recorded", root, 20, FEATURES, resume=True) as writer:
-        survived = writer.num_episodes
-        assert survived == (1 if moves_before == 0 else 2)  # the journal is the first move, and the point of no return
-        write_episode(writer, 2)
-    values = column(root, "observation.audio.gripper")[:, 0].tolist()
-    assert values == [0] * 3 + [1] * 3 * (survived - 1) + [2] * 3
-    stats = load(root).meta.stats["action"]
-    assert int(stats["count"][0]) == len(values)
-    assert stats["mean"] == pytest.approx(np.full(4, np.mean(values)))
-
-
-_WRITE_FOREVER = """
-import sys
-sys.path.insert(0, {tests!r})
-from test_record import FEATURES, write_episode
-from lerobot_playbyear.datasets.durable import DurableWriter
-writer = DurableWriter("test/recorded", {root!r}, 20, FEATURES, resume=True)
-while True:
-    write_episode(writer, writer.num_episodes)
-    print(writer.num_episodes, flush=True)
-"""
-
-
-def test_episodes_survive_sigkill(tmp_path):
-    root = tmp_path / "dataset"
-    saved = 0
-    script = _WRITE_FOREVER.format(tests=str(Path(__file__).parent), root=str(root))
-    process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    while saved < 4:
-        saved = int(process.stdout.readline())
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert load(root).num_episodes >= saved
-    values = column(root, "observation.audio.gripper")[:, 0]
-    assert values[: 3 * saved].tolist() == np.repeat(np.arange(saved), 3).tolist()
-    with DurableWriter("test/recorded", root, 20, FEATURES, resume=True) as writer:
-        write_episode(writer, 99)
-    assert column(root, "observation.audio.gripper")[-1, 0] == 99
-
-
-def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path):
-    root = tmp_path / "dataset"
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
-        write_episode(writer, 0)
-        noise = np.random.default_rng(0)
-        for _ in range(60):
-            noisy = {**frame(1), "observation.images.front": noise.integers(0, 255, (16, 16, 3), np.uint8)}
-            writer.add_frame(noisy)
-        try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (16384, limits[1]))
-            with pytest.raises(DatasetWriteError, match=r"Episode 1 could not be written.*1 episodes before it"):
-                writer.save_episode()
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert load(root).num_episodes == 1
-    assert len(column(root, "action")) == 3
-
-
-def test_two_processes_cannot_write_to_one_dataset(tmp_path):
-    root = tmp_path / "dataset"
-    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
-        write_episode(writer, 0)
-        with pytest.raises(DatasetWriteError, match="Another process is writing"):
-            DurableWriter("test/recorded", root, 20, FEATURES, resume=True)
-
-
-def test_nothing_but_the_dataset_stays_on_disk(tmp_path):
-    root = tmp_path / "dataset"
-    with DurableWriter("test/recorded", root, 20, FEATURES) as writer:
-        write_episode(writer, 0)
-        writer.add_frame(frame(1))
-    assert {path.name for path in root.iterdir()} == {"data", "meta"}

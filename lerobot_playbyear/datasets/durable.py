@@ -6,28 +6,27 @@ real one and then moves the finished files over, so that the dataset on disk is 
 """
 
 import contextlib
-import json
-import os
+import logging
 import shutil
-from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import datasets
-import pyarrow.parquet as pq
 from filelock import FileLock, Timeout
+from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot.utils.utils import SuppressProgressBars
 
-# Everything of ours lives under LeRobot's scratch folder for frames, which push_to_hub leaves out.
-_SCRATCH = Path("images")
-_STAGING = _SCRATCH / ".staging"
-_JOURNAL = _SCRATCH / ".journal.json"
-_LOCK = _SCRATCH / ".lock"
-_INFO = Path("meta/info.json")
+from lerobot_playbyear.datasets.journal import JOURNAL, LOCK, SCRATCH, STAGING, finish_journal, publish
+from lerobot_playbyear.datasets.repair import RepairReport, repair_dataset
+from lerobot_playbyear.datasets.repair.repairing import finish_repair
+from lerobot_playbyear.datasets.settling import INFO, settle_episode
+from lerobot_playbyear.datasets.staging import IncompleteEpisodeError, check_pictures, check_videos, open_staging
+
+logger = logging.getLogger(__name__)
+
 _LOW_DISK_BYTES = 64 * 2**20
 
 
@@ -42,6 +41,10 @@ class DurableWriter:
     names these files is written (from here on the episode counts); the files are moved into place one by one,
     `meta/info.json` last; the journal is removed. After a crash the next writer finishes the moves of a journal it
     finds and throws other staged files away. The dataset loads with plain LeRobot between any two of these steps.
+    Files and folders are synchronised with the disk before they are referred to, so that this holds for a power cut.
+
+    A dataset that another tool left half-written is repaired when it is opened (`repair_dataset`), and what was found
+    is logged as a warning and kept in `repair`.
 
     Args:
         repo_id: Name of the dataset, `user/name`.
@@ -51,11 +54,18 @@ class DurableWriter:
         resume: Append to the dataset in `root` if there is one. Otherwise an existing one is an error.
         robot_type: Noted in a new dataset's metadata.
         image_writer_threads: Threads that compress pictures. 0: `add_frame` does it.
+        streaming_encoding: Encode video while frames come in, not in `save_episode`. An episode of which the encoder
+            dropped a frame is refused.
+        rgb_encoder: Codec and quality of video. None: LeRobot's default.
+
+    Attributes:
+        repair: What was repaired when the dataset was opened; None if nothing was.
 
     Raises:
         FileExistsError: `root` holds a dataset, or other files, and `resume` is off.
         ValueError: The dataset in `root` has another fps or other features; the message names the differences.
         DatasetWriteError: `root` cannot be written, or another process is writing to it.
+        DatasetDamagedError: The dataset in `root` is damaged beyond repair; the message says what is missing.
     """
 
     def __init__(
@@ -68,37 +78,52 @@ class DurableWriter:
         resume: bool = False,
         robot_type: str | None = None,
         image_writer_threads: int = 4,
+        streaming_encoding: bool = False,
+        rgb_encoder: RGBEncoderConfig | None = None,
     ):
         self.repo_id = repo_id
         self.root = Path(root)
         self.features = features
-        self._image_writer_threads = image_writer_threads
+        self.repair: RepairReport | None = None
         self._create_options: dict[str, Any] = {
             "fps": fps,
             "features": deepcopy(features),
             "robot_type": robot_type,
             "use_videos": any(feature["dtype"] == "video" for feature in features.values()),
         }
-        check_root(self.root, resume=resume)
-        self._lock = self._acquire_lock()
+        self._write_options: dict[str, Any] = {
+            "video_backend": "pyav",
+            "image_writer_threads": image_writer_threads,
+            "streaming_encoding": streaming_encoding,
+            "rgb_encoder": rgb_encoder,
+        }
+        self._dataset: LeRobotDataset | None = None
+        self._staged_before: set[Path] = set()
+        self._lock: FileLock | None = None
         try:
-            self._finish_journal()
-            if self._has_dataset():
-                check_compatible(LeRobotDatasetMetadata(repo_id, root=self.root), fps, features)
-            self._staging = self._open_staging()
-        except BaseException:
-            self._lock.release()
+            finish_repair(self.root)
+            check_root(self.root, resume=resume)
+            self._lock = self._acquire_lock()
+            finish_journal(self.root)
+            if has_dataset(self.root):
+                self._check_and_repair(fps, features)
+            self._meta = self._staging.meta
+        except BaseException as error:
+            if self._lock is not None:
+                self._lock.release()
+            if isinstance(error, OSError) and not isinstance(error, FileExistsError):
+                raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
             raise
 
     @property
     def num_episodes(self) -> int:
         """Episodes on disk."""
-        return self._staging.meta.total_episodes
+        return self._meta.total_episodes
 
     @property
     def num_frames(self) -> int:
         """Frames on disk, without those of the episode in progress."""
-        return self._staging.meta.total_frames
+        return self._meta.total_frames
 
     def add_frame(self, frame: dict[str, Any]) -> None:
         """Adds one frame to the episode in progress.
@@ -108,8 +133,12 @@ class DurableWriter:
 
         Raises:
             ValueError: The frame does not fit the features.
+            DatasetWriteError: The disk does not take it.
         """
-        self._staging.add_frame(frame)
+        try:
+            self._staging.add_frame(frame)
+        except (OSError, RuntimeError) as error:
+            raise DatasetWriteError(self._describe_failure(self.num_episodes, error)) from error
 
     def save_episode(self) -> int:
         """Writes the episode in progress. Returns its index.
@@ -117,15 +146,22 @@ class DurableWriter:
         Raises:
             DatasetWriteError: It could not be written (disk full, permissions). The dataset is as it was before.
         """
-        index = self.num_episodes
+        index, staging = self.num_episodes, self._staging
+        length = staging.writer.episode_buffer["size"] if staging.writer is not None else 0
         try:
+            check_pictures(staging, streaming=self._write_options["streaming_encoding"])
             with SuppressProgressBars():
-                self._staging.save_episode(parallel_encoding=False)
-            self._staging.finalize()
-            self._publish()
-            self._staging = self._open_staging()
+                staging.save_episode(parallel_encoding=False)
+            staging.finalize()
+            check_videos(staging, length)
+            publish(self.root, settle_episode(self.root, self.root / STAGING, staging.meta, self._staged_before))
         except Exception as error:
+            self._drop_staging()
             raise DatasetWriteError(self._describe_failure(index, error)) from error
+        self._dataset = None
+        self._meta = staging.meta
+        with contextlib.suppress(OSError):  # the next frame tries again, and says why it cannot
+            self._meta = self._staging.meta
         return index
 
     def discard_episode(self) -> None:
@@ -134,15 +170,15 @@ class DurableWriter:
 
     def close(self) -> None:
         """Drops an episode in progress and removes what was needed only for writing. Safe to call twice."""
-        if not self._lock.is_locked:
+        if self._lock is None or not self._lock.is_locked:
             return
-        with contextlib.suppress(Exception):
-            self._staging.finalize()
-        shutil.rmtree(self.root / _STAGING, ignore_errors=True)
+        self._drop_staging()
+        if not (self.root / JOURNAL).exists():
+            shutil.rmtree(self.root / STAGING, ignore_errors=True)
         self._lock.release()
-        (self.root / _LOCK).unlink(missing_ok=True)
         with contextlib.suppress(OSError):
-            (self.root / _SCRATCH).rmdir()
+            (self.root / LOCK).unlink(missing_ok=True)
+            (self.root / SCRATCH).rmdir()
 
     def __enter__(self) -> "DurableWriter":
         return self
@@ -150,88 +186,55 @@ class DurableWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # Staging
-
-    def _has_dataset(self) -> bool:
-        return (self.root / _INFO).is_file()
-
     def _acquire_lock(self) -> FileLock:
+        (self.root / SCRATCH).mkdir(parents=True, exist_ok=True)
+        lock = FileLock(self.root / LOCK, timeout=0)
         try:
-            (self.root / _SCRATCH).mkdir(parents=True, exist_ok=True)
-            lock = FileLock(self.root / _LOCK, timeout=0)
             lock.acquire()
         except Timeout:
             raise DatasetWriteError(f"Another process is writing to {self.root}: wait until it has ended.") from None
-        except OSError as error:
-            raise DatasetWriteError(f"Cannot write to {self.root}: {error.strerror or error}.") from error
         return lock
 
-    def _open_staging(self) -> LeRobotDataset:
-        """A dataset that continues the real one, with nothing but the metadata that LeRobot needs to do so."""
-        staging = self.root / _STAGING
-        shutil.rmtree(staging, ignore_errors=True)
-        if not self._has_dataset():
-            dataset = LeRobotDataset.create(
-                self.repo_id,
-                root=staging,
-                video_backend="pyav",
-                image_writer_threads=self._image_writer_threads,
-                **self._create_options,
-            )
-            self._staged_before: set[Path] = set()
-            return dataset
-        (staging / "meta").mkdir(parents=True)
-        for name in ("info.json", "stats.json", "tasks.parquet"):
-            if (self.root / "meta" / name).exists():
-                shutil.copyfile(self.root / "meta" / name, staging / "meta" / name)
-        self._staged_before = set()
-        for path in sorted(self.root.glob("meta/episodes/*/*.parquet"))[-1:]:
-            table = path.relative_to(self.root)
-            _copy_last_episode(path, staging / table)
-            self._staged_before.add(table)
-        with _datasets_cache_in(staging / ".cache"), SuppressProgressBars():
-            return LeRobotDataset.resume(
-                self.repo_id,
-                root=staging,
-                video_backend="pyav",
-                image_writer_threads=self._image_writer_threads,
-            )
+    def _check_and_repair(self, fps: int, features: dict[str, dict]) -> None:
+        report = repair_dataset(self.root, fps=fps, features=features, thorough=False, has_lock=True)
+        if report.changed:
+            logger.warning("%s", report)
+            self.repair = report
+            if self._lock is not None:
+                self._lock.release()  # of the folder that was put aside
+            self._lock = self._acquire_lock()
+        check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features)
 
-    def _publish(self) -> None:
-        staging = self.root / _STAGING
-        folders = [staging / name for name in ("data", "videos", "meta")]
-        paths = [path for folder in folders for path in sorted(folder.rglob("*")) if path.is_file()]
-        names = [path.relative_to(staging) for path in paths]
-        names = [name for name in names if name not in self._staged_before and name != _INFO] + [_INFO]
-        for name in names:
-            _flush(staging / name)
-        journal = self.root / _JOURNAL
-        partial = journal.with_suffix(".partial")
-        partial.write_text(json.dumps([str(name) for name in names]))
-        _flush(partial)
-        os.replace(partial, journal)
-        _flush(journal.parent)
-        self._finish_journal()
+    @property
+    def _staging(self) -> LeRobotDataset:
+        """The dataset that LeRobot writes the episode in progress to; a fresh one after every episode."""
+        if self._dataset is None:
+            finish_journal(self.root)
+            self._dataset, self._staged_before = open_staging(
+                self.repo_id, self.root, self.root / STAGING, self._create_options, self._write_options
+            )
+        return self._dataset
 
-    def _finish_journal(self) -> None:
-        """Moves what the journal names into place. Does the rest of the work where a crash interrupted it."""
-        journal = self.root / _JOURNAL
-        if not journal.exists():
+    def _drop_staging(self) -> None:
+        if self._dataset is None:
             return
-        for name in json.loads(journal.read_text()):
-            source, target = self.root / _STAGING / name, self.root / name
-            if source.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                os.replace(source, target)
-                _flush(target.parent)
-        journal.unlink()
-        _flush(journal.parent)
+        with contextlib.suppress(Exception):
+            self._dataset.clear_episode_buffer()
+        self._dataset.meta._metadata_buffer.clear()  # or LeRobot writes the row of an episode that is not there
+        with contextlib.suppress(Exception):
+            self._dataset.finalize()
+        self._dataset = None
 
     def _describe_failure(self, index: int, error: Exception) -> str:
-        reason = f"{type(error).__name__}: {error}"
+        reason = str(error) if isinstance(error, IncompleteEpisodeError) else f"{type(error).__name__}: {error}"
         with contextlib.suppress(OSError):
             if shutil.disk_usage(self.root).free < _LOW_DISK_BYTES:
                 reason = f"the disk is full ({reason})"
+        if (self.root / JOURNAL).exists():
+            return (
+                f"Episode {index} is complete on disk, but could not be moved to its place in {self.root}: {reason}. "
+                "It is there as soon as the dataset is opened with resume=true and the cause is gone."
+            )
         return (
             f"Episode {index} could not be written to {self.root}: {reason}. "
             f"The {index} episodes before it are complete; go on with resume=true once the cause is gone."
@@ -247,13 +250,18 @@ def check_root(root: Path, *, resume: bool) -> None:
     """
     if root.exists() and not root.is_dir():
         raise DatasetWriteError(f"Cannot write a dataset to {root}: it is a file.")
-    if (root / _INFO).is_file() or (root / _JOURNAL).is_file():
+    if has_dataset(root) or (root / JOURNAL).is_file():
         if not resume:
             raise FileExistsError(
                 f"{root} already holds a dataset. Append to it with resume=true, or choose another root."
             )
-    elif root.is_dir() and any(path.name != _SCRATCH.name for path in root.iterdir()):
+    elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
         raise FileExistsError(f"{root} is not empty and holds no dataset. Choose another root.")
+
+
+def has_dataset(root: Path) -> bool:
+    """Whether a folder holds a LeRobotDataset, however damaged."""
+    return (root / INFO).is_file() or any(root.glob("data/chunk-*/file-*")) or any(root.glob("meta/episodes/*/*"))
 
 
 def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str, dict]) -> None:
@@ -282,33 +290,3 @@ def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str,
 def _signature(feature: dict) -> str:
     rate = (feature.get("info") or {}).get("sample_rate")
     return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
-
-
-def _copy_last_episode(source: Path, target: Path) -> None:
-    """Copies the last row of an episode table without its statistics, which make up nearly all of it."""
-    names = [name for name in pq.read_schema(source).names if not name.startswith("stats/")]
-    table = pq.read_table(source, columns=names)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table.slice(table.num_rows - 1), target)
-
-
-def _flush(path: Path) -> None:
-    """Asks the operating system to put a file, or the entries of a folder, on the disk itself."""
-    if os.name == "nt" and path.is_dir():
-        return
-    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-@contextlib.contextmanager
-def _datasets_cache_in(folder: Path) -> Iterator[None]:
-    """Keeps the copies that `datasets` makes of every metadata file out of the user's cache."""
-    before = datasets.config.HF_DATASETS_CACHE
-    datasets.config.HF_DATASETS_CACHE = folder
-    try:
-        yield
-    finally:
-        datasets.config.HF_DATASETS_CACHE = before
