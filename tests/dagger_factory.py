@@ -1,0 +1,103 @@
+"""A small policy, its demonstrations and the command line of `playbyear-dagger`, for tests of HG-DAgger."""
+
+import json
+import sys
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.scripts import dagger as dagger_script
+from lerobot_playbyear.scripts import train as train_script
+
+ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v0", "--env.image_size=16")
+SMALL = ("--updates_per_episode=2", "--warmup_episodes=1", "--batch_size=4", "--eval_every=0")
+_TINY_POLICY = (
+    "--policy.type=playbyear",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+    "--policy.image_size=16",
+    "--policy.vision_width=4",
+    "--policy.audio_window_s=0.9",
+    "--policy.n_memory_steps=2",
+    "--policy.n_supervised_steps=4",
+    "--policy.hidden_size=32",
+)
+
+
+@cache
+def base_folder() -> Path:
+    """A folder with `demos`, two episodes of the expert, and `policy`, a checkpoint after two updates: it does nothing well."""
+    folder = Path(mkdtemp(prefix="dagger_"))
+    demos = RecordDatasetConfig("tests/demos", str(folder / "demos"), num_episodes=2)
+    record(RecordConfig(PlaybyearEnvConfig(image_size=16), demos, num_workers=0))
+    data = ("--dataset.repo_id=tests/demos", f"--dataset.root={folder / 'demos'}", "--num_workers=0")
+    run = ("--steps=2", "--batch_size=2", f"--output_dir={folder / 'train'}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train", *_TINY_POLICY, *data, *run])
+        train_script.train()
+    (folder / "policy").symlink_to(folder / "train/checkpoints/last/pretrained_model")
+    return folder
+
+
+def arguments(folder: Path, *options: str, env: tuple[str, ...] = ENV) -> list[str]:
+    """The command line of a small run in `folder`; later options win."""
+    base = base_folder()
+    given = [
+        f"--policy.path={base / 'policy'}",
+        "--demos.repo_id=tests/demos",
+        f"--demos.root={base / 'demos'}",
+        "--interventions.repo_id=tests/corrections",
+        f"--interventions.root={folder / 'corrections'}",
+        f"--output_dir={folder / 'out'}",
+        *env,
+        *SMALL,
+        *options,
+    ]
+    return list({option.split("=")[0]: option for option in given}.values())
+
+
+def dagger(folder: Path, *options: str, **kwargs: Any) -> Path:
+    """Run the command in this process. Returns the output folder."""
+    return command(*arguments(folder, *options, **kwargs))
+
+
+def command(*args: str) -> Path:
+    """Run the command with these arguments in this process, as `main` does, but without turning errors into exits."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["playbyear-dagger", *dagger_script.with_saved_options(list(args))])
+        return dagger_script.dagger()
+
+
+def metrics(folder: Path, kind: str | None = None) -> list[dict[str, Any]]:
+    """The lines of figures of a run, of one kind or all."""
+    lines = [json.loads(line) for line in (folder / "out" / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in lines if kind in (None, line["kind"])]
+
+
+def state(folder: Path) -> dict[str, Any]:
+    """The counters of a run."""
+    return json.loads((folder / "out" / "dagger_state.json").read_text())
+
+
+def corrections(folder: Path) -> LeRobotDataset:
+    """The intervention dataset, opened with LeRobot alone."""
+    return LeRobotDataset("tests/corrections", root=folder / "corrections", video_backend="pyav")
+
+
+def column(dataset: LeRobotDataset, key: str) -> np.ndarray:
+    """All values of a column, (N, ...)."""
+    return np.stack([np.asarray(value) for value in dataset.hf_dataset.with_format("numpy")[key]])
+
+
+def seeds(folder: Path) -> list[int]:
+    """The seed of each attempt in the intervention dataset, in their order."""
+    dataset = corrections(folder)
+    values = column(dataset, "seed").ravel()
+    return [int(values[row["dataset_from_index"]]) for row in dataset.meta.episodes]

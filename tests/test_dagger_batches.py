@@ -1,0 +1,165 @@
+"""Balanced batches: half of what is learned from ends on a frame whose action an expert chose."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from dataset_factory import make_dataset
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.dagger.batches import BalancedBatches, intervention_run_weights
+from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.training import PolicyWindows
+
+N_DEMONSTRATIONS = 1000
+"""Actions of the demonstrations are below it, those of the attempts above: a window tells where it is from."""
+
+
+def store(lengths, interventions=None, first=0):
+    """Episodes whose action is the number of the frame; `interventions` as 0 and 1 per frame."""
+    n = sum(lengths)
+    columns = {
+        "action": first + torch.arange(n, dtype=torch.float32).unsqueeze(1),
+        "observation.state": torch.zeros(n, 2),
+    }
+    if interventions is not None:
+        columns["intervention"] = torch.tensor([mark == "x" for mark in interventions])
+    ends = np.cumsum(lengths).tolist()
+    return EpisodeStore(columns, [0, *ends[:-1]], ends, fps=20)
+
+
+def windows(n_windows):
+    config = PlaybyearConfig(
+        use_vision=False,
+        use_audio=False,
+        n_memory_steps=3,
+        n_supervised_steps=n_windows,
+        device="cpu",
+        push_to_hub=False,
+    )
+    return PolicyWindows(config, SimpleNamespace(fps=20))
+
+
+def supervised(batch):
+    """The last frames of all windows that count, (n,)."""
+    weight = batch.get("loss_weight", torch.ones(len(batch["action"]), batch["action"].shape[1]))
+    assert not (batch["action_is_pad"] & (weight > 0)).any()
+    return batch["action"][..., 0][weight > 0].int()
+
+
+ATTEMPTS = "....xxxxxxxxxxxx..........xxx.....x" + "xx............" + "xxxxxxxxxx"
+
+
+@pytest.mark.parametrize("n_windows", [1, 4, 8])
+def test_half_of_every_batchs_windows_end_on_an_intervention_frame(n_windows):
+    demonstrations = store([40, 30])
+    interventions = store([35, 14, 10], ATTEMPTS, first=N_DEMONSTRATIONS)
+    batches = BalancedBatches(windows(n_windows), demonstrations, interventions, batch_size=12)
+    marks = np.array(list(ATTEMPTS)) == "x"
+
+    for number in range(50):
+        ends = supervised(batches.batch(number)).numpy()
+        from_attempts = ends[ends >= N_DEMONSTRATIONS] - N_DEMONSTRATIONS
+        assert len(from_attempts) == len(ends) / 2
+        assert marks[from_attempts].all()
+        assert len(ends) > 6 * n_windows  # most of the windows that are computed are learned from
+
+
+def test_both_halves_weigh_the_same_in_the_loss():
+    batches = BalancedBatches(windows(8), store([40]), store([len(ATTEMPTS)], ATTEMPTS), batch_size=12)
+    for number in range(20):
+        weight = batches.batch(number)["loss_weight"]
+        assert weight[:6].sum() == weight[6:].sum() > 0
+
+
+def test_every_intervention_frame_is_learned_from_alike():
+    interventions = store([35, 14, 10], ATTEMPTS, first=N_DEMONSTRATIONS)
+    batches = BalancedBatches(windows(4), store([40]), interventions, batch_size=12)
+    counts = np.zeros(len(ATTEMPTS))
+    for number in range(1000):
+        ends = supervised(batches.batch(number)).numpy()
+        np.add.at(counts, ends[ends >= N_DEMONSTRATIONS] - N_DEMONSTRATIONS, 1)
+    marks = np.array(list(ATTEMPTS)) == "x"
+    assert counts[~marks].sum() == 0
+    relative = counts[marks] / counts[marks].mean()
+    assert relative.min() > 0.5
+    assert relative.max() < 2
+
+
+@pytest.mark.parametrize(
+    ("marks", "runs"),
+    [
+        ("......xxxxx...", {9: 2.5, 10: 2.5}),  # inside: two runs of four, which hold its ends
+        ("......xx......", {7: 4.0}),  # shorter than a run: one run that ends with it
+        ("x.............", {3: 4.0}),  # at the start: a run that holds it and does not reach before
+        (".............x", {13: 4.0}),
+        ("x.", {1: 4.0}),  # an episode shorter than a run
+        ("..............", {}),
+    ],
+)
+def test_runs_lie_where_the_expert_was_in_control(marks, runs):
+    weights = intervention_run_weights(store([len(marks)], marks), n_windows=4)
+    assert {int(i): float(weights[i]) for i in weights.nonzero()} == runs
+
+
+def test_an_episode_appended_while_training_goes_on_is_drawn():
+    interventions = store([10], "xxxxxx....", first=N_DEMONSTRATIONS)
+    batches = BalancedBatches(windows(4), store([40]), interventions, batch_size=8)
+    new = [
+        {
+            "action": np.array([5000.0], np.float32),
+            "observation.state": np.zeros(2, np.float32),
+            "intervention": np.array([True]),
+        }
+    ] * 6
+    interventions.append_episode(new)
+    batches.set_interventions(interventions)
+    drawn = torch.cat([supervised(batches.batch(number)) for number in range(20)])
+    assert (drawn == 5000).any()
+    assert ((drawn >= N_DEMONSTRATIONS) & (drawn < 5000)).any()
+
+
+def test_a_batch_is_given_by_its_number_alone():
+    first, again = (
+        BalancedBatches(windows(4), store([40]), store([len(ATTEMPTS)], ATTEMPTS), 8, seed=3) for _ in range(2)
+    )
+    expected = [first.batch(number) for number in range(5)]
+    for key in ("action", "loss_weight"):
+        assert torch.equal(again.batch(4)[key], expected[4][key])
+        assert not torch.equal(expected[3][key], expected[4][key])
+
+
+def test_halves_are_demonstrations_and_corrections():
+    interventions = store([len(ATTEMPTS)], ATTEMPTS, first=N_DEMONSTRATIONS)
+    demonstrations, corrections = BalancedBatches(windows(4), store([40]), interventions, 8).halves(0)
+    assert (supervised(demonstrations) < N_DEMONSTRATIONS).all()
+    assert (supervised(corrections) >= N_DEMONSTRATIONS).all()
+
+
+def test_without_a_single_correction_there_is_a_clear_error():
+    with pytest.raises(ValueError, match="None of the 14 frames of the intervention dataset has 'intervention' set"):
+        BalancedBatches(windows(4), store([40]), store([14], "." * 14), 8)
+
+
+def test_half_a_batch_must_be_a_whole_number():
+    with pytest.raises(ValueError, match="--batch_size=7 must be even"):
+        BalancedBatches(windows(4), store([40]), None, 7)
+
+
+def test_other_policies_get_lerobots_items_and_the_same_halves(tmp_path):
+    """ACT, say: one window per item, and no weights, which it does not know."""
+    make_dataset(tmp_path / "demos", (12, 9), image_size=8)
+    make_dataset(tmp_path / "attempts", (15,), image_size=8, seed=1)
+    demos, attempts = (LeRobotDataset("a/b", root=tmp_path / name) for name in ("demos", "attempts"))
+    policy = SimpleNamespace(
+        type="other", observation_delta_indices=None, action_delta_indices=[0, 1, 2], reward_delta_indices=None
+    )
+    policy_windows = PolicyWindows(policy, demos.meta)
+    stores = [EpisodeStore.from_dataset(dataset, policy_windows.keys, "cpu") for dataset in (demos, attempts)]
+    batch = BalancedBatches(policy_windows, *stores, batch_size=8).batch(0)
+    assert "loss_weight" not in batch
+    assert batch["action"].shape == (8, 3, 4)
+    assert batch["intervention"][4:].all()
+    assert len(batch["task"]) == 8
