@@ -15,11 +15,11 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import torch
-from gym_playbyear.base import SensorNoise
-from gym_playbyear.experts import ExpertConfig, GraspExpert
 from torch import nn
 
 from experiments.protocol import RESULTS
+from gym_playbyear.base import SensorNoise
+from gym_playbyear.experts import ExpertConfig, GraspExpert
 
 TASK = "OccludedGrasp-v0"
 _ASIDE = -0.15  # x of a cube that is not in the way [m]
