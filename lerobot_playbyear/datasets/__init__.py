@@ -8,21 +8,28 @@ from lerobot_playbyear.datasets.audio_feature import (
     episode_waveform,
     write_wav,
 )
+from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.microphone import MicrophoneBuffer
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 
 __all__ = [
     "AUDIO_PREFIX",
     "EpisodeStore",
+    "MicrophoneBuffer",
     "RunSampler",
     "audio_feature",
     "audio_keys",
     "check_audio_features",
     "check_dataset_files",
+    "cut_into_frames",
     "episode_waveform",
     "loud_frames",
+    "read_audio",
+    "resample",
     "run_weights",
     "start_frames",
+    "write_audio",
     "write_wav",
 ]

@@ -1,0 +1,181 @@
+"""Sound in files: WAV, FLAC and the sound tracks of videos in, WAV and FLAC out, and how a recording meets frames."""
+
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import torch
+import torchaudio
+
+from lerobot_playbyear.datasets.audio_feature import samples_per_frame, to_pcm_s16, write_wav
+
+_GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
+_FLAC_BLOCK = 4096  # samples
+
+
+class AudioFileError(ValueError):
+    """A sound file cannot be used; the message says why, and what to do."""
+
+
+def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
+    """Reads the sound of a file: WAV, FLAC, MP3, or a video's sound track; whatever FFmpeg reads.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The samples, (n, channels) int16 PCM, and the sample rate [Hz]. Sample 0 is at the file's time 0: a sound
+        track that begins after its video begins with silence. 16-bit files come out bit for bit; others are rounded.
+
+    Raises:
+        AudioFileError: The file is missing, or holds no sound that can be decoded.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise AudioFileError(f"There is no sound file {path}.")
+    parts: list[np.ndarray] = []
+    position = rate = 0
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.audio:
+                raise AudioFileError(f"{path} holds no sound.")
+            rate = container.streams.audio[0].rate
+            for frame in container.decode(audio=0):
+                samples = _to_samples(frame)  # (n, channels)
+                start = round(frame.time * rate) if frame.time is not None else position
+                if position == 0 and start < 0:
+                    samples, start = samples[-start:], 0
+                if start - position > (_GAP_SECONDS * rate if position else 0):
+                    parts.append(np.zeros((start - position, samples.shape[1]), np.int16))
+                    position = start
+                parts.append(samples)
+                position += len(samples)
+    except (av.FFmpegError, ValueError) as error:
+        if isinstance(error, AudioFileError):
+            raise
+        raise AudioFileError(f"The sound of {path} cannot be decoded: {error}.") from error
+    if not parts:
+        raise AudioFileError(f"{path} holds no samples.")
+    return np.concatenate(parts), rate
+
+
+def write_audio(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
+    """Writes sound as 16-bit WAV or FLAC, as the file's name ends.
+
+    Args:
+        path: Of the file, `.wav` or `.flac`; its folder is made.
+        waveform: (n,) or (n, channels), int16 PCM or floats in [-1, 1].
+        sample_rate: Samples per second [Hz].
+
+    Returns:
+        The path.
+
+    Raises:
+        AudioFileError: The name ends otherwise.
+        ValueError: The samples are neither, or the shape is another.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".wav":
+        return write_wav(path, waveform, sample_rate)
+    if path.suffix.lower() != ".flac":
+        raise AudioFileError(f"{path}: sound is written as .wav or .flac; choose such a name.")
+    samples = to_pcm_s16(waveform)
+    if samples.ndim not in (1, 2):
+        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
+    samples = samples.reshape(len(samples), -1)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    layout = "mono" if samples.shape[1] == 1 else "stereo" if samples.shape[1] == 2 else f"{samples.shape[1]}c"
+    with av.open(str(path), "w", format="flac") as container:
+        stream: Any = container.add_stream("flac", rate=sample_rate, layout=layout)
+        for start in range(0, len(samples), _FLAC_BLOCK):
+            block = np.ascontiguousarray(samples[start : start + _FLAC_BLOCK])
+            frame = av.AudioFrame.from_ndarray(block.reshape(1, -1), format="s16", layout=layout)
+            frame.sample_rate, frame.pts = sample_rate, start
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np.ndarray:
+    """Sound at another sample rate, band-limited.
+
+    Args:
+        waveform: (n,) or (n, channels), int16 PCM or floats in [-1, 1].
+        sample_rate: What it has [Hz].
+        new_sample_rate: What it shall have [Hz].
+
+    Returns:
+        As many seconds at the new rate, in the same form.
+    """
+    if sample_rate == new_sample_rate:
+        return waveform
+    is_pcm = waveform.dtype == np.int16
+    floats = torch.from_numpy(waveform.astype(np.float32) / (32768 if is_pcm else 1))
+    channels_first = floats.reshape(len(floats), -1).T  # (channels, n)
+    converted = torchaudio.functional.resample(
+        channels_first,
+        sample_rate,
+        new_sample_rate,
+        lowpass_filter_width=64,
+        rolloff=0.9475937167399596,
+        resampling_method="sinc_interp_kaiser",
+        beta=14.769656459379492,
+    )
+    result = converted.T.reshape(-1, *waveform.shape[1:]).numpy()
+    return to_pcm_s16(result) if is_pcm else result.astype(waveform.dtype)
+
+
+def cut_into_frames(
+    waveform: np.ndarray, sample_rate: int, fps: int, n_frames: int, offset: float = 0.0, pad: bool = False
+) -> np.ndarray:
+    """The blocks of sound that belong to an episode's frames: for each, what was heard since the frame before.
+
+    The block of frame i ends when frame i is taken. What was heard before the file began, at most the first frame's
+    block when `offset` is 0, is silence.
+
+    Args:
+        waveform: (n,), the file's samples.
+        sample_rate: Its samples per second [Hz], a multiple of `fps`.
+        fps: Frames per second [Hz].
+        n_frames: The episode's length.
+        offset: Where in the file the episode's first frame was taken [s]; negative if the file begins after it.
+        pad: Fill what the file lacks at its beginning and its end with silence.
+
+    Returns:
+        (n_frames, S), in the waveform's dtype.
+
+    Raises:
+        ValueError: The frame rate does not divide the sample rate.
+        AudioFileError: The file begins too late or ends too early, and `pad` is off.
+    """
+    size = samples_per_frame(sample_rate, fps)
+    start = round(offset * sample_rate) - size
+    stop = start + n_frames * size
+    missing_before, missing_after = max(-start - size, 0), max(stop - len(waveform), 0)
+    if (missing_before or missing_after) and not pad:
+        lacks = [
+            f"{missing / sample_rate:.3f} s at its {end}"
+            for missing, end in ((missing_before, "beginning"), (missing_after, "end"))
+            if missing
+        ]
+        raise AudioFileError(
+            f"it lasts {len(waveform) / sample_rate:.3f} s; {n_frames} frames at {fps} per second from {offset:.3f} s on "
+            f"need {' and '.join(lacks)} more. Correct the offset, or fill with silence: pad=true."
+        )
+    found = waveform[max(start, 0) : max(stop, 0)]
+    before = min(max(-start, 0), stop - start)
+    after = n_frames * size - before - len(found)
+    return np.pad(found, (before, after)).reshape(n_frames, size)
+
+
+def _to_samples(frame: Any) -> np.ndarray:
+    """(n, channels) int16 of a decoded frame, whatever its format."""
+    values = frame.to_ndarray()  # (channels, n) or, interleaved, (1, n * channels)
+    n_channels = frame.layout.nb_channels
+    values = values.T if frame.format.is_planar else values.reshape(-1, n_channels)
+    if values.dtype == np.uint8:
+        return (values.astype(np.int16) - 128) * 256
+    if values.dtype == np.int32:  # 24 bits are shifted up to these
+        return np.clip((values.astype(np.int64) + 2**15) >> 16, -32768, 32767).astype(np.int16)
+    return to_pcm_s16(values)

@@ -1,0 +1,296 @@
+"""Sound from files and from a microphone's callback, and back into files."""
+
+import threading
+import time
+import wave
+from fractions import Fraction
+
+import av
+import numpy as np
+import pytest
+
+from lerobot_playbyear.datasets import MicrophoneBuffer, cut_into_frames, read_audio, resample, write_audio
+from lerobot_playbyear.datasets.audio_files import AudioFileError
+from lerobot_playbyear.datasets.microphone import DropOut
+
+RATE, FPS = 16000, 20
+SIZE = RATE // FPS
+
+
+def noise(n_samples: int, n_channels: int | None = None, seed: int = 0) -> np.ndarray:
+    shape = (n_samples,) if n_channels is None else (n_samples, n_channels)
+    return np.random.default_rng(seed).integers(-32768, 32768, shape).astype(np.int16)
+
+
+def tone(frequency: float, sample_rate: int, seconds: float) -> np.ndarray:
+    return (10000 * np.sin(2 * np.pi * frequency * np.arange(round(seconds * sample_rate)) / sample_rate)).astype(
+        np.int16
+    )
+
+
+# Files
+
+
+@pytest.mark.parametrize("ending", ["wav", "flac"])
+@pytest.mark.parametrize("n_channels", [None, 1, 2])
+def test_16_bits_come_back_bit_for_bit(tmp_path, ending, n_channels):
+    waveform = noise(12345, n_channels)
+    samples, rate = read_audio(write_audio(tmp_path / "deep" / f"sound.{ending}", waveform, 44100))
+    assert rate == 44100
+    assert samples.dtype == np.int16
+    np.testing.assert_array_equal(samples, waveform.reshape(len(waveform), -1))
+
+
+@pytest.mark.parametrize(("width", "tolerance"), [(1, 256), (3, 1), (4, 1)])
+def test_other_depths_are_rounded_to_16_bits(tmp_path, width, tolerance):
+    """PCM of 8, 24 and 32 bits, as a recorder may write it."""
+    waveform = tone(440, RATE, 0.5)
+    if width == 1:
+        data = ((waveform.astype(np.int32) >> 8) + 128).astype(np.uint8).tobytes()
+    else:
+        wide = (waveform.astype(np.int64) << 8 * (width - 2)).astype("<i8").view(np.uint8).reshape(-1, 8)
+        data = wide[:, :width].tobytes()
+    with wave.open(str(tmp_path / "sound.wav"), "wb") as file:
+        file.setparams((1, width, RATE, len(waveform), "NONE", ""))
+        file.writeframes(data)
+    samples, _ = read_audio(tmp_path / "sound.wav")
+    assert np.abs(samples[:, 0].astype(int) - waveform).max() <= tolerance
+
+
+def test_flac_of_24_bits_is_rounded(tmp_path):
+    waveform = tone(440, RATE, 0.3)
+    with av.open(str(tmp_path / "deep.flac"), "w") as container:
+        stream = container.add_stream("flac", rate=RATE, layout="mono", format="s32")
+        frame = av.AudioFrame.from_ndarray((waveform.astype(np.int32) << 16).reshape(1, -1), "s32", "mono")
+        frame.sample_rate = RATE
+        container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    samples, _ = read_audio(tmp_path / "deep.flac")
+    np.testing.assert_array_equal(samples[:, 0], waveform)
+
+
+def write_film(path, seconds: float, sound: np.ndarray | None, sound_from: float = 0.0) -> None:
+    with av.open(str(path), "w") as film:
+        video = film.add_stream("libx264", rate=FPS)
+        video.width = video.height = 64
+        audio = None if sound is None else film.add_stream("flac" if path.suffix == ".mkv" else "aac", rate=RATE)
+        if audio is not None:
+            audio.layout = "mono"
+        for _ in range(round(seconds * FPS)):
+            film.mux(video.encode(av.VideoFrame.from_ndarray(np.zeros((64, 64, 3), np.uint8), "rgb24")))
+        film.mux(video.encode(None))
+        if audio is not None:
+            frame = av.AudioFrame.from_ndarray(sound.reshape(1, -1), "s16", "mono")
+            frame.sample_rate, frame.pts, frame.time_base = RATE, round(sound_from * RATE), Fraction(1, RATE)
+            film.mux(audio.encode(frame))
+            film.mux(audio.encode(None))
+
+
+def test_a_videos_sound_track_is_read_in_time_with_its_pictures(tmp_path):
+    click = np.zeros(RATE, np.int16)
+    click[4000:4010] = 30000
+    write_film(tmp_path / "film.mkv", 2, click, sound_from=0.5)
+    samples, rate = read_audio(tmp_path / "film.mkv")
+    assert rate == RATE
+    assert abs(int(np.argmax(samples[:, 0])) - (4000 + RATE // 2)) < 0.002 * RATE  # Matroska counts milliseconds
+
+
+def test_aac_sounds_alike(tmp_path):
+    waveform = tone(440, RATE, 2)
+    write_film(tmp_path / "film.mp4", 2, waveform)
+    samples, _ = read_audio(tmp_path / "film.mp4")
+    middle = slice(RATE // 2, RATE)
+    assert np.corrcoef(samples[middle, 0], waveform[middle])[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("missing.wav", None, "There is no sound file"),
+        ("text.wav", b"hello", "cannot be decoded"),
+        ("empty.flac", b"", "holds no samples"),
+    ],
+)
+def test_files_without_sound_are_named(tmp_path, name, content, message):
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(AudioFileError, match=message) as error:
+        read_audio(tmp_path / name)
+    assert name in str(error.value)
+
+
+def test_a_film_without_sound_and_another_ending_are_named(tmp_path):
+    write_film(tmp_path / "silent.mp4", 0.5, None)
+    with pytest.raises(AudioFileError, match="holds no sound"):
+        read_audio(tmp_path / "silent.mp4")
+    with pytest.raises(AudioFileError, match=r"written as \.wav or \.flac"):
+        write_audio(tmp_path / "sound.mp3", noise(10), RATE)
+    with pytest.raises(ValueError, match="NaN"):
+        write_audio(tmp_path / "sound.flac", np.array([np.nan]), RATE)
+
+
+# Sample rates
+
+
+@pytest.mark.parametrize(("old", "new"), [(44100, 48000), (48000, 16000), (16000, 48000)])
+def test_resampling_keeps_a_tone(old, new):
+    result = resample(tone(1000, old, 1), old, new)
+    expected = tone(1000, new, 1)
+    assert result.dtype == np.int16
+    assert len(result) == new
+    middle = slice(new // 10, -new // 10)
+    assert np.abs(result[middle].astype(int) - expected[middle]).max() < 60
+
+
+def test_resampling_removes_what_the_new_rate_cannot_hold():
+    assert np.abs(resample(tone(12000, 48000, 1), 48000, 16000)[1600:-1600]).max() < 30
+
+
+def test_resampling_treats_channels_alike_and_floats_as_floats():
+    both = np.stack([tone(500, 44100, 0.2), tone(700, 44100, 0.2)], axis=1)
+    result = resample(both, 44100, 48000)
+    assert result.shape == (9600, 2)
+    np.testing.assert_array_equal(result[:, 1], resample(both[:, 1], 44100, 48000))
+    floats = resample(both[:, 0].astype(np.float32) / 32768, 44100, 48000)
+    assert floats.dtype == np.float32
+    np.testing.assert_allclose(floats * 32768, result[:, 0], atol=0.6)
+
+
+# From a file to frames
+
+
+def test_a_frames_block_ends_when_the_frame_is_taken():
+    waveform = np.arange(RATE * 2, dtype=np.int16)
+    blocks = cut_into_frames(waveform, RATE, FPS, 10, offset=0.5)
+    assert blocks.shape == (10, SIZE)
+    assert blocks[0, -1] == RATE // 2 - 1
+    np.testing.assert_array_equal(blocks.ravel(), waveform[RATE // 2 - SIZE : RATE // 2 + 9 * SIZE])
+
+
+def test_before_the_file_began_there_was_silence():
+    blocks = cut_into_frames(np.arange(1, RATE, dtype=np.int16), RATE, FPS, 3)
+    assert not blocks[0].any()
+    assert blocks[1, 0] == 1
+
+
+def test_a_file_that_is_too_short_is_refused_or_filled():
+    waveform = np.ones(5 * SIZE, np.int16)
+    cut_into_frames(waveform, RATE, FPS, 6)  # exactly enough
+    with pytest.raises(AudioFileError, match=r"lasts 0\.250 s; 7 frames .* need 0\.050 s at its end more.*pad=true"):
+        cut_into_frames(waveform, RATE, FPS, 7)
+    with pytest.raises(AudioFileError, match=r"0\.100 s at its beginning"):
+        cut_into_frames(waveform, RATE, FPS, 3, offset=-0.1)
+    padded = cut_into_frames(waveform, RATE, FPS, 10, offset=-0.1, pad=True)
+    assert padded.any(axis=1).tolist() == [False] * 3 + [True] * 5 + [False] * 2
+    assert not cut_into_frames(waveform, RATE, FPS, 4, offset=9, pad=True).any()
+    assert not cut_into_frames(waveform, RATE, FPS, 4, offset=-9, pad=True).any()
+
+
+# From a callback to frames
+
+
+def test_chunks_of_any_length_become_blocks_without_gaps():
+    """A sound card's thread against a loop of frames, in real time."""
+    buffer = MicrophoneBuffer(RATE, FPS)
+    waveform = noise(RATE * 2)
+    rng = np.random.default_rng(1)
+
+    def play() -> None:
+        position, begun = 0, time.monotonic()
+        while position < len(waveform):
+            chunk = waveform[position : position + int(rng.integers(1, 300))]
+            position += len(chunk)
+            time.sleep(max(0.0, begun + position / RATE - time.monotonic()))
+            buffer.write(chunk)
+
+    card = threading.Thread(target=play)
+    card.start()
+    time.sleep(0.2)
+    begun = time.monotonic()
+    blocks = []
+    for frame in range(25):
+        time.sleep(max(0.0, begun + frame / FPS - time.monotonic()))
+        blocks.append(buffer.read_frame())
+    card.join()
+
+    heard = np.concatenate(blocks)
+    assert not buffer.drop_outs
+    starts = np.flatnonzero(waveform == heard[0])
+    assert any(np.array_equal(waveform[start : start + len(heard)], heard) for start in starts)
+
+
+def fed(*, timestamps: bool, **options) -> tuple[MicrophoneBuffer, list[np.ndarray]]:
+    """A buffer that has got a second of noise in chunks of one frame."""
+    buffer = MicrophoneBuffer(RATE, FPS, timeout=0.01, **{"reserve": 0.0, **options})
+    chunks = list(noise(RATE * 2).reshape(-1, SIZE))
+    for i in range(FPS):
+        buffer.write(chunks[i], 100 + i / FPS if timestamps else None)
+    return buffer, chunks
+
+
+def test_the_first_block_is_the_newest_sound():
+    buffer, chunks = fed(timestamps=False)
+    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS - 1])
+    buffer.write(chunks[FPS])
+    buffer.write(chunks[FPS + 1])
+    buffer.reset()
+    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS + 1])
+
+
+def test_the_reserve_is_left_for_chunks_that_come_late():
+    buffer, chunks = fed(timestamps=False, reserve=SIZE / RATE)
+    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS - 2])
+    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS - 1])
+    assert not buffer.drop_outs
+
+
+def test_samples_that_the_sound_card_lost_become_silence_in_their_place():
+    buffer, chunks = fed(timestamps=True)
+    buffer.read_frame()
+    for i in (FPS, FPS + 2):  # one is lost
+        buffer.write(chunks[i], 100 + i / FPS)
+    blocks = [buffer.read_frame() for _ in range(3)]
+    np.testing.assert_array_equal(blocks, [chunks[FPS], np.zeros(SIZE, np.int16), chunks[FPS + 2]])
+    assert buffer.drop_outs == [DropOut(2, SIZE, "lost")]
+
+
+@pytest.mark.parametrize("come_after_all", [True, False])
+def test_samples_that_come_late_do_not_shift_what_follows(come_after_all):
+    buffer, chunks = fed(timestamps=True)
+    buffer.read_frame()
+    late = buffer.read_frame()
+    if come_after_all:
+        buffer.write(chunks[FPS], 100 + FPS / FPS)
+    buffer.write(chunks[FPS + 1], 100 + (FPS + 1) / FPS)
+    assert not late.any()
+    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS + 1])
+    assert buffer.drop_outs[0] == DropOut(1, SIZE, "late")
+    assert len(buffer.drop_outs) == (1 if come_after_all else 2)
+
+
+def test_sound_that_runs_ahead_is_cut():
+    buffer, chunks = fed(timestamps=False, max_lag=0.12)
+    buffer.read_frame()
+    for i in range(FPS, FPS + 6):
+        buffer.write(chunks[i])
+    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS + 5])
+    assert buffer.drop_outs == [DropOut(1, 5 * SIZE, "skipped")]
+
+
+def test_clocks_that_drift_apart_are_no_drop_out():
+    """200 parts in a million over ten minutes: 1,920 samples."""
+    buffer = MicrophoneBuffer(RATE, FPS, timeout=0.01)
+    for i in range(600 * FPS):
+        buffer.write(np.full(SIZE, 5, np.int16), i / FPS * 1.0002)
+        buffer.read_frame()
+    assert not [drop_out for drop_out in buffer.drop_outs if drop_out.reason == "lost"]
+
+
+def test_chunks_are_floats_or_columns_too():
+    buffer = MicrophoneBuffer(RATE, FPS, reserve=0.0)
+    buffer.write(np.full((SIZE, 1), 0.5, np.float32))
+    assert (buffer.read_frame() == 16384).all()
+    with pytest.raises(ValueError, match=r"shape \(800, 2\); wanted"):
+        buffer.write(np.zeros((SIZE, 2), np.int16))
+    with pytest.raises(ValueError, match="reserve"):
+        MicrophoneBuffer(RATE, FPS, reserve=0.5)
