@@ -237,8 +237,9 @@ class PlaybyearNetwork(nn.Module):
         """One camera's embeddings, (B * n_frames, embedding size)."""
         config = self.config
         images = newest(batch, key, n_frames + config.frame_stack - 1)  # (B, T, 3, H, W)
-        images = images.float() / 255 if images.dtype == torch.uint8 else images
-        images = self.augment(images, config.image_size) if self.training else resize(images, config.image_size)
+        with torch.autocast(images.device.type, enabled=False):  # colours keep their 8 bits
+            images = images.float() / 255 if images.dtype == torch.uint8 else images
+            images = self.augment(images, config.image_size) if self.training else resize(images, config.image_size)
         stacks = torch.cat([images[:, i : i + n_frames] for i in range(config.frame_stack)], dim=2)
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
