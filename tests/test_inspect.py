@@ -392,7 +392,7 @@ def test_a_truncated_file_is_one_clear_line(clean, tmp_path, monkeypatch, capsys
     assert run(monkeypatch, f"--dataset.root={root}") == 2
     printed = capsys.readouterr().err
     assert printed.startswith("error: The dataset in ")
-    assert "truncated" in printed
+    assert f"Repair it: playbyear-repair --root={root}" in printed
     assert len(printed.splitlines()) == 1
 
 

@@ -19,6 +19,7 @@ from PIL import Image
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import check_dataset_files, column_to_numpy, episode_bounds
+from lerobot_playbyear.inspection.damage import find_damage
 
 SUCCESS = "next.success"
 INTERVENTION = "intervention"
@@ -99,9 +100,9 @@ class DatasetSource:
             dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, video_backend=video_backend)
             source = cls(dataset, video_backend)
             n_episodes = len(source.episodes)
-        except Exception as error:
+        except Exception as error:  # whatever LeRobot, Arrow or the network may raise
             where = f"in '{folder}'" if root is not None else f"'{repo_id}' (neither in '{folder}' nor from the Hub)"
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = find_damage(folder) or " ".join(str(error.__cause__ or error).split()) or type(error).__name__
             raise InspectionError(f"The dataset {where} cannot be opened: {reason}") from error
         if n_episodes == 0:
             raise InspectionError(f"The dataset in '{dataset.root}' is empty: it has no frames.")

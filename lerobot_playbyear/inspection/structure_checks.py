@@ -156,7 +156,7 @@ def _stats_difference(values: np.ndarray, stats: dict[str, np.ndarray]) -> str |
     for name, compute in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
         if name not in stats:
             return f"no {name}"
-        stored = np.asarray(stats[name], np.float64).reshape(-1)
+        stored: np.ndarray = np.asarray(stats[name], np.float64).reshape(-1)
         if stored.size > 1 and (stored == stored[0]).all():
             stored = stored[:1]
         axis = 0 if stored.size == values.shape[1] > 1 else None

@@ -1,0 +1,30 @@
+"""Why a dataset's folder cannot be opened, where the reader's own error does not say it."""
+
+from pathlib import Path
+
+from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
+
+_LISTED = 3
+
+
+def find_damage(folder: Path) -> str | None:
+    """What is wrong with the files of a local dataset, and how to repair it, in one line.
+
+    Args:
+        folder: The dataset's root.
+
+    Returns:
+        The line, or None if there is no dataset in the folder, or nothing wrong with its files.
+    """
+    if not (folder / "meta" / "info.json").is_file():
+        return None
+    try:
+        report = check_dataset(folder, thorough=False)
+    except (DatasetDamagedError, OSError) as error:
+        return " ".join(str(error).split())
+    lost = [f"episode {number} is lost: {reason}" for number, reason in sorted(report.dropped.items())]
+    lines = [*report.findings, *lost]
+    if not lines:
+        return None
+    more = f"; and {len(lines) - _LISTED} more" if len(lines) > _LISTED else ""
+    return f"{'; '.join(lines[:_LISTED])}{more}. Repair it: playbyear-repair --root={folder}"
