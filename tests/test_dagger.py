@@ -17,6 +17,7 @@ from safetensors.torch import load_file
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerError, Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.collector import PolicyActor, collect
+from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
 from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.recording import env_spec
 
@@ -193,6 +194,19 @@ def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_pat
     small = ("--steps=1", "--batch_size=2", "--dataset.video_backend=pyav", "--env_eval_freq=0")
     run(lerobot_train.train, f"--policy.path={policy}", *data, *small, f"--output_dir={tmp_path / 'tuned'}")
     assert (tmp_path / "tuned/checkpoints/000001").is_dir()
+
+
+def test_the_rate_rises_once_and_falls_in_every_round():
+    cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), learning_rate=1.0, warmup_updates=4)
+    first = [cfg.rate(step, step, 10) for step in range(10)]
+    later = [cfg.rate(10 + number, number, 10) for number in range(10)]
+    assert first[:3] == [0.25, pytest.approx(0.5 * later[1]), pytest.approx(0.75 * later[2])]
+    assert first[3:] == later[3:]
+    assert later[0] == 1
+    assert later == sorted(later, reverse=True)
+    assert later[-1] < 0.05
+    cfg.anneal = False
+    assert cfg.rate(17, 7, 10) == 1
 
 
 # Who is kept

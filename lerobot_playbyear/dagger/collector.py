@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -62,6 +62,17 @@ class Attempt:
         return self.verdict is not Verdict.DISCARD and self.episode.success and self.intervention_share > 0
 
 
+class Learner(Protocol):
+    """Whoever acts while the expert does not."""
+
+    def reset(self) -> None:
+        """An episode begins."""
+
+    def act(self, observation: Observation, task: str) -> np.ndarray:
+        """An action (action dim,), as the environment takes it."""
+        ...
+
+
 class PolicyActor:
     """A policy as it acts in lerobot-eval, one environment at a time.
 
@@ -102,7 +113,7 @@ class PolicyActor:
         return action.to("cpu", torch.float32).numpy()[0]
 
 
-def collect(env: gym.Env, actor: PolicyActor, expert: Expert, seed: int, seconds: Seconds | None = None) -> Attempt:
+def collect(env: gym.Env, actor: Learner, expert: Expert, seed: int, seconds: Seconds | None = None) -> Attempt:
     """Plays one episode: in every step the expert is asked, and either acts or lets the policy act.
 
     The policy sees every step, also those in which the expert acts, so that its memory is that of the whole episode.

@@ -1,6 +1,7 @@
 """What `playbyear-dagger` can be told."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -71,7 +72,11 @@ class DaggerConfig:
         warmup_episodes: Attempts that the dataset holds before the first updates.
         updates: With `episodes=0`, how many updates to make from the corrections that are there.
         batch_size: Runs of windows per update, half of them from the demonstrations.
-        learning_rate: Of Adam, constant. The schedule that the policy was trained with has ended.
+        learning_rate: Of Adam, the largest of each round. The schedule that the policy was trained with has ended, and its
+            last rate was next to nothing.
+        anneal: Whether the rate falls to 0 over the updates of each round (a cosine), so that the policy that acts next has
+            settled. Otherwise it is constant.
+        warmup_updates: Over so many first updates of the run the rate rises, until Adam has its averages.
         seed: Of the random numbers of training, and of the first evaluation episode, as in lerobot-train.
         episode_seed: Of the first attempt; further ones take the next, but none of the evaluation's.
         max_attempts: Attempts in a row without one to keep, after which the run ends.
@@ -97,7 +102,9 @@ class DaggerConfig:
     warmup_episodes: int = 5
     updates: int = 0
     batch_size: int = 24
-    learning_rate: float = 1e-4
+    learning_rate: float = 3e-4
+    anneal: bool = True
+    warmup_updates: int = 50
     seed: int = 1000
     episode_seed: int = 10_000
     max_attempts: int = 50
@@ -154,6 +161,18 @@ class DaggerConfig:
                 "No environment: give --env.type and --env.task, or --episodes=0 --updates=N to learn from recorded "
                 "corrections alone."
             )
+
+    def rate(self, step: int, number: int, n_updates: int) -> float:
+        """The learning rate of an update.
+
+        Args:
+            step: Updates of the run before it.
+            number: Updates of the round before it.
+            n_updates: Updates of the round.
+        """
+        rise = min(1.0, (step + 1) / max(self.warmup_updates, 1))
+        fall = 0.5 * (1 + math.cos(math.pi * number / n_updates)) if self.anneal else 1.0
+        return self.learning_rate * rise * fall
 
     def training(self) -> PlaybyearTrainConfig:
         """The same as options of playbyear-train, for what HG-DAgger shares with it."""

@@ -177,12 +177,14 @@ class Loop:
             self._report.doing(f"learning {number + 1}/{n_updates}")
             with seconds.of("batch"):
                 batch = self._batches.batch(parts.step)
+            for group in parts.optimizer.param_groups:
+                group["lr"] = self._cfg.rate(parts.step, number, n_updates)
             with seconds.of("update"):
                 parts.update(batch, tracker, self._training.optimizer.grad_clip_norm)
             tracker.step()
             if self._scene is None:
                 self._report.advance()
-        figures = {key: tracker.to_dict()[key] for key in ("loss", "grad_norm", "lr")}
+        figures = {key: tracker.to_dict()[key] for key in ("loss", "grad_norm")}
         with seconds.of("loss"):
             halves = self._batches.halves(_LOSS_BATCHES + self._state.round)
             figures["loss_demonstrations"], figures["loss_interventions"] = (parts.loss(half) for half in halves)
