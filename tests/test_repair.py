@@ -1,7 +1,7 @@
 """Damaged datasets: what is whole is kept bit for bit, what is lost is named, and nothing ends in a traceback."""
 
-import json
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,11 @@ import pytest
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from recording_factory import (
-    CAMERA,
     FEATURES,
     FILM,
     FPS,
     REPO_ID,
     RICH_FEATURES,
-    TASKS,
     differences,
     episode_frames,
     load,
@@ -27,6 +25,7 @@ from recording_factory import (
 from lerobot_playbyear.datasets import settling
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, RepairReport, check_dataset, repair_dataset
+from lerobot_playbyear.scripts import repair as repair_command
 
 N_EPISODES = 6
 ENCODER = {"vcodec": "h264", "preset": "ultrafast"}
@@ -84,6 +83,18 @@ def copy(originals, tmp_path):
 
 def files(root: Path) -> list[Path]:
     return sorted(path for path in root.rglob("*") if path.is_file())
+
+
+def episodes_in(root: Path, name: Path) -> set[int]:
+    """The episodes whose frames or pictures are in a file."""
+    if name.parts[0] == "data":
+        return set(pq.read_table(root / name, columns=["episode_index"]).column(0).to_pylist())
+    if name.parts[0] == "videos":
+        rows = [row for path in root.glob("meta/episodes/*/*") for row in pq.read_table(path).to_pylist()]
+        numbers = tuple(int(part.rsplit("-", 1)[-1]) for part in name.with_suffix("").parts[-2:])
+        keys = [f"videos/{FILM}/{what}_index" for what in ("chunk", "file")]
+        return {row["episode_index"] for row in rows if tuple(row[key] for key in keys) == numbers}
+    return set()
 
 
 def check_kept(root: Path, report: RepairReport, features: dict[str, Any]) -> LeRobotDataset:
@@ -146,19 +157,197 @@ def test_recording_goes_on_where_lerobot_was_killed(copy):
     assert check_dataset(root).is_sound
 
 
+# What is damaged or deleted later
+
+
+def truncate(path: Path, share: float) -> None:
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+
+
+def flip(path: Path, share: float) -> None:
+    data = bytearray(path.read_bytes())
+    data[int(len(data) * share)] ^= 64
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("how", [truncate, flip])
+@pytest.mark.parametrize("folder", ["data", "videos"])
+def test_what_is_lost_takes_only_its_episodes_with_it(copy, folder, how):
+    """The second file holds episodes from the middle of the dataset; those after it move up."""
+    root = copy("ours")
+    path = files(root / folder)[1]
+    hit = episodes_in(root, path.relative_to(root))
+    how(path, 0.3)
+
+    report = repair_dataset(root)
+
+    lost = set(report.dropped)
+    assert lost <= hit < set(range(N_EPISODES))
+    assert set(report.kept) == set(range(N_EPISODES)) - lost
+    check_kept(root, report, RICH_FEATURES)
+    assert all(f"episode {number} is lost" in str(report) for number in lost)
+    assert lost
+    assert "Numbered anew" in str(report)
+    assert (report.original / path.relative_to(root)).exists()
+
+
+@pytest.mark.parametrize(("name", "is_deleted"), [("ours", True), ("lerobot", False)])
+@pytest.mark.parametrize("victim", ["meta/stats.json", "meta/tasks.parquet", "meta/episodes"])
+def test_tables_that_are_lost_are_made_anew(copy, originals, name, victim, is_deleted):
+    root = copy(name)
+    for path in files(root / victim) or [root / victim]:
+        path.unlink() if is_deleted else truncate(path, 0.5)
+
+    report = repair_dataset(root)
+
+    assert not report.dropped
+    assert victim in str(report)
+    dataset = check_kept(root, report, RICH_FEATURES)
+    original = load(originals[name][0])
+    assert dataset.meta.stats.keys() == original.meta.stats.keys()
+    np.testing.assert_allclose(dataset.meta.stats["action"]["q90"], original.meta.stats["action"]["q90"], atol=1e-6)
+
+
+def test_without_its_features_a_dataset_needs_one_that_is_like_it(copy, originals, capsys):
+    root = copy("ours")
+    (root / "meta/info.json").write_text("{")
+    with pytest.raises(DatasetDamagedError, match=r"info\.json is damaged.*--like="):
+        repair_dataset(root)
+
+    command(f"--root={root}", f"--like={originals['lerobot'][0]}")
+
+    assert "made anew" in capsys.readouterr().out
+    assert load(root).features.keys() == load(originals["ours"][0]).features.keys()
+    assert not differences(load(root), {n: n for n in range(N_EPISODES)}, RICH_FEATURES)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('"fps": 20', '"fps": 30', "fps was 30; the frames' timestamps are 20 per second"),
+        ('"sample_rate": 1600', '"sample_rate": 1602', "the sample rate of 'observation.audio.gripper' was 1602"),
+        ('"total_episodes": 6', '"total_episodes": 7', "counts 7 episodes of 30 frames in all; there are 6 of 30"),
+        ('"codebase_version": "v3.0"', '"codebase_version": "w3.0"', "codebase_version was 'w3.0'"),
+        ("{chunk_index:03d}/file", "{chunk_index:03d}/fike", "where nothing is"),
+    ],
+)
+def test_what_the_dataset_says_about_itself_is_held_against_the_data(copy, old, new, said):
+    root = copy("one file")
+    info = root / "meta/info.json"
+    assert old in info.read_text()
+    info.write_text(info.read_text().replace(old, new))
+
+    report = repair_dataset(root)
+
+    assert said in str(report)
+    check_kept(root, report, FEATURES)
+    dataset = load(root)
+    assert dataset.fps == FPS
+    assert dataset.features["observation.audio.gripper"]["info"]["sample_rate"] == 1600
+
+
+def test_a_feature_of_another_name_is_not_believed(copy):
+    root = copy("one file")
+    info = root / "meta/info.json"
+    info.write_text(info.read_text().replace('"action"', '"cction"'))
+    with pytest.raises(DatasetDamagedError, match=r"disagree: its columns are not .*: action, cction"):
+        repair_dataset(root)
+    report = repair_dataset(root, fps=FPS, features=FEATURES)
+    check_kept(root, report, FEATURES)
+
+
+def test_the_recorder_repairs_what_it_continues_and_says_so(copy, caplog):
+    root = copy("ours")
+    first = sorted(root.glob("data/*/*"))[0]
+    lost = episodes_in(root, first.relative_to(root))
+    first.unlink()
+    write_ours(root, RICH_FEATURES, range(20, 21))
+    assert f"Kept: {N_EPISODES - len(lost)} complete episodes" in caplog.text
+    assert "its frames are lost" in caplog.text
+    kept = [number for number in range(N_EPISODES) if number not in lost]
+    assert not differences(load(root), dict(enumerate([*kept, 20])), RICH_FEATURES)
+
+
+def test_nothing_is_changed_where_nothing_would_be_left(copy):
+    root = copy("one file")
+    for path in root.glob("data/*/*"):
+        truncate(path, 0.01)
+    before = {path: path.read_bytes() for path in files(root)}
+    with pytest.raises(DatasetDamagedError, match="No complete episode is left"):
+        repair_dataset(root)
+    assert {path: path.read_bytes() for path in files(root)} == before
+    assert not list(root.parent.glob(".*"))
+
+
+def test_a_repair_that_was_killed_is_finished(copy):
+    """Between the two renames that put the repaired copy in the dataset's place."""
+    root = copy("one file")
+    root.rename(root.with_name(".dataset.repairing"))
+    write_ours(root, FEATURES, range(N_EPISODES, N_EPISODES + 1))
+    assert load(root).num_episodes == N_EPISODES + 1
+
+
+# Folders of other tools
+
+
+def test_an_older_format_is_told_how_to_be_converted(copy):
+    root = copy("one file")
+    info = root / "meta/info.json"
+    info.write_text(info.read_text().replace('"v3.0"', '"v2.1"'))
+    shutil.rmtree(root / "meta/episodes")
+    (root / "meta/episodes.jsonl").write_text("{}\n")
+    with pytest.raises(DatasetDamagedError, match=r"older format v2\.1.*convert_dataset_v21_to_v30"):
+        write_ours(root, FEATURES)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error"),
+    [
+        ("demo.hdf5", b"\x89HDF", "holds no LeRobotDataset"),
+        ("meta/info.json", b'{"robot": "arm"}', "holds no LeRobotDataset"),
+        ("data/chunk-000/file-000.parquet", b"PAR1", "needs|--like|and nothing else says"),
+    ],
+)
+def test_a_folder_of_another_tool_is_named_as_such(tmp_path, name, content, error):
+    root = tmp_path / "dataset"
+    (root / name).parent.mkdir(parents=True)
+    (root / name).write_bytes(content)
+    with pytest.raises(DatasetDamagedError, match=error):
+        repair_dataset(root)
+    assert [path.relative_to(root).as_posix() for path in files(root)] == [name]
+
+
+def test_a_dataset_that_lerobot_had_only_begun_can_be_continued(tmp_path):
+    root = tmp_path / "dataset"
+    LeRobotDataset.create(REPO_ID, FPS, FEATURES, root=root, use_videos=False)
+    assert check_dataset(root).is_sound
+    write_ours(root, FEATURES, range(2))
+    assert not differences(load(root), {0: 0, 1: 1}, FEATURES)
+
+
+# The command
+
+
+def command(*arguments: str) -> int | str | None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["playbyear-repair", *arguments])
+        with pytest.raises(SystemExit) as end:
+            repair_command.main()
+    return end.value.code
+
+
+def test_the_command_looks_and_repairs(copy, capsys):
+    root = copy("killed")
+    assert command(f"--root={root}", "--dry_run=true") == 1
+    assert "is damaged" in capsys.readouterr().out
+    assert command(f"--root={root}") == 0
+    assert "Kept: 6 complete episodes" in capsys.readouterr().out
+    assert command(f"--root={root}", "--dry_run=true") == 0
+    assert "nothing wrong" in capsys.readouterr().out
+    assert str(command(f"--root={root}/nowhere")).startswith("error: ")
+
+
 # Damage of every kind, at random
-
-
-def episodes_in(root: Path, name: Path) -> set[int]:
-    """The episodes whose frames or pictures are in a file."""
-    if name.parts[0] == "data":
-        return set(pq.read_table(root / name, columns=["episode_index"]).column(0).to_pylist())
-    if name.parts[0] == "videos":
-        rows = [row for path in root.glob("meta/episodes/*/*") for row in pq.read_table(path).to_pylist()]
-        numbers = tuple(int(part.rsplit("-", 1)[-1]) for part in name.with_suffix("").parts[-2:])
-        keys = [f"videos/{FILM}/{what}_index" for what in ("chunk", "file")]
-        return {row["episode_index"] for row in rows if tuple(row[key] for key in keys) == numbers}
-    return set()
 
 
 def damage(path: Path, rng: np.random.Generator) -> str:
@@ -194,10 +383,13 @@ def damage_and_repair(original: Path, features: dict[str, Any], root: Path, seed
         hit |= episodes_in(original, name)
         hit_names.append(f"{damage(path, rng)} {name}")
     story = f"seed {seed} of {original.name}: {', '.join(hit_names)}"
+    report, error = None, ""
     try:
         report = repair_dataset(root, **({"fps": FPS, "features": features} if tells else {}))
-    except DatasetDamagedError as error:
-        assert str(root) in str(error), story
+    except DatasetDamagedError as refusal:
+        error = str(refusal)
+    if report is None:
+        assert str(root) in error, story
         excused = hit == set(range(N_EPISODES)) or (not tells and any("info.json" in name for name in hit_names))
         assert excused, f"{story}: {error}"
         return
@@ -206,7 +398,7 @@ def damage_and_repair(original: Path, features: dict[str, Any], root: Path, seed
     assert all(reason for reason in report.dropped.values())
     dataset = load(root)
     assert dataset.num_episodes == len(report.kept), story
-    # A bit of sound or of a film can flip unseen where LeRobot wrote it: without checksums.
+    # A bit of sound can flip unseen where LeRobot wrote it: without checksums.
     exact = {new: old for old, new in report.kept.items() if has_checksums or old not in hit}
     checked = {key: feature for key, feature in features.items() if key != FILM}
     wrong = differences(dataset, exact, checked)

@@ -26,6 +26,7 @@ from lerobot_playbyear.datasets.parquet_files import (
 )
 from lerobot_playbyear.datasets.statistics import add_stats, read_stats, row_stats, sound_stats, with_sound_stats
 from lerobot_playbyear.datasets.statistics import write_stats as write_dataset_stats
+from lerobot_playbyear.datasets.video_seal import seal
 
 logger = logging.getLogger(__name__)
 
@@ -55,6 +56,9 @@ def settle_episode(root: Path, staging: Path, meta: LeRobotDatasetMetadata, befo
     row_file = _settle_row(root, staging, row, row_file, last)
     _settle_stats(root, staging, meta, row, list(sound))
     names = [path for folder in ("data", "videos") for path in _new_files(staging, folder, before)]
+    for name in names:
+        if name.suffix == ".mp4":
+            seal(staging / name)
     tables = [path for path in _new_files(staging, "meta", before) if path not in (row_file, INFO)]
     return [*names, *tables, row_file, INFO]
 

@@ -27,6 +27,8 @@ from lerobot_playbyear.datasets.repair.info import DatasetDamagedError, correct_
 from lerobot_playbyear.datasets.repair.videos import check_videos
 from lerobot_playbyear.datasets.statistics import read_stats
 
+_MOST_EPISODES = 10_000  # that are believed to be lost; a larger number was misread
+
 
 @dataclass
 class RepairReport:
@@ -172,10 +174,8 @@ def _check_counts(info: DatasetInfo, runs: dict[int, Run], reasons: dict[int, st
     gone = [number for number in range(max(known, default=-1) + 1) if number not in known]
     reasons.update(dict.fromkeys(gone, "nothing is left of it"))
     count = max(known, default=-1) + 1
-    if info.total_episodes > count:
-        findings.append(
-            f"meta/info.json counts {info.total_episodes} episodes; nothing is left of those from number {count} on"
-        )
+    if count < info.total_episodes < count + _MOST_EPISODES and info.total_frames != _n_frames(runs):
+        reasons.update(dict.fromkeys(range(count, info.total_episodes), "nothing is left of it"))
     elif info.total_episodes != count or (not reasons and info.total_frames != _n_frames(runs)):
         findings.append(
             f"meta/info.json counts {info.total_episodes} episodes of {info.total_frames} frames in all; there are "

@@ -6,34 +6,33 @@ For every file that is named, one line of JSON: the times [s] of all pictures th
 import json
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-_SECONDS_PER_FILE = 3600
 
-
-def picture_times(path: Path) -> list[float]:
-    """Decodes a video to its end, in a process of its own.
+def picture_times(names: Iterable[Path], root: Path) -> dict[Path, list[float] | str]:
+    """Decodes videos to their end, in a process of its own.
 
     Args:
-        path: The file.
+        names: The files.
+        root: What their names are relative to.
 
     Returns:
-        The times of its pictures [s], in their order.
-
-    Raises:
-        ValueError: It cannot be decoded.
+        For each file the times of its pictures [s], in order, or why it cannot be decoded.
     """
-    command = [sys.executable, __file__, str(path)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_SECONDS_PER_FILE)
-    try:
-        answer = json.loads(result.stdout.splitlines()[-1])
-    except (IndexError, ValueError):
-        raise ValueError("it makes the decoder crash") from None
-    if "problem" in answer:
-        raise ValueError(answer["problem"])
-    return sorted(answer["times"])
+    answers: dict[Path, list[float] | str] = {}
+    left = sorted(names)
+    while left:
+        command = [sys.executable, __file__, *(str(root / name) for name in left)]
+        result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, check=False)
+        lines = [json.loads(line) for line in result.stdout.splitlines() if line.endswith("}")]
+        for name, answer in zip(left, lines, strict=False):
+            answers[name] = answer["problem"] if "problem" in answer else sorted(answer["times"])
+        if len(lines) < len(left):
+            answers[left[len(lines)]] = "it makes the decoder crash"
+        left = left[len(lines) + 1 :]
+    return answers
 
 
 def _decode(path: str) -> dict[str, Any]:

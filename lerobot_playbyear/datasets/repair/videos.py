@@ -1,6 +1,5 @@
 """The videos of a dataset: whether each episode's pictures are in them, and where."""
 
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -9,37 +8,10 @@ from lerobot.datasets.utils import DatasetInfo
 from lerobot_playbyear.datasets.repair.episodes import Row, name_episodes
 from lerobot_playbyear.datasets.repair.frames import Run
 from lerobot_playbyear.datasets.repair.video_times import picture_times
+from lerobot_playbyear.datasets.video_seal import is_intact
 
 _TOLERANCE = 1e-4  # seconds, LeRobot's own
 _BOX_HEADER = 8
-
-
-@dataclass
-class VideoFile:
-    """One video file.
-
-    Args:
-        problem: Why it cannot be read; None if it can.
-        times: When its pictures are shown [s], (N,); None where nobody looked.
-    """
-
-    problem: str | None = None
-    times: np.ndarray | None = field(default=None, repr=False)
-
-    def has(self, start: float, length: int, fps: int) -> bool:
-        """Whether it shows a picture at every frame of an episode that begins at `start` [s]."""
-        if self.problem:
-            return False
-        if self.times is None:
-            return True
-        wanted = start + np.arange(length) / fps
-        if len(self.times) == 0:
-            return False
-        nearest = np.clip(np.searchsorted(self.times, wanted), 1, max(len(self.times) - 1, 1))
-        nearest = np.minimum(nearest, len(self.times) - 1)
-        before = np.maximum(nearest - 1, 0)
-        distance = np.minimum(abs(self.times[nearest] - wanted), abs(self.times[before] - wanted))
-        return bool((distance < _TOLERANCE).all())
 
 
 def check_videos(
@@ -58,45 +30,103 @@ def check_videos(
         info: What it says about itself.
         runs: The episodes whose frames are complete; those without pictures are removed.
         rows: Their rows; those that are missing are begun, with the place of the videos.
-        thorough: Decode every video to its end; otherwise only look whether it is cut off.
+        thorough: Read every video to its end; otherwise only look whether it is cut off.
         reasons: Gets, for each episode that is removed, why.
         findings: Gets what was found wrong.
     """
     for key, feature in info.features.items():
         if feature["dtype"] != "video":
             continue
-        files: dict[Path, VideoFile] = {}
+        camera = _Camera(root, info, key, thorough)
+        if any(f"videos/{key}/file_index" not in rows.get(episode, {}) for episode in runs):
+            _place(camera, runs, rows)
         lost: dict[str, list[int]] = {}
-        lacking = [episode for episode in runs if episode not in rows]
-        if lacking:
-            _place(root, info, key, runs, rows, files)
         for episode, run in list(runs.items()):
-            row = rows.get(episode, {})
-            if f"videos/{key}/file_index" not in row:
-                reasons[episode] = f"its video of '{key}' is lost"
-                del runs[episode]
-                continue
-            name = _name(info, key, row)
-            video = _file(root / name, files, thorough)
-            if not video.has(row[f"videos/{key}/from_timestamp"], run.length, info.fps):
-                lost.setdefault(f"{name} {video.problem or 'ends, or has a gap, before its last picture'}", []).append(
-                    episode
-                )
-                reasons[episode] = f"its video of '{key}' is damaged: {name} {video.problem or 'lacks pictures of it'}"
+            problem = _problem(camera, rows.get(episode, {}), run.length)
+            if problem:
+                lost.setdefault(problem, []).append(episode)
+                reasons[episode] = f"its video of '{key}' is lost: {problem}"
                 del runs[episode]
         findings.extend(f"{problem}: {name_episodes(episodes)}" for problem, episodes in lost.items())
 
 
-def _file(path: Path, files: dict[Path, VideoFile], thorough: bool) -> VideoFile:
-    if path not in files:
-        problem = _cut_off(path)
-        files[path] = VideoFile(problem) if problem or not thorough else _decode(path)
-    return files[path]
+class _Camera:
+    """The video files of one camera.
+
+    Args:
+        root: The dataset's folder.
+        info: What it says about itself.
+        key: The camera.
+        thorough: Read files to their end.
+    """
+
+    def __init__(self, root: Path, info: DatasetInfo, key: str, thorough: bool) -> None:
+        self.key, self.fps = key, info.fps
+        self.names = sorted(path.relative_to(root) for path in (root / "videos" / key).glob("*/*.mp4"))
+        self._root, self._info, self._thorough = root, info, thorough
+        self._problems: dict[Path, str | None] = {}
+        self._sealed: set[Path] = set()
+        self._times: dict[Path, np.ndarray] = {}
+
+    def name(self, row: Row) -> Path:
+        """The file in which an episode's row says that its pictures are."""
+        chunk, file = row[f"videos/{self.key}/chunk_index"], row[f"videos/{self.key}/file_index"]
+        return Path(str(self._info.video_path).format(video_key=self.key, chunk_index=int(chunk), file_index=int(file)))
+
+    def problem(self, name: Path) -> str | None:
+        """What is wrong with a file as a whole."""
+        if name not in self._problems:
+            self._problems[name] = _cut_off(self._root / name)
+            if self._thorough and self._problems[name] is None:
+                intact = is_intact(self._root / name)
+                if intact:
+                    self._sealed.add(name)
+                elif intact is False:
+                    self._problems[name] = "is not what was recorded: its checksum differs"
+        return self._problems[name]
+
+    def shows(self, name: Path, start: float, length: int, certainly: bool = False) -> bool:
+        """Whether a file has a picture for each frame of an episode that begins at `start` [s].
+
+        Args:
+            name: The file.
+            start: When the episode begins in it [s].
+            length: The episode's frames.
+            certainly: Decode it, even where its checksum, or a less thorough check, makes that unnecessary.
+        """
+        if self.problem(name):
+            return False
+        if not certainly and (name in self._sealed or not self._thorough):
+            return True
+        times = self._picture_times(name, also_sealed=certainly)
+        if self.problem(name) or len(times) == 0:
+            return False
+        wanted = start + np.arange(length) / self._info.fps
+        after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
+        before = np.maximum(after - 1, 0)
+        return bool((np.minimum(abs(times[after] - wanted), abs(times[before] - wanted)) < _TOLERANCE).all())
+
+    def _picture_times(self, name: Path, also_sealed: bool) -> np.ndarray:
+        """Of one file; all others that will be asked for are decoded in one go."""
+        if name not in self._times:
+            sound = [other for other in self.names if not self.problem(other)]
+            names = {name, *(other for other in sound if also_sealed or other not in self._sealed)}
+            for other, answer in picture_times(names, self._root).items():
+                self._times[other] = np.array([] if isinstance(answer, str) else answer)
+                if isinstance(answer, str):
+                    self._problems[other] = f"cannot be decoded: {answer}"
+        return self._times[name]
 
 
-def _name(info: DatasetInfo, key: str, row: Row) -> Path:
-    chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
-    return Path(str(info.video_path).format(video_key=key, chunk_index=int(chunk), file_index=int(file)))
+def _problem(camera: _Camera, row: Row, length: int) -> str | None:
+    if f"videos/{camera.key}/file_index" not in row:
+        return f"no video of '{camera.key}' has its pictures"
+    name = camera.name(row)
+    if problem := camera.problem(name):
+        return f"{name} {problem}"
+    if camera.shows(name, row[f"videos/{camera.key}/from_timestamp"], length):
+        return None
+    return f"{name} {camera.problem(name) or 'lacks some of the pictures'}"
 
 
 def _cut_off(path: Path) -> str | None:
@@ -121,41 +151,23 @@ def _cut_off(path: Path) -> str | None:
     return None if b"moov" in kinds else "is cut off"
 
 
-def _decode(path: Path) -> VideoFile:
-    """Decodes a video to its end, or to where it breaks off."""
-    try:
-        return VideoFile(times=np.array(picture_times(path)))
-    except ValueError as error:
-        return VideoFile(f"cannot be decoded ({error})")
-
-
-def _place(
-    root: Path, info: DatasetInfo, key: str, runs: dict[int, Run], rows: dict[int, Row], files: dict[Path, VideoFile]
-) -> None:
-    """Finds the videos of episodes without a row: LeRobot puts one episode behind the other until a file is full."""
-    names = sorted(path.relative_to(root) for path in (root / "videos" / key).glob("*/*.mp4"))
-    at, place = 0, 0.0
+def _place(camera: _Camera, runs: dict[int, Run], rows: dict[int, Row]) -> None:
+    """Finds the pictures of episodes without a row: LeRobot puts one episode behind the other until a file is full."""
+    key, at, start = camera.key, 0, 0.0
     for episode in sorted(runs):
         row = rows.get(episode, {})
         if f"videos/{key}/file_index" in row:
-            name = _name(info, key, row)
-            at, place = names.index(name) if name in names else at, float(row[f"videos/{key}/to_timestamp"])
+            name = camera.name(row)
+            at = camera.names.index(name) if name in camera.names else at
+            start = float(row[f"videos/{key}/to_timestamp"])
             continue
-        while at < len(names):
-            video = _file(root / names[at], files, thorough=True)
-            if video.has(place, runs[episode].length, info.fps):
-                break
-            at, place = at + 1, 0.0
-        if at == len(names):
+        length = runs[episode].length
+        while at < len(camera.names) and not camera.shows(camera.names[at], start, length, certainly=True):
+            at, start = at + 1, 0.0
+        if at == len(camera.names):
             return
-        chunk, file = (int(part.rsplit("-", 1)[-1]) for part in names[at].with_suffix("").parts[-2:])
-        end = place + runs[episode].length / info.fps
-        rows.setdefault(episode, {}).update(
-            {
-                f"videos/{key}/chunk_index": chunk,
-                f"videos/{key}/file_index": file,
-                f"videos/{key}/from_timestamp": place,
-                f"videos/{key}/to_timestamp": end,
-            }
-        )
-        place = end
+        end = start + length / camera.fps
+        chunk, file = (int(part.rsplit("-", 1)[-1]) for part in camera.names[at].with_suffix("").parts[-2:])
+        place = {"chunk_index": chunk, "file_index": file, "from_timestamp": start, "to_timestamp": end}
+        rows.setdefault(episode, {}).update({f"videos/{key}/{what}": value for what, value in place.items()})
+        start = end
