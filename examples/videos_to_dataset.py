@@ -23,17 +23,18 @@ ENDINGS = (".mp4", ".mov", ".mkv", ".webm", ".avi")
 def pictures(film: Path, fps: int, size: int) -> np.ndarray:
     """The film's pictures at `fps` per second, (n, size, size, 3) uint8: at every frame's time the last one shown."""
     shown: list[np.ndarray] = []
-    last = None
+    last, at = None, 0.0
     with av.open(str(film)) as container:
         for frame in container.decode(video=0):
             picture = np.asarray(Image.fromarray(frame.to_ndarray(format="rgb24")).resize((size, size)))
-            last = picture if last is None else last
-            while len(shown) / fps < frame.time - 1e-6:
+            last, at = picture if last is None else last, frame.time
+            while len(shown) / fps < at - 1e-6:
                 shown.append(last)
             last = picture
     if last is None:
         raise SystemExit(f"{film} has no pictures.")
-    shown.append(last)
+    if len(shown) / fps <= at + 1e-6:
+        shown.append(last)
     return np.stack(shown)
 
 
@@ -65,6 +66,8 @@ def main() -> None:
             mono = resample(samples.mean(axis=1).astype(np.int16), rate, args.sample_rate)
             blocks = cut_into_frames(mono, args.sample_rate, args.fps, len(frames), pad=True)
             moves = np.loadtxt(actions[film], delimiter=",", ndmin=2) if "action" in features else None
+            if moves is not None and len(moves) != len(frames):
+                raise SystemExit(f"{actions[film]} has {len(moves)} lines; the film has {len(frames)} frames.")
             for i, picture in enumerate(frames):
                 frame = {"observation.images.camera": picture, "observation.audio.camera": blocks[i], "task": args.task}
                 if moves is not None:

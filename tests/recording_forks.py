@@ -5,6 +5,7 @@ Reads orders as lines of JSON, forks for each a child that begins like a fresh p
 
 import json
 import os
+import random
 import signal
 import sys
 import time
@@ -77,8 +78,8 @@ def record(root: str, episodes: int, share: float) -> dict[str, Any]:
     return {"saved": counts[-1] if counts else 0, "error": error}
 
 
-def read(root: str) -> dict[str, Any]:
-    """Has a child compare all episodes with what was recorded."""
+def read(root: str, begin: int) -> dict[str, Any]:
+    """Has a child compare what is there with what was recorded: all episodes from `begin` on, and some before it."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -88,7 +89,11 @@ def read(root: str) -> dict[str, Any]:
 
             dataset = load(root)
             answer["episodes"] = dataset.num_episodes
-            answer["wrong"] = differences(dataset, {n: n for n in range(dataset.num_episodes)}, RICH_FEATURES)[:5]
+            before = random.Random(begin).sample(range(begin), min(begin, 5))
+            numbers = [*before, *range(begin, dataset.num_episodes)]
+            answer["wrong"] = differences(dataset, {n: n for n in numbers}, RICH_FEATURES)[:5]
+            answer["rows"] = len(dataset.hf_dataset)
+            answer["frames"] = dataset.num_frames
             assert not [name for name in sys.modules if name.startswith("lerobot_playbyear")]
         except BaseException:
             answer["error"] = traceback.format_exc()
@@ -107,7 +112,7 @@ def main() -> None:
     os.dup2(2, 1)  # what libraries print is no answer
     if role == "read":
         sys.meta_path.insert(0, WithoutThePlugin())
-        import lerobot.datasets.lerobot_dataset
+        import lerobot.datasets.lerobot_dataset  # noqa: F401
     else:
         import lerobot_playbyear.datasets.durable  # noqa: F401
     import recording_factory  # noqa: F401

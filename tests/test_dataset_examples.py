@@ -1,0 +1,101 @@
+"""The examples that make datasets, run as they are printed."""
+
+import runpy
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_playbyear.datasets import episode_waveform, read_audio
+from lerobot_playbyear.datasets.repair import check_dataset
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+
+
+@pytest.fixture
+def run(monkeypatch):
+    def call(name: str, *arguments: str | Path) -> None:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+    return call
+
+
+def load(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("me/example", root=root, video_backend="pyav")
+
+
+def test_an_environment_of_ones_own_is_recorded_and_two_recordings_merge(run, tmp_path, capsys):
+    run("record_own_environment.py", f"--root={tmp_path / 'one'}", "--episodes=1")
+    run("record_own_environment.py", f"--root={tmp_path / 'one'}", "--episodes=2")  # goes on
+    run("record_own_environment.py", f"--root={tmp_path / 'two'}", "--episodes=1")
+    assert "Episode 1 is safe." in capsys.readouterr().out
+
+    merged = tmp_path / "merged"
+    run("merge_recordings.py", "--roots", tmp_path / "one", tmp_path / "two", f"--root={merged}", "--repo_id=me/both")
+
+    assert "3 episodes" in capsys.readouterr().out
+    assert check_dataset(merged).is_sound
+    for episode, (root, its) in enumerate([("one", 0), ("one", 1), ("two", 0)]):
+        waveform, rate = episode_waveform(load(merged), episode, "observation.audio.finger")
+        np.testing.assert_array_equal(
+            waveform, episode_waveform(load(tmp_path / root), its, "observation.audio.finger")[0]
+        )
+        assert rate == 16000
+    assert np.abs(waveform).max() > 4000  # it knocked
+
+
+def test_a_dataset_is_heard_in_ten_lines(run, tmp_path):
+    run("record_own_environment.py", f"--root={tmp_path / 'one'}", "--episodes=1")
+    where = ["--repo_id=me/knock", f"--root={tmp_path / 'one'}", f"--output_dir={tmp_path}"]
+    run("listen_to_dataset.py", *where)
+    samples, _ = read_audio(tmp_path / "episode_0_finger.wav")
+    waveform, _ = episode_waveform(load(tmp_path / "one"), 0, "observation.audio.finger")
+    np.testing.assert_array_equal(samples[:, 0], waveform)
+
+
+def write_film(path: Path, n_frames: int, fps: int, flash: int, sample_rate: int = 48000) -> None:
+    """A film of `n_frames` with a flash and a click at the same time."""
+    with av.open(str(path), "w") as film:
+        video = film.add_stream("libx264", rate=fps)
+        video.width = video.height = 96
+        audio = film.add_stream("aac", rate=sample_rate, layout="stereo")
+        for i in range(n_frames):
+            picture = np.full((96, 96, 3), 255 if i == flash else 30, np.uint8)
+            film.mux(video.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+        film.mux(video.encode(None))
+        sound = np.zeros((n_frames * sample_rate // fps, 2), np.int16)
+        click = round(flash / fps * sample_rate)
+        sound[click - 100 : click] = 20000
+        frame = av.AudioFrame.from_ndarray(sound.reshape(1, -1), "s16", "stereo")
+        frame.sample_rate, frame.pts, frame.time_base = sample_rate, 0, Fraction(1, sample_rate)
+        film.mux(audio.encode(frame))
+        film.mux(audio.encode(None))
+
+
+def test_a_folder_of_films_becomes_a_dataset(run, tmp_path, capsys):
+    films = tmp_path / "films"
+    films.mkdir()
+    write_film(films / "a.mp4", 60, 30, flash=30)
+    write_film(films / "b.mp4", 45, 30, flash=15)
+    for name, n_frames in (("a", 40), ("b", 30)):
+        np.savetxt(films / f"{name}.csv", np.arange(2 * n_frames).reshape(n_frames, 2), delimiter=",")
+    root = tmp_path / "dataset"
+
+    run("videos_to_dataset.py", f"--films={films}", f"--root={root}", "--task=Knock.")
+
+    assert "b.mp4: episode 1, 1.5 s" in capsys.readouterr().out
+    dataset = load(root)
+    assert [int(length) for length in dataset.meta.episodes["length"]] == [40, 30]
+    assert check_dataset(root).is_sound
+    for episode, flash in ((0, 20), (1, 10)):
+        first = dataset.meta.episodes[episode]["dataset_from_index"]
+        items = [dataset[first + i] for i in range(dataset.meta.episodes[episode]["length"])]
+        assert max(range(len(items)), key=lambda i: items[i]["observation.images.camera"].mean()) == flash
+        loudness = [np.abs(item["observation.audio.camera"].numpy().astype(int)).max() for item in items]
+        assert int(np.argmax(loudness)) == flash  # heard by the time of the picture
+        np.testing.assert_array_equal(items[3]["action"].numpy(), [6, 7])
