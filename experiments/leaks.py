@@ -18,7 +18,7 @@ import torch
 from torch import nn
 
 from experiments.protocol import RESULTS
-from gym_playbyear.base import SensorNoise
+from gym_playbyear.base import NO_SENSOR_NOISE, SensorNoise
 from gym_playbyear.experts import ExpertConfig, GraspExpert
 
 TASK = "OccludedGrasp-v0"
@@ -26,9 +26,10 @@ _ASIDE = -0.15  # x of a cube that is not in the way [m]
 _HISTORY = 10  # frames, as long as the policy's memory
 _PARTS = {"all": range(7), "hand": range(3), "fingers": (3, 4), "finger velocities": (5, 6)}
 _SENSORS = {
-    "the simulator's own state": SensorNoise(0, 0, 0, 0, 0, differentiated=False),
-    "noise, velocities of their own": SensorNoise(differentiated=False),
-    "noise, velocities from widths": SensorNoise(),
+    "the simulator's own state": NO_SENSOR_NOISE,
+    "noise of 0.2 mm, velocities of their own": SensorNoise(finger=0.0002, quantum_finger=0.0001, differentiated=False),
+    "noise of 0.2 mm, velocities from widths": SensorNoise(finger=0.0002, quantum_finger=0.0001),
+    "widths in steps of 0.5 mm, velocities from them": SensorNoise(),
 }
 
 

@@ -44,17 +44,22 @@ _LIFTED_SILENCE_HEIGHT = 0.84  # m: above it the paper's force proxy is silent (
 class SensorNoise:
     """Standard deviation and quantum of what the arm measures of itself, as on a real one. Zero switches noise off.
 
-    position: end effector [m]; finger: finger positions [m]; finger_velocity: [m/s]; quantum_*: rounding step;
+    position: end effector [m]; finger: finger positions [m]; finger_velocity: [m/s]; quantum_*: rounding step. A hand whose
+    encoder has 8 bits counts in steps of half a millimetre.
     differentiated: finger velocities are differences of the measured positions over a step, as from a hand that reports
     its width alone; otherwise they are the fingers' own at the moment, in which every touch rings.
     """
 
     position: float = 0.0003
-    finger: float = 0.0002
+    finger: float = 0.00002
     finger_velocity: float = 0.002
     quantum_position: float = 0.0001
+    quantum_finger: float = 0.0005
     quantum_velocity: float = 0.001
     differentiated: bool = True
+
+
+NO_SENSOR_NOISE = SensorNoise(0, 0, 0, 0, 0, 0, differentiated=False)
 
 
 @dataclass(frozen=True)
@@ -319,7 +324,7 @@ class PlayByEarEnv(gym.Env):
         values = np.concatenate([self.eef_position - self._base, self.data.qpos[fingers], self.data.qvel[fingers]])
         scale = np.repeat([noise.position, noise.finger, noise.finger_velocity], (3, 2, 2))
         values += scale * self.np_random.standard_normal(7)
-        quantum = np.repeat([noise.quantum_position, noise.quantum_velocity], (5, 2))
+        quantum = np.repeat([noise.quantum_position, noise.quantum_finger, noise.quantum_velocity], (3, 2, 2))
         coarse = quantum > 0
         values[coarse] = np.round(values[coarse] / quantum[coarse]) * quantum[coarse]
         if noise.differentiated:

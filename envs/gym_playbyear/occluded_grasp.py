@@ -7,7 +7,7 @@ import numpy as np
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.base import PlayByEarEnv, SensorNoise, Variant
+from gym_playbyear.base import NO_SENSOR_NOISE, PlayByEarEnv, Variant
 from gym_playbyear.blind import blind_grasps
 from gym_playbyear.experts import CORRECTING_EXPERT, GraspExpert
 from gym_playbyear.gates import InterventionGate
@@ -89,7 +89,7 @@ class OccludedGraspEnv(PlayByEarEnv):
             cube_friction=5,
             horizon=250,
             arm=replace(ArmConfig(), max_opening=0.08, gripper_cooldown=0.0),
-            sensors=SensorNoise(0, 0, 0, 0, 0, differentiated=False),
+            sensors=NO_SENSOR_NOISE,
         ),
     }
 

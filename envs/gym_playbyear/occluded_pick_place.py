@@ -7,7 +7,7 @@ import numpy as np
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml, tray_xml
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.base import PlayByEarEnv, SensorNoise, Variant
+from gym_playbyear.base import NO_SENSOR_NOISE, PlayByEarEnv, Variant
 from gym_playbyear.blind import blind_pick_places
 from gym_playbyear.experts import CORRECTING_EXPERT, PickPlaceExpert
 from gym_playbyear.gates import InterventionGate
@@ -92,7 +92,7 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
             cube_friction=5,
             horizon=400,
             arm=replace(ArmConfig(), max_opening=0.08, gripper_cooldown=0.0),
-            sensors=SensorNoise(0, 0, 0, 0, 0, differentiated=False),
+            sensors=NO_SENSOR_NOISE,
         ),
     }
 
