@@ -299,7 +299,7 @@ def test_a_video_dataset_of_two_cameras_and_two_microphones_at_an_odd_rate(brows
     size = page.evaluate("[document.getElementById('video').videoWidth, document.getElementById('video').videoHeight]")
     assert size == [96, 48]
     assert text(page, "#cameras").split() == ["front", "wrist"]
-    assert "left left, right right" in text(page, "#heard")
+    assert "L left, R right" in text(page, "#heard")
     assert len(page.evaluate("[...document.querySelectorAll('.scale')].map((scale) => scale.width)")) == 2
     assert page.evaluate("document.getElementById('video').duration") == pytest.approx(1, abs=0.1)
 

@@ -33,7 +33,7 @@ function showHead() {
     byId("verdicts").append(line);
   }
   const decibels = 20 * Math.log10(dataset.gain);
-  const heard = dataset.microphones.length > 1 ? [`${shortName(dataset.microphones[0].key)} left, ${shortName(dataset.microphones[1].key)} right`] : [];
+  const heard = dataset.microphones.length > 1 ? [`L ${shortName(dataset.microphones[0].key)}, R ${shortName(dataset.microphones[1].key)}`] : [];
   if (dataset.microphones.length && Math.abs(decibels) >= 1) heard.push(`${Math.abs(decibels).toFixed(0)} dB ${decibels > 0 ? "louder" : "quieter"} than recorded`);
   byId("heard").textContent = heard.join(", ");
   byId("volume-label").hidden = !dataset.microphones.length;

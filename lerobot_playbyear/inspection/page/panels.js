@@ -2,6 +2,7 @@
 
 const DASHES = [[], [5, 3], [1.5, 2.5], [8, 3, 2, 3]];
 const N_COLOURS = 7;
+const LONG_NAME = 8; // letters
 const VERY_DIFFERENT = 8; // ranges: drawn on one scale the smallest curve would be flat
 
 class Panel {
@@ -59,7 +60,7 @@ class MomentsPanel extends Panel {
 
 class WavePanel extends Panel {
   constructor(episode, axis, microphone) {
-    super(episode, axis, 66);
+    super(episode, axis, episode.microphones.length > 1 ? 52 : 66);
     this.microphone = microphone;
     this.value = make("p");
     this.legend.append(
@@ -95,7 +96,7 @@ class WavePanel extends Panel {
 
 class SpectrogramPanel extends Panel {
   constructor(episode, axis, microphone) {
-    super(episode, axis, 136);
+    super(episode, axis, episode.microphones.length > 1 ? 100 : 136);
     this.microphone = microphone;
     this.picture = coloured(microphone.levels);
     const scale = make("canvas", { className: "scale", width: 256, height: 1 });
@@ -134,7 +135,8 @@ class SpectrogramPanel extends Panel {
 
 class CurvesPanel extends Panel {
   constructor(episode, axis, curve, settings) {
-    super(episode, axis, Math.max(112, 34 + 18 * Math.ceil(curve.names.length / (curve.names.length > 4 ? 2 : 1))));
+    const columns = curve.names.length > 4 && Math.max(...curve.names.map((name) => name.length)) < LONG_NAME ? 2 : 1;
+    super(episode, axis, Math.max(112, 30 + 17 * Math.ceil(curve.names.length / columns)));
     Object.assign(this, { curve, settings });
     this.size = curve.names.length;
     const spans = curve.names.map((_, d) => curve.high[d] - curve.low[d]).filter((span) => span > 0);
@@ -146,7 +148,7 @@ class CurvesPanel extends Panel {
     button.onclick = () => settings.toggleScale(curve.key);
     const title = make("h4", {}, curve.key);
     if (this.size > 1) title.append(button);
-    const list = make("div", { className: this.size > 4 ? "dimensions" : "dimensions wide" });
+    const list = make("div", { className: columns > 1 ? "dimensions" : "dimensions wide" });
     curve.names.forEach((name, d) => {
       const entry = make("button", { title: `Show or hide ${name}` });
       entry.innerHTML = `<svg width="16" height="8"><line x1="0" x2="16" y1="4" y2="4" stroke="var(--c${d % N_COLOURS})" stroke-width="2.5" stroke-dasharray="${dash(d).join(" ")}"/></svg>`;
