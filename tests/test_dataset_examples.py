@@ -1,5 +1,6 @@
 """The examples that make datasets, run as they are printed."""
 
+import re
 import runpy
 import sys
 from fractions import Fraction
@@ -8,6 +9,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from dataset_factory import make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_playbyear.datasets import episode_waveform, read_audio
@@ -99,3 +101,16 @@ def test_a_folder_of_films_becomes_a_dataset(run, tmp_path, capsys):
         loudness = [np.abs(item["observation.audio.camera"].numpy().astype(int)).max() for item in items]
         assert int(np.argmax(loudness)) == flash  # heard by the time of the picture
         np.testing.assert_array_equal(items[3]["action"].numpy(), [6, 7])
+
+
+def test_the_pages_programs_run(tmp_path, monkeypatch):
+    """Every Python block of docs/dataset.md, in a folder that holds the dataset of `make demo`."""
+    monkeypatch.chdir(tmp_path)
+    make_dataset(tmp_path / "outputs/demo/dataset", (12,), image_size=16, repo_id="demo/occluded")
+    page = (EXAMPLES.parent / "docs" / "dataset.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    assert len(blocks) == 3
+    for block in blocks:
+        exec(compile(block, "docs/dataset.md", "exec"), {})
+    assert read_audio("episode_0.flac")[0].shape == (12 * 800, 1)
+    assert load(tmp_path / "outputs/knocks").num_frames == 60

@@ -175,8 +175,8 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None) -> None:
             pq.read_metadata(path)
         except (pa.ArrowInvalid, OSError) as error:
             raise ValueError(
-                f"'{path}' is truncated or not a parquet file ({error}). The recording was killed before "
-                "`dataset.finalize()`: delete the file's episodes and record them again."
+                f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
+                f"killed, its episodes can be saved: playbyear-repair --root={folder}"
             ) from error
     if not any(folder.glob("data/*/*.parquet")):
         raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
