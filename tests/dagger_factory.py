@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
@@ -12,11 +13,15 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
 from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.scripts import dagger as dagger_script
 from lerobot_playbyear.scripts import train as train_script
 
 ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v0", "--env.image_size=16")
+QUICK = ("--expert.type=test_quick", "--env.episode_length=12")
+"""Attempts of a few steps, of which every third is not worth keeping."""
+
 SMALL = ("--updates_per_episode=2", "--warmup_episodes=1", "--batch_size=4", "--eval_every=0")
 _TINY_POLICY = (
     "--policy.type=playbyear",
@@ -29,6 +34,37 @@ _TINY_POLICY = (
     "--policy.n_supervised_steps=4",
     "--policy.hidden_size=32",
 )
+
+
+@ExpertConfig.register_subclass("test_quick")
+@dataclass
+class QuickConfig(ExpertConfig):
+    """Acts for three steps and ends the attempt: as a success, but for seeds that 3 divides."""
+
+    n_steps: int = 8
+
+    def make(self, env):
+        return Quick(self.n_steps)
+
+
+class Quick(Expert):
+    def __init__(self, n_steps):
+        self.n_steps = n_steps
+
+    def reset(self, env):
+        self.n, self.is_success = 0, env.unwrapped.np_random_seed % 3 > 0
+
+    def wants_control(self, observation, policy_action):
+        self.n += 1
+        return 3 <= self.n < 6
+
+    def act(self):
+        return np.array([0.2, 0.1, -0.2, -1.0], np.float32)
+
+    def verdict(self):
+        if self.n < self.n_steps:
+            return None
+        return Verdict.SUCCESS if self.is_success else Verdict.FAILURE
 
 
 @cache

@@ -1,0 +1,220 @@
+"""What `playbyear-dagger` refuses, each with one clear error and before any work; and datasets that others wrote."""
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+import torch
+from dagger_factory import QUICK, arguments, base_folder, command, dagger, metrics
+from dataset_factory import dataset_features, make_dataset, random_frame
+from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets import LeRobotDataset
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_playbyear.dagger import DaggerError
+from lerobot_playbyear.scripts import dagger as dagger_script
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    register_third_party_plugins()
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+@pytest.mark.parametrize(
+    ("features", "message"),
+    [
+        ({"fps": 10}, "has 10 frames per second, and the policy is configured for 20"),
+        ({"sample_rate": 48000}, r"recorded at 48000 Hz in the dataset 'tests/demos'.*trained with 16000 Hz"),
+        ({"state_size": 6}, r"'observation.state' has shape \(6,\).*trained with \(7,\)"),
+        ({"action_size": 7}, r"'action' has shape \(7,\).*trained with \(4,\)"),
+        ({"microphones": ()}, r"lacks \['observation.audio.gripper'\]"),
+        ({"image_size": 24}, r"'observation.images.front' has shape \(24, 24, 3\)"),
+    ],
+    ids=["fps", "sample rate", "state", "action", "no microphone", "camera"],
+)
+def test_demonstrations_that_the_policy_was_not_made_for(features, message, tmp_path):
+    features = {"image_size": 16, **features}
+    fps = features.get("fps", 20)
+    make_dataset(tmp_path / "demos", (5,), fps, features=dataset_features(**features))
+    with pytest.raises(DaggerError, match=message):
+        dagger(tmp_path, *QUICK, f"--demos.root={tmp_path / 'demos'}")
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "corrections").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            ("--env.sample_rate=8000",),
+            r"differ: 'observation.audio.gripper' is int16 \(800,\) at 16000 Hz there and int16",
+        ),
+        (
+            ("--env.image_size=20",),
+            r"differ: 'observation.images.front' is picture \(16, 16, 3\) there and picture \(20",
+        ),
+        (("--env.sound=none",), "'observation.audio.gripper' is int16 .* there and absent here"),
+        (("--env.microphones=[ceiling]",), "does not start.*ceiling"),
+        (("--batch_size=5",), "--batch_size=5 must be even"),
+        (("--warmup_episodes=0",), "--warmup_episodes=0: give at least 1"),
+        (("--learning_rate=0",), "--learning_rate=0.0 must be above 0"),
+        (("--updates=5",), "--updates is for --episodes=0"),
+        (("--episodes=0",), "give --updates"),
+        (("--policy.push_to_hub=true",), "--policy.push_to_hub=true needs a name: give --policy.repo_id"),
+    ],
+)
+def test_options_that_do_not_go_together(options, message, tmp_path):
+    with pytest.raises(DaggerError, match=message):
+        dagger(tmp_path, *QUICK, *options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_without_an_environment_or_a_policy(tmp_path):
+    with pytest.raises(
+        DaggerError, match=r"No environment: give --env.type and --env.task, or --episodes=0 --updates=N"
+    ):
+        command(*arguments(tmp_path, "--episodes=1", env=()))
+    without = [option for option in arguments(tmp_path, *QUICK) if not option.startswith("--policy")]
+    with pytest.raises(DaggerError, match=r"HG-DAgger improves a trained policy: give .* --policy.path"):
+        command(*without)
+
+
+def test_an_environment_without_a_gate(tmp_path, monkeypatch):
+    from gym_playbyear.occluded_grasp import OccludedGraspEnv
+
+    monkeypatch.setattr(OccludedGraspEnv, "intervention_gate", None)
+    with pytest.raises(DaggerError, match=r"needs an environment with `intervention_gate\(\)`.*own_expert.py"):
+        dagger(tmp_path)
+
+
+# Output folders
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    dagger(folder, *QUICK, "--episodes=1")
+    return folder
+
+
+def test_the_folder_of_a_run_is_not_touched_without_resume(finished):
+    with pytest.raises(DaggerError, match=r"holds a run already: go on with it with --resume=true"):
+        dagger(finished, *QUICK)
+
+
+@pytest.mark.parametrize(
+    ("options", "difference"),
+    [
+        (("--env.task=OccludedPickPlace-v0",), r"--env was .*OccludedGrasp-v0.* and is .*OccludedPickPlace-v0"),
+        (("--demos.repo_id=other/demos",), r"--demos was .*tests/demos.* and is .*other/demos"),
+        (("--expert.n_steps=9",), "--expert was .*'n_steps': 8.* and is .*'n_steps': 9"),
+        (("--episode_seed=5",), "--episode_seed was 10000 and is 5"),
+        (("--policy.path=elsewhere",), "--policy.path was .*policy and is elsewhere"),
+    ],
+)
+def test_resuming_another_run_names_the_difference(finished, options, difference):
+    with pytest.raises(DaggerError, match=f"holds another run: {difference}"):
+        dagger(finished, "--resume=true", *QUICK, *options)
+
+
+def test_the_output_of_another_command_is_refused(tmp_path):
+    with pytest.raises(DaggerError, match=r"holds files, but no run of playbyear-dagger"):
+        dagger(tmp_path, *QUICK, "--resume=true", f"--output_dir={base_folder() / 'train'}")
+
+
+def test_a_dataset_that_something_else_changed_is_refused(finished, tmp_path):
+    shutil.copytree(finished / "out", tmp_path / "out")
+    state = json.loads((tmp_path / "out/dagger_state.json").read_text())
+    state["kept"] = state["round"] = 5
+    (tmp_path / "out/dagger_state.json").write_text(json.dumps(state))
+    with pytest.raises(DaggerError, match="holds 1 attempts, and this run knows of 5"):
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=8")
+
+
+def test_nothing_to_do_is_said(finished, tmp_path):
+    with pytest.raises(DaggerError, match="holds 1 attempts already, and --episodes=1 asks for no more"):
+        dagger(finished, *QUICK, "--episodes=1", f"--output_dir={tmp_path / 'out'}")
+
+
+def test_the_command_says_in_one_line_what_is_wrong(finished, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(finished, *QUICK)])
+    with pytest.raises(SystemExit, match=r"^error: --output_dir=.* holds a run already"):
+        dagger_script.main()
+
+
+# Recorded corrections
+
+
+def learn(tmp_path, root, *options):
+    offline = ("--episodes=0", "--updates=2", f"--interventions.root={root}")
+    return command(*arguments(tmp_path, *offline, *options, env=()))
+
+
+def rollout_dataset(root, lengths, mark, use_videos=False):
+    """A dataset as `lerobot-rollout --strategy.type=dagger` writes it: observations, action and `intervention`, no more."""
+    features = dataset_features(image_size=16, use_videos=use_videos)
+    del features["next.reward"]
+    names = [f"joint_{i}.pos" for i in range(4)]
+    features["action"] = {"dtype": "float32", "shape": (4,), "names": names}
+    options = {"robot_type": "so100", "use_videos": use_videos, "video_backend": "pyav"}
+    if use_videos:  # LeRobot's default encoder does not take pictures as small as these
+        options["rgb_encoder"] = RGBEncoderConfig(vcodec="h264")
+    dataset = LeRobotDataset.create("tests/rollout_corrections", 20, features, root=root, **options)
+    rng = np.random.default_rng(0)
+    for length in lengths:
+        for step in range(length):
+            frame = {**random_frame(features, rng), "intervention": np.array([mark(step)], dtype=bool)}
+            dataset.add_frame({**frame, "task": "grasp"})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+@pytest.mark.parametrize(
+    ("mark", "use_videos"),
+    [(lambda step: 5 <= step < 12, False), (lambda step: True, True)],
+    ids=["whole", "corrections"],
+)
+def test_it_learns_from_what_lerobots_rollout_recorded(tmp_path, mark, use_videos):
+    """Both of its modes: whole attempts with tags, and episodes of corrections alone; as pictures and as video."""
+    rollout_dataset(tmp_path / "rollout", (20, 14), mark, use_videos=use_videos)
+    out = learn(tmp_path, tmp_path / "rollout")
+    assert (out / "checkpoints/000002/pretrained_model/model.safetensors").is_file()
+    assert metrics(tmp_path, "round")[-1]["loss_interventions"] > 0
+
+
+def test_demonstrations_alone_are_the_control(tmp_path):
+    """Every frame of a demonstration was chosen by an expert: the same updates without corrections."""
+    learn(tmp_path, base_folder() / "demos")
+    assert metrics(tmp_path, "round")[-1]["step"] == 2
+
+
+def test_corrections_without_a_correction(tmp_path):
+    rollout_dataset(tmp_path / "rollout", (20,), lambda step: False)
+    with pytest.raises(DaggerError, match="None of the 20 frames of the intervention dataset has 'intervention' set"):
+        learn(tmp_path, tmp_path / "rollout")
+
+
+def test_corrections_that_do_not_say_who_acted(tmp_path):
+    features = dataset_features(image_size=16)
+    del features["intervention"]
+    make_dataset(tmp_path / "data", (20,), features=features)
+    with pytest.raises(DaggerError, match=r"wanted 'intervention', bool \(1,\), and there is no such feature"):
+        learn(tmp_path, tmp_path / "data")
+
+
+def test_corrections_that_are_empty(tmp_path):
+    LeRobotDataset.create("tests/corrections", 20, dataset_features(image_size=16), root=tmp_path / "data").finalize()
+    with pytest.raises(DaggerError, match="is empty"):
+        learn(tmp_path, tmp_path / "data")
+
+
+def test_corrections_that_differ_from_the_demonstrations(tmp_path):
+    make_dataset(tmp_path / "data", (20,), features=dataset_features(image_size=16, state_size=5))
+    with pytest.raises(DaggerError, match=r"the corrections differ: 'observation.state' is float32 \(7,\) there and"):
+        learn(tmp_path, tmp_path / "data")

@@ -1,0 +1,264 @@
+"""A run of HG-DAgger that is killed at any moment goes on and ends as one that was not; nothing is lost or doubled."""
+
+import contextlib
+import multiprocessing
+import os
+import resource
+import signal
+
+import numpy as np
+import pytest
+import torch
+from dagger_factory import (
+    QUICK,
+    arguments,
+    base_folder,
+    column,
+    command,
+    corrections,
+    dagger,
+    metrics,
+    seeds,
+    state,
+)
+from lerobot.utils.import_utils import register_third_party_plugins
+from safetensors.torch import load_file
+
+from lerobot_playbyear.dagger import DaggerError
+from lerobot_playbyear.dagger import folder as folder_module
+from lerobot_playbyear.datasets.durable import DurableWriter
+
+RUN = (*QUICK, "--eval_every=2", "--eval.n_episodes=1", "--episodes=4", "--warmup_episodes=2")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    register_third_party_plugins()
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """A run of four attempts that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    dagger(folder, *RUN)
+    return folder
+
+
+def weights(folder):
+    return load_file(folder / "out/checkpoints/last/pretrained_model/model.safetensors")
+
+
+def figures(folder):
+    """All figures but times, and where they stand; a recovered attempt has no times anyway."""
+    lines = [{key: value for key, value in line.items() if not key.endswith("_s")} for line in metrics(folder)]
+    return [{key: value for key, value in line.items() if key != "recovered"} for line in lines]
+
+
+def assert_ended_alike(folder, expected):
+    assert seeds(folder) == seeds(expected)
+    for key in ("action", "intervention", "observation.state", "observation.audio.gripper"):
+        np.testing.assert_array_equal(column(corrections(folder), key), column(corrections(expected), key))
+    ours, theirs = weights(folder), weights(expected)
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+    assert figures(folder) == figures(expected)
+    assert state(folder) == state(expected)
+    assert {path.name for path in (folder / "out").iterdir()} == {path.name for path in (expected / "out").iterdir()}
+    names = [{path.name for path in (f / "out/checkpoints").iterdir()} for f in (folder, expected)]
+    assert names[0] == names[1]
+
+
+class PowerCut(BaseException):
+    """Stops the run at a chosen moment, so that no clean-up of its own runs."""
+
+
+def cut_power(monkeypatch, owner, name, after):
+    """Lets `owner.name` work `after` times; the next call stops the run before it does anything."""
+    calls, real = iter(range(10**6)), getattr(owner, name)
+
+    def wrapped(*args, **kwargs):
+        if next(calls) == after:
+            raise PowerCut
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, wrapped)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "after"),
+    [
+        (DurableWriter, "add_frame", 20),  # while an attempt is written
+        (folder_module.RunFolder, "commit", 6),  # the attempt is on disk and not yet counted
+        (folder_module.RunFolder, "save_checkpoint", 1),
+        (folder_module.os, "replace", 14),  # the checkpoint is complete and not yet at its place
+        (folder_module.RunFolder, "clean", 3),  # the round counts, `last` does not say so yet
+    ],
+    ids=["writing", "counting", "saving", "placing", "cleaning"],
+)
+def test_wherever_it_stops_it_ends_alike(undisturbed, tmp_path, monkeypatch, owner, name, after):
+    with monkeypatch.context() as patch:
+        cut_power(patch, owner, name, after)
+        with pytest.raises(PowerCut):
+            dagger(tmp_path, *RUN)
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}")
+    assert_ended_alike(tmp_path, undisturbed)
+
+
+def test_more_episodes_go_on_with_a_finished_run(undisturbed, tmp_path):
+    dagger(tmp_path, *RUN, "--episodes=2")
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=4")
+    assert seeds(tmp_path) == seeds(undisturbed)
+    ours, theirs = weights(tmp_path), weights(undisturbed)
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def test_a_finished_run_stays_as_it_is(undisturbed):
+    before = figures(undisturbed), state(undisturbed), seeds(undisturbed)
+    command("--resume=true", f"--output_dir={undisturbed / 'out'}")
+    assert (figures(undisturbed), state(undisturbed), seeds(undisturbed)) == before
+
+
+def test_resuming_where_there_is_nothing_begins(undisturbed, tmp_path):
+    dagger(tmp_path, *RUN, "--resume=true")
+    assert_ended_alike(tmp_path, undisturbed)
+
+
+# SIGKILL: a process of its own, killed by the operating system
+
+
+def _run_command(args):
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    torch.set_num_threads(1)
+    register_third_party_plugins()
+    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
+        command(*args)
+
+
+@pytest.fixture(scope="module")
+def processes():
+    """Makes processes that have LeRobot imported already, and nothing else done."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["dagger_factory", "lerobot_env_playbyear", "lerobot.scripts.lerobot_eval"])
+    return context
+
+
+def run_and_kill(processes, folder, n_kills, shortest, longest, *options):
+    """Runs the command, kills it n times after random times [s], and lets it end. Returns what each kill found."""
+    rng = np.random.default_rng(0)
+    args = [*arguments(folder, *options), "--resume=true"]
+    found = []
+    for number in range(n_kills + 1):
+        process = processes.Process(target=_run_command, args=(args,))
+        process.start()
+        process.join(rng.uniform(shortest, longest) if number < n_kills else None)
+        if process.exitcode is None:
+            os.kill(process.pid, signal.SIGKILL)
+            process.join()
+            found.append(_what_is_there(folder))
+            assert_everything_loads(folder)
+        else:
+            assert process.exitcode == 0
+            break
+    return found
+
+
+def _what_is_there(folder):
+    """How far the run was when it was killed."""
+    if not (folder / "out/dagger_state.json").exists():
+        return "starting"
+    counters = state(folder)
+    half_done = sorted(path.name for path in folder.rglob("*.partial")) + [
+        p.name for p in folder.rglob(".journal.json")
+    ]
+    return f"attempt {counters['attempts']}, round {counters['round']}, kept {counters['kept']} {half_done}"
+
+
+def assert_everything_loads(folder):
+    """After a kill: the dataset with plain LeRobot, the newest checkpoint, the state."""
+    if (folder / "corrections/meta/info.json").exists():
+        dataset = corrections(folder)
+        assert len(column(dataset, "action")) == dataset.num_frames
+    if (folder / "out/dagger_state.json").exists():
+        checkpoint = state(folder)["checkpoint"]
+        if checkpoint is not None:
+            load_file(folder / "out/checkpoints" / checkpoint / "pretrained_model/model.safetensors")
+            load_file(folder / "out/checkpoints" / checkpoint / "training_state/optimizer_state.safetensors")
+
+
+def assert_complete(folder, n_episodes):
+    found = seeds(folder)
+    assert len(found) == n_episodes
+    assert found == sorted(set(found)), "an attempt is there twice"
+    kept = [line["seed"] for line in metrics(folder, "attempt") if line["outcome"] == "kept"]
+    assert kept == found
+    attempts = [line["attempt"] for line in metrics(folder, "attempt")]
+    assert attempts == list(range(1, state(folder)["attempts"] + 1))
+    assert [line["round"] for line in metrics(folder, "round")] == list(range(1, n_episodes + 1))
+    assert (folder / "out/checkpoints/last/pretrained_model/model.safetensors").is_file()
+    assert len(list((base_folder() / "demos/data").rglob("*.parquet"))) > 0
+
+
+def test_killed_it_goes_on(processes, tmp_path, undisturbed):
+    found = run_and_kill(processes, tmp_path, 3, 1.0, 4.0, *RUN)
+    assert len(found) > 0
+    assert_complete(tmp_path, 4)
+    assert_ended_alike(tmp_path, undisturbed)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_killed_twenty_times_it_ends_complete_and_alike(processes, tmp_path):
+    """The scripted expert, whole attempts, evaluations; and the weights of a run that was never killed."""
+    options = (
+        "--eval_every=2",
+        "--eval.n_episodes=2",
+        "--warmup_episodes=2",
+        "--updates_per_episode=20",
+        "--episodes=20",
+    )
+    found = run_and_kill(processes, tmp_path / "killed", 20, 2.0, 12.0, *options)
+    print("\n".join(found))
+    assert len(found) == 20
+    assert_complete(tmp_path / "killed", 20)
+    assert run_and_kill(processes, tmp_path / "calm", 0, 0, 0, *options) == []
+    assert_ended_alike(tmp_path / "killed", tmp_path / "calm")
+
+
+# What cannot be written
+
+
+@contextlib.contextmanager
+def small_disk(n_bytes):
+    """No file can become larger than this: writing more fails, as on a full disk."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.mark.parametrize(
+    ("n_bytes", "message"),
+    [
+        (300_000, r"Cannot write to .*out.*What was saved before is complete.*--resume=true"),
+        (80_000, r"Episode 2 could not be written.*2 episodes before it"),
+    ],
+    ids=["checkpoint", "attempt"],
+)
+def test_a_full_disk_is_reported_and_harms_nothing(tmp_path, n_bytes, message):
+    run = (*RUN, "--env.episode_length=70", "--expert.n_steps=60", "--eval_every=0")
+    dagger(tmp_path, *run, "--episodes=2")
+    before = weights(tmp_path), seeds(tmp_path)
+    with small_disk(n_bytes), pytest.raises(DaggerError, match=message):
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=4")
+    assert seeds(tmp_path)[:2] == before[1]
+    assert all(torch.equal(weights(tmp_path)[key], before[0][key]) for key in before[0])
+    assert not list((tmp_path / "out/checkpoints").glob("*.partial"))
+
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=3")
+    assert_complete(tmp_path, 3)
