@@ -28,6 +28,7 @@ lint: install  ## Style and types
 
 test: lint  ## Style, types and tests
 	./tools/browser.sh
+	./tools/screen.sh
 	$(BIN)/pytest
 
 test-slow: install  ## The tests that take minutes

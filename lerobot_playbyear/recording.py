@@ -1,10 +1,11 @@
-"""`playbyear-record`: an environment's scripted expert becomes a LeRobotDataset with sound."""
+"""`playbyear-record`: episodes of an environment's scripted expert, or of a person, become a LeRobotDataset with sound."""
 
 import itertools
 import os
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, Self
 
 import gymnasium as gym
 import numpy as np
@@ -90,11 +91,28 @@ class RecordConfig:
             self.num_workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1, 8)
 
 
-def record(cfg: RecordConfig) -> Path:
+class Rollouts(Protocol):
+    """Where episodes come from: a pool of processes that roll a script out, or a person."""
+
+    def facts(self) -> EnvFacts:
+        """What the environment looks like."""
+        ...
+
+    def episodes(self, seeds: Iterable[int]) -> Iterator[Episode]:
+        """One episode per seed, in their order."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = None) -> Path:
     """Records expert episodes until the dataset has as many as asked for; only successes are kept.
 
     Args:
         cfg: The options.
+        make_rollouts: Makes what the episodes come from. None: the environment's script, in `num_workers` processes.
 
     Returns:
         The dataset's folder.
@@ -107,7 +125,7 @@ def record(cfg: RecordConfig) -> Path:
     try:
         _check_options(cfg)
         check_root(root, resume=cfg.resume)
-        with RolloutPool(env_spec(cfg.env), cfg.num_workers or 0) as pool:
+        with make_rollouts() if make_rollouts else RolloutPool(env_spec(cfg.env), cfg.num_workers or 0) as pool:
             facts = pool.facts()
             _check_facts(facts, cfg.env)
             features = dataset_features(facts, cfg.dataset.video)
@@ -197,7 +215,7 @@ def next_seed(root: Path, seed: int) -> int:
     return max([seed, *(int(value) + 1 for value in used)])
 
 
-def _record_episodes(cfg: RecordConfig, pool: RolloutPool, writer: DurableWriter) -> None:
+def _record_episodes(cfg: RecordConfig, pool: Rollouts, writer: DurableWriter) -> None:
     wanted = cfg.dataset.num_episodes
     first_seed = next_seed(writer.root, cfg.seed)
     attempts = successes = failures_in_a_row = 0
@@ -236,7 +254,7 @@ def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:
     if not facts.has_expert:
         raise RecordError(
             f"--env.type={env.type} --env.task={env.task} has no scripted expert, so there is nobody to record. "
-            "Record a person with lerobot-record instead."
+            "Record a person with --expert.type=teleop."
         )
     if facts.fps != env.fps:
         raise RecordError(f"--env.fps={env.fps}, but the environment runs at {facts.fps} steps per second: give that.")

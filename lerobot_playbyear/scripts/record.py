@@ -1,4 +1,4 @@
-"""Records a scripted expert into a LeRobotDataset with sound.
+"""Records a scripted expert, or a person (`--expert.type=teleop`), into a LeRobotDataset with sound.
 
     playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v0 \
         --dataset.repo_id=user/grasp --dataset.root=outputs/grasp --dataset.num_episodes=50 --seed=0
@@ -14,11 +14,12 @@ def main() -> None:
     from lerobot.configs import parser
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_playbyear.recording import RecordConfig, RecordError, record
+    from lerobot_playbyear.recording import RecordError
+    from lerobot_playbyear.teleoperation.demonstrations import DemonstrationConfig, record_demonstrations
 
     @parser.wrap()
-    def run(cfg: RecordConfig) -> None:
-        record(cfg)
+    def run(cfg: DemonstrationConfig) -> None:
+        record_demonstrations(cfg)
 
     register_third_party_plugins()
     try:

@@ -1,0 +1,130 @@
+"""The window's keys, and the LeRobot teleoperator that moves a hand with them."""
+
+import threading
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot.lerobot_types import RobotAction
+from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+
+from lerobot_playbyear.teleoperation.actions import DELTAS
+
+MOVES = {"right": (0, 1), "left": (0, -1), "up": (1, 1), "down": (1, -1), "e": (2, 1), "d": (2, -1)}
+"""Which displacement a key makes, and its sign."""
+
+
+class WindowKeys:
+    """Which keys a person holds, and which were pressed since the last look.
+
+    The window's thread writes, and `look` makes a picture of it that holds until the next look: a key that was tapped
+    between two looks counts as held once.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._held: set[str] = set()
+        self._pressed_since: list[str] = []
+        self.held: frozenset[str] = frozenset()
+        self.pressed: tuple[str, ...] = ()
+        self.has_focus = False
+
+    def look(self) -> None:
+        """Take in what happened since the last time."""
+        with self._lock:
+            self.pressed = tuple(self._pressed_since)
+            self.held = frozenset(self._held | set(self._pressed_since))
+            self._pressed_since.clear()
+
+    def is_held(self, name: str) -> bool:
+        """Whether it was held at the last look, or tapped before it."""
+        return name in self.held
+
+    @property
+    def down(self) -> frozenset[str]:
+        """What is held at this moment."""
+        with self._lock:
+            return frozenset(self._held)
+
+    def note(self, name: str, is_pressed: bool) -> None:
+        """A key went down or up."""
+        with self._lock:
+            if is_pressed:
+                self._held.add(name)
+                self._pressed_since.append(name)
+            else:
+                self._held.discard(name)
+
+
+@TeleoperatorConfig.register_subclass("keyboard_window")
+@dataclass
+class KeyboardWindowTeleopConfig(TeleoperatorConfig):
+    """The keyboard, as the window sees it while it has the focus: nothing needs to be installed, and Wayland is fine."""
+
+
+class KeyboardWindowTeleop(Teleoperator):
+    """Arrow keys move right, left, away and near; E and D move up and down; several at once add up.
+
+    Args:
+        config: Its configuration.
+        keys: The window's keys; give them with `listen_to` before `connect` if they are not there yet.
+    """
+
+    config_class = KeyboardWindowTeleopConfig
+    name = "keyboard_window"
+
+    def __init__(self, config: KeyboardWindowTeleopConfig, keys: WindowKeys | None = None) -> None:
+        super().__init__(config)
+        self._keys, self._is_connected = keys, False
+
+    def listen_to(self, keys: WindowKeys) -> None:
+        """Whose keys they are."""
+        self._keys = keys
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        return dict.fromkeys(DELTAS, float)
+
+    @property
+    def feedback_features(self) -> dict[str, Any]:
+        return {}
+
+    @property
+    def is_connected(self) -> bool:
+        return self._is_connected
+
+    @property
+    def is_calibrated(self) -> bool:
+        return True
+
+    def connect(self, calibrate: bool = True) -> None:
+        if self._keys is None:
+            raise ConnectionError("keyboard_window has no window: it works with --expert.type=teleop.")
+        self._is_connected = True
+
+    def calibrate(self) -> None:
+        """Keys need none."""
+
+    def configure(self) -> None:
+        """Keys need none."""
+
+    def get_action(self) -> RobotAction:
+        """-1, 0 or 1 for each displacement."""
+        assert self._keys is not None
+        return dict(zip(DELTAS, displacement(self._keys.held), strict=True))
+
+    def send_feedback(self, feedback: dict[str, Any]) -> None:
+        """Keys take none."""
+
+    def disconnect(self) -> None:
+        self._is_connected = False
+
+
+def displacement(held: Iterable[str]) -> list[float]:
+    """What held keys add up to, x, y, z."""
+    moved = [0.0, 0.0, 0.0]
+    for name in held:
+        if name in MOVES:
+            axis, sign = MOVES[name]
+            moved[axis] += sign
+    return moved

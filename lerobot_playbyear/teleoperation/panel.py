@@ -1,0 +1,189 @@
+"""What the window looks like: a frame for the scene in the colour of who acts, and a panel beside it."""
+
+import math
+from collections import deque
+from functools import cache
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from lerobot_playbyear.teleoperation.levels import FLOOR_DB
+from lerobot_playbyear.teleoperation.status import Control, Status
+
+SIZE = (1000, 748)
+"""Width and height of the window's picture."""
+
+_BANNER, _BORDER, _VIEW = 56, 12, 680
+SCENE = (_BORDER, _BANNER, _VIEW, _VIEW)
+"""Where the scene is in it: left, top, width, height."""
+
+FRAME = {
+    Control.POLICY: "#0072b2",
+    Control.PERSON: "#e69f00",
+    Control.PAUSED: "#999999",
+    Control.WAITING: "#5a5f66",
+}
+"""Border per state, from the colours of Okabe and Ito, which people tell apart whatever colours they see."""
+
+_TITLES = {
+    Control.POLICY: "The policy is in control",
+    Control.PERSON: "You are in control",
+    Control.PAUSED: "Paused",
+    Control.WAITING: "Please wait",
+}
+_ON_FRAME = {
+    Control.POLICY: "#ffffff",
+    Control.PERSON: "#000000",
+    Control.PAUSED: "#000000",
+    Control.WAITING: "#ffffff",
+}
+_BACKGROUND, _TEXT, _DIM, _LINE, _WARNING = "#15181c", "#f2f3f4", "#9aa3ad", "#343a42", "#e69f00"
+_BAR, _LOUD = "#56b4e9", "#f0e442"
+_LEFT, _RIGHT = 728, 976  # of the panel's content
+_HISTORY_S = 4.0
+_LOUD_DB = -20.0
+
+
+class Panel:
+    """Draws all but the scene, and remembers how loud it was."""
+
+    def __init__(self) -> None:
+        self._levels: dict[str, deque[float]] = {}
+        self._last: tuple[int, int] | None = None
+
+    def draw(self, status: Status) -> np.ndarray:
+        """The window's picture (height, width, 3) uint8; the scene is empty."""
+        self._remember(status)
+        image = Image.new("RGB", SIZE, _BACKGROUND)
+        draw = ImageDraw.Draw(image)
+        _draw_frame(draw, status)
+        y = self._draw_progress(draw, status, 24)
+        y = self._draw_levels(draw, status, y + 22)
+        y = _draw_gripper(draw, status, y + 22) if status.gripper else y
+        _draw_pace(draw, status, y + 22)
+        keys = _keys(tuple(status.keys))
+        image.paste(keys, (_LEFT, SIZE[1] - 18 - keys.height))
+        return np.asarray(image)
+
+    def _remember(self, status: Status) -> None:
+        moment = (status.attempt, status.step)
+        if moment == self._last:
+            return
+        if self._last is None or moment[0] != self._last[0]:
+            self._levels.clear()
+        self._last = moment
+        for name, level in status.levels_db.items():
+            levels = self._levels.setdefault(name, deque(maxlen=max(int(_HISTORY_S * status.fps), 2)))
+            levels.append(level)
+
+    def _draw_progress(self, draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
+        for line in _wrapped(status.task, _font(17), _RIGHT - _LEFT)[:3]:
+            draw.text((_LEFT, y), line, _TEXT, _font(17), "lm")
+            y += 22
+        if not status.n_steps:
+            return y
+        draw.text((_LEFT, y + 6), f"Attempt {status.attempt}", _DIM, _font(14), "lm")
+        seconds = f"step {status.step} of {status.n_steps}"
+        draw.text((_RIGHT, y + 6), seconds, _DIM, _font(14), "rm")
+        _bar(draw, y + 20, 4, status.step / status.n_steps, _DIM)
+        return y + 24
+
+    def _draw_levels(self, draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
+        for name, level in status.levels_db.items():
+            draw.text((_LEFT, y), f"Microphone {name}", _TEXT, _font(15), "lm")
+            text = "silence" if level <= FLOOR_DB else f"{level:.0f} dB"
+            draw.text((_RIGHT, y), text, _DIM, _font(14), "rm")
+            _bar(draw, y + 15, 10, 1 - level / FLOOR_DB, _LOUD if level > _LOUD_DB else _BAR)
+            self._draw_history(draw, self._levels.get(name, ()), y + 31)
+            y += 92
+        if status.levels_db:
+            sound = f"Not played: {status.sound}" if status.sound else "Played on the loudspeaker"
+            draw.text((_LEFT, y), _shortened(sound, _font(13)), _DIM, _font(13), "lm")
+            y += 8
+        return y
+
+    def _draw_history(self, draw: ImageDraw.ImageDraw, levels, y: int) -> None:
+        height = 46
+        draw.rectangle((_LEFT, y, _RIGHT, y + height), fill="#1d2126")
+        if not levels:
+            return
+        step = (_RIGHT - _LEFT) / levels.maxlen
+        x = _RIGHT - step * len(levels)
+        for level in levels:
+            top = y + height - round(height * (1 - level / FLOOR_DB))
+            draw.rectangle((round(x), top, max(round(x + step) - 1, round(x)), y + height), fill=_BAR)
+            x += step
+
+
+def _draw_frame(draw: ImageDraw.ImageDraw, status: Status) -> None:
+    colour, on_colour = FRAME[status.control], _ON_FRAME[status.control]
+    draw.rectangle((0, 0, _VIEW + 2 * _BORDER - 1, SIZE[1] - 1), fill=colour)
+    draw.rectangle((_BORDER, _BANNER, _BORDER + _VIEW - 1, _BANNER + _VIEW - 1), fill=_LINE)
+    middle = _BANNER // 2
+    draw.text((_BORDER + 6, middle), _TITLES[status.control], on_colour, _font(27), "lm")
+    note = status.waiting if status.control is Control.WAITING else status.note
+    draw.text((_VIEW + _BORDER - 6, middle), note, on_colour, _font(16), "rm")
+
+
+def _draw_gripper(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
+    draw.text((_LEFT, y), "Gripper", _TEXT, _font(15), "lm")
+    rest = f"{status.gripper}, changes in {status.cooldown_s:.1f} s" if status.cooldown_s > 0 else status.gripper
+    draw.text((_RIGHT, y), rest, _DIM, _font(14), "rm")
+    return y
+
+
+def _draw_pace(draw: ImageDraw.ImageDraw, status: Status, y: int) -> None:
+    if not status.fps:
+        return
+    draw.text((_LEFT, y), "Pace", _TEXT, _font(15), "lm")
+    if status.is_slow:
+        text = f"slow: {status.achieved_fps:.0f} of {status.fps:.0f} steps/s"
+        draw.text((_RIGHT, y), text, _WARNING, _font(14), "rm")
+    else:
+        draw.text((_RIGHT, y), f"{status.fps:.0f} steps/s", _DIM, _font(14), "rm")
+
+
+@cache
+def _keys(keys: tuple[tuple[str, str], ...]) -> Image.Image:
+    """What to press: a picture as wide as the panel."""
+    row = 31
+    image = Image.new("RGB", (_RIGHT - _LEFT + 1, row * len(keys) + 8), _BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    draw.line((0, 0, image.width, 0), _LINE)
+    for number, (key, meaning) in enumerate(keys):
+        y = 8 + row * number
+        width = max(round(_font(14).getlength(key)) + 18, 30)
+        draw.rounded_rectangle((0, y + 4, width, y + 27), 4, fill="#2a2f36", outline="#4a525c")
+        draw.text((width / 2, y + 15), key, _TEXT, _font(14), "mm")
+        draw.text((max(width + 10, 84), y + 15), meaning, _DIM, _font(14), "lm")
+    return image
+
+
+def _bar(draw: ImageDraw.ImageDraw, y: int, height: int, share: float, colour: str) -> None:
+    draw.rectangle((_LEFT, y, _RIGHT, y + height - 1), fill=_LINE)
+    width = math.floor((_RIGHT - _LEFT) * min(max(share, 0.0), 1.0))
+    if width:
+        draw.rectangle((_LEFT, y, _LEFT + width, y + height - 1), fill=colour)
+
+
+def _wrapped(text: str, font: ImageFont.FreeTypeFont, width: int) -> list[str]:
+    lines: list[str] = []
+    for word in text.split():
+        if lines and font.getlength(f"{lines[-1]} {word}") <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines
+
+
+def _shortened(text: str, font: ImageFont.FreeTypeFont) -> str:
+    while len(text) > 4 and font.getlength(text) > _RIGHT - _LEFT:
+        text = text[:-4].rstrip() + "..."
+    return text
+
+
+@cache
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    font = ImageFont.load_default(size)
+    assert isinstance(font, ImageFont.FreeTypeFont), "Pillow was built without FreeType"
+    return font

@@ -1,0 +1,88 @@
+"""Plays what a microphone hears, if the package `sounddevice` is there."""
+
+import contextlib
+import threading
+from typing import Any
+
+import numpy as np
+
+_LATENCY_BLOCKS = 2  # that are there before the first is played, so that a late step leaves no gap
+_MOST_BLOCKS = 6  # more than this is too late to be played
+
+
+class SoundQueue:
+    """Samples between the control loop, which brings a block per step, and the sound card, which takes what it likes."""
+
+    def __init__(self, block_size: int) -> None:
+        self._block_size = block_size
+        self._samples: np.ndarray = np.zeros(0, np.float32)
+        self._is_playing = False
+        self._lock = threading.Lock()
+
+    def put(self, block: np.ndarray) -> None:
+        """Samples (S,) in [-1, 1]."""
+        with self._lock:
+            self._samples = np.concatenate([self._samples, block])[-_MOST_BLOCKS * self._block_size :]
+            self._is_playing |= len(self._samples) >= _LATENCY_BLOCKS * self._block_size
+
+    def take(self, n: int) -> np.ndarray:
+        """The next n samples; silence where there are none."""
+        played = np.zeros(n, np.float32)
+        with self._lock:
+            if self._is_playing:
+                head, self._samples = self._samples[:n], self._samples[n:]
+                played[: len(head)] = head
+                self._is_playing = len(head) == n
+        return played
+
+    def clear(self) -> None:
+        with self._lock:
+            self._samples, self._is_playing = self._samples[:0], False
+
+
+class Speaker:
+    """The default output of the sound card.
+
+    Args:
+        sample_rate: [Hz].
+        block_size: Samples per step.
+
+    Attributes:
+        problem: Why nothing is heard; empty if it is.
+    """
+
+    def __init__(self, sample_rate: int, block_size: int) -> None:
+        self._queue = SoundQueue(block_size)
+        self._stream: Any = None
+        self.problem = ""
+        try:
+            import sounddevice  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        except ImportError:
+            self.problem = "pip install sounddevice"
+            return
+        except OSError:
+            self.problem = "PortAudio is missing (Debian: libportaudio2)"
+            return
+        try:
+            self._stream = sounddevice.OutputStream(sample_rate, channels=1, dtype="float32", callback=self._fill)
+            self._stream.start()
+        except Exception as error:  # whatever a sound card may say, work goes on without
+            self.problem = f"no sound card ({str(error).splitlines()[0]})"
+            self.close()
+
+    def play(self, block: np.ndarray) -> None:
+        """What was heard in a step, (S,) in [-1, 1]."""
+        self._queue.put(block)
+
+    def clear(self) -> None:
+        """What has not been played yet is not played any more."""
+        self._queue.clear()
+
+    def close(self) -> None:
+        if self._stream is not None:
+            with contextlib.suppress(Exception):
+                self._stream.close()
+            self._stream = None
+
+    def _fill(self, out: np.ndarray, n_frames: int, time: Any, status: Any) -> None:
+        out[:, 0] = self._queue.take(n_frames)

@@ -1,0 +1,284 @@
+"""A person in a real window on a virtual screen, with real key events (Xvfb, xdotool)."""
+
+import subprocess
+import sys
+import threading
+from importlib.util import find_spec
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from dagger_factory import arguments, base_folder, column, corrections, metrics
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+from virtual_screen import MISSING, VirtualScreen, wait_for
+
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.dagger import Verdict
+from lerobot_playbyear.dagger.collector import PolicyActor, collect
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.recording import RecordDatasetConfig, env_spec
+from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
+from lerobot_playbyear.teleoperation.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
+from lerobot_playbyear.teleoperation.expert import PersonLeftError
+from lerobot_playbyear.teleoperation.panel import FRAME
+from lerobot_playbyear.teleoperation.status import Control
+from lerobot_playbyear.teleoperation.window import Window
+
+pytestmark = pytest.mark.skipif(
+    bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (Debian: apt-get install xvfb xdotool)"
+)
+_TITLE = "Play it by ear"
+_MOVES = {"Right": (0, 1), "Up": (1, 1), "d": (2, -1)}  # X's names of keys: axis of the environment, sign
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    register_third_party_plugins()
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+@pytest.fixture
+def screen(monkeypatch):
+    screen = VirtualScreen()
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setenv("DISPLAY", screen.display)
+    yield screen
+    screen.close()
+
+
+def env_config(**options):
+    sizes = {"image_size": 16, "visualization_width": 96, "visualization_height": 96}
+    return PlaybyearEnvConfig(**sizes, **options)
+
+
+def state_shown(screen):
+    """Who acts, as the border on the screen says; None if there is no window."""
+    colour = "#{:02x}{:02x}{:02x}".format(*screen.picture()[400, 4])
+    return next((control for control, frame in FRAME.items() if frame == colour), None)
+
+
+class Person(gym.Wrapper):
+    """Presses and releases keys between two steps of an environment, and goes on when the window has heard of it.
+
+    Args:
+        env: The environment.
+        screen: Where the keys are pressed.
+        held: For each key, the steps in which it is held, from and to.
+        seen: What the screen looked like after some steps, by step.
+    """
+
+    def __init__(self, env, screen, held, look_after=()):
+        super().__init__(env)
+        self.screen, self.held, self.look_after = screen, held, look_after
+        self.expert, self.n, self.seen, self.positions, self.opening = None, 0, {}, [], None
+
+    def reset(self, **kwargs):
+        result = super().reset(**kwargs)
+        self.n, self.positions = 0, [self.unwrapped.eef_position]
+        return result
+
+    def step(self, action):
+        result = super().step(action)
+        self.positions.append(self.unwrapped.eef_position)
+        self.opening = self.unwrapped.finger_positions.sum() if self.n == 43 else self.opening
+        if self.n in self.look_after:
+            self.seen[self.n] = state_shown(self.screen)
+        self.n += 1
+        for name, (first, after) in self.held.items():
+            if self.n == first:
+                self.screen.hold(name)
+            if self.n == after:
+                self.screen.let_go(name)
+            if self.n in (first, after):
+                is_held = self.n == first
+                wait_for(lambda name=name, is_held=is_held: (name.lower() in self.window.keys.down) is is_held)
+        return result
+
+    @property
+    def window(self):
+        return self.expert._desk.window
+
+
+class Remembering(PolicyActor):
+    """A policy that remembers what it wanted to do."""
+
+    wanted: list  # of actions (action dim,)
+
+    def reset(self):
+        super().reset()
+        self.wanted = []
+
+    def act(self, observation, task):
+        self.wanted.append(super().act(observation, task))
+        return self.wanted[-1]
+
+
+def make_actor(env_cfg):
+    policy = PlaybyearPolicy.from_pretrained(base_folder() / "policy")
+    return Remembering(policy, env_cfg, *make_pre_post_processors(policy.config, str(base_folder() / "policy")))
+
+
+def test_an_override_is_recorded_on_exactly_the_held_frames_and_the_arm_moves_as_the_keys_say(screen):
+    env_cfg = env_config(episode_length=60)
+    held = {"space": (8, 44), "Right": (10, 20), "Up": (22, 32), "d": (34, 42)}
+    env = Person(env_spec(env_cfg).make(), screen, held, look_after=(5, 25, 55))
+    actor = make_actor(env_cfg)
+    env.expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
+    try:
+        screen.focus(screen.window(_TITLE))
+        episode = collect(env, actor, env.expert, seed=5).episode
+        axes = env.unwrapped.data.cam("people").xmat.reshape(3, 3)
+    finally:
+        env.expert.close()
+        env.close()
+
+    assert np.flatnonzero(episode.interventions).tolist() == list(range(8, 44))
+    expected = np.zeros((36, 4), np.float32)
+    expected[:, 3] = 1 if env.opening < 0.03 else -1  # the gripper stays as the policy left it
+    for name, (axis, sign) in _MOVES.items():
+        first, after = held[name]
+        expected[first - 8 : after - 8, axis] = 0.3 * sign
+    np.testing.assert_allclose(episode.actions[8:44], expected, atol=1e-6)
+    by_policy = ~episode.interventions
+    np.testing.assert_allclose(episode.actions[by_policy], np.clip(actor.wanted, -1, 1)[by_policy], atol=1e-6)
+
+    positions = np.array(env.positions)
+    for name, (axis, sign) in _MOVES.items():
+        first, after = held[name]
+        moved = positions[after] - positions[first]
+        assert sign * moved[axis] > 0.02, (name, moved)
+        assert np.abs(np.delete(moved, axis)).max() < 0.5 * abs(moved[axis]), (name, moved)
+        if name == "Right":
+            assert moved @ axes[:, 0] > 0.02  # as it is seen in the window
+    assert env.seen == {5: Control.POLICY, 25: Control.PERSON, 55: Control.POLICY}
+
+
+def person_corrects(screen, outcome):
+    """Waits for the window, begins, takes over, hands back, and says that the task is solved."""
+    screen.focus(screen.window(_TITLE, timeout_s=300))
+    wait_for(lambda: state_shown(screen) is Control.PAUSED, 120)
+    screen.press("p")
+    wait_for(lambda: state_shown(screen) is Control.POLICY)
+    screen.hold("space", "Right")
+    wait_for(lambda: state_shown(screen) is Control.PERSON)
+    threading.Event().wait(0.7)
+    screen.let_go("Right", "space")
+    wait_for(lambda: state_shown(screen) is Control.POLICY)
+    screen.press("s")
+    outcome.append("done")
+
+
+@pytest.mark.timeout(500)
+def test_playbyear_dagger_learns_from_a_person_at_lerobots_keyboard(screen, tmp_path):
+    kind = "keyboard_ee" if find_spec("pynput") else "keyboard_window"
+    options = ("--expert.type=teleop", f"--expert.teleop.type={kind}", "--episodes=1", "--env.episode_length=2000")
+    command = [sys.executable, "-m", "lerobot_playbyear.scripts.dagger", *arguments(tmp_path, *options)]
+    log = tmp_path / "log.txt"
+    with log.open("w") as file:
+        process = subprocess.Popen(command, env=screen.environment, stdout=file, stderr=subprocess.STDOUT)
+    outcome = []
+    try:
+        person_corrects(screen, outcome)
+        assert process.wait(timeout=200) == 0, log.read_text()[-3000:]
+    finally:
+        process.kill()
+        process.wait()
+    assert outcome == ["done"], log.read_text()[-3000:]
+
+    dataset = corrections(tmp_path)
+    flags = column(dataset, "intervention").ravel()
+    actions, positions = column(dataset, "action"), column(dataset, "observation.state")[:, :3]
+    changes = np.flatnonzero(np.diff(np.concatenate([[0], flags, [0]])))
+    assert len(changes) == 2, "one stretch without gaps"
+    first, after = changes
+    assert after - first >= 5
+    by_person = np.isclose(actions[:, 0], 0.3) & (actions[:, 1:3] == 0).all(axis=1)
+    assert not by_person[~flags].any()
+    assert by_person[first + 2 : after - 2].all()  # both keys go down within two steps, and up
+    assert positions[after, 0] - positions[first, 0] > 0.02
+    assert column(dataset, "next.success").ravel()[-1]
+    [attempt] = metrics(tmp_path, "attempt")
+    assert (attempt["outcome"], attempt["n_frames"]) == ("kept", len(dataset))
+    assert metrics(tmp_path, "round")[0]["n_updates"] == 2
+
+
+def person_demonstrates(screen):
+    """Throws the first attempt away and keeps the second one."""
+    screen.focus(screen.window(_TITLE))
+    for ending in ("r", "s"):
+        wait_for(lambda: state_shown(screen) is Control.PAUSED, 60)
+        screen.press("p")
+        wait_for(lambda: state_shown(screen) is Control.PERSON)
+        screen.hold("Up")
+        threading.Event().wait(0.3)
+        screen.let_go("Up")
+        screen.press(ending)
+        wait_for(lambda: state_shown(screen) is not Control.PERSON)
+
+
+def test_playbyear_record_records_a_persons_demonstrations(screen, tmp_path):
+    dataset = RecordDatasetConfig("test/person", str(tmp_path / "person"), num_episodes=1)
+    env_cfg = env_config(episode_length=2000)
+    cfg = DemonstrationConfig(env_cfg, dataset, seed=7, expert=TeleopExpertConfig(play_sound=False))
+    person = threading.Thread(target=person_demonstrates, args=(screen,))
+    person.start()
+    root = record_demonstrations(cfg)
+    person.join(timeout=60)
+    recorded = LeRobotDataset("test/person", root=root, video_backend="pyav")
+    assert recorded.num_episodes == 1
+    assert set(column(recorded, "seed").ravel()) == {7}  # the one that was thrown away is done again
+    assert column(recorded, "intervention").all()
+    assert column(recorded, "next.success").ravel()[-1]
+    moved = np.isclose(column(recorded, "action")[:, 1], 0.3)
+    assert 2 <= moved.sum() < len(recorded)
+
+
+def test_the_window_tells_when_it_is_gone(screen):
+    window = Window(f"{_TITLE}: test")
+    number = screen.window(_TITLE)
+    assert window.is_open
+    screen.kill_window(number)
+    wait_for(lambda: not window.is_open)
+    window.close()
+
+
+def test_escape_ends_the_session(screen):
+    env = env_spec(env_config(episode_length=2000)).make()
+    expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
+    screen.focus(screen.window(_TITLE))
+    screen.press("s", "Escape")  # before an attempt has begun
+    wait_for(lambda: "escape" in expert._desk.window.keys._pressed_since)
+    with pytest.raises(PersonLeftError):
+        collect(env, Nobody(env), expert, seed=1)
+    expert.close()
+    env.close()
+
+
+def test_a_key_that_is_held_is_let_go_when_the_window_loses_the_keyboard(screen):
+    windows = [Window(f"{_TITLE}: {name}") for name in ("first", "second")]
+    screen.focus(screen.window("first"))
+    screen.hold("space")
+    wait_for(lambda: "space" in windows[0].keys.down)
+    screen.focus(screen.window("second"))
+    wait_for(lambda: "space" not in windows[0].keys.down)
+    assert not windows[0].keys.has_focus
+    screen.let_go("space")
+    for window in windows:
+        window.close()
+
+
+def test_verdicts_reach_the_loop(screen):
+    """A tap between two steps is not lost."""
+    env = Person(env_spec(env_config(episode_length=2000)).make(), screen, {"r": (4, 6)})
+    env.expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
+    screen.focus(screen.window(_TITLE))
+    attempt = collect(env, Nobody(env), env.expert, seed=1)
+    env.expert.close()
+    env.close()
+    assert (attempt.verdict, len(attempt.episode)) == (Verdict.DISCARD, 5)
