@@ -366,7 +366,7 @@ def test_a_picture_that_did_not_reach_the_disk_is_not_forgotten(tmp_path):
             resource.setrlimit(resource.RLIMIT_FSIZE, (300, limits[1]))
             for frame in episode_frames(1, FEATURES):
                 target.add_frame(frame)
-            target._dataset.writer.image_writer.wait_until_done()
+            target._episode.dataset.writer.image_writer.wait_until_done()
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         with pytest.raises(DatasetWriteError, match=f"Episode 1 .*: frame 0 of '{CAMERA}' did not reach the disk"):
@@ -443,7 +443,7 @@ def test_streamed_video_is_whole_or_refused(tmp_path, monkeypatch):
         frames = episode_frames(2, RICH_FEATURES)
         for frame in frames:
             target.add_frame(frame)
-        encoder = target._dataset.writer._streaming_encoder
+        encoder = target._episode.dataset.writer._streaming_encoder
         for queue in encoder._frame_queues.values():
             queue.get()  # as if the encoder had been too slow for it
         with pytest.raises(DatasetWriteError, match="has 2 frames where 3 were recorded"):

@@ -15,15 +15,13 @@ from typing import Any
 from filelock import FileLock, Timeout
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.utils.constants import DEFAULT_FEATURES
-from lerobot.utils.utils import SuppressProgressBars
 
 from lerobot_playbyear.datasets.journal import JOURNAL, LOCK, SCRATCH, STAGING, finish_journal, publish
 from lerobot_playbyear.datasets.repair import RepairReport, repair_dataset
 from lerobot_playbyear.datasets.repair.repairing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
-from lerobot_playbyear.datasets.staging import IncompleteEpisodeError, check_pictures, check_videos, open_staging
+from lerobot_playbyear.datasets.staging import IncompleteEpisodeError, Staging
 
 logger = logging.getLogger(__name__)
 
@@ -37,7 +35,8 @@ class DatasetWriteError(RuntimeError):
 class DurableWriter:
     """Appends episodes to a LeRobotDataset v3.0; each is on disk for good when `save_episode` returns.
 
-    Protocol: LeRobot writes the episode into a staging dataset inside the root and closes its files; a journal that
+    Protocol: LeRobot writes the episode, all but its sound, into a staging dataset inside the root and closes its
+    files; the sound is added; a journal that
     names these files is written (from here on the episode counts); the files are moved into place one by one,
     `meta/info.json` last; the journal is removed. After a crash the next writer finishes the moves of a journal it
     finds and throws other staged files away. The dataset loads with plain LeRobot between any two of these steps.
@@ -97,8 +96,7 @@ class DurableWriter:
             "streaming_encoding": streaming_encoding,
             "rgb_encoder": rgb_encoder,
         }
-        self._dataset: LeRobotDataset | None = None
-        self._staged_before: set[Path] = set()
+        self._episode: Staging | None = None
         self._lock: FileLock | None = None
         try:
             finish_repair(self.root)
@@ -107,7 +105,7 @@ class DurableWriter:
             finish_journal(self.root)
             if has_dataset(self.root):
                 self._check_and_repair(fps, features)
-            self._meta = self._staging.meta
+            self._meta = self._staging.dataset.meta
         except BaseException as error:
             if self._lock is not None:
                 self._lock.release()
@@ -146,27 +144,22 @@ class DurableWriter:
         Raises:
             DatasetWriteError: It could not be written (disk full, permissions). The dataset is as it was before.
         """
-        index, staging = self.num_episodes, self._staging
-        length = staging.writer.episode_buffer["size"] if staging.writer is not None else 0
+        index, episode = self.num_episodes, self._staging
         try:
-            check_pictures(staging, streaming=self._write_options["streaming_encoding"])
-            with SuppressProgressBars():
-                staging.save_episode(parallel_encoding=False)
-            staging.finalize()
-            check_videos(staging, length)
-            publish(self.root, settle_episode(self.root, self.root / STAGING, staging.meta, self._staged_before))
+            sound = episode.save()
+            publish(self.root, settle_episode(self.root, episode, sound))
         except Exception as error:
             self._drop_staging()
             raise DatasetWriteError(self._describe_failure(index, error)) from error
-        self._dataset = None
-        self._meta = staging.meta
+        self._episode = None
+        self._meta = episode.dataset.meta
         with contextlib.suppress(OSError):  # the next frame tries again, and says why it cannot
-            self._meta = self._staging.meta
+            self._meta = self._staging.dataset.meta
         return index
 
     def discard_episode(self) -> None:
         """Forgets the episode in progress."""
-        self._staging.clear_episode_buffer()
+        self._staging.discard()
 
     def close(self) -> None:
         """Drops an episode in progress and removes what was needed only for writing. Safe to call twice."""
@@ -206,24 +199,18 @@ class DurableWriter:
         check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features)
 
     @property
-    def _staging(self) -> LeRobotDataset:
-        """The dataset that LeRobot writes the episode in progress to; a fresh one after every episode."""
-        if self._dataset is None:
+    def _staging(self) -> Staging:
+        """The episode in progress; a fresh one after every episode that was saved."""
+        if self._episode is None:
             finish_journal(self.root)
-            self._dataset, self._staged_before = open_staging(
-                self.repo_id, self.root, self.root / STAGING, self._create_options, self._write_options
-            )
-        return self._dataset
+            folder = self.root / STAGING
+            self._episode = Staging(self.repo_id, self.root, folder, self._create_options, self._write_options)
+        return self._episode
 
     def _drop_staging(self) -> None:
-        if self._dataset is None:
-            return
-        with contextlib.suppress(Exception):
-            self._dataset.clear_episode_buffer()
-        self._dataset.meta._metadata_buffer.clear()  # or LeRobot writes the row of an episode that is not there
-        with contextlib.suppress(Exception):
-            self._dataset.finalize()
-        self._dataset = None
+        if self._episode is not None:
+            self._episode.drop()
+            self._episode = None
 
     def _describe_failure(self, index: int, error: Exception) -> str:
         reason = str(error) if isinstance(error, IncompleteEpisodeError) else f"{type(error).__name__}: {error}"

@@ -38,11 +38,13 @@ def writer_options(schema: pa.Schema) -> dict:
     """Options of `pyarrow.parquet.ParquetWriter` for a data file."""
     leaves = [leaf for field in schema for leaf in leaf_columns(field.name, field.type)]
     pcm = {path for path, kind, nested in leaves if nested and kind == pa.int16()}
+    counters = {path for path, kind, nested in leaves if not nested and kind == pa.int64()}  # most go up by one
     pictures = {path for path, kind, _ in leaves if pa.types.is_binary(kind)}
+    deltas = pcm | counters
     return {
         "compression": "snappy",
-        "use_dictionary": [path for path, _, _ in leaves if path not in pcm],
-        "column_encoding": dict.fromkeys(pcm, "DELTA_BINARY_PACKED") or None,
+        "use_dictionary": [path for path, _, _ in leaves if path not in deltas | {"timestamp"}],
+        "column_encoding": dict.fromkeys(deltas, "DELTA_BINARY_PACKED") or None,
         "write_page_checksum": True,
         # Readers skip row groups by these; for sound and pictures they would only take room.
         "write_statistics": [path for path, _, nested in leaves if not nested and path not in pictures] or False,

@@ -5,17 +5,18 @@ takes over what the last one of the dataset holds, and replaces it in one step. 
 episodes has some files of several MB each, and one table of episodes.
 """
 
+import dataclasses
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.datasets.utils import DEFAULT_EPISODES_PATH
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from lerobot.datasets.io_utils import write_info
+from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DatasetInfo
 
-from lerobot_playbyear.datasets.audio_feature import audio_keys
-from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
     fit_to_schema,
@@ -24,7 +25,8 @@ from lerobot_playbyear.datasets.parquet_files import (
     read_table,
     write_tables,
 )
-from lerobot_playbyear.datasets.statistics import add_stats, read_stats, row_stats, sound_stats, with_sound_stats
+from lerobot_playbyear.datasets.staging import Staging
+from lerobot_playbyear.datasets.statistics import add_stats, read_stats, sound_stats, with_sound_stats
 from lerobot_playbyear.datasets.statistics import write_stats as write_dataset_stats
 from lerobot_playbyear.datasets.video_seal import seal
 
@@ -35,37 +37,42 @@ _SMALL_DATA_BYTES = 8 * 2**20  # a data file below this is continued
 _SMALL_TABLE_BYTES = 2 * 2**20  # a table of episodes below this is continued
 
 
-def settle_episode(root: Path, staging: Path, meta: LeRobotDatasetMetadata, before: set[Path]) -> list[Path]:
+def settle_episode(root: Path, staging: Staging, waveforms: Mapping[str, np.ndarray]) -> list[Path]:
     """Makes the staged files of one episode what the dataset in `root` shall hold.
 
     Args:
         root: The dataset's folder; only read.
-        staging: The staging dataset's folder, closed by LeRobot.
-        meta: The staging dataset's metadata.
-        before: Files, relative to `staging`, that were put there for LeRobot to continue from.
+        staging: The episode, written and closed by LeRobot.
+        waveforms: Its sound, (n_frames, S) per microphone.
 
     Returns:
-        The files to publish, relative to `staging`, in the order in which they may be moved one by one.
+        The files to publish, relative to the staging folder, in the order in which they may be moved one by one.
     """
-    (row_file,) = _new_files(staging, "meta/episodes", before)
-    row = pq.read_table(staging / row_file)
+    folder, meta = staging.folder, staging.dataset.meta
+    (row_file,) = _new_files(staging, "meta/episodes")
+    info = dataclasses.replace(
+        meta.info, features={key: meta.features.get(key, feature) for key, feature in staging.features.items()}
+    )
+    write_info(info, folder)
     last = _last_row(root)
-    row, waveforms = _settle_data(root, staging, meta, row, last)
     sound = {key: sound_stats(waveform) for key, waveform in waveforms.items()}
-    row = with_sound_stats(row, sound)
-    row_file = _settle_row(root, staging, row, row_file, last)
-    _settle_stats(root, staging, meta, row, list(sound))
-    names = [path for folder in ("data", "videos") for path in _new_files(staging, folder, before)]
+    row = with_sound_stats(pq.read_table(folder / row_file), sound)
+    row = _settle_data(root, folder, info, row, last, waveforms)
+    row_file = _settle_row(root, folder, row, row_file, last)
+    if meta.stats is not None and sound:
+        known = {key: stats for key, stats in (read_stats(root) or {}).items() if key in sound}
+        write_dataset_stats({**meta.stats, **add_stats(known, [sound], sound)}, folder)
+    names = [name for part in ("data", "videos") for name in _new_files(staging, part)]
     for name in names:
         if name.suffix == ".mp4":
-            seal(staging / name)
-    tables = [path for path in _new_files(staging, "meta", before) if path not in (row_file, INFO)]
+            seal(folder / name)
+    tables = [name for name in _new_files(staging, "meta") if name not in (row_file, INFO)]
     return [*names, *tables, row_file, INFO]
 
 
-def _new_files(staging: Path, folder: str, before: set[Path]) -> list[Path]:
-    paths = (path for path in sorted((staging / folder).rglob("*")) if path.is_file())
-    return [name for path in paths if (name := path.relative_to(staging)) not in before]
+def _new_files(staging: Staging, part: str) -> list[Path]:
+    paths = (path for path in sorted((staging.folder / part).rglob("*")) if path.is_file())
+    return [name for path in paths if (name := path.relative_to(staging.folder)) not in staging.before]
 
 
 def _last_row(root: Path) -> dict | None:
@@ -78,30 +85,43 @@ def _last_row(root: Path) -> dict | None:
 
 
 def _settle_data(
-    root: Path, staging: Path, meta: LeRobotDatasetMetadata, row: pa.Table, last: dict | None
-) -> tuple[pa.Table, dict[str, np.ndarray]]:
-    """Writes the episode's frames as our files are written, behind those of the last small file."""
-    name = _data_file(meta, row.to_pylist()[0])
-    frames = pq.read_table(staging / name)
-    waveforms = {
-        key: column_to_numpy(frames.column(key)).reshape(len(frames), -1)
-        for key in audio_keys(frames.column_names)
-        if meta.features[key]["dtype"] != "string"
-    }
+    root: Path,
+    staging: Path,
+    info: DatasetInfo,
+    row: pa.Table,
+    last: dict | None,
+    waveforms: Mapping[str, np.ndarray],
+) -> pa.Table:
+    """Writes the episode's frames as our files are written, behind those of the last small file. Returns its row."""
+    name = _data_file(info, row.to_pylist()[0])
+    frames = _with_sound(pq.read_table(staging / name), info, waveforms)
     target, tables = name, [frames]
-    if last is not None and _is_small(root / _data_file(meta, last), _SMALL_DATA_BYTES):
+    if last is not None and _is_small(root / _data_file(info, last), _SMALL_DATA_BYTES):
         try:
-            tables = [*_tables_of(root / _data_file(meta, last), frames.schema), frames]
-            target = _data_file(meta, last)
+            tables = [*_tables_of(root / _data_file(info, last), frames.schema), frames]
+            target = _data_file(info, last)
         except (ParquetDamageError, pa.ArrowException) as error:
-            logger.warning("%s is not continued: %s.", root / _data_file(meta, last), error)
+            logger.warning("%s is not continued: %s.", root / _data_file(info, last), error)
     (staging / name).unlink()
     write_tables(staging / target, tables, frames.schema)
     if target != name:
         assert last is not None
         for key in ("data/chunk_index", "data/file_index"):
             row = row.set_column(row.column_names.index(key), key, pa.array([last[key]], row.schema.field(key).type))
-    return row, waveforms
+    return row
+
+
+def _with_sound(frames: pa.Table, info: DatasetInfo, waveforms: Mapping[str, np.ndarray]) -> pa.Table:
+    """An episode's frames with its microphones' columns, all in the order of the features."""
+    schema = get_hf_features_from_features(info.features).arrow_schema
+    for key, waveform in waveforms.items():
+        kind = schema.field(key).type
+        values = pa.array(waveform.reshape(-1))
+        column = (
+            pa.FixedSizeListArray.from_arrays(values, kind.list_size) if pa.types.is_fixed_size_list(kind) else values
+        )
+        frames = frames.append_column(key, column.cast(kind))
+    return frames.select(schema.names).cast(schema)
 
 
 def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict | None) -> Path:
@@ -136,20 +156,8 @@ def write_rows(rows: pa.Table, path: Path) -> None:
     )
 
 
-def _settle_stats(
-    root: Path, staging: Path, meta: LeRobotDatasetMetadata, row: pa.Table, microphones: list[str]
-) -> None:
-    """Corrects the sound's entries in the dataset's statistics, which LeRobot made from those it knew."""
-    if not microphones or meta.stats is None:
-        return
-    own = {key: stats for key, stats in row_stats(row.to_pylist()[0]).items() if key in microphones}
-    known = read_stats(root) or {}
-    known = {key: known[key] for key in microphones if key in known}
-    write_dataset_stats({**meta.stats, **add_stats(known, [own], microphones)}, staging)
-
-
-def _data_file(meta: LeRobotDatasetMetadata, row: dict) -> Path:
-    return Path(meta.data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]))
+def _data_file(info: DatasetInfo, row: dict) -> Path:
+    return Path(info.data_path.format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"]))
 
 
 def _is_small(path: Path, limit: int) -> bool:

@@ -53,13 +53,10 @@ def numeric_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Mapp
 
 
 def with_sound_stats(row: pa.Table, sound: Mapping[str, Mapping[str, np.ndarray]]) -> pa.Table:
-    """One episode's row of `meta/episodes`, with the statistics of its microphones replaced."""
+    """One episode's row of `meta/episodes`, with the statistics of its microphones."""
     for key, stats in sound.items():
         for name, value in stats.items():
-            column = f"stats/{key}/{name}"
-            if column in row.column_names:
-                place = row.column_names.index(column)
-                row = row.set_column(place, column, pa.array([value.tolist()], row.schema.field(column).type))
+            row = row.append_column(f"stats/{key}/{name}", pa.array([value.tolist()]))
     return row
 
 
