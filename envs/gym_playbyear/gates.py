@@ -37,6 +37,7 @@ class GateConfig:
             at least this much.
         grasp_reach, grasp_height: Fingers may close when the cube is this near to their middle along the table, and their tips
             this low.
+        land_reach: Fingers may come down when the cube is this near to their middle.
         release_reach: Fingers may open when the held cube is this near to the tray's middle.
         drop_distance: A cube that was held and is this far from the hand was dropped.
         stray_x, stray_y: How far a hand that searches on the table may be beside the line of the sweep, and before its start.
@@ -58,6 +59,7 @@ class GateConfig:
     push_step: float = 0.003
     grasp_reach: float = 0.012
     grasp_height: float = 0.034
+    land_reach: float = 0.009
     release_reach: float = 0.02
     drop_distance: float = 0.04
     stray_x: float = 0.03
@@ -175,6 +177,7 @@ class InterventionGate:
         holds = self._holds()
         checks = {
             "pushes": self._drags(action) if holds else self._pushes(action),
+            "lands": not holds and self._lands(action),
             "closes": not holds and action[3] > 0 and self._is_open() and not self._is_between(),
             "opens": holds and action[3] <= 0,
             "dropped": not holds and self._was_held and np.linalg.norm(self._offset()) > self.config.drop_distance,
@@ -200,6 +203,12 @@ class InterventionGate:
     def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
         return bool(moved > self.config.shove_share * self.env.variant.max_shove)
+
+    def _lands(self, action: np.ndarray) -> bool:
+        """Comes down on the cube that it found, instead of around it."""
+        beside, above = np.abs(self._offset()[:2]).max(), self._height() > self.config.grasp_height
+        comes_down = self._knows() and action[2] * ACTION_SCALE < -2 * self.config.push_step
+        return bool(above and comes_down and self.config.land_reach < beside < self.expert.reach - 0.005)
 
     def _missed(self) -> bool:
         """High above the table without the cube, although it was touched or should have been."""
@@ -274,7 +283,7 @@ class InterventionGate:
             return "grasp"
         if self._touches() and self._is_low():
             return "dwell"
-        if self._height() > config.clear_height - config.tolerance:
+        if self._height() > config.clear_height - 0.02:
             return "hop"
         return "descend" if abs(self._offset()[1]) < config.tolerance and self._is_open() else "rise"
 
