@@ -256,7 +256,8 @@ class PlaybyearNetwork(nn.Module):
         if is_pad is not None:
             begun = ~is_pad.repeat_interleave(sound.shape[2], dim=1)
         spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
-        assert isinstance(spectrogram, LogSpectrogram) and isinstance(encoder, AudioEncoder)
+        assert isinstance(spectrogram, LogSpectrogram)
+        assert isinstance(encoder, AudioEncoder)
         shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
         levels = spectrogram(shared.stretches(wave), shared.stretches(begun))
         return self._normalize(shared.windows(encoder(levels), encoder.length).flatten(1))

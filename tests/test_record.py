@@ -1,7 +1,6 @@
 """`playbyear-record`: what is on disk, and what is said when it cannot be."""
 
 import multiprocessing
-import os
 import subprocess
 import sys
 from dataclasses import dataclass
