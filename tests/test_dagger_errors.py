@@ -13,7 +13,9 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_playbyear.dagger import DaggerError
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.dagger import DaggerConfig, DaggerError
+from lerobot_playbyear.dagger.config import DatasetSource
 from lerobot_playbyear.scripts import dagger as dagger_script
 
 
@@ -32,7 +34,7 @@ def one_thread():
         ({"fps": 10}, "has 10 frames per second, and the policy is configured for 20"),
         ({"sample_rate": 48000}, r"recorded at 48000 Hz in the dataset 'tests/demos'.*trained with 16000 Hz"),
         ({"state_size": 6}, r"'observation.state' has shape \(6,\).*trained with \(7,\)"),
-        ({"action_size": 7}, r"'action' has shape \(7,\).*trained with \(4,\)"),
+        ({"action_size": 5}, r"'action' has shape \(5,\).*trained with \(4,\)"),
         ({"microphones": ()}, r"lacks \['observation.audio.gripper'\]"),
         ({"image_size": 24}, r"'observation.images.front' has shape \(24, 24, 3\)"),
     ],
@@ -61,11 +63,6 @@ def test_demonstrations_that_the_policy_was_not_made_for(features, message, tmp_
         ),
         (("--env.sound=none",), "'observation.audio.gripper' is int16 .* there and absent here"),
         (("--env.microphones=[ceiling]",), "does not start.*ceiling"),
-        (("--batch_size=5",), "--batch_size=5 must be even"),
-        (("--warmup_episodes=0",), "--warmup_episodes=0: give at least 1"),
-        (("--learning_rate=0",), "--learning_rate=0.0 must be above 0"),
-        (("--updates=5",), "--updates is for --episodes=0"),
-        (("--episodes=0",), "give --updates"),
         (("--policy.push_to_hub=true",), "--policy.push_to_hub=true needs a name: give --policy.repo_id"),
     ],
 )
@@ -73,6 +70,21 @@ def test_options_that_do_not_go_together(options, message, tmp_path):
     with pytest.raises(DaggerError, match=message):
         dagger(tmp_path, *QUICK, *options)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"batch_size": 5}, "--batch_size=5 must be even"),
+        ({"warmup_episodes": 0}, "--warmup_episodes=0: give at least 1"),
+        ({"learning_rate": 0.0}, "--learning_rate=0.0 must be above 0"),
+        ({"updates": 5}, "--updates is for --episodes=0"),
+        ({"episodes": 0}, "give --updates"),
+    ],
+)
+def test_numbers_out_of_their_range(options, message):
+    with pytest.raises(DaggerError, match=message):
+        DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), env=PlaybyearEnvConfig(), **options).check()
 
 
 def test_without_an_environment_or_a_policy(tmp_path):

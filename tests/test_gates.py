@@ -64,7 +64,7 @@ def roll_out(env, seed: int, name: str):
 @pytest.mark.parametrize("task", TASKS)
 def test_a_policy_as_good_as_the_expert_is_left_alone(task):
     env = make(task)
-    episodes = [roll_out(env, seed, "expert") for seed in range(3000, 3020)]
+    episodes = [roll_out(env, seed, "expert") for seed in range(3000, 3014)]
     env.close()
     assert all(success for success, _, _ in episodes)
     assert np.mean([by_expert.any() for _, by_expert, _ in episodes]) <= 0.2
@@ -72,16 +72,16 @@ def test_a_policy_as_good_as_the_expert_is_left_alone(task):
 
 
 @pytest.mark.parametrize(
-    ("name", "rescued"), [("middle", 10), ("search", 10), ("push", 8), ("still", 10), ("restless", 5)]
+    ("name", "rescued"), [("middle", 6), ("search", 6), ("push", 5), ("still", 6), ("restless", 3)]
 )
 @pytest.mark.parametrize("task", TASKS)
 def test_a_bad_policy_is_rescued(task, name, rescued):
-    """Alone these policies solve 0 to 2 of 10 episodes (`test_tasks.py` has the blind ones)."""
+    """Alone these policies solve at most every fifth episode (`test_tasks.py` has the blind ones)."""
     env = make(task)
-    episodes = [roll_out(env, seed, name) for seed in range(3000, 3010)]
+    episodes = [roll_out(env, seed, name) for seed in range(3000, 3006)]
     env.close()
     assert sum(success for success, _, _ in episodes) >= rescued
-    assert sum(by_expert.any() for _, by_expert, _ in episodes) >= 9
+    assert sum(by_expert.any() for _, by_expert, _ in episodes) >= 5
 
 
 def test_the_expert_hands_back_when_it_has_found_the_cube_and_when_it_holds_it():

@@ -10,12 +10,17 @@ import pytest
 from gymnasium.spaces import Box
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
 from lerobot.teleoperators.gamepad import GamepadTeleopConfig
-from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleopConfig, KeyboardTeleopConfig
+from lerobot.teleoperators.keyboard import (
+    KeyboardEndEffectorTeleopConfig,
+    KeyboardTeleop,
+    KeyboardTeleopConfig,
+)
 
 from gym_playbyear.arm import ArmConfig, CartesianController
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import ExpertConfig, ExpertError, Verdict
+from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
 from lerobot_playbyear.dagger.collector import collect
+from lerobot_playbyear.dagger.config import DatasetSource
 from lerobot_playbyear.recording import RecordDatasetConfig, RecordError, env_spec
 from lerobot_playbyear.teleoperation.actions import CLOSE, DELTAS, OPEN, STAY, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
@@ -25,7 +30,7 @@ from lerobot_playbyear.teleoperation.expert import Desk, PersonLeftError, Teleop
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig, WindowKeys
 from lerobot_playbyear.teleoperation.levels import FLOOR_DB, as_float, level_db
 from lerobot_playbyear.teleoperation.pace import Pace
-from lerobot_playbyear.teleoperation.panel import FRAME, SIZE, Panel
+from lerobot_playbyear.teleoperation.panel import FRAME, SIZE, draw
 from lerobot_playbyear.teleoperation.speaker import SoundQueue
 from lerobot_playbyear.teleoperation.status import Control, Status
 from lerobot_playbyear.teleoperation.window import Window
@@ -199,7 +204,9 @@ def test_sound_plays_on_without_gaps_until_nothing_is_left():
 
 def test_messages_arrive_as_they_were_sent():
     picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
-    status = Status(Control.PERSON, "Grasp", 2, 3, 9, 20.0, 19.5, "open", 0.5, {"gripper": -30.5}, "", [("P", "pause")])
+    status = Status(
+        Control.PERSON, "Grasp", 2, 3, 9, 20.0, 19.5, "open", 0.5, {"gripper": [-30.5]}, "", [("P", "pause")]
+    )
     stream = io.BytesIO()
     send(stream, {"status": status.to_json()}, picture)
     send(stream, {"key": "space", "is_pressed": True})
@@ -300,6 +307,24 @@ def test_a_teleoperators_events_count_when_they_begin():
 )
 def test_terminate_says_less_than_what_is_beside_it(events, verdict):
     assert Controls(scripted(events=[events]), WindowKeys()).read().verdict is verdict
+
+
+class Listening(ScriptedTeleop, KeyboardTeleop):
+    """Hears the keyboard whichever window has it, as LeRobot's own does."""
+
+
+def test_what_is_typed_into_other_windows_moves_nothing():
+    keys = WindowKeys()
+    on = {TeleopEvents.IS_INTERVENTION, TeleopEvents.SUCCESS}
+    teleop = Listening(ScriptedTeleopConfig(), [(1, 0, 0, CLOSE)], [on])
+    teleop.connect()
+    controls = Controls(teleop, keys)
+    wish = controls.read()
+    assert (wish.overrides, wish.verdict) == (False, None)
+    assert wish.action == {"delta_x": 0, "delta_y": 0, "delta_z": 0, "gripper": STAY}
+    keys.has_focus = True
+    wish = controls.read()
+    assert (wish.overrides, wish.verdict, wish.action["delta_x"]) == (True, Verdict.SUCCESS, 1)
 
 
 def test_a_teleoperator_without_events_and_one_that_left():
@@ -476,8 +501,9 @@ def test_leaving_ends_the_command_as_ctrl_c_does(leave):
 def test_the_microphones_level_is_shown():
     _, window = play({})
     levels = [status.levels_db["gripper"] for status, picture in window.shown if picture is not None]
-    assert len(levels) == 30
-    assert all(FLOOR_DB < level < 0 for level in levels)
+    assert [len(heard) for heard in levels] == list(range(1, 31))
+    assert levels[3] == levels[-1][:4]
+    assert all(FLOOR_DB < level < 0 for level in levels[-1])
 
 
 # The window's picture
@@ -485,7 +511,7 @@ def test_the_microphones_level_is_shown():
 
 @pytest.mark.parametrize("control", Control)
 def test_the_border_tells_who_acts(control):
-    image = Panel().draw(Status(control))
+    image = draw(Status(control))
     colour = tuple(int(FRAME[control][i : i + 2], 16) for i in (1, 3, 5))
     for x, y in ((3, 400), (698, 400), (300, 744), (400, 4)):
         assert tuple(image[y, x]) == colour
@@ -502,11 +528,11 @@ def test_long_texts_stay_inside_the_panel():
         achieved_fps=3,
         gripper="closed",
         cooldown_s=1.9,
-        levels_db={"gripper": -20.0, "table": -75.0},
+        levels_db={"gripper": [-20.0] * 200, "table": [-75.0]},
         sound="a very long reason for which no loudspeaker could be found on this machine",
         keys=[("Arrows", "right, left, away, near")] * 9,
     )
-    image = Panel().draw(status)
+    image = draw(status)
     assert image.shape == (SIZE[1], SIZE[0], 3)
     background = image[0, -1]
     assert (image[:, 985:] == background).all()
@@ -526,6 +552,15 @@ def test_the_options_choose_a_teleoperator_and_survive_being_saved():
     assert isinstance(config, TeleopExpertConfig)
     assert config.teleop == KeyboardEndEffectorTeleopConfig(use_gripper=False)
     assert draccus.decode(ExpertConfig, json.loads(json.dumps(draccus.encode(config, ExpertConfig)))) == config
+
+
+def test_a_resumed_run_has_the_same_person(tmp_path):
+    """What playbyear-dagger keeps of its options, and reads again with --resume=true."""
+    source = DatasetSource("test/none")
+    expert = TeleopExpertConfig(KeyboardEndEffectorTeleopConfig(use_gripper=False), speed=0.4)
+    path = tmp_path / "dagger_config.json"
+    path.write_text(json.dumps(DaggerConfig(source, source, env=PlaybyearEnvConfig(), expert=expert).options()))
+    assert draccus.parse(DaggerConfig, config_path=path, args=[]).expert == expert
 
 
 def test_the_keyboard_of_the_window_is_the_default():

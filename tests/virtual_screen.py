@@ -80,7 +80,7 @@ class VirtualScreen:
         subprocess.run(["xdotool", *args], env=self.environment, check=True, timeout=60)
 
 
-def wait_for(question: Callable[[], Any], timeout_s: float = 30.0) -> Any:
+def wait_for(question: Callable[[], Any], timeout_s: float = 60.0) -> Any:
     """Asks until the answer is true, and returns it."""
     deadline = time.monotonic() + timeout_s
     while not (answer := question()):

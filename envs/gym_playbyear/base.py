@@ -151,6 +151,7 @@ class PlayByEarEnv(gym.Env):
         self._people_camera: SceneRenderer | None = None
         self._window: Window | None = None
         self._n_steps = 0
+        self._measured_fingers = np.zeros(2)
 
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         observation: dict[str, spaces.Space] = {

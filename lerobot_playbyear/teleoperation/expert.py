@@ -14,7 +14,7 @@ from lerobot_playbyear.teleoperation.controls import Controls, Wish
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
-from lerobot_playbyear.teleoperation.status import Control, Status
+from lerobot_playbyear.teleoperation.status import HISTORY_S, Control, Status
 from lerobot_playbyear.teleoperation.window import Window
 
 _BEGIN = "Press P to begin"
@@ -77,6 +77,7 @@ class TeleopExpert(Expert):
         status = self._status
         status.attempt, status.step = status.attempt + 1, -1
         status.n_steps, status.task = int(env.get_wrapper_attr("_max_episode_steps")), _task(env)
+        status.levels_db = {}
         status.note = _NOTES[self._verdict] if self._verdict else ""
         self._verdict, self._last_command, self._is_paused = None, None, self._begins_paused
         status.control = Control.PERSON if self._demonstrates else Control.POLICY
@@ -93,7 +94,10 @@ class TeleopExpert(Expert):
         if self._last_command is not None:
             desk.gripper.follow(self._last_command > 0)
         blocks = microphone_blocks(observation)
-        status.levels_db = {name: round(level_db(block), 1) for name, block in blocks.items()}
+        for name, block in blocks.items():
+            levels = status.levels_db.setdefault(name, [])
+            levels.append(round(level_db(block), 1))
+            del levels[: -max(round(HISTORY_S * desk.pace.fps), 1)]
         if desk.speaker is not None and blocks:
             desk.speaker.play(next(iter(blocks.values())))
         picture = self._env.render()

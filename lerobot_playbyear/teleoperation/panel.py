@@ -1,14 +1,13 @@
 """What the window looks like: a frame for the scene in the colour of who acts, and a panel beside it."""
 
 import math
-from collections import deque
 from functools import cache
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from lerobot_playbyear.teleoperation.levels import FLOOR_DB
-from lerobot_playbyear.teleoperation.status import Control, Status
+from lerobot_playbyear.teleoperation.status import HISTORY_S, Control, Status
 
 SIZE = (1000, 748)
 """Width and height of the window's picture."""
@@ -40,79 +39,21 @@ _ON_FRAME = {
 _BACKGROUND, _TEXT, _DIM, _LINE, _WARNING = "#15181c", "#f2f3f4", "#9aa3ad", "#343a42", "#e69f00"
 _BAR, _LOUD = "#56b4e9", "#f0e442"
 _LEFT, _RIGHT = 728, 976  # of the panel's content
-_HISTORY_S = 4.0
 _LOUD_DB = -20.0
 
 
-class Panel:
-    """Draws all but the scene, and remembers how loud it was."""
-
-    def __init__(self) -> None:
-        self._levels: dict[str, deque[float]] = {}
-        self._last: tuple[int, int] | None = None
-
-    def draw(self, status: Status) -> np.ndarray:
-        """The window's picture (height, width, 3) uint8; the scene is empty."""
-        self._remember(status)
-        image = Image.new("RGB", SIZE, _BACKGROUND)
-        draw = ImageDraw.Draw(image)
-        _draw_frame(draw, status)
-        y = self._draw_progress(draw, status, 24)
-        y = self._draw_levels(draw, status, y + 22)
-        y = _draw_gripper(draw, status, y + 22) if status.gripper else y
-        _draw_pace(draw, status, y + 22)
-        keys = _keys(tuple(status.keys))
-        image.paste(keys, (_LEFT, SIZE[1] - 18 - keys.height))
-        return np.asarray(image)
-
-    def _remember(self, status: Status) -> None:
-        moment = (status.attempt, status.step)
-        if moment == self._last:
-            return
-        if self._last is None or moment[0] != self._last[0]:
-            self._levels.clear()
-        self._last = moment
-        for name, level in status.levels_db.items():
-            levels = self._levels.setdefault(name, deque(maxlen=max(int(_HISTORY_S * status.fps), 2)))
-            levels.append(level)
-
-    def _draw_progress(self, draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
-        for line in _wrapped(status.task, _font(17), _RIGHT - _LEFT)[:3]:
-            draw.text((_LEFT, y), line, _TEXT, _font(17), "lm")
-            y += 22
-        if not status.n_steps:
-            return y
-        draw.text((_LEFT, y + 6), f"Attempt {status.attempt}", _DIM, _font(14), "lm")
-        seconds = f"step {status.step} of {status.n_steps}"
-        draw.text((_RIGHT, y + 6), seconds, _DIM, _font(14), "rm")
-        _bar(draw, y + 20, 4, status.step / status.n_steps, _DIM)
-        return y + 24
-
-    def _draw_levels(self, draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
-        for name, level in status.levels_db.items():
-            draw.text((_LEFT, y), f"Microphone {name}", _TEXT, _font(15), "lm")
-            text = "silence" if level <= FLOOR_DB else f"{level:.0f} dB"
-            draw.text((_RIGHT, y), text, _DIM, _font(14), "rm")
-            _bar(draw, y + 15, 10, 1 - level / FLOOR_DB, _LOUD if level > _LOUD_DB else _BAR)
-            self._draw_history(draw, self._levels.get(name, ()), y + 31)
-            y += 92
-        if status.levels_db:
-            sound = f"Not played: {status.sound}" if status.sound else "Played on the loudspeaker"
-            draw.text((_LEFT, y), _shortened(sound, _font(13)), _DIM, _font(13), "lm")
-            y += 8
-        return y
-
-    def _draw_history(self, draw: ImageDraw.ImageDraw, levels, y: int) -> None:
-        height = 46
-        draw.rectangle((_LEFT, y, _RIGHT, y + height), fill="#1d2126")
-        if not levels:
-            return
-        step = (_RIGHT - _LEFT) / levels.maxlen
-        x = _RIGHT - step * len(levels)
-        for level in levels:
-            top = y + height - round(height * (1 - level / FLOOR_DB))
-            draw.rectangle((round(x), top, max(round(x + step) - 1, round(x)), y + height), fill=_BAR)
-            x += step
+def draw(status: Status) -> np.ndarray:
+    """All but the scene: the window's picture (height, width, 3) uint8."""
+    image = Image.new("RGB", SIZE, _BACKGROUND)
+    canvas = ImageDraw.Draw(image)
+    _draw_frame(canvas, status)
+    y = _draw_progress(canvas, status, 24)
+    y = _draw_levels(canvas, status, y + 22)
+    y = _draw_gripper(canvas, status, y + 22) if status.gripper else y
+    _draw_pace(canvas, status, y + 22)
+    keys = _keys(tuple(status.keys))
+    image.paste(keys, (_LEFT, SIZE[1] - 18 - keys.height))
+    return np.asarray(image)
 
 
 def _draw_frame(draw: ImageDraw.ImageDraw, status: Status) -> None:
@@ -123,6 +64,43 @@ def _draw_frame(draw: ImageDraw.ImageDraw, status: Status) -> None:
     draw.text((_BORDER + 6, middle), _TITLES[status.control], on_colour, _font(27), "lm")
     note = status.waiting if status.control is Control.WAITING else status.note
     draw.text((_VIEW + _BORDER - 6, middle), note, on_colour, _font(16), "rm")
+
+
+def _draw_progress(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
+    for line in _wrapped(status.task, _font(17), _RIGHT - _LEFT)[:3]:
+        draw.text((_LEFT, y), line, _TEXT, _font(17), "lm")
+        y += 22
+    if not status.n_steps:
+        return y
+    draw.text((_LEFT, y + 6), f"Attempt {status.attempt}", _DIM, _font(14), "lm")
+    draw.text((_RIGHT, y + 6), f"step {status.step} of {status.n_steps}", _DIM, _font(14), "rm")
+    _bar(draw, y + 20, 4, status.step / status.n_steps, _DIM)
+    return y + 24
+
+
+def _draw_levels(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
+    for name, levels in status.levels_db.items():
+        level = levels[-1]
+        draw.text((_LEFT, y), f"Microphone {name}", _TEXT, _font(15), "lm")
+        text = "silence" if level <= FLOOR_DB else f"{level:.0f} dB"
+        draw.text((_RIGHT, y), text, _DIM, _font(14), "rm")
+        _bar(draw, y + 15, 10, 1 - level / FLOOR_DB, _LOUD if level > _LOUD_DB else _BAR)
+        _draw_history(draw, levels, max(round(HISTORY_S * status.fps), 1), y + 31)
+        y += 92
+    if not status.levels_db:
+        return y
+    sound = f"Not played: {status.sound}" if status.sound else "Played on the loudspeaker"
+    draw.text((_LEFT, y), _shortened(sound, _font(13)), _DIM, _font(13), "lm")
+    return y + 8
+
+
+def _draw_history(draw: ImageDraw.ImageDraw, levels: list[float], n_shown: int, y: int) -> None:
+    height, step = 46, (_RIGHT - _LEFT + 1) / n_shown
+    draw.rectangle((_LEFT, y, _RIGHT, y + height), fill="#1d2126")
+    for age, level in enumerate(reversed(levels[-n_shown:])):
+        left, right = round(_RIGHT + 1 - (age + 1) * step), round(_RIGHT + 1 - age * step) - 1
+        top = y + height - round(height * (1 - level / FLOOR_DB))
+        draw.rectangle((left, top, max(right, left), y + height), fill=_BAR)
 
 
 def _draw_gripper(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:

@@ -4,6 +4,9 @@ import json
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 
+HISTORY_S = 4.0
+"""How far back the microphones' levels are shown [s]."""
+
 
 class Control(StrEnum):
     """Who acts."""
@@ -27,7 +30,7 @@ class Status:
         achieved_fps: Those of the last second; 0 while unknown.
         gripper: `open`, `closed`, or nothing for an arm without one.
         cooldown_s: Until the gripper may change again [s].
-        levels_db: Of each microphone over the last step [dB of full scale].
+        levels_db: Of each microphone over each of the last steps, the newest last [dB of full scale].
         sound: Why nothing is heard; empty if it is.
         keys: What to press, and what it does.
         note: What happened last.
@@ -43,7 +46,7 @@ class Status:
     achieved_fps: float = 0.0
     gripper: str = ""
     cooldown_s: float = 0.0
-    levels_db: dict[str, float] = field(default_factory=dict)
+    levels_db: dict[str, list[float]] = field(default_factory=dict)
     sound: str = ""
     keys: list[tuple[str, str]] = field(default_factory=list)
     note: str = ""

@@ -38,7 +38,7 @@ class Window:
         self.keys = WindowKeys()
         self._is_open = threading.Event()
         self._problem = ""
-        self._newest: tuple[Status, np.ndarray | None] | None = None
+        self._newest: tuple[str, np.ndarray | None] | None = None
         self._has_newest = threading.Condition()
         self._process = subprocess.Popen(
             [sys.executable, "-m", _MODULE, title], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -65,10 +65,11 @@ class Window:
             status: What to tell.
             picture: (H, W, 3) uint8; None: the last one stays.
         """
+        text = status.to_json()  # now, because it goes on changing
         with self._has_newest:
             if picture is None and self._newest is not None:
                 picture = self._newest[1]
-            self._newest = (status, picture)
+            self._newest = (text, picture)
             self._has_newest.notify()
 
     def close(self) -> None:
@@ -93,7 +94,7 @@ class Window:
             if newest is None:
                 continue
             try:
-                send(self._process.stdin, {"status": newest[0].to_json()}, newest[1])
+                send(self._process.stdin, {"status": newest[0]}, newest[1])
             except (OSError, ValueError):
                 return
 

@@ -10,7 +10,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from lerobot_playbyear.teleoperation.panel import SCENE, SIZE, Panel
+from lerobot_playbyear.teleoperation.panel import SCENE, SIZE, draw
 from lerobot_playbyear.teleoperation.status import Control, Status
 from lerobot_playbyear.teleoperation.wire import receive, send
 
@@ -134,18 +134,18 @@ def run(glfw: Any, screen: Screen, inbox: Inbox, out: IO[bytes]) -> None:
     glfw.set_key_callback(screen.window, on_key)
     glfw.set_window_focus_callback(screen.window, lambda window, has: send(out, {"has_focus": bool(has)}))
     glfw.set_window_refresh_callback(screen.window, lambda window: screen.redraw())
-    panel, status, arrived = Panel(), Status(), time.monotonic()
-    screen.show(panel.draw(status))
+    status, arrived = Status(), time.monotonic()
+    screen.show(draw(status))
     send(out, {"has_focus": bool(glfw.get_window_attrib(screen.window, glfw.FOCUSED))})
     send(out, {"is_open": True})
     while not glfw.window_should_close(screen.window) and not inbox.is_closed:
         newest = inbox.take()
         if newest is not None:
             status, arrived = newest[0], time.monotonic()
-            screen.show(panel.draw(status), newest[1])
+            screen.show(draw(status), newest[1])
         elif status.control is not Control.WAITING and time.monotonic() - arrived > _WAITING_AFTER_S:
             status = dataclasses.replace(status, control=Control.WAITING)
-            screen.show(panel.draw(status))
+            screen.show(draw(status))
         glfw.wait_events_timeout(_LOOK_S)
 
 
