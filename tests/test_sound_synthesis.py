@@ -267,8 +267,8 @@ def test_unusable_options_are_refused(changes, message):
 
 
 def test_unknown_material_is_refused():
-    with pytest.raises(ValueError, match=r"'glass'.*cube"):
-        ContactPair("gripper-glass", ("gripper", "glass"), ("gripper", "glass"))
+    with pytest.raises(ValueError, match=r"'jelly'.*cube"):
+        ContactPair("gripper-jelly", ("gripper", "jelly"), ("gripper", "jelly"))
 
 
 def test_wrong_or_diverged_forces_are_refused():

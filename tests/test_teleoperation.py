@@ -314,6 +314,7 @@ class Listening(ScriptedTeleop, KeyboardTeleop):
 
 
 def test_what_is_typed_into_other_windows_moves_nothing():
+    pytest.importorskip("pynput", reason="LeRobot's keyboard needs pynput", exc_type=ImportError)
     keys = WindowKeys()
     on = {TeleopEvents.IS_INTERVENTION, TeleopEvents.SUCCESS}
     teleop = Listening(ScriptedTeleopConfig(), [(1, 0, 0, CLOSE)], [on])

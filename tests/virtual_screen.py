@@ -1,5 +1,6 @@
 """A screen without a monitor, on which real windows get real key events."""
 
+import itertools
 import os
 import shutil
 import subprocess
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import ImageGrab
 
+_numbers = itertools.count()
 MISSING = [name for name in ("Xvfb", "xdotool") if shutil.which(name) is None]
 """What is not installed (Debian: xvfb, xdotool)."""
 
@@ -22,15 +24,18 @@ class VirtualScreen:
     """
 
     def __init__(self, width: int = 1100, height: int = 800) -> None:
+        number = (
+            100 + os.getpid() % 50_000 + next(_numbers)
+        )  # two that look for a free one at the same time take the same
         read, write = os.pipe()
-        command = ["Xvfb", "-displayfd", str(write), "-screen", "0", f"{width}x{height}x24", "-nolisten", "tcp"]
+        size = f"{width}x{height}x24"
+        command = ["Xvfb", f":{number}", "-displayfd", str(write), "-screen", "0", size, "-nolisten", "tcp"]
         self._process = subprocess.Popen(
             command, pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
         os.close(write)
         with os.fdopen(read) as answer:
-            number = answer.readline().strip()
-        assert number, "Xvfb did not start"
+            assert answer.readline().strip() == str(number), "Xvfb did not start"
         self.display = f":{number}"
 
     @property
