@@ -4,6 +4,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
 BIN := .venv/bin
+TEST_JOBS ?= 2
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
 
@@ -26,10 +27,10 @@ lint: install  ## Style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: lint  ## Style, types and tests
+test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, default 2)
 	./tools/browser.sh
 	./tools/screen.sh
-	$(BIN)/pytest
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile
 
 test-slow: install  ## The tests that take minutes
 	$(BIN)/pytest -m slow

@@ -1,6 +1,7 @@
 """Train and evaluate one policy with the commands that everybody has; what is there already is kept."""
 
 import json
+import shutil
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -103,6 +104,8 @@ def train(job: Job) -> tuple[str, float]:
     if not (folder / "checkpoints" / str(job.steps).zfill(6)).exists():
         last = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
         resume = [tool("playbyear-train"), "--resume=true", f"--config_path={last}"]
+        if folder.exists() and not last.exists():  # interrupted before its first checkpoint
+            shutil.rmtree(folder)
         start = time.monotonic()
         run(resume if last.exists() else command, RUNS / "logs" / f"train-{job.name}.log", job.threads)
         spent += (time.monotonic() - start) / 60
