@@ -123,4 +123,5 @@ class MemoryHead(nn.Module):
         windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
         n_items, n_windows = windows.shape[:2]
         outputs, _ = self.lstm(windows.flatten(0, 1))  # (B * K, H, D)
-        return torch.tanh(self.head(outputs[:, -1])).unflatten(0, (n_items, n_windows))
+        actions = torch.tanh(self.head(outputs[:, -1]).float())  # whatever autocast computed in
+        return actions.unflatten(0, (n_items, n_windows))

@@ -296,6 +296,15 @@ def test_a_preset_leaves_checkpoints_and_the_hub_alone():
         apply_preset(["--preset=paper", "--policy.type=act"])
 
 
+@pytest.mark.parametrize("capable", [False, True])
+def test_the_cpu_preset_computes_in_bfloat16_where_that_is_faster(monkeypatch, capable):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": capable}, raising=False)
+
+    assert ("--policy.use_amp=true" in apply_preset(["--preset=cpu"])) == capable
+    assert "--policy.use_amp=true" not in apply_preset(["--preset=cpu", "--policy.use_amp=false"])
+    assert "--policy.use_amp=true" not in apply_preset(["--preset=paper"])
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_are_options_that_exist(name, command, monkeypatch, root):
     seen = []
