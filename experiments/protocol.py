@@ -20,7 +20,7 @@ EVALUATION_SEEDS = range(70000, 70100)
 DONOR_SEEDS = range(60000, 60040)  # expert episodes whose sounds the listening probes play
 TRAINING_SEEDS = (1, 2, 3)
 N_DEMONSTRATIONS = 50
-STEPS = {"OccludedGrasp-v0": 2500, "OccludedPickPlace-v0": 3000}
+STEPS = {"OccludedGrasp-v0": 3000, "OccludedPickPlace-v0": 3000}
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
     "full": (),

@@ -120,14 +120,15 @@ class PlaybyearPolicy(PreTrainedPolicy):
             (B, n_actions), normalised.
         """
         self.eval()
-        config = self.config
-        encoding = self.model.encode_frame(self._remember(batch))  # (B, D)
-        steps = config.memory_steps
-        if self._encodings is None:
-            self._encodings = encoding.unsqueeze(1).repeat(1, steps, 1)
-        else:
-            self._encodings = torch.cat([self._encodings[:, 1:], encoding.unsqueeze(1)], dim=1)
-        return self.model.memory_head(self._encodings)[:, -1]
+        run = self._remember(batch)
+        device = next(iter(run.values())).device
+        with torch.autocast(device.type, enabled=False):  # bfloat16 would round positions to half a millimetre
+            encoding = self.model.encode_frame(run)  # (B, D)
+            if self._encodings is None:
+                self._encodings = encoding.unsqueeze(1).repeat(1, self.config.memory_steps, 1)
+            else:
+                self._encodings = torch.cat([self._encodings[:, 1:], encoding.unsqueeze(1)], dim=1)
+            return self.model.memory_head(self._encodings)[:, -1]
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

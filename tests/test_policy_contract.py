@@ -125,6 +125,19 @@ def test_the_past_matters_exactly_as_far_as_the_windows_reach():
     assert not torch.equal(policy.predict_run(run_ending_at(episode, 79, config)), before)
 
 
+@torch.no_grad()
+def test_acting_is_exact_under_autocast():
+    policy = make_policy()
+    episode = make_episode(seed=1, config=policy.config)
+    expected = step_through(policy, [episode])
+
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        actions = step_through(policy, [episode])
+
+    assert actions.dtype == torch.float32
+    torch.testing.assert_close(actions, expected, rtol=0, atol=0)
+
+
 def test_every_frame_is_encoded_once():
     policy = make_policy(n_supervised_steps=6)
     seen: list[int] = []
