@@ -124,17 +124,24 @@ def dataset_root(task: str) -> Path:
     return RUNS / "datasets" / task
 
 
-def record(task: str, n_episodes: int) -> str:
-    """Records demonstrations, or as many as are missing; returns the command."""
+def record(task: str, n_episodes: int, root: Path | None = None) -> str:
+    """Records demonstrations, or as many as are missing; returns the command.
+
+    Args:
+        task: What the expert does.
+        n_episodes: How many there shall be.
+        root: The dataset's folder; by default the task's own.
+    """
+    root = root or dataset_root(task)
     command = [
         tool("playbyear-record"),
         "--env.type=playbyear",
         f"--env.task={task}",
-        f"--dataset.repo_id=experiments/{task}",
-        f"--dataset.root={dataset_root(task)}",
+        f"--dataset.repo_id=experiments/{root.name}",
+        f"--dataset.root={root}",
         f"--dataset.num_episodes={n_episodes}",
         f"--seed={DEMONSTRATION_SEED}",
         "--resume=true",
     ]
-    run(command, RUNS / "logs" / f"record-{task}.log", threads=1)
+    run(command, RUNS / "logs" / f"record-{root.name}.log", threads=1)
     return shown(command)

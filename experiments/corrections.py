@@ -1,0 +1,170 @@
+"""What corrections are worth: a middling policy, the same after HG-DAgger, and after as many updates without it.
+
+    python -m experiments.corrections --task=OccludedGrasp-v0 --n_demonstrations=20 --steps=2000
+
+1. A policy is trained on few demonstrations.
+2. `playbyear-dagger` keeps 25 attempts in which the expert had to help, and learns from them as they come.
+3. The control goes on with the same demonstrations, for as many updates at the same largest rate.
+
+All three are evaluated on the same 50 seeds. Resumes where it was interrupted.
+"""
+
+import argparse
+import json
+import time
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from experiments.protocol import EVALUATION_SEEDS, RUNS, TASKS, library_versions, record, run, shown, tool
+from experiments.training import Job, evaluate, train
+
+STUDY = "corrections"
+SEEDS = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + 50)
+N_EPISODES = 25
+BATCH_SIZE = 12
+LEARNING_RATE = "3e-4"
+
+
+@dataclass
+class Corrected:
+    """One policy's way through corrections.
+
+    Attributes:
+        task, training_seed, n_demonstrations, steps: How the policy came to be that is corrected.
+        first_seed, n_episodes: Of every evaluation.
+        evaluations: Over the kept attempts and the updates, the percentage of successes.
+        attempts: Seed, outcome and share of interventions of each.
+        updates: Of HG-DAgger, and of the control.
+        control: The percentage of successes of the control.
+        minutes: Of HG-DAgger with its evaluations, and of the control's training.
+        commands: What was run, in order.
+        versions: Of the libraries that matter.
+    """
+
+    task: str
+    training_seed: int
+    n_demonstrations: int
+    steps: int
+    first_seed: int
+    n_episodes: int
+    evaluations: list[dict[str, float]]
+    attempts: list[dict[str, Any]]
+    updates: int
+    control: float
+    minutes: dict[str, float]
+    commands: list[str]
+    versions: dict[str, str] = field(default_factory=library_versions)
+
+
+def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
+    """Runs all three parts, or what is missing of them."""
+    train_command, _ = train(job)
+    folder = RUNS / "dagger" / job.name
+    dagger = [
+        tool("playbyear-dagger"),
+        f"--policy.path={job.checkpoint}",
+        f"--demos.repo_id=experiments/{demonstrations.name}",
+        f"--demos.root={demonstrations}",
+        f"--interventions.repo_id=experiments/corrections-{job.name}",
+        f"--interventions.root={RUNS / 'datasets' / f'corrections-{job.name}'}",
+        "--env.type=playbyear",
+        f"--env.task={job.task}",
+        f"--episodes={N_EPISODES}",
+        f"--batch_size={BATCH_SIZE}",
+        f"--learning_rate={LEARNING_RATE}",
+        f"--seed={SEEDS.start}",
+        f"--eval.n_episodes={len(SEEDS)}",
+        "--eval.batch_size=25",
+        "--eval_every=7",
+        f"--output_dir={folder}",
+        "--resume=true",
+    ]
+    spent = _clocked(dagger, folder, threads)
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    updates = max(line["step"] for line in lines)
+    kept, evaluations, attempts = 0, [], []
+    for line in lines:
+        if line["kind"] == "attempt":
+            kept += line["outcome"] == "kept"
+            attempts.append({key: line[key] for key in ("seed", "outcome", "intervention_share")})
+        if line["kind"] == "eval":
+            evaluations.append({"kept": kept, "updates": line["step"], "success": line["pc_success"]})
+
+    control_job = replace(job, steps=updates, variant="control")  # its folder; it begins where the job's policy ended
+    go_on = [
+        tool("playbyear-train"),
+        f"--policy.path={job.checkpoint}",
+        f"--dataset.repo_id=experiments/{demonstrations.name}",
+        f"--dataset.root={demonstrations}",
+        f"--output_dir={RUNS / 'train' / control_job.name}",
+        f"--steps={updates}",
+        f"--save_freq={updates}",
+        "--env_eval_freq=0",
+        f"--batch_size={BATCH_SIZE}",
+        f"--policy.optimizer_lr={LEARNING_RATE}",
+        "--policy.push_to_hub=false",
+        f"--seed={job.training_seed}",
+        "--wandb.enable=false",
+    ]
+    control_spent = 0.0
+    if not control_job.checkpoint.exists():
+        control_spent = _clocked(go_on, RUNS / "train" / control_job.name, threads)
+    commands = [train_command, shown(dagger), shown(go_on)]
+    successes = evaluate(control_job, commands)
+    return Corrected(
+        task=job.task,
+        training_seed=job.training_seed,
+        n_demonstrations=job.n_demonstrations,
+        steps=job.steps,
+        first_seed=SEEDS.start,
+        n_episodes=len(SEEDS),
+        evaluations=evaluations,
+        attempts=attempts,
+        updates=updates,
+        control=100 * sum(successes) / len(successes),
+        minutes={"dagger": round(spent, 1), "control": round(control_spent, 1)},
+        commands=commands,
+    )
+
+
+def _clocked(command: list[str], folder: Path, threads: int) -> float:
+    """Runs a command that can go on where it stopped; returns the minutes that it took in all."""
+    clock = folder.with_suffix(".minutes")
+    clock.parent.mkdir(parents=True, exist_ok=True)
+    spent = float(clock.read_text()) if clock.exists() else 0.0
+    start = time.monotonic()
+    run(command, RUNS / "logs" / f"{Path(command[0]).name}-{folder.name}.log", threads)
+    spent += (time.monotonic() - start) / 60
+    clock.write_text(str(spent))
+    return spent
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=TASKS, default=TASKS[0])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of training")
+    parser.add_argument("--n_demonstrations", type=int, default=20)
+    parser.add_argument("--steps", type=int, default=2000, help="updates of the policy that is corrected")
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    record(options.task, options.n_demonstrations)
+    demonstrations = RUNS / "datasets" / f"{options.task}-{options.n_demonstrations}"
+    record(options.task, options.n_demonstrations, demonstrations)
+    for seed in options.seeds:
+        job = Job(STUDY, options.task, "full", seed, options.n_demonstrations, options.steps, options.threads, SEEDS)
+        if not job.result_path.exists():
+            result = correct(job, demonstrations, options.threads)
+            job.result_path.parent.mkdir(parents=True, exist_ok=True)
+            job.result_path.write_text(json.dumps(asdict(result)) + "\n")
+        result = Corrected(**json.loads(job.result_path.read_text()))
+        first, last = result.evaluations[0], result.evaluations[-1]
+        print(
+            f"{result.task} seed {seed}: {first['success']:.0f} % before, {last['success']:.0f} % with {last['kept']} "
+            f"corrected attempts and {result.updates} updates, {result.control:.0f} % with the updates alone",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
