@@ -1,0 +1,112 @@
+"""The results as pictures: `python -m experiments.figures --output=docs/media`."""
+
+import argparse
+import json
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("agg")
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+
+from experiments.protocol import RESULTS, TASKS, load_results, wilson_interval
+
+COLOURS = {"full": "#1f6f8b", "deaf": "#c8553d", "blind": "#777777"}
+
+
+def band(axes: Axes, points: dict[float, list[bool]], label: str, colour: str) -> None:
+    """A line of success rates over some quantity, with 95 % intervals."""
+    xs = sorted(points)
+    rates = [100 * sum(points[x]) / len(points[x]) for x in xs]
+    intervals = [wilson_interval(sum(points[x]), len(points[x])) for x in xs]
+    axes.plot(xs, rates, marker="o", color=colour, label=label)
+    axes.fill_between(
+        xs, [100 * low for low, _ in intervals], [100 * high for _, high in intervals], color=colour, alpha=0.15
+    )
+
+
+def blind_line(axes: Axes, task: str) -> None:
+    path = RESULTS / "ablations" / f"{task}-blind.json"
+    if path.exists():
+        rates = json.loads(path.read_text())["success"]
+        best = max(rate for name, rate in rates.items() if name != "expert")
+        axes.axhline(100 * best, color=COLOURS["blind"], linestyle="--", label="best blind script")
+
+
+def demonstrations(output: Path) -> None:
+    """Success of the full and the deaf policy over the number of demonstrations."""
+    for task in TASKS:
+        few = load_results(f"demonstrations/{task}-*.json")
+        if not few:
+            continue
+        seed = few[0].training_seed
+        results = few + [r for r in load_results(f"ablations/{task}-*.json") if r.training_seed == seed]
+        figure, axes = plt.subplots(figsize=(6, 3.6))
+        for condition in ("full", "deaf"):
+            points = {r.n_demonstrations: r.successes for r in results if r.condition == condition}
+            band(axes, points, condition, COLOURS[condition])
+        blind_line(axes, task)
+        axes.set_xscale("log")
+        ticks = sorted({r.n_demonstrations for r in results})
+        axes.set_xticks(ticks, [str(tick) for tick in ticks])
+        axes.minorticks_off()
+        finish(figure, axes, "demonstrations", output / f"demonstrations-{task}.png")
+
+
+def noise(output: Path) -> None:
+    """Success of the full policies over the background's level."""
+    for task in TASKS:
+        by_level: dict[float, list[bool]] = {}
+        for result in load_results(f"noise/{task}-*.json"):
+            by_level.setdefault(float(result.environment["noise_level"]), []).extend(result.successes)
+        if not by_level:
+            continue
+        figure, axes = plt.subplots(figsize=(6, 3.6))
+        band(axes, by_level, "full", COLOURS["full"])
+        blind_line(axes, task)
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(sorted(by_level), [f"{level:g}" for level in sorted(by_level)])
+        finish(figure, axes, "background noise (1: as in training)", output / f"noise-{task}.png")
+
+
+def corrections(output: Path) -> None:
+    """Success over the attempts that were corrected, with the control beside it."""
+    for task in TASKS:
+        reports = [json.loads(path.read_text()) for path in sorted((RESULTS / "corrections").glob(f"{task}-*.json"))]
+        if not reports:
+            continue
+        figure, axes = plt.subplots(figsize=(6, 3.6))
+        for report in reports:
+            kept = [point["kept"] for point in report["evaluations"]]
+            axes.plot(kept, [point["success"] for point in report["evaluations"]], marker="o", color=COLOURS["full"])
+            axes.plot(kept[-1], report["control"], marker="x", markersize=9, color=COLOURS["deaf"])
+        axes.plot([], [], marker="o", color=COLOURS["full"], label="corrected")
+        axes.plot([], [], marker="x", color=COLOURS["deaf"], linestyle="", label="as many updates on demonstrations")
+        finish(figure, axes, "attempts with corrections", output / f"corrections-{task}.png")
+
+
+def finish(figure, axes: Axes, label: str, path: Path) -> None:
+    """Axes, legend, file."""
+    axes.set_xlabel(label)
+    axes.set_ylabel("success [%]")
+    axes.set_ylim(0, 100)
+    axes.grid(alpha=0.25)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
+    plt.close(figure)
+    print(path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("docs/media"))
+    output = parser.parse_args().output
+    for draw in (demonstrations, noise, corrections):
+        draw(output)
+
+
+if __name__ == "__main__":
+    main()
