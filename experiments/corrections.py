@@ -1,6 +1,6 @@
 """What corrections are worth: a middling policy, the same after HG-DAgger, and after as many updates without it.
 
-    python -m experiments.corrections --task=OccludedGrasp-v0 --n_demonstrations=20 --steps=2000
+    python -m experiments.corrections --task=OccludedGrasp-v0 --n_demonstrations=20
 
 1. A policy is trained on few demonstrations.
 2. `playbyear-dagger` keeps 25 attempts in which the expert had to help, and learns from them as they come.
@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("--task", choices=TASKS, default=TASKS[0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of training")
     parser.add_argument("--n_demonstrations", type=int, default=20)
-    parser.add_argument("--steps", type=int, default=2000, help="updates of the policy that is corrected")
+    parser.add_argument("--steps", type=int, default=3000, help="updates of the policy that is corrected")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     record(options.task, options.n_demonstrations)
