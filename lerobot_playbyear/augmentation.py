@@ -33,7 +33,10 @@ class Augmentation:
         Returns:
             (B, T, 3, size, size).
         """
-        return self._warp(self._recolour(images), size)
+        height, width = images.shape[-2:]
+        if height > size or width > size:  # first: there is less to recolour, the same but where a colour saturates
+            images = resize(images, size)
+        return self._warp(self._recolour(images), size, (height, width))
 
     def _recolour(self, images: Tensor) -> Tensor:
         n_runs, device = images.shape[0], images.device
@@ -48,8 +51,9 @@ class Augmentation:
         recoloured = (matrix.to(images.dtype) @ flat).clamp_(0, 1)
         return recoloured.view(images.shape[0], 3, images.shape[1], *images.shape[3:]).transpose(1, 2)
 
-    def _warp(self, images: Tensor, size: int) -> Tensor:
-        n_runs, n_frames, _, height, width = images.shape
+    def _warp(self, images: Tensor, size: int, original: tuple[int, int]) -> Tensor:
+        n_runs, n_frames = images.shape[:2]
+        height, width = original
         device = images.device
         angle = math.radians(self.degrees) * _uniform(n_runs, device)
         scale = 1 / (1 + self.scale * _uniform(n_runs, device))
@@ -62,8 +66,6 @@ class Augmentation:
         shift_x = self.translate * _uniform(n_runs, device) + self.crop / width * _uniform(n_runs, device)
         shift_y = self.translate * _uniform(n_runs, device) + self.crop / height * _uniform(n_runs, device)
         theta[:, 0, 2], theta[:, 1, 2] = 2 * shift_x, 2 * shift_y
-        if height > size or width > size:
-            images = resize(images, size)
         grid = functional.affine_grid(theta, [n_runs, 1, size, size], align_corners=False).to(images.dtype)
         warped = functional.grid_sample(
             images.flatten(1, 2), grid, mode="bilinear", padding_mode="border", align_corners=False
