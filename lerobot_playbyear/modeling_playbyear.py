@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from lerobot_playbyear.augmentation import Augmentation, resize
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.hub.policy_card import with_hearing
 from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
 from lerobot_playbyear.runs import before_episode, newest
 from lerobot_playbyear.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, segment_and_hop, to_float_wave
@@ -64,6 +65,10 @@ class PlaybyearPolicy(PreTrainedPolicy):
                 f"too many, of {len(missing)} and {len(unexpected)}. {hint}"
             )
         return model
+
+    def generate_model_card(self, *args: Any, **kwargs: Any) -> Any:
+        """LeRobot's card, with what the policy hears."""
+        return with_hearing(super().generate_model_card(*args, **kwargs), self.config)
 
     def reset(self) -> None:
         """Forgets the episode."""

@@ -10,7 +10,6 @@ from typing import Any, Protocol, Self
 import gymnasium as gym
 import numpy as np
 import pyarrow.parquet as pq
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import (
     ACTION,
@@ -28,6 +27,9 @@ from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, check_root
+from lerobot_playbyear.hub.client import use_patient_client
+from lerobot_playbyear.hub.datasets import push_dataset
+from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.rollouts import EnvFacts, EnvSpec, Episode, Observation, RolloutError, RolloutPool
 
 INTERVENTION = "intervention"
@@ -119,7 +121,7 @@ def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = Non
 
     Raises:
         RecordError: Bad options, a folder that cannot be written, an environment without an expert, a dataset that
-            does not fit, a full disk. Episodes saved before are safe.
+            does not fit, a full disk, a Hub that cannot be reached. Episodes saved before are safe.
     """
     root = cfg.dataset.folder
     try:
@@ -139,12 +141,12 @@ def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = Non
     except OSError as error:
         raise RecordError(f"Cannot write to {root}: {error}") from error
     print(f"\nDataset: {root} ({summary})")
-    if cfg.dataset.push_to_hub:
-        _push(cfg, root)
     print(
         "Train on it: playbyear-train --policy.type=playbyear --policy.push_to_hub=false "
         f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={root}"
     )
+    if cfg.dataset.push_to_hub:
+        _push(cfg.dataset)
     return root
 
 
@@ -248,6 +250,8 @@ def _check_options(cfg: RecordConfig) -> None:
         raise RecordError(f"seed={cfg.seed}: give 0 or more.")
     if cfg.dataset.push_to_hub and "/" not in cfg.dataset.repo_id:
         raise RecordError(f"dataset.repo_id={cfg.dataset.repo_id!r}: to push, give it as user/name.")
+    if cfg.dataset.push_to_hub:
+        warn_without_login()
 
 
 def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:
@@ -281,12 +285,10 @@ def _flat_observation(observation: Observation) -> dict[str, Any]:
     return flat
 
 
-def _push(cfg: RecordConfig, root: Path) -> None:
+def _push(dataset: RecordDatasetConfig) -> None:
+    use_patient_client()
     try:
-        dataset = LeRobotDataset(cfg.dataset.repo_id, root=root, video_backend="pyav")
-        dataset.push_to_hub(private=cfg.dataset.private, tags=cfg.dataset.tags)
-    except Exception as error:
-        raise RecordError(
-            f"The dataset is complete in {root}, but it could not be uploaded: {error}. "
-            "Try again with the same command and --resume=true."
-        ) from error
+        url = push_dataset(dataset.repo_id, dataset.root, private=dataset.private, tags=dataset.tags)
+    except HubError as error:
+        raise RecordError(str(error)) from error
+    print(f"On the Hub: {url}")

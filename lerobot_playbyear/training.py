@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from torch import Tensor
 
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
+from lerobot_playbyear.hub.pushing import push_meanwhile
 from lerobot_playbyear.modeling_playbyear import LOSS_WEIGHT
 from lerobot_playbyear.train_config import PlaybyearTrainConfig
 
@@ -161,7 +163,9 @@ class TrainingParts:
         self.write_checkpoint(folder, cfg)
         update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
-            push_checkpoint_to_hub(folder, cfg.policy.repo_id, private=cfg.policy.private)
+            push_meanwhile(
+                partial(push_checkpoint_to_hub, folder, cfg.policy.repo_id, private=cfg.policy.private), folder
+            )
         return folder
 
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:

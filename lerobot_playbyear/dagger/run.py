@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.datasets import LeRobotDataset
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import init_logging, inside_slurm
 
 from lerobot_playbyear.dagger.batches import BalancedBatches
@@ -22,11 +22,13 @@ from lerobot_playbyear.dagger.loop import Loop
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.durable import DatasetWriteError
+from lerobot_playbyear.hub.policies import push_policy
+from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.recording import dataset_features, env_spec, next_seed
 from lerobot_playbyear.rollouts import RolloutError, env_facts
 from lerobot_playbyear.tracking import METRICS_NAME
 from lerobot_playbyear.train_config import PlaybyearTrainConfig
-from lerobot_playbyear.training import PolicyWindows, TrainingParts, dataset_names, make_training_parts
+from lerobot_playbyear.training import PolicyWindows, dataset_names, make_training_parts
 
 
 def run_dagger(cfg: DaggerConfig) -> Path:
@@ -53,6 +55,8 @@ def run_dagger(cfg: DaggerConfig) -> Path:
         with ExitStack() as stack:
             _run(cfg, folder, state, stack)
     _print_results(cfg, folder, state)
+    if cfg.policy is not None and cfg.policy.push_to_hub and state.checkpoint is not None:
+        _push(cfg.policy, folder)
     return folder.path
 
 
@@ -89,6 +93,8 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
         raise DaggerError(
             "--policy.push_to_hub=true needs a name: give --policy.repo_id, or --policy.push_to_hub=false."
         )
+    if cfg.policy.push_to_hub:
+        warn_without_login()
     return state
 
 
@@ -132,8 +138,6 @@ def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack
         actor = PolicyActor(policy, cfg.env, parts.preprocessor, parts.postprocessor, parts.accelerator.autocast)
         scene = (env, actor, expert)
     Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, report, scene).run()
-    if cfg.policy.push_to_hub:
-        _push(training, parts, demos)
 
 
 def _make_env(cfg: DaggerConfig, stack: ExitStack) -> gym.Env:
@@ -173,11 +177,14 @@ def _make_report(cfg: DaggerConfig, folder: RunFolder, state: RunState, training
     return report
 
 
-def _push(training: PlaybyearTrainConfig, parts: TrainingParts, demos: LeRobotDataset) -> None:
-    policy = parts.accelerator.unwrap_model(parts.policy)
-    policy.push_model_to_hub(training, dataset_meta=demos.meta)
-    for processor in (parts.preprocessor, parts.postprocessor):
-        processor.push_to_hub(policy.config.repo_id)
+def _push(policy: PreTrainedConfig, folder: RunFolder) -> None:
+    assert policy.repo_id is not None
+    try:
+        checkpoint = folder.checkpoints / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+        url = push_policy(checkpoint, policy.repo_id, private=policy.private)
+    except HubError as error:
+        raise DaggerError(str(error)) from error
+    print(f"On the Hub:  {url}")
 
 
 @contextmanager

@@ -63,14 +63,14 @@ def encode(pictures: Iterator[np.ndarray], fps: int, sound: Sequence[np.ndarray]
     stacked = (
         np.stack(blocks if len(n_samples) == 1 else blocks[:1], axis=-1) if blocks else np.zeros((1, 0, 0), np.int16)
     )
-    samples, sample_rate = _at_a_rate_of_aac(episode_sound(stacked), stacked.shape[1] * fps)
+    samples, sample_rate = at_a_rate_of_aac(episode_sound(stacked), stacked.shape[1] * fps)
     with tempfile.TemporaryDirectory() as folder:
         # Key frames every second, so that stepping backwards is quick.
         path = write_film(Path(folder) / "film.mp4", pictures, fps, samples, sample_rate, {"crf": "23", "g": str(fps)})
         return path.read_bytes()
 
 
-def _at_a_rate_of_aac(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, int]:
+def at_a_rate_of_aac(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, int]:
     """Resamples (n, channels) to the next higher rate that AAC has, where that is necessary."""
     if samples.shape[1] == 0 or sample_rate in _AAC_RATES:
         return samples, sample_rate or _AAC_RATES[-1]

@@ -36,6 +36,9 @@ from lerobot_playbyear.datasets import (
     run_weights,
     start_frames,
 )
+from lerobot_playbyear.hub.client import use_patient_client
+from lerobot_playbyear.hub.policies import push_policy
+from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.memory import keep_freed_memory
 from lerobot_playbyear.presets import apply_preset
 from lerobot_playbyear.tracking import METRICS_NAME, make_tracker
@@ -58,12 +61,15 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         The output folder.
 
     Raises:
-        TrainError: If an option, the dataset and the policy do not go together; before any work is done.
+        TrainError: If an option, the dataset and the policy do not go together, before any work is done; or, after it, if
+            the Hub does not take the policy.
     """
     init_logging()
     with _errors_of_input():
         cfg.validate()
         check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root)
+        if cfg.policy is not None and cfg.policy.push_to_hub:
+            warn_without_login()
         if cfg.seed is not None:
             set_seed(cfg.seed)
         _configure_backends(cfg)
@@ -79,9 +85,9 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     _log_start(cfg, parts, store)
     with _Report(cfg, store, parts) as report:
         _loop(cfg, parts, windows, store, sampler, validation_store, report)
-    if cfg.policy is not None and cfg.policy.push_to_hub:
-        _push(cfg, parts, dataset)
     _print_results(cfg, report.last_success)
+    if cfg.policy is not None and cfg.policy.push_to_hub:
+        _push(cfg, parts)
     return Path(str(cfg.output_dir))
 
 
@@ -235,11 +241,16 @@ def _log_start(cfg: PlaybyearTrainConfig, parts: TrainingParts, store: EpisodeSt
     )
 
 
-def _push(cfg: PlaybyearTrainConfig, parts: TrainingParts, dataset: LeRobotDataset) -> None:
-    policy = parts.accelerator.unwrap_model(parts.policy)
-    policy.push_model_to_hub(cfg, dataset_meta=dataset.meta)
-    parts.preprocessor.push_to_hub(policy.config.repo_id)
-    parts.postprocessor.push_to_hub(policy.config.repo_id)
+def _push(cfg: PlaybyearTrainConfig, parts: TrainingParts) -> None:
+    """Uploads the last checkpoint, which is on disk and stays there."""
+    assert cfg.policy is not None
+    assert cfg.policy.repo_id is not None
+    folder = (Path(str(cfg.output_dir)) / "checkpoints" / "last") if cfg.save_checkpoint else parts.save(cfg)
+    try:
+        url = push_policy(folder / "pretrained_model", cfg.policy.repo_id, private=cfg.policy.private)
+    except HubError as error:
+        raise TrainError(str(error)) from error
+    print(f"On the Hub: {url}")
 
 
 def _print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
@@ -259,6 +270,7 @@ def main() -> None:
     """The command."""
     keep_freed_memory()
     register_third_party_plugins()
+    use_patient_client()
     try:
         with _errors_of_input():
             sys.argv[1:] = apply_preset(sys.argv[1:])

@@ -1,0 +1,115 @@
+"""Uploads a policy: a checkpoint as LeRobot wrote it, with its card."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from huggingface_hub import HfApi, ModelCard
+from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies import get_policy_class
+from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+
+from lerobot_playbyear.hub.datasets import CARD, FILM
+from lerobot_playbyear.hub.policy_card import with_evaluation, with_film
+from lerobot_playbyear.hub.pushing import HubError, push_patiently
+from lerobot_playbyear.train_config import PlaybyearTrainConfig
+
+_FILES = ("*.safetensors", "*.json", "*.yaml")  # as LeRobot uploads them
+
+
+def push_policy(
+    path: str | Path,
+    repo_id: str,
+    *,
+    private: bool | None = None,
+    tags: list[str] | None = None,
+    license: str | None = None,
+    film: Path | None = None,
+) -> str:
+    """Uploads a checkpoint of any LeRobot policy.
+
+    Args:
+        path: The folder `pretrained_model` of a checkpoint, or one that it is in: a checkpoint, or the output folder of a
+            training, whose last checkpoint is taken.
+        repo_id: Its name on the Hub, `user/name`.
+        private: Whether a repository that is created is private. None: as the account's default says.
+        tags: For its card, besides LeRobot's, the policy's own and those of sound.
+        license: As the Hub names licences. None: the policy's own, or else apache-2.0.
+        film: An mp4 that the card shows.
+
+    Returns:
+        Its address on the Hub.
+
+    Raises:
+        HubError: There is no checkpoint, or it could not be uploaded.
+    """
+    folder = find_checkpoint(Path(path))
+    if film is not None and not film.is_file():
+        raise HubError(f"preview={film}: there is no such file.")
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.repo_id, config.license, config.device = repo_id, license or config.license, "cpu"
+    config.tags = [*(config.tags or []), *(tags or [])]
+    policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+
+    def push() -> str:
+        api = HfApi()
+        url = api.create_repo(repo_id, private=private, exist_ok=True)
+        with TemporaryDirectory() as scratch:
+            for file in [file for pattern in _FILES for file in folder.glob(pattern)]:
+                (Path(scratch) / file.name).symlink_to(file.resolve())
+            card = _make_card(policy, folder)
+            if film is not None:
+                (Path(scratch) / FILM).symlink_to(film.resolve())
+                with_film(card, f"{api.endpoint}/{url.repo_id}/resolve/main/{FILM}")
+            card.save(Path(scratch) / CARD)
+            api.upload_folder(repo_id=url.repo_id, folder_path=scratch, commit_message="Upload policy")
+        return str(url)
+
+    later = ["playbyear-push", f"--policy.path={path}", f"--policy.repo_id={repo_id}"]
+    later += [f"--private={str(private).lower()}"] if private is not None else []
+    later += [f"--tags=[{','.join(tags)}]"] if tags else []
+    later += [f"--license={license}"] if license is not None else []
+    later += [f"--preview={film}"] if film is not None else []
+    return push_patiently(push, f"The policy is complete in {folder}", later)
+
+
+def find_checkpoint(path: Path) -> Path:
+    """The folder `pretrained_model` in or at `path`.
+
+    Raises:
+        HubError: There is none.
+    """
+    for inside in ("", PRETRAINED_MODEL_DIR, f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}"):
+        folder = path / inside
+        if all((folder / name).is_file() for name in (CONFIG_NAME, SAFETENSORS_SINGLE_FILE)):
+            return folder
+    raise HubError(
+        f"policy.path={path}: there is no checkpoint with {CONFIG_NAME} and {SAFETENSORS_SINGLE_FILE}. Give the folder "
+        f"`{PRETRAINED_MODEL_DIR}` of one, or the output folder of a training."
+    )
+
+
+def _make_card(policy: Any, folder: Path) -> ModelCard:
+    config, training = policy.config, _training(folder)
+    dataset = training.dataset if training is not None else None
+    meta = None
+    if dataset is not None:
+        root = Path(dataset.root) if dataset.root else HF_LEROBOT_HOME / dataset.repo_id
+        if (root / "meta" / "info.json").is_file():
+            meta = LeRobotDatasetMetadata(dataset.repo_id, root=root)
+    card = policy.generate_model_card(
+        dataset.repo_id if dataset is not None else None,
+        config.type,
+        config.license,
+        config.tags,
+        cfg=training,
+        dataset_meta=meta,
+    )
+    return with_evaluation(card, folder)
+
+
+def _training(folder: Path) -> TrainPipelineConfig | None:
+    return PlaybyearTrainConfig.from_pretrained(folder) if (folder / TRAIN_CONFIG_NAME).is_file() else None

@@ -1,0 +1,107 @@
+"""One upload: repeated while the Hub fails for a passing reason, and ended with what to do when it does not come back."""
+
+import json
+import logging
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import httpx
+from huggingface_hub import constants, get_token
+from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
+
+_WAITS_S = (2, 5)
+_PASSING = (408, 409, 425, 429)  # besides all from 500
+
+logger = logging.getLogger(__name__)
+
+
+class HubError(RuntimeError):
+    """Nothing was uploaded, or not all; the message says why, and how to go on."""
+
+
+def push_patiently(push: Callable[[], str], what: str, later: Sequence[str]) -> str:
+    """Uploads something.
+
+    Args:
+        push: Uploads it. Called again after a failure, it sends what has not arrived.
+        what: Where it is safe on this machine, "The dataset is complete in outputs/demo".
+        later: The command that uploads it later.
+
+    Returns:
+        What `push` returns: its address on the Hub.
+
+    Raises:
+        HubError: The Hub cannot be reached, or refuses.
+    """
+    waits = list(_WAITS_S)
+    while True:
+        try:
+            return push()
+        except Exception as error:  # whatever the client, its Rust extension or the file system raise
+            if not waits or not _is_passing(error):
+                raise HubError(
+                    f"{what}, but it could not be uploaded: {reason(error)}. Upload it later with\n"
+                    f"  {shlex.join(later)}\nwhich does not send again what has arrived."
+                ) from error
+            logger.warning("The upload failed (%s); once more in %d s", reason(error), waits[0])
+        time.sleep(waits.pop(0))
+
+
+def push_meanwhile(push: Callable[[], object], path: Path) -> None:
+    """Uploads something in the middle of work, which a Hub that cannot be reached must not end.
+
+    Args:
+        push: Uploads it.
+        path: Where it is safe on this machine.
+    """
+    try:
+        push()
+    except Exception as error:  # as in `push_patiently`
+        logger.warning("%s was not uploaded (%s). Work goes on without", path, reason(error))
+
+
+def reason(error: BaseException) -> str:
+    """Why the Hub could not be used, in one line."""
+    for cause in _causes(error):
+        if isinstance(cause, OfflineModeIsEnabled):
+            return "the environment variable HF_HUB_OFFLINE forbids it"
+        if isinstance(cause, HfHubHTTPError):
+            status = cause.response.status_code
+            if status in (401, 403):
+                return (
+                    f"{constants.ENDPOINT} refused (status {status}): log in with `hf auth login`, with a token that may "
+                    "write there"
+                )
+            return f"{constants.ENDPOINT} answered: {_first_line(cause)}"
+        if isinstance(cause, httpx.TransportError):
+            return f"{constants.ENDPOINT} cannot be reached ({type(cause).__name__}: {_first_line(cause)})"
+    return f"{type(error).__name__}: {_first_line(error)}"
+
+
+def warn_without_login() -> None:
+    """Says before long work that its upload will fail, so that there is time to log in."""
+    if not get_token():
+        logger.warning("Nobody is logged in to the Hub: log in with `hf auth login` before the upload at the end.")
+
+
+def _is_passing(error: BaseException) -> bool:
+    for cause in _causes(error):
+        if isinstance(cause, OfflineModeIsEnabled):
+            return False
+        if isinstance(cause, HfHubHTTPError):
+            return cause.response.status_code in _PASSING or cause.response.status_code >= 500
+        if isinstance(cause, httpx.TransportError | json.JSONDecodeError):
+            return True
+    return type(error) is RuntimeError  # hf_xet's, for want of a better one
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _first_line(error: BaseException) -> str:
+    return next((line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()), type(error).__name__)

@@ -1,0 +1,145 @@
+"""A process whose Hub is the one on loopback, and which runs commands.
+
+`HF_ENDPOINT` is read when `huggingface_hub` is imported, so that commands need a process of their own. Importing LeRobot
+takes half a minute: it is done once, and every command runs in a fork of that process.
+"""
+
+import contextlib
+import importlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+COMMANDS = {
+    **{f"playbyear-{name}": f"lerobot_playbyear.scripts.{name}" for name in ("record", "push", "inspect", "train")},
+    **{f"lerobot-{name}": f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval")},
+}
+_IMPORTED_LATER = (
+    "lerobot_playbyear.teleoperation.demonstrations",
+    "lerobot_policy_playbyear",
+    "lerobot_env_playbyear",
+)
+
+
+@dataclass
+class Result:
+    """Of a command: its exit status, negative if a signal ended it, and what it printed."""
+
+    status: int
+    output: str
+
+
+class HubClient:
+    """Runs commands.
+
+    Args:
+        folder: Of the caches and the output.
+        environment: Besides that of this process.
+    """
+
+    def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
+        self._home, self._output = folder / "home", folder / "output"
+        folder.mkdir(parents=True, exist_ok=True)
+        self._process = subprocess.Popen(
+            [sys.executable, __file__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "HF_HOME": str(self._home), "OMP_NUM_THREADS": "1", **environment},
+        )
+
+    def run(
+        self,
+        *arguments: str,
+        fresh: bool = True,
+        environment: Mapping[str, str] | None = None,
+        kill_when: Callable[[], bool] | None = None,
+    ) -> Result:
+        """Run a command.
+
+        Args:
+            arguments: Its name and its options.
+            fresh: Whether it begins without anything in its caches.
+            environment: For this command alone.
+            kill_when: The command is killed when this becomes true.
+        """
+        if fresh:
+            shutil.rmtree(self._home, ignore_errors=True)
+        job = {"arguments": arguments, "environment": dict(environment or {}), "output": str(self._output)}
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps(job) + "\n")
+        self._process.stdin.flush()
+        pid = int(self._process.stdout.readline())
+        done = threading.Event()
+        if kill_when is not None:
+            threading.Thread(target=_kill, args=(pid, kill_when, done), daemon=True).start()
+        status = int(self._process.stdout.readline())
+        done.set()
+        return Result(status, self._output.read_text())
+
+    def snapshot(self, repo_id: str) -> Path:
+        """Where LeRobot has put a dataset that it fetched."""
+        (folder,) = (self._home / "lerobot" / "hub" / f"datasets--{repo_id.replace('/', '--')}" / "snapshots").iterdir()
+        return folder
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
+def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
+    while not done.wait(0.005):
+        if when():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+            return
+
+
+def _serve() -> None:
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # whatever is printed meanwhile is no answer
+    modules = {name: importlib.import_module(module) for name, module in COMMANDS.items()}
+    for module in _IMPORTED_LATER:
+        importlib.import_module(module)
+    for line in sys.stdin:
+        job = json.loads(line)
+        pid = os.fork()
+        if pid == 0:
+            _run(modules[job["arguments"][0]].main, job)
+        print(pid, file=answers, flush=True)
+        print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), file=answers, flush=True)
+
+
+def _run(main: Callable[[], Any], job: dict[str, Any]) -> None:
+    """Never returns."""
+    status = 0
+    os.environ.update(job["environment"])
+    with open(job["output"], "w") as output:
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
+    sys.argv = job["arguments"]
+    try:
+        main()
+    except SystemExit as error:
+        status = error.code if isinstance(error.code, int) else 0 if error.code is None else 1
+        if isinstance(error.code, str):
+            print(error.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+        status = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
+
+
+if __name__ == "__main__":
+    _serve()

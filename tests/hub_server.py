@@ -1,0 +1,305 @@
+"""A Hub on loopback: an HTTP server that speaks the Hub's API to the real client, and fails as it is told.
+
+Large files go up and down by git-lfs's basic transfer; clients have to be started with `HF_HUB_DISABLE_XET=1`.
+"""
+
+import contextlib
+import json
+import re
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+import yaml
+from hub_faults import Fault, nothing_fails
+from hub_repositories import LARGE_SUFFIXES, HubAnswerError, Repository
+
+TOKEN = "hf_loopback"
+USER = "tester"
+
+_REPO = r"(?P<kind>models|datasets)/(?P<name>[^/]+/[^/]+)"
+_SLOW_S = 0.3
+
+
+@dataclass
+class Answer:
+    """What goes back: JSON, or `data`."""
+
+    content: Any = None
+    status: int = 200
+    headers: dict[str, str] = field(default_factory=dict)
+    data: bytes | None = None
+
+
+class HubServer:
+    """The Hub.
+
+    Attributes:
+        url: For `HF_ENDPOINT`.
+        repositories: By (kind, name), kind "models" or "datasets".
+        objects: Large files by their SHA-256.
+        arrivals: How many times each large file came up as a whole.
+        requests: Method, path and what went wrong, of every request.
+        fault: Decides what goes wrong.
+    """
+
+    def __init__(self) -> None:
+        self.repositories: dict[tuple[str, str], Repository] = {}
+        self.objects: dict[str, bytes] = {}
+        self.arrivals: Counter[str] = Counter()
+        self.requests: list[tuple[str, str, str | None]] = []
+        self.fault: Fault = nothing_fails
+        self.lock = threading.Lock()
+        hub = self
+
+        class Handler(_Handler):
+            server_hub = hub
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server.daemon_threads = True
+        self.port = self._server.server_address[1]
+        self.url = f"http://127.0.0.1:{self.port}"
+        self.storage_url = f"http://localhost:{self.port}"  # another host, as the Hub's storage is
+
+    def __enter__(self) -> "HubServer":
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+    def environment(self) -> dict[str, str]:
+        """What makes a client come here."""
+        return {"HF_ENDPOINT": self.url, "HF_TOKEN": TOKEN, "HF_HUB_DISABLE_XET": "1", "HF_HUB_DISABLE_TELEMETRY": "1"}
+
+    def dataset(self, name: str) -> Repository:
+        return self.repositories["datasets", name]
+
+    def model(self, name: str) -> Repository:
+        return self.repositories["models", name]
+
+    def faults(self) -> Counter[str]:
+        """How often what went wrong."""
+        return Counter(fault for _, _, fault in self.requests if fault)
+
+    # Answers; each regular expression's groups and the request are the arguments
+
+    def create(self, request: "_Handler") -> Answer:
+        body = request.json()
+        kind = f"{body.get('type') or 'model'}s"
+        name = f"{body.get('organization') or USER}/{body['name']}"
+        url = f"{self.url}/{'datasets/' if kind == 'datasets' else ''}{name}"
+        if (kind, name) in self.repositories:
+            return Answer({"error": "You already created this repo", "url": url}, 409)
+        self.repositories[kind, name] = Repository(kind, name, body.get("visibility") == "private")
+        return Answer({"url": url, "name": name})
+
+    def validate_card(self, request: "_Handler") -> Answer:
+        found = re.match(r"\s*---\n(.*?)\n---\n", request.json()["content"], re.DOTALL)
+        data = yaml.safe_load(found[1]) if found else None
+        if not isinstance(data, dict) or not isinstance(data.get("license"), str):
+            return Answer({"errors": [{"message": "metadata with a license is wanted"}], "warnings": []}, 400)
+        return Answer({"errors": [], "warnings": []})
+
+    def preupload(self, request: "_Handler", kind: str, name: str, revision: str) -> Answer:
+        there = self._repository(kind, name).files(revision)
+        files = [
+            {
+                "path": file["path"],
+                "uploadMode": "lfs" if file["path"].endswith(LARGE_SUFFIXES) else "regular",
+                "shouldIgnore": False,
+                "oid": there[file["path"]].oid if file["path"] in there else None,
+            }
+            for file in request.json()["files"]
+        ]
+        return Answer({"files": files})
+
+    def large_files(self, request: "_Handler", name: str) -> Answer:
+        objects = []
+        for wanted in request.json()["objects"]:
+            entry = dict(wanted)
+            if wanted["oid"] not in self.objects:
+                entry["actions"] = {
+                    "upload": {"href": f"{self.storage_url}/storage/{wanted['oid']}"},
+                    "verify": {"href": f"{self.url}/verify"},
+                }
+            objects.append(entry)
+        return Answer({"transfer": "basic", "objects": objects})
+
+    def store(self, request: "_Handler", oid: str) -> Answer:
+        self.objects[oid] = request.body
+        self.arrivals[oid] += 1
+        return Answer()
+
+    def verify(self, request: "_Handler") -> Answer:
+        wanted = request.json()
+        if len(self.objects.get(wanted["oid"], b"")) != wanted["size"]:
+            raise HubAnswerError(404, "EntryNotFound")
+        return Answer({})
+
+    def commit(self, request: "_Handler", kind: str, name: str, revision: str) -> Answer:
+        lines = [json.loads(line) for line in request.body.splitlines()]
+        oid = self._repository(kind, name).commit(revision, lines, self.objects)
+        prefix = "datasets/" if kind == "datasets" else ""
+        return Answer({"success": True, "commitOid": oid, "commitUrl": f"{self.url}/{prefix}{name}/commit/{oid}"})
+
+    def tag(self, request: "_Handler", kind: str, name: str, revision: str) -> Answer:
+        tags = self._repository(kind, name).tags
+        if request.command == "DELETE":
+            if tags.pop(revision, None) is None:
+                raise HubAnswerError(404, "RevisionNotFound")
+            return Answer({})
+        tag = request.json()["tag"]
+        if tag in tags:
+            return Answer({"error": "Tag reference exists already"}, 409)
+        tags[tag] = self._repository(kind, name).resolve(revision)
+        return Answer({})
+
+    def refs(self, request: "_Handler", kind: str, name: str) -> Answer:
+        return Answer(self._repository(kind, name).refs())
+
+    def info(self, request: "_Handler", kind: str, name: str, revision: str | None = None) -> Answer:
+        return Answer(self._repository(kind, name).info(revision or "main"))
+
+    def tree(self, request: "_Handler", kind: str, name: str, revision: str) -> Answer:
+        files = self._repository(kind, name).files(revision)
+        return Answer([file.describe(path) for path, file in sorted(files.items())])
+
+    def file(self, request: "_Handler", name: str, revision: str, path: str, kind: str | None = None) -> Answer:
+        repository = self._repository(kind or "models", name)
+        commit = repository.resolve(revision)
+        file = repository.commits[commit].get(path)
+        if file is None:
+            raise HubAnswerError(404, "EntryNotFound")
+        headers = {"X-Repo-Commit": commit, "ETag": f'"{file.oid}"'}
+        if not file.is_large:
+            return request.part_of(file.data, headers)
+        linked = {"X-Linked-Etag": f'"{file.oid}"', "X-Linked-Size": str(len(file.data))}
+        return Answer(status=302, headers={**headers, **linked, "Location": f"{self.storage_url}/storage/{file.oid}"})
+
+    def fetch(self, request: "_Handler", oid: str) -> Answer:
+        return request.part_of(self.objects[oid], {"ETag": f'"{oid}"'})
+
+    def whoami(self, request: "_Handler") -> Answer:
+        return Answer({"type": "user", "name": USER, "orgs": [], "auth": {"type": "access_token"}})
+
+    def _repository(self, kind: str, name: str) -> Repository:
+        if (kind, name) not in self.repositories:
+            raise HubAnswerError(404, "RepoNotFound")
+        return self.repositories[kind, name]
+
+
+_ROUTES: list[tuple[str, str, Callable[..., Answer]]] = [
+    ("POST", r"/api/repos/create", HubServer.create),
+    ("POST", r"/api/validate-yaml", HubServer.validate_card),
+    ("GET", r"/api/whoami-v2", HubServer.whoami),
+    ("POST", rf"/api/{_REPO}/preupload/(?P<revision>[^/]+)", HubServer.preupload),
+    ("POST", rf"/api/{_REPO}/commit/(?P<revision>[^/]+)", HubServer.commit),
+    ("POST DELETE", rf"/api/{_REPO}/tag/(?P<revision>[^/]+)", HubServer.tag),
+    ("GET", rf"/api/{_REPO}/refs", HubServer.refs),
+    ("GET", rf"/api/{_REPO}/tree/(?P<revision>[^/]+)", HubServer.tree),
+    ("GET", rf"/api/{_REPO}(/revision/(?P<revision>[^/]+))?", HubServer.info),
+    ("POST", r"/(datasets/)?(?P<name>[^/]+/[^/]+)\.git/info/lfs/objects/batch", HubServer.large_files),
+    ("POST", r"/verify", HubServer.verify),
+    ("PUT", r"/storage/(?P<oid>\w+)", HubServer.store),
+    ("GET HEAD", r"/storage/(?P<oid>\w+)", HubServer.fetch),
+    (
+        "GET HEAD",
+        r"/((?P<kind>datasets)/)?(?P<name>[^/]+/[^/]+)/resolve/(?P<revision>[^/]+)/(?P<path>.+)",
+        HubServer.file,
+    ),
+]
+
+_FOR_WRITERS = (HubServer.create, HubServer.preupload, HubServer.commit, HubServer.tag, HubServer.large_files)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Reads a request, lets go wrong what shall, and writes the Hub's answer."""
+
+    protocol_version = "HTTP/1.1"
+    server_hub: HubServer
+
+    def do_GET(self) -> None:
+        hub, path = self.server_hub, unquote(urlsplit(self.path).path)
+        length = int(self.headers.get("Content-Length") or 0)
+        with hub.lock:
+            fault = hub.fault(self.command, path)
+            hub.requests.append((self.command, path, fault))
+        if fault == "cut":
+            self.rfile.read(length // 2)
+            return self._hang_up()
+        self.body = (
+            self._read_chunks() if "chunked" in self.headers.get("Transfer-Encoding", "") else self.rfile.read(length)
+        )
+        if len(self.body) < length:  # the client is gone
+            return self._hang_up()
+        if fault == "unavailable":
+            return self._write(Answer(status=503, data=b"<html>The Hub is busy</html>"))
+        if fault == "slow":
+            time.sleep(_SLOW_S)
+        with hub.lock:
+            answer = self._answer(path)
+        self._write(answer, half=fault == "lost")
+
+    do_HEAD = do_POST = do_PUT = do_DELETE = do_GET  # noqa: N815
+
+    def log_message(self, *_: Any) -> None:
+        """Says nothing."""
+
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+    def part_of(self, data: bytes, headers: dict[str, str]) -> Answer:
+        """The bytes that the request asks for."""
+        found = re.match(r"bytes=(\d+)-$", self.headers.get("Range", ""))
+        if not found:
+            return Answer(data=data, headers=headers)
+        first = int(found[1])
+        headers = {**headers, "Content-Range": f"bytes {first}-{len(data) - 1}/{len(data)}"}
+        return Answer(data=data[first:], status=206, headers=headers)
+
+    def _answer(self, path: str) -> Answer:
+        for methods, pattern, method in _ROUTES:
+            found = re.fullmatch(pattern, path)
+            if found and self.command in methods.split():
+                if method in _FOR_WRITERS and self.headers.get("Authorization") != f"Bearer {TOKEN}":
+                    return Answer({"error": "Invalid username or password."}, 401)
+                groups = {key: value for key, value in found.groupdict().items() if value is not None}
+                try:
+                    return method(self.server_hub, self, **groups)
+                except HubAnswerError as error:
+                    headers = {"X-Error-Code": error.code, "X-Error-Message": error.message}
+                    return Answer({"error": error.message}, error.status, headers)
+        return Answer({"error": f"{self.command} {self.path} is not spoken here"}, 501)
+
+    def _write(self, answer: Answer, half: bool = False) -> None:
+        data = answer.data if answer.data is not None else json.dumps(answer.content).encode()
+        self.send_response(answer.status)
+        for name, value in answer.headers.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        if self.command == "HEAD":
+            return None
+        self.wfile.write(data[: len(data) // 2] if half else data)
+        return self._hang_up() if half else None
+
+    def _hang_up(self) -> None:
+        self.close_connection = True
+        with contextlib.suppress(OSError):  # the client hung up before
+            self.connection.shutdown(socket.SHUT_RDWR)
+
+    def _read_chunks(self) -> bytes:
+        body = b""
+        while size := int(self.rfile.readline(), 16):
+            body += self.rfile.read(size)
+            self.rfile.readline()
+        self.rfile.readline()
+        return body

@@ -1,0 +1,242 @@
+"""Datasets and policies go to the Hub and come back, through the real client and an HTTP server on loopback."""
+
+import json
+import shlex
+from pathlib import Path
+
+import av
+import pytest
+import yaml
+from hub_client import HubClient, Result
+from hub_faults import down_after, everything_fails, nothing_fails, one_in
+from hub_repositories import File, git_oid
+from hub_server import TOKEN, HubServer
+
+DATASET = "tester/grasp"
+POLICY = "tester/hearing"
+ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v0", "--env.image_size=16", "--env.episode_length=60")
+TINY = (
+    "--policy.type=playbyear",
+    "--policy.device=cpu",
+    "--policy.image_size=16",
+    "--policy.vision_width=4",
+    "--policy.audio_window_s=0.9",
+    "--policy.n_memory_steps=2",
+    "--policy.hidden_size=32",
+    "--num_workers=0",
+    "--batch_size=2",
+)
+
+
+@pytest.fixture(scope="module")
+def server():
+    with HubServer() as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def client(server, tmp_path_factory):
+    client = HubClient(tmp_path_factory.mktemp("client"), server.environment())
+    yield client
+    client.close()
+
+
+@pytest.fixture
+def hub(server):
+    """The server, to which nothing has come yet in this test, and where nothing fails."""
+    server.fault = nothing_fails
+    server.arrivals.clear()
+    server.requests.clear()
+    yield server
+    server.fault = nothing_fails
+
+
+@pytest.fixture(scope="module")
+def recording(client, server, tmp_path_factory):
+    """A recording whose upload at the end failed, and what the command said."""
+    root = tmp_path_factory.mktemp("recording") / "grasp"
+    server.fault = everything_fails
+    dataset = (f"--dataset.repo_id={DATASET}", f"--dataset.root={root}", "--dataset.num_episodes=2")
+    result = client.run("playbyear-record", *ENV, *dataset, "--dataset.push_to_hub=true", "--num_workers=0")
+    return root, result
+
+
+@pytest.fixture(scope="module")
+def pushed(client, server, recording):
+    """The recording's folder, after the command that was named had its Hub."""
+    root, result = recording
+    server.fault = nothing_fails
+    assert_well(client.run(*command_in(result)))
+    return root
+
+
+def command_in(result: Result) -> list[str]:
+    """The command that a message tells to run."""
+    return next(shlex.split(line) for line in result.output.splitlines() if line.startswith("  playbyear-push "))
+
+
+def assert_well(result: Result) -> None:
+    assert result.status == 0, result.output[-3000:]
+
+
+def content(root: Path) -> dict[str, bytes]:
+    """A dataset's files by their names in it."""
+    folders = (root / "data", root / "meta", root / "videos")
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes() for f in folders for path in f.rglob("*") if path.is_file()
+    }
+
+
+def content_on(hub: HubServer, name: str = DATASET) -> dict[str, bytes]:
+    return {
+        path: file.data
+        for path, file in hub.dataset(name).files("v3.0").items()
+        if path.startswith(("data/", "meta/", "videos/"))
+    }
+
+
+def test_a_recording_is_safe_without_the_hub_and_says_how_to_push_it_later(recording):
+    root, result = recording
+    assert result.status == 1
+    assert f"The dataset is complete in {root}, but it could not be uploaded: http" in result.output
+    assert "cannot be reached" in result.output
+    assert "Traceback" not in result.output
+    assert command_in(result) == ["playbyear-push", f"--dataset.repo_id={DATASET}", f"--dataset.root={root}"]
+    assert json.loads((root / "meta" / "info.json").read_text())["total_episodes"] == 2
+
+
+def test_the_repository_holds_the_dataset_and_nothing_of_the_recording(pushed, hub):
+    assert content_on(hub) == content(pushed)
+    repository = hub.dataset(DATASET)
+    assert set(repository.files()) - set(content(pushed)) == {"README.md", "preview.mp4"}
+    assert repository.resolve("v3.0") == repository.resolve("main")
+
+
+def test_the_card_says_what_is_in_the_dataset(pushed, hub):
+    card = hub.dataset(DATASET).files()["README.md"].data.decode()
+    data = yaml.safe_load(card.split("---\n")[1])
+    assert {"LeRobot", "audio"} <= set(data["tags"])
+    assert data["task_categories"] == ["robotics"]
+    assert "| Episodes | 2, " in card
+    assert "| Success | 2 of 2 episodes |" in card
+    assert "| Frame rate | 20 Hz |" in card
+    assert "`observation.images.front`: 16 x 16 x 3, image" in card
+    assert "`observation.audio.gripper`: 16,000 Hz, 800 samples a frame, int16" in card
+    assert f"{hub.url}/datasets/{DATASET}/resolve/main/preview.mp4" in card
+    assert "playbyear-train --policy.type=playbyear --policy.fps=20" in card
+
+
+def test_the_film_beside_the_card_has_pictures_and_sound(pushed, hub, tmp_path):
+    (tmp_path / "film.mp4").write_bytes(hub.dataset(DATASET).files()["preview.mp4"].data)
+    with av.open(str(tmp_path / "film.mp4")) as film:
+        loudest = max(abs(frame.to_ndarray()).max() for frame in film.decode(audio=0))
+        film.seek(0)
+        pictures = list(film.decode(video=0))
+    info = json.loads((pushed / "meta" / "info.json").read_text())
+    assert 0.3 < loudest <= 1.1
+    assert 10 < len(pictures) <= info["total_frames"]
+
+
+def test_what_has_arrived_is_not_sent_again(pushed, hub, client):
+    commits = len(hub.dataset(DATASET).commits)
+    assert_well(client.run("playbyear-push", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}"))
+    assert not hub.arrivals
+    assert len(hub.dataset(DATASET).commits) == commits
+
+
+def test_a_file_that_the_dataset_no_longer_has_goes_from_the_hub(pushed, hub, client):
+    stale = File(git_oid(b"old"), b"old", is_large=False)
+    hub.dataset(DATASET).files()["data/chunk-000/file-009.parquet"] = stale
+    hub.dataset(DATASET).files()["notes.txt"] = stale
+    assert_well(client.run("playbyear-push", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}"))
+    assert content_on(hub) == content(pushed)
+    assert "notes.txt" in hub.dataset(DATASET).files()
+
+
+@pytest.mark.parametrize("end", [pytest.param("hub", marks=pytest.mark.slow), "process"])
+def test_an_upload_that_ended_in_between_goes_on(pushed, hub, client, end):
+    hub.objects.clear()
+    push = ("playbyear-push", f"--dataset.repo_id=tester/{end}", f"--dataset.root={pushed}")
+    if end == "hub":
+        hub.fault = down_after(2)
+        assert client.run(*push).status == 1
+    else:
+        assert client.run(*push, kill_when=lambda: len(hub.arrivals) >= 2).status < 0
+    sent = len(hub.arrivals)
+    assert 2 <= sent < len([path for path in content(pushed) if path.endswith(".parquet")]) + 1
+    hub.fault = nothing_fails
+    assert_well(client.run(*push))
+    assert content_on(hub, f"tester/{end}") == content(pushed)
+    assert set(hub.arrivals.values()) == {1}
+
+
+def test_without_a_login_the_message_says_so_at_once(pushed, hub, client):
+    push = ("playbyear-push", "--dataset.repo_id=tester/secret", f"--dataset.root={pushed}")
+    result = client.run(*push, environment={"HF_TOKEN": TOKEN[::-1]})
+    assert result.status == 1
+    assert "log in with `hf auth login`" in result.output
+    assert len(hub.requests) < 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "Give either --dataset.repo_id"),
+        (("--dataset.repo_id=me/nothing", "--dataset.root=/nowhere"), "There is no LeRobotDataset in '/nowhere'"),
+        (("--dataset.repo_id=nameless", "--dataset.root={root}"), "give it as user/name"),
+        (("--policy.path={root}", "--policy.repo_id=me/policy"), "there is no checkpoint with config.json"),
+    ],
+)
+def test_what_cannot_be_pushed_is_refused(pushed, hub, client, options, message):
+    result = client.run("playbyear-push", *(option.format(root=pushed) for option in options))
+    assert result.status == 1
+    assert message in result.output
+    assert "Traceback" not in result.output
+    assert not hub.requests
+
+
+def test_lerobot_trains_on_a_dataset_from_the_hub(pushed, hub, client, tmp_path):
+    run = (*TINY, "--policy.push_to_hub=false", "--steps=2", f"--output_dir={tmp_path / 'out'}")
+    assert_well(client.run("lerobot-train", f"--dataset.repo_id={DATASET}", *run))
+    assert content(client.snapshot(DATASET)) == content(pushed)
+    assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+def test_our_commands_load_a_dataset_from_the_hub_although_one_request_in_ten_fails(pushed, hub, client, tmp_path):
+    hub.fault = one_in(10, seed=1)
+    looked = client.run("playbyear-inspect", f"--dataset.repo_id={DATASET}", "--json")
+    assert_well(looked)
+    assert content(client.snapshot(DATASET)) == content(pushed)
+    policy = ("--policy.push_to_hub=true", f"--policy.repo_id={POLICY}")
+    run = (*TINY, *policy, "--steps=2", f"--output_dir={tmp_path / 'out'}")
+    assert_well(client.run("playbyear-train", f"--dataset.repo_id={DATASET}", *run))
+    hub.fault = nothing_fails
+    card = hub.model(POLICY).files()["README.md"].data.decode()
+    assert {"audio", "lerobot", "playbyear", "robotics"} <= set(yaml.safe_load(card.split("---\n")[1])["tags"])
+    assert "| Microphones | `observation.audio.gripper`: 16,000 Hz, 800 samples a step |" in card
+    assert f"lerobot-eval --policy.path={POLICY}" in card
+    assert DATASET in card
+    evaluation = (
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        "--policy.device=cpu",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert_well(client.run("lerobot-eval", f"--policy.path={POLICY}", *ENV, *evaluation))
+    assert (tmp_path / "eval" / "eval_info.json").is_file()
+    assert hub.faults()
+
+
+def test_a_policy_is_safe_without_the_hub_and_says_how_to_push_it_later(pushed, hub, client, tmp_path):
+    hub.fault = lambda method, path: "cut" if method == "POST" else None
+    policy = ("--policy.push_to_hub=true", "--policy.repo_id=tester/later", "--save_checkpoint=false")
+    run = (*TINY, *policy, "--steps=1", f"--output_dir={tmp_path / 'out'}")
+    result = client.run("playbyear-train", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}", *run)
+    assert result.status == 1
+    message = result.output[result.output.index("The policy is complete in ") :]
+    assert "cannot be reached" in message
+    assert "Traceback" not in message
+    hub.fault = nothing_fails
+    assert_well(client.run(*command_in(result)))
+    names = {"README.md", "config.json", "model.safetensors", "train_config.json"}
+    assert names <= set(hub.model("tester/later").files())
