@@ -20,7 +20,10 @@ from pathlib import Path
 from typing import Any
 
 COMMANDS = {
-    **{f"playbyear-{name}": f"lerobot_playbyear.scripts.{name}" for name in ("record", "push", "inspect", "train")},
+    **{
+        f"playbyear-{name}": f"lerobot_playbyear.scripts.{name}"
+        for name in ("record", "push", "inspect", "train", "dagger")
+    },
     **{f"lerobot-{name}": f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval")},
 }
 _IMPORTED_LATER = (

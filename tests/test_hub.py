@@ -240,3 +240,52 @@ def test_a_policy_is_safe_without_the_hub_and_says_how_to_push_it_later(pushed, 
     assert_well(client.run(*command_in(result)))
     names = {"README.md", "config.json", "model.safetensors", "train_config.json"}
     assert names <= set(hub.model("tester/later").files())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(10))
+def test_a_dataset_goes_up_and_comes_back_although_one_request_in_ten_fails(pushed, hub, client, seed):
+    hub.repositories.pop(("datasets", "tester/rough"), None)
+    hub.objects.clear()
+    hub.fault = one_in(10, seed)
+    assert_well(client.run("playbyear-push", "--dataset.repo_id=tester/rough", f"--dataset.root={pushed}"))
+    assert content_on(hub, "tester/rough") == content(pushed)
+    assert_well(client.run("playbyear-inspect", "--dataset.repo_id=tester/rough", "--json"))
+    assert content(client.snapshot("tester/rough")) == content(pushed)
+    assert hub.faults()
+
+
+@pytest.mark.slow
+def test_lerobot_train_by_itself_goes_on_when_it_is_run_again(pushed, hub, client, tmp_path):
+    """LeRobot asks some things only once: a run may end for a lost request, but what has arrived stays."""
+    hub.fault = one_in(10, seed=2)
+    for attempt in range(10):
+        run = (*TINY, "--policy.push_to_hub=false", "--steps=1", f"--output_dir={tmp_path / str(attempt)}")
+        result = client.run("lerobot-train", f"--dataset.repo_id={DATASET}", *run, fresh=attempt == 0)
+        if result.status == 0:
+            break
+    assert_well(result)
+    assert content(client.snapshot(DATASET)) == content(pushed)
+
+
+@pytest.mark.slow
+def test_a_corrected_policy_goes_up_from_dagger(pushed, hub, client, tmp_path):
+    data = (f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}")
+    run = (*TINY, "--policy.push_to_hub=false", "--steps=1", f"--output_dir={tmp_path / 'train'}")
+    assert_well(client.run("playbyear-train", *data, *run))
+    corrected = client.run(
+        "playbyear-dagger",
+        f"--policy.path={tmp_path / 'train/checkpoints/last/pretrained_model'}",
+        "--policy.push_to_hub=true",
+        "--policy.repo_id=tester/corrected",
+        f"--demos.repo_id={DATASET}",
+        "--interventions.repo_id=tester/corrections",
+        f"--interventions.root={tmp_path / 'corrections'}",
+        f"--output_dir={tmp_path / 'dagger'}",
+        *ENV[:-1],
+        *("--episodes=1", "--updates_per_episode=1", "--warmup_episodes=1", "--batch_size=2", "--eval_every=0"),
+    )
+    assert_well(corrected)
+    weights = (tmp_path / "dagger" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
+    assert hub.model("tester/corrected").files()["model.safetensors"].data == weights
+    assert "## Hearing" in hub.model("tester/corrected").files()["README.md"].data.decode()
