@@ -1,7 +1,6 @@
 """The policy `playbyear`: what LeRobot calls, and how observations become the network's inputs."""
 
 import math
-from collections import deque
 from typing import Any
 
 import torch
@@ -14,8 +13,10 @@ from torch.nn import functional
 
 from lerobot_playbyear.augmentation import Augmentation, resize
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.distributed import mean_over_processes
 from lerobot_playbyear.hub.policy_card import with_hearing
 from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
+from lerobot_playbyear.recent import RecentFrames
 from lerobot_playbyear.runs import before_episode, newest
 from lerobot_playbyear.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, segment_and_hop, to_float_wave
 
@@ -72,9 +73,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forgets the episode."""
-        self._images: dict[str, deque[Tensor]] = {}
-        self._sound: dict[str, Tensor] = {}
-        self._n_heard = 0
+        self.model.prepare_to_act()
+        self._recent = RecentFrames(self.config)
         self._encodings: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
@@ -105,7 +105,9 @@ class PlaybyearPolicy(PreTrainedPolicy):
         if reduction == "none":
             losses = (error * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)  # (B,)
             return losses, {"mse": losses.mean().item()}
-        loss = (error * weight).sum() / weight.sum().clamp(min=1e-8)
+        # Over the mean weight of all processes: the mean of their losses is then that of one with all their items.
+        total = mean_over_processes(weight.sum()) if self.training else weight.sum()
+        loss = (error * weight).sum() / total.clamp(min=1e-8)
         return loss, {"mse": loss.item()}
 
     def predict_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
@@ -124,8 +126,9 @@ class PlaybyearPolicy(PreTrainedPolicy):
         Returns:
             (B, n_actions), normalised.
         """
-        self.eval()
-        run = self._remember(batch)
+        if self.training:
+            self.eval()
+        run = self._recent.add(batch, self.model.prepare_images)
         device = next(iter(run.values())).device
         with torch.autocast(device.type, enabled=False):  # bfloat16 would round positions to half a millimetre
             encoding = self.model.encode_frame(run)  # (B, D)
@@ -139,33 +142,6 @@ class PlaybyearPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """The action of `select_action` as a chunk of one, (B, 1, n_actions)."""
         return self.select_action(batch).unsqueeze(1)
-
-    def _remember(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Puts the newest frame into the buffers; returns what one encoding needs, as a batch of runs of one frame."""
-        config = self.config
-        run: dict[str, Tensor] = {}
-        if config.use_vision:
-            for key in config.camera_keys:
-                image = batch[key]
-                buffer = self._images.setdefault(key, deque([image] * config.frame_stack, maxlen=config.frame_stack))
-                buffer.append(image)
-                run[key] = torch.stack(list(buffer), dim=1)  # (B, frame_stack, 3, H, W)
-        if config.use_audio:
-            for key in config.audio_keys:
-                sound = newest({key: batch[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)
-                sound = to_float_wave(sound, key)  # (B, S)
-                earlier = self._sound.get(key)
-                if earlier is None:
-                    earlier = sound.new_zeros(sound.shape[0], sound.shape[1] * config.audio_frames)
-                self._sound[key] = torch.cat([earlier[:, sound.shape[1] :], sound], dim=1)
-                run[key] = self._sound[key].unflatten(1, (config.audio_frames, -1))
-            self._n_heard = min(self._n_heard + 1, config.audio_frames)
-            is_pad = torch.arange(config.audio_frames, device=sound.device) < config.audio_frames - self._n_heard
-            for key in config.audio_keys:
-                run[f"{key}_is_pad"] = is_pad.expand(sound.shape[0], -1)
-        for key in config.low_dimensional_keys:
-            run[key] = batch[key].unsqueeze(1)
-        return run
 
 
 class PlaybyearNetwork(nn.Module):
@@ -242,10 +218,7 @@ class PlaybyearNetwork(nn.Module):
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n_frames, embedding size)."""
         config = self.config
-        images = newest(batch, key, n_frames + config.frame_stack - 1)  # (B, T, 3, H, W)
-        with torch.autocast(images.device.type, enabled=False):  # colours keep their 8 bits
-            images = images.float() / 255 if images.dtype == torch.uint8 else images
-            images = self.augment(images, config.image_size) if self.training else resize(images, config.image_size)
+        images = self.prepare_images(newest(batch, key, n_frames + config.frame_stack - 1))  # (B, T, 3, size, size)
         stacks = torch.cat([images[:, i : i + n_frames] for i in range(config.frame_stack)], dim=2)
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
@@ -267,6 +240,18 @@ class PlaybyearNetwork(nn.Module):
         shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
         levels = spectrogram(shared.stretches(wave), shared.stretches(begun))
         return self._normalize(shared.windows(encoder(levels), encoder.length).flatten(1))
+
+    def prepare_images(self, images: Tensor) -> Tensor:
+        """(B, T, 3, H, W) bytes or in [0, 1] -> (B, T, 3, size, size) in [0, 1], in training augmented."""
+        size = self.config.image_size
+        with torch.autocast(images.device.type, enabled=False):  # colours keep their 8 bits
+            images = images.float() / 255 if images.dtype == torch.uint8 else images
+            return self.augment(images, size) if self.training else resize(images, size)
+
+    def prepare_to_act(self) -> None:
+        """Makes ready what acting needs and learning does not."""
+        for encoder in self.vision.values() if self.config.use_vision else ():
+            encoder.refresh()  # type: ignore[operator]
 
     def _normalize(self, encodings: Tensor) -> Tensor:
         if not self.config.normalize_encodings:

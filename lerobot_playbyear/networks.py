@@ -5,6 +5,8 @@ from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, ResNet
 
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.distributed import SharedBatchNorm2d
+from lerobot_playbyear.folding import FoldedCopy
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
@@ -27,22 +29,37 @@ class VisionEncoder(nn.Module):
         self.network = _SlimResNet(3 * n_stacked, width)
         self.register_buffer("mean", torch.tensor(_IMAGE_MEAN).repeat(n_stacked)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(_IMAGE_STD).repeat(n_stacked)[:, None, None], persistent=False)
+        self._folded = FoldedCopy()  # for acting; no part of a checkpoint
 
     def forward(self, stacks: Tensor) -> Tensor:
         """(N, 3 * n_stacked, size, size) in [0, 1] -> (N, embedding_size)."""
         stacks = (stacks - self.mean) / self.std
         # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
-        return self.network(stacks.contiguous(memory_format=torch.channels_last))
+        stacks = stacks.contiguous(memory_format=torch.channels_last)
+        acts = not self.training and not torch.is_grad_enabled() and self.mean.dtype == torch.float32
+        return self._folded.of(self.network)(stacks) if acts else self.network(stacks)
+
+    def train(self, mode: bool = True) -> "VisionEncoder":
+        """Also forgets what was prepared for acting."""
+        if mode:
+            self._folded.drop()
+        return super().train(mode)
+
+    def refresh(self) -> None:
+        """Prepares for acting anew: even a change of weights that passed torch's own count of changes by is seen."""
+        self._folded.drop()
+        if not self.training and self.mean.dtype == torch.float32:
+            self._folded.of(self.network)
 
 
 class _SlimResNet(ResNet):
     """torchvision's ResNet-18 with another number of input channels and another width, without the classifier."""
 
     def __init__(self, in_channels: int, width: int):
-        super().__init__(BasicBlock, [2, 2, 2, 2])
+        super().__init__(BasicBlock, [2, 2, 2, 2], norm_layer=SharedBatchNorm2d)
         self.inplanes = width
         self.conv1 = nn.Conv2d(in_channels, width, kernel_size=7, stride=2, padding=3, bias=False)
-        self.bn1 = nn.BatchNorm2d(width)
+        self.bn1 = SharedBatchNorm2d(width)
         self.layer1 = self._make_layer(BasicBlock, width, 2)
         self.layer2 = self._make_layer(BasicBlock, 2 * width, 2, stride=2)
         self.layer3 = self._make_layer(BasicBlock, 4 * width, 2, stride=2)

@@ -8,6 +8,8 @@ import torchaudio
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_playbyear.distributed import mean_over_processes
+
 _POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
 
 
@@ -156,11 +158,11 @@ class LogSpectrogram(nn.Module):
 
     def _update(self, levels: Tensor, real: Tensor) -> None:
         weights = real.to(levels.dtype)
-        count = weights.sum()
+        count = mean_over_processes(weights.sum())
         if count < 2:
             return
-        mean = (levels * weights).sum(dim=(0, 2)) / count
-        variance = ((levels - mean[:, None]).square() * weights).sum(dim=(0, 2)) / count
+        mean = mean_over_processes((levels * weights).sum(dim=(0, 2))) / count
+        variance = mean_over_processes(((levels - mean[:, None]).square() * weights).sum(dim=(0, 2))) / count
         momentum = torch.where(self.n_batches == 0, 1.0, self.momentum)
         self.mean.lerp_(mean, momentum)
         self.variance.lerp_(variance, momentum)

@@ -86,7 +86,8 @@ def test_stepping_equals_one_forward_over_the_episode(options):
     policy = make_policy(**options)
     episode = make_episode(seed=1, config=policy.config)
     stepped = step_through(policy, [episode])
-    whole = policy.predict_run(run_ending_at(episode, N_STEPS - 1, policy.config, N_STEPS), N_STEPS)
+    with torch.enable_grad():  # the network as it learns; steps are taken by its folded copy
+        whole = policy.predict_run(run_ending_at(episode, N_STEPS - 1, policy.config, N_STEPS), N_STEPS)
     torch.testing.assert_close(stepped, whole, atol=1e-5, rtol=0)
 
 
@@ -97,7 +98,8 @@ def test_training_windows_equal_stepping_at_every_frame(n_supervised_steps):
     episode = make_episode(seed=2, config=policy.config)
     stepped = step_through(policy, [episode])
     for last in range(N_STEPS):
-        predicted = policy.predict_run(run_ending_at(episode, last, policy.config))
+        with torch.enable_grad():
+            predicted = policy.predict_run(run_ending_at(episode, last, policy.config))
         for back in range(min(n_supervised_steps, last + 1)):
             torch.testing.assert_close(predicted[:, -1 - back], stepped[:, last - back], atol=1e-5, rtol=0)
 
