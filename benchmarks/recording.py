@@ -1,12 +1,15 @@
-"""Whether recording keeps up, and how much room it takes.
+"""Frames per second that recording can take, beside stock LeRobot; with `--paced`, whether it keeps up, and the room it takes.
 
     python benchmarks/recording.py
+    python benchmarks/recording.py --paced
 
-Frames are made at the rate of the robot. A frame is late if writing the one before it took longer than a frame; the
-longest time that `add_frame` takes is the longest that a frame waits for the disk. `save_episode` runs between
-episodes. Then, what sound and metadata take on the disk.
+Frames of one camera and one microphone are added as fast as they are taken, and the episode is saved: by
+`DurableWriter`, after which it survives a power cut, and by `LeRobotDataset` alone, in turns. The limit is compressing the
+pictures. With `--paced` frames come at the rate of the robot instead, for a minute each: a frame is late if writing the one
+before it took longer than a frame; the longest time that `add_frame` takes is the longest that a frame waits for the disk.
 """
 
+import io
 import os
 import tempfile
 import time
@@ -15,18 +18,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from common import Row, in_turns, machine, medians, parser_for, report
 from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets import LeRobotDataset
+from PIL import Image
+from scenes import dataset_features, frames
 
 from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 
-RATE = 48000
-SECONDS = 20
+SECONDS = 20  # of a paced episode
 N_EPISODES = 3
+_ROOM_RATE = 48000  # Hz
 
 
-@dataclass
+@dataclass(frozen=True)
 class Case:
+    """A robot's sensors."""
+
     name: str
     fps: int
     height: int
@@ -34,9 +43,15 @@ class Case:
     microphones: int
     dtype: str
     streaming: bool = False
+    sample_rate: int = 48000
+
+    @property
+    def features(self) -> dict[str, dict]:
+        return dataset_features((self.height, self.width), self.sample_rate, self.fps, self.microphones, self.dtype)
 
 
-CASES = (
+SIMULATION = Case("84 px pictures, one 16 kHz microphone", 20, 84, 84, 1, "image", sample_rate=16000)
+PACED = (
     Case("20 Hz, 84x84 pictures, one microphone", 20, 84, 84, 1, "image"),
     Case("30 Hz, 640x480 pictures, two microphones", 30, 480, 640, 2, "image"),
     Case("30 Hz, 640x480 video, two microphones", 30, 480, 640, 2, "video"),
@@ -44,47 +59,50 @@ CASES = (
 )
 
 
-def features(case: Case) -> dict[str, dict]:
-    return {
-        "observation.images.front": {
-            "dtype": case.dtype,
-            "shape": (case.height, case.width, 3),
-            "names": ["height", "width", "channels"],
-        },
-        **{f"observation.audio.{i}": audio_feature(RATE, case.fps) for i in range(case.microphones)},
-        "observation.state": {"dtype": "float32", "shape": (7,), "names": None},
-        "action": {"dtype": "float32", "shape": (4,), "names": None},
-    }
+def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
+    """As fast as it goes: ours, stock, and compression alone."""
+    features, fps = SIMULATION.features, SIMULATION.fps
+    episode = list(frames(features, n_frames))
+    stock = LeRobotDataset.create("benchmark/stock", fps, features, root=folder / "stock", image_writer_threads=4)
+
+    def write(writer: DurableWriter | LeRobotDataset) -> None:
+        for frame in episode:
+            writer.add_frame(dict(frame))
+        writer.save_episode()
+
+    def compress() -> None:
+        for frame in episode:
+            Image.fromarray(frame["observation.images.front"]).save(io.BytesIO(), format="PNG", compress_level=1)
+
+    with DurableWriter("benchmark/ours", folder / "ours", fps, features) as ours:
+        works = {"ours": lambda: write(ours), "stock": lambda: write(stock), "limit": compress}
+        seconds = medians(in_turns(works, turns))
+    stock.finalize()
+    rates = {name: n_frames / value for name, value in seconds.items()}
+    return [
+        Row(
+            f"recording, {SIMULATION.name}, saved for good",
+            rates["ours"],
+            "frames/s",
+            "stock LeRobotDataset, which a crash can cost the session",
+            rates["stock"],
+            "compressing the pictures",
+            rates["limit"],
+            f"at least {fps}",
+            rates["ours"] >= fps,
+        )
+    ]
 
 
-def pictures(case: Case, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
-    """A scene of smooth shapes that moves, with a camera's noise, as pictures compress about like a camera's."""
-    y, x = np.mgrid[0 : case.height, 0 : case.width] / case.width
-    scene = np.stack([127 + 90 * np.sin(a * x + b * y) for a, b in ((9, 4), (3, 11), (14, 2))], axis=-1)
-    noise = [rng.normal(0, 2, scene.shape) for _ in range(4)]
-    rolled = [np.clip(np.roll(scene, 3 * i, axis=1) + noise[i % 4], 0, 255).astype(np.uint8) for i in range(40)]
-    return lambda i: rolled[i % 40]
-
-
-def measure(case: Case, root: Path) -> None:
-    rng = np.random.default_rng(0)
-    picture = pictures(case, rng)
-    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if case.dtype == "video" else None
+def measure_paced(case: Case, root: Path) -> None:
     waits, saves, late = [], [], 0
+    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if case.dtype == "video" else None
     with DurableWriter(
-        "benchmark/recording", root, case.fps, features(case), streaming_encoding=case.streaming, rgb_encoder=encoder
+        "benchmark/recording", root, case.fps, case.features, streaming_encoding=case.streaming, rgb_encoder=encoder
     ) as writer:
-        for _ in range(N_EPISODES):
+        for episode in range(N_EPISODES):
             begun = time.perf_counter()
-            for i in range(SECONDS * case.fps):
-                frame = {
-                    "observation.images.front": picture(i),
-                    "observation.state": rng.normal(size=7).astype(np.float32),
-                    "action": rng.normal(size=4).astype(np.float32),
-                    "task": "listen",
-                }
-                for k in range(case.microphones):
-                    frame[f"observation.audio.{k}"] = rng.normal(0, 300, RATE // case.fps).astype(np.int16)
+            for i, frame in enumerate(frames(case.features, SECONDS * case.fps, episode)):
                 due = begun + i / case.fps
                 late += time.perf_counter() > due + 1 / case.fps
                 time.sleep(max(0.0, due - time.perf_counter()))
@@ -102,13 +120,13 @@ def measure(case: Case, root: Path) -> None:
 
 
 def measure_room(folder: Path) -> None:
-    own = {"observation.audio.gripper": audio_feature(RATE, 20)}
+    own = {"observation.audio.gripper": audio_feature(_ROOM_RATE, 20)}
     own["action"] = {"dtype": "float32", "shape": (4,), "names": None}
     rng = np.random.default_rng(0)
     sounds: dict[str, Callable[[], np.ndarray]] = {
-        "noise at full scale": lambda: rng.integers(-32768, 32768, RATE // 20),
-        "a quiet room (noise of 100 of 32,768)": lambda: rng.normal(0, 100, RATE // 20),
-        "silence": lambda: np.zeros(RATE // 20),
+        "noise at full scale": lambda: rng.integers(-32768, 32768, _ROOM_RATE // 20),
+        "a quiet room (noise of 100 of 32,768)": lambda: rng.normal(0, 100, _ROOM_RATE // 20),
+        "silence": lambda: np.zeros(_ROOM_RATE // 20),
     }
     for number, (name, sound) in enumerate(sounds.items()):
         root = folder / str(number)
@@ -123,17 +141,25 @@ def measure_room(folder: Path) -> None:
                 sizes.append(sum(path.stat().st_size for path in (root / "meta").rglob("*") if path.is_file()))
         data = sum(path.stat().st_size for path in (root / "data").rglob("*.parquet"))
         print(
-            f"{name}: {data / (10 * 5 * RATE):.3f} bytes per sample; metadata {sizes[0] / 1e3:.0f} kB with the first "
-            f"episode, {(sizes[-1] - sizes[0]) / 9e3:.1f} kB for each further one"
+            f"{name}: {data / (10 * 5 * _ROOM_RATE):.3f} bytes per sample; metadata {sizes[0] / 1e3:.0f} kB with the "
+            f"first episode, {(sizes[-1] - sizes[0]) / 9e3:.1f} kB for each further one"
         )
 
 
 def main() -> None:
     os.environ.setdefault("SVT_LOG", "1")
-    print(f"{os.cpu_count()} processor cores")
+    parser = parser_for(__doc__)
+    parser.add_argument("--paced", action="store_true", help="at the rate of the robot instead; takes 5 minutes")
+    parser.add_argument("--frames", type=int, default=200, help="of an episode")
+    parser.add_argument("--turns", type=int, default=5)
+    args = parser.parse_args()
+    started = machine()
     with tempfile.TemporaryDirectory() as folder:
-        for number, case in enumerate(CASES):
-            measure(case, Path(folder) / f"case{number}")
+        if not args.paced:
+            report("recording", measure(Path(folder), args.frames, args.turns), args.output, started)
+            return
+        for number, case in enumerate(PACED):
+            measure_paced(case, Path(folder) / f"case{number}")
         measure_room(Path(folder))
 
 

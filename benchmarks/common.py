@@ -1,0 +1,205 @@
+"""What the benchmarks share: turns of measuring, helpers in processes of their own, the table, and the file of figures."""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+
+BENCH = Path("outputs/bench.json")
+_LESS_IS_BETTER = ("ms", "s", "MiB")
+_VERSIONS = ("torch", "lerobot", "mujoco", "numpy")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table.
+
+    Attributes:
+        what: What was measured.
+        ours: The figure, a median.
+        unit: Of all figures of the row; in ms, s and MiB less is better.
+        beside: What it is compared with, measured in the same run.
+        theirs: The figure of that.
+        limit_is: What bounds the figure on this machine.
+        limit: That bound, measured in the same run.
+        wanted: What the figures ought to be, in words.
+        holds: Whether they are.
+    """
+
+    what: str
+    ours: float
+    unit: str
+    beside: str = ""
+    theirs: float | None = None
+    limit_is: str = ""
+    limit: float | None = None
+    wanted: str = ""
+    holds: bool | None = None
+
+    @property
+    def times_better(self) -> float | None:
+        """How many times better ours is than what it is compared with."""
+        if not self.theirs or not self.ours:
+            return None
+        return self.theirs / self.ours if self.unit in _LESS_IS_BETTER else self.ours / self.theirs
+
+
+def parser_for(doc: str | None) -> argparse.ArgumentParser:
+    """A command line that prints the module's docstring as help."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=BENCH, help="JSON file that the figures are merged into")
+    return parser
+
+
+def in_turns(works: Mapping[str, Callable[[], object]], n_turns: int, warm_up: int = 1) -> dict[str, list[float]]:
+    """Times several pieces of work in turns, so that whatever else the machine does hits all of them.
+
+    Args:
+        works: Each called once per turn.
+        n_turns: How often.
+        warm_up: Turns before these that do not count.
+
+    Returns:
+        The seconds of every call.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in works}
+    for turn in range(warm_up + n_turns):
+        for name, work in works.items():
+            start = time.perf_counter()
+            work()
+            if turn >= warm_up:
+                seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def medians(seconds: Mapping[str, Sequence[float]]) -> dict[str, float]:
+    """The median of every list."""
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+class Helper:
+    """A script that measures in a process of its own, whenever it is asked to: a line in, a line with a number out.
+
+    Args:
+        command: What to run.
+        environment: Variables besides this process's.
+    """
+
+    def __init__(self, *command: str, **environment: str) -> None:
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, **environment},
+        )
+
+    def ask(self, question: str = "") -> None:
+        """Lets it begin."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(question + "\n")
+            self._process.stdin.flush()
+        except BrokenPipeError:
+            self._fail()
+
+    def answer(self) -> float:
+        """Waits for its number."""
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            if line.startswith("answer "):
+                return float(line.split()[1])
+        self._fail()
+        raise AssertionError
+
+    def measure(self, question: str = "") -> float:
+        """Asks and waits."""
+        self.ask(question)
+        return self.answer()
+
+    def close(self) -> None:
+        """Ends it."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.wait(timeout=60)
+
+    def _fail(self) -> None:
+        assert self._process.stderr is not None
+        raise RuntimeError(f"A helper did not run:\n{self._process.stderr.read()[-2000:]}")
+
+
+def serve(work: Callable[[str], float]) -> None:
+    """What a helper does: answers every line from the one who started it."""
+    for line in sys.stdin:
+        print("answer", work(line.strip()), flush=True)
+
+
+def machine() -> dict[str, object]:
+    """What ran, and whether it ran alone."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    installed = {name: metadata.version(name) for name in _VERSIONS}
+    return {
+        "processor": model,
+        "cores": os.cpu_count(),
+        "threads": os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())),
+        "python": platform.python_version(),
+        **installed,
+        "load_before": round(os.getloadavg()[0], 2),
+    }
+
+
+def report(section: str, rows: Sequence[Row], output: Path, started: dict[str, object]) -> None:
+    """Prints a benchmark's rows and merges them into the file of figures.
+
+    Args:
+        section: The benchmark's name.
+        rows: Its results.
+        output: The file.
+        started: `machine()` from before the work.
+    """
+    print("\n".join(markdown(rows)), flush=True)
+    figures = json.loads(output.read_text()) if output.is_file() else {}
+    entries = [{**asdict(row), "times_better": row.times_better} for row in rows]
+    figures[section] = {"machine": started, "rows": entries}
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(figures, indent=1) + "\n")
+
+
+def rows_of(section: Mapping[str, object]) -> list[Row]:
+    """The rows in a section of the file of figures."""
+    entries = section["rows"]
+    assert isinstance(entries, list)
+    return [Row(**{key: value for key, value in entry.items() if key != "times_better"}) for entry in entries]
+
+
+def markdown(rows: Sequence[Row]) -> list[str]:
+    """The table, line by line."""
+    lines = ["| what | ours | beside it | times better | limit | wanted |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        beside = f"{row.beside}: {_figure(row.theirs)}" if row.beside else ""
+        times = f"{row.times_better:.3g}" if row.times_better else ""
+        limit = f"{row.limit_is}: {_figure(row.limit)}" if row.limit_is else ""
+        wanted = row.wanted + ("" if row.holds is None else ": holds" if row.holds else ": **does not hold**")
+        lines.append(f"| {row.what} | {_figure(row.ours)} {row.unit} | {beside} | {times} | {limit} | {wanted} |")
+    return lines
+
+
+def _figure(value: float | None) -> str:
+    if value is None:
+        return "not measured"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

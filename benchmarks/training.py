@@ -1,0 +1,144 @@
+"""Supervised windows per second in training at 224 pixels, beside the published scheme and the bare ResNet.
+
+    python benchmarks/training.py
+
+A whole update counts: augmentation, spectrograms, network, gradients, clipping and Adam. The published scheme
+(`benchmarks/reference.py`) runs in a process of its own, with PyTorch's own memory allocation, in turn with ours. The limit
+is the time that the ResNet's forward and backward pass alone take for the frames that an update encodes. Noise as data.
+"""
+
+import sys
+import time
+from collections.abc import Callable
+
+import torch
+from common import Helper, Row, in_turns, machine, medians, parser_for, report, serve
+from reference import Reference, random_windows
+from torch import nn
+
+REFERENCE_WINDOWS = 4  # per update; its cost per window does not depend on it
+RUNS = {8: 2, 16: 2, 32: 1}  # windows per run, K, and runs per update
+WANTED = {8: 10, 32: 20}  # times the published scheme
+OVERHEAD_WANTED = 1.3
+
+
+def update_of(module: nn.Module, loss: Callable[[], torch.Tensor]) -> Callable[[], None]:
+    """An update as LeRobot does it: forward, backward, clip, Adam."""
+    optimizer = torch.optim.Adam(module.parameters(), lr=1e-4)
+
+    def update() -> None:
+        loss().backward()
+        nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        optimizer.step()
+        optimizer.zero_grad()
+
+    return update
+
+
+def serve_reference() -> None:
+    """The published scheme, in a process of its own: seconds of an update."""
+    model = Reference().train()
+    images, sound, state, action = random_windows(REFERENCE_WINDOWS)
+    update = update_of(model, lambda: (model(images, sound, state) - action).square().mean())
+
+    def timed(_: str) -> float:
+        start = time.perf_counter()
+        update()
+        return time.perf_counter() - start
+
+    timed("")
+    serve(timed)
+
+
+def our_update(n_supervised_steps: int, image_size: int, amp: bool = False) -> Callable[[], None]:
+    """An update of the policy of the paper's sizes."""
+    from policies import make_policy, random_runs
+
+    policy = make_policy(image_size=image_size, n_supervised_steps=n_supervised_steps).train()
+    batch = random_runs(policy.config, RUNS[n_supervised_steps])
+
+    def loss() -> torch.Tensor:
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=amp):
+            return policy(batch)[0]
+
+    return update_of(policy, loss)
+
+
+def bare_resnet(n_frames: int, image_size: int) -> Callable[[], None]:
+    """Forward and backward pass of the vision encoder's ResNet alone, on frames that are already as it reads them."""
+    from policies import CAMERA, make_policy
+
+    network = make_policy(use_audio=False).train().model.vision[CAMERA.removeprefix("observation.").replace(".", "_")]
+    frames = torch.rand(n_frames, 9, image_size, image_size).contiguous(memory_format=torch.channels_last)
+
+    def passes() -> None:
+        network.network(frames).square().mean().backward()
+        network.zero_grad()
+
+    return passes
+
+
+def main() -> None:
+    parser = parser_for(__doc__)
+    parser.add_argument("--turns", type=int, default=4)
+    parser.add_argument("--image_size", type=int, default=224)
+    parser.add_argument("--reference", action="store_true", help="be the process of the published scheme")
+    args = parser.parse_args()
+    if args.reference:
+        serve_reference()
+        return
+    started = machine()
+    helper = Helper(sys.executable, __file__, "--reference")
+    from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+    from lerobot_playbyear.memory import keep_freed_memory
+
+    keep_freed_memory()  # as playbyear-train does
+    default = PlaybyearConfig().n_supervised_steps
+    frames = {k: n * (k + PlaybyearConfig().n_memory_steps - 1) for k, n in RUNS.items()}
+    theirs: list[float] = []
+    works: dict[str, Callable[[], object]] = {f"K={k}": our_update(k, args.image_size) for k in RUNS}
+    works["bfloat16"] = our_update(default, args.image_size, amp=True)
+    works |= {f"bare {k}": bare_resnet(frames[k], args.image_size) for k in WANTED}
+    works["reference"] = lambda: theirs.append(helper.measure())
+    seconds = medians(in_turns(works, args.turns))
+    seconds["reference"] = medians({"reference": theirs[1:]})["reference"]
+    helper.close()
+
+    reference = REFERENCE_WINDOWS / seconds["reference"]
+    size, rows = f"{args.image_size} px", []
+    for k, n in RUNS.items():
+        ours, wanted = n * k / seconds[f"K={k}"], WANTED.get(k)
+        bare = n * k / seconds[f"bare {k}"] if k in WANTED else None
+        rows.append(
+            Row(
+                f"training, {size}, K = {k}" + (" (default)" if k == default else ""),
+                ours,
+                "windows/s",
+                "ten frames per window (K = 1)",
+                reference,
+                "convolutions alone" if bare else "",
+                bare,
+                f"at least {wanted} times" if wanted else "",
+                ours >= wanted * reference if wanted else None,
+            )
+        )
+    amp = RUNS[default] * default / seconds["bfloat16"]
+    fast = f"training, {size}, K = {default}, bfloat16 (`--policy.use_amp=true`)"
+    rows.append(Row(fast, amp, "windows/s", "ten frames per window (K = 1)", reference))
+    overhead = seconds[f"K={default}"] / seconds[f"bare {default}"]
+    rows.append(
+        Row(
+            "a whole update over its convolutions' time",
+            overhead,
+            "times",
+            limit_is="convolutions alone",
+            limit=1.0,
+            wanted=f"at most {OVERHEAD_WANTED}",
+            holds=overhead <= OVERHEAD_WANTED,
+        )
+    )
+    report("training", rows, args.output, started)
+
+
+if __name__ == "__main__":
+    main()
