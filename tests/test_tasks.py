@@ -1,5 +1,6 @@
 """The tasks as Gymnasium environments: interface, hidden cube, experts, blind baselines, sound."""
 
+import os
 import subprocess
 import sys
 import warnings
@@ -84,6 +85,27 @@ def test_same_seed_same_bytes(task):
         for a, b in zip(first, second, strict=True):
             np.testing.assert_array_equal(a, b)
     env.close()
+
+
+_DRAW = """
+import os, hashlib, gymnasium
+env = gymnasium.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0")
+picture = env.reset(seed=0)[0]["pixels"]["front"]
+print(hashlib.sha256(picture.tobytes()).hexdigest(), os.environ["LP_NUM_THREADS"])
+"""
+
+
+def test_pictures_do_not_depend_on_how_many_threads_draw_them():
+    environments = [{}, {"LP_NUM_THREADS": "2"}]
+    without = {key: value for key, value in os.environ.items() if key != "LP_NUM_THREADS"}
+    drawn = [
+        subprocess.run(
+            [sys.executable, "-c", _DRAW], capture_output=True, text=True, check=True, env={**without, **environment}
+        ).stdout.split()
+        for environment in environments
+    ]
+    assert [n_threads for _, n_threads in drawn] == ["0", "2"]
+    assert drawn[0][0] == drawn[1][0]
 
 
 @pytest.mark.parametrize("task", TASKS)
