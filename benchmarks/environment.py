@@ -22,7 +22,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 WANTED_RATE, WANTED_TIMES = 250, 1.8
 _PEERS = {
     "robosuite": ("robosuite==1.5.2", "mujoco==3.3.7", "numpy<2.3"),
-    "gym-hil": ("gym-hil==0.1.13",),
+    "gym-hil": ("gym-hil==0.1.13", "mujoco==3.3.7"),
 }
 _NAMES = {
     "robosuite": "robosuite 1.5.2 Lift, one 84 px camera, no sound",

@@ -1,0 +1,95 @@
+"""What the benchmarks compare with is what they say, and their figures and tables are put together rightly."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from test_policy_contract import make_config
+
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+
+
+@pytest.fixture(autouse=True)
+def benchmarks_on_path(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+
+def test_the_published_scheme_gives_our_actions_for_the_same_weights():
+    """Encoding ten frames per window anew is slower, and not something else."""
+    from reference import Reference, random_windows
+
+    torch.manual_seed(0)
+    config = make_config(
+        image_size=224,
+        vision_width=64,
+        hidden_size=1024,
+        normalize_encodings=False,
+        low_dimensional_gain=1.0,
+        n_supervised_steps=1,
+    )
+    policy = PlaybyearPolicy(config).eval()
+    reference = Reference().eval()
+    reference.load_from(policy.model.state_dict())
+    images, sound, state, _ = random_windows(2)
+    batch = {
+        "observation.images.front": images,
+        "observation.audio.gripper": sound.view(2, -1, 800),
+        "observation.state": state,
+    }
+    with torch.no_grad():
+        torch.testing.assert_close(reference(images, sound, state), policy.predict_run(batch)[:, 0], rtol=0, atol=1e-4)
+
+
+def test_the_references_augmentation_moves_and_colours_a_little():
+    from reference import augment
+
+    image = torch.rand(1, 3, 84, 84).expand(3, 3, 84, 84)
+    augmented = augment(image)
+    assert augmented.shape == image.shape
+    assert (augmented == augmented[:1]).all()
+    assert 0.01 < (augmented - image).abs().mean() < 0.5
+
+
+def test_work_is_timed_in_turns_and_warm_up_does_not_count():
+    from common import in_turns
+
+    calls: list[str] = []
+    seconds = in_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, n_turns=3, warm_up=2)
+    assert calls == ["a", "b"] * 5
+    assert [len(values) for values in seconds.values()] == [3, 3]
+
+
+def test_figures_are_merged_and_printed(tmp_path, capsys):
+    from common import Row, machine, report, rows_of
+    from run import print_table
+
+    output = tmp_path / "bench.json"
+    fast = Row("steps", 500.0, "steps/s", "other", 20.0, wanted="at least 250", holds=True)
+    slow = Row("latency", 40.0, "ms", "other", 80.0, "alone", 30.0, "at most 35 ms", False)
+    report("environment", [fast], output, machine())
+    report("acting", [slow], output, machine())
+    assert fast.times_better == 25
+    assert slow.times_better == 2
+    assert rows_of(json.loads(output.read_text())["acting"]) == [slow]
+    capsys.readouterr()
+    print_table(output)
+    table = capsys.readouterr().out
+    assert "| steps | 500 steps/s | other: 20 | 25 |  | at least 250: holds |" in table
+    assert "| latency | 40 ms | other: 80 | 2 | alone: 30 | at most 35 ms: **does not hold** |" in table
+
+
+def test_a_helper_answers_and_tells_why_it_cannot():
+    from common import Helper
+
+    code = (
+        f"import sys; sys.path.insert(0, {str(BENCHMARKS)!r}); from common import serve; serve(lambda q: 2 * float(q))"
+    )
+    helper = Helper(sys.executable, "-c", code)
+    assert [helper.measure("3"), helper.measure("4")] == [6, 8]
+    helper.close()
+    with pytest.raises(RuntimeError, match="no such thing"):
+        Helper(sys.executable, "-c", "raise SystemExit('no such thing')").measure()
