@@ -237,9 +237,13 @@ def test_a_policy_is_safe_without_the_hub_and_says_how_to_push_it_later(pushed, 
     assert "cannot be reached" in message
     assert "Traceback" not in message
     hub.fault = nothing_fails
-    assert_well(client.run(*command_in(result)))
-    names = {"README.md", "config.json", "model.safetensors", "train_config.json"}
-    assert names <= set(hub.model("tester/later").files())
+    film = tmp_path / "film.mp4"
+    film.write_bytes(hub.dataset(DATASET).files()["preview.mp4"].data)
+    assert_well(client.run(*command_in(result), f"--preview={film}"))
+    files = hub.model("tester/later").files()
+    assert {"config.json", "model.safetensors", "train_config.json"} <= set(files)
+    assert files["preview.mp4"].data == film.read_bytes()
+    assert f"{hub.url}/tester/later/resolve/main/preview.mp4" in files["README.md"].data.decode()
 
 
 @pytest.mark.slow

@@ -57,6 +57,7 @@ def push_policy(
     def push() -> str:
         api = HfApi()
         url = api.create_repo(repo_id, private=private, exist_ok=True)
+        config.repo_id = url.repo_id  # with the user's name, for the card
         with TemporaryDirectory() as scratch:
             for file in [file for pattern in _FILES for file in folder.glob(pattern)]:
                 (Path(scratch) / file.name).symlink_to(file.resolve())
