@@ -31,6 +31,7 @@ class SharedBatchNorm2d(nn.BatchNorm2d):
         assert self.running_mean is not None
         assert self.running_var is not None
         assert self.num_batches_tracked is not None
+        assert self.momentum is not None
         values = input.float()
         mean = mean_over_processes(values.mean(dim=(0, 2, 3)))  # (C,)
         centred = values - mean[:, None, None]

@@ -23,7 +23,8 @@ def fold_batch_norm(network: nn.Module) -> nn.Module:
             fused = fuse_conv_bn_eval(module.get_submodule(convolution), module.get_submodule(norm))
             module.register_module(convolution, fused)
             module.register_module(norm, nn.Identity())
-    return folded.to(memory_format=torch.channels_last)
+    folded.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return folded
 
 
 class FoldedCopy:
