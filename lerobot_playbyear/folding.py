@@ -19,10 +19,12 @@ def fold_batch_norm(network: nn.Module) -> nn.Module:
         pairs = [pair for pair in _PAIRS if hasattr(module, pair[0])]
         if isinstance(module, nn.Sequential) and len(module) == 2 and isinstance(module[1], nn.BatchNorm2d):
             pairs.append(("0", "1"))  # a shortcut
-        for convolution, norm in pairs:
-            fused = fuse_conv_bn_eval(module.get_submodule(convolution), module.get_submodule(norm))
-            module.register_module(convolution, fused)
-            module.register_module(norm, nn.Identity())
+        for name, norm_name in pairs:
+            convolution, norm = module.get_submodule(name), module.get_submodule(norm_name)
+            assert isinstance(convolution, nn.Conv2d)
+            assert isinstance(norm, nn.BatchNorm2d)
+            module.register_module(name, fuse_conv_bn_eval(convolution, norm))
+            module.register_module(norm_name, nn.Identity())
     folded.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return folded
 
