@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import datasets
 import numpy as np
 from common import Row, in_turns, machine, medians, parser_for, report
 from lerobot.configs.video import RGBEncoderConfig
@@ -63,7 +64,8 @@ def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
     """As fast as it goes: ours, stock, and compression alone."""
     features, fps = SIMULATION.features, SIMULATION.fps
     episode = list(frames(features, n_frames))
-    stock = LeRobotDataset.create("benchmark/stock", fps, features, root=folder / "stock", image_writer_threads=4)
+    options = {"image_writer_threads": 4, "video_backend": "pyav"}
+    stock = LeRobotDataset.create("benchmark/stock", fps, features, root=folder / "stock", **options)
 
     def write(writer: DurableWriter | LeRobotDataset) -> None:
         for frame in episode:
@@ -148,6 +150,7 @@ def measure_room(folder: Path) -> None:
 
 def main() -> None:
     os.environ.setdefault("SVT_LOG", "1")
+    datasets.disable_progress_bars()
     parser = parser_for(__doc__)
     parser.add_argument("--paced", action="store_true", help="at the rate of the robot instead; takes 5 minutes")
     parser.add_argument("--frames", type=int, default=200, help="of an episode")

@@ -16,12 +16,13 @@ from pathlib import Path
 from common import machine, markdown, parser_for, rows_of
 
 SCRIPTS = ("training", "acting", "windows", "recording", "environment")
+SECTIONS = (*SCRIPTS, "scaling")  # the last is measured by hand
 
 
 def print_table(path: Path) -> None:
     """The whole table and what it was measured on, in Markdown."""
     figures = json.loads(path.read_text())
-    measured = {name: figures[name] for name in SCRIPTS if name in figures}
+    measured = {name: figures[name] for name in SECTIONS if name in figures}
     print("\n" + "\n".join(markdown([row for section in measured.values() for row in rows_of(section)])))
     for name, section in measured.items():
         print(f"\n{name}: " + ", ".join(f"{key} {value}" for key, value in section["machine"].items()))

@@ -5,13 +5,14 @@
 
 Three ways to batches of the same windows, in turns: LeRobot's (`LeRobotDataset[i]`, collated, in this process), the store
 returning exactly those tensors, and the store as training uses it: bytes and 16-bit sound, and of each key only the frames
-that the policy looks at. The limit is copying as many bytes. Peak memory is that of reading the dataset into a store, above
-what the opened dataset takes.
+that the policy looks at. The limit is copying as many bytes. Peak memory is the process's own while it reads the dataset into a
+store, above what it has when the dataset is open.
 """
 
 import argparse
 import multiprocessing
 import tempfile
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -41,15 +42,32 @@ def record(root: Path, args: argparse.Namespace) -> None:
             writer.save_episode()
 
 
-def peak_memory() -> int:
-    """The most memory that this process has had since `forget_peak` [bytes]; Linux."""
+class PeakMemory:
+    """The most memory of its own that this process has while the block runs [bytes]; Linux.
+
+    Pages of files that are mapped into memory do not count: the system takes them back when it needs them.
+    """
+
+    def __enter__(self) -> "PeakMemory":
+        self._before = self.peak = _own_memory()
+        self._done = threading.Event()
+        self._watch = threading.Thread(target=self._look)
+        self._watch.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._done.set()
+        self._watch.join()
+        self.peak = max(self.peak, _own_memory()) - self._before
+
+    def _look(self) -> None:
+        while not self._done.wait(0.002):
+            self.peak = max(self.peak, _own_memory())
+
+
+def _own_memory() -> int:
     status = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in status if line.startswith("VmHWM"))
-
-
-def forget_peak() -> None:
-    """Lets `peak_memory` begin again at what is in use now."""
-    Path("/proc/self/clear_refs").write_text("5")
+    return 1024 * next(int(line.split()[1]) for line in status if line.startswith("RssAnon"))
 
 
 def drawing(make_batch: Callable[[list[int]], Any], n_frames: int, n_batches: int) -> Callable[[], None]:
@@ -65,12 +83,10 @@ def drawing(make_batch: Callable[[list[int]], Any], n_frames: int, n_batches: in
 
 def measure(root: Path, args: argparse.Namespace) -> list[Row]:
     opened = LeRobotDataset(args.repo_id, root, video_backend="pyav")
-    forget_peak()
-    before = peak_memory()
-    store = EpisodeStore.from_dataset(opened, device="cpu")
-    memory = peak_memory() - before
+    with PeakMemory() as memory:
+        store = EpisodeStore.from_dataset(opened, device="cpu")
 
-    policy = PlaybyearConfig(sample_rate=args.sample_rate)
+    policy = PlaybyearConfig(sample_rate=args.sample_rate, device="cpu")
     keys = [key for key in store.keys if key.startswith("observation.") or key == "action"]
     full = dict.fromkeys(keys, range(1 - args.window, 1))
     timestamps = {key: [delta / opened.fps for delta in deltas] for key, deltas in full.items()}
@@ -95,7 +111,7 @@ def measure(root: Path, args: argparse.Namespace) -> list[Row]:
     what = f"dataset windows, {args.window} frames, "
     wanted, times = f"at least {WANTED_TIMES} times", rates["compact"] / rates["stock"]
     name, limit = "stock LeRobotDataset", "copying as many bytes"
-    ratio = memory / store.nbytes
+    ratio = memory.peak / store.nbytes
     return [
         Row(
             what + "as training uses them",
@@ -111,7 +127,7 @@ def measure(root: Path, args: argparse.Namespace) -> list[Row]:
         Row(what + "LeRobot's very tensors", rates["same"], "windows/s", name, rates["stock"]),
         Row(
             f"peak memory of reading {store.n_episodes} episodes",
-            memory / 2**20,
+            memory.peak / 2**20,
             "MiB",
             limit_is="their raw bytes",
             limit=store.nbytes / 2**20,

@@ -24,12 +24,12 @@ class VirtualScreen:
     """
 
     def __init__(self, width: int = 1100, height: int = 800) -> None:
-        number = (
-            100 + os.getpid() % 50_000 + next(_numbers)
-        )  # two that look for a free one at the same time take the same
+        # Two that look for a free number at the same time take the same, so each process has a hundred of its own.
+        number = 100 + os.getpid() % 500 * 100 + next(_numbers)
         read, write = os.pipe()
         size = f"{width}x{height}x24"
         command = ["Xvfb", f":{number}", "-displayfd", str(write), "-screen", "0", size, "-nolisten", "tcp"]
+        command += ["-noreset"]  # otherwise it starts anew when its last client leaves, and turns away who comes then
         self._process = subprocess.Popen(
             command, pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )

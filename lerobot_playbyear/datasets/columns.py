@@ -6,7 +6,7 @@ through Arrow, an image column is decoded by a few threads, and a video is decod
 
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from PIL import Image
 from torch import Tensor
 
+_ROWS_AT_ONCE = 128  # images
 Progress = Callable[[str, int], Any]
 """Called with a key and the number of its frames that were just decoded."""
 
@@ -59,7 +60,7 @@ def read_values(dataset: LeRobotDataset, key: str) -> Tensor:
     if np.issubdtype(values.dtype, np.floating):
         check_finite(values, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
         values = values.astype(np.float32, copy=False)
-    return torch.from_numpy(np.array(values, order="C"))
+    return torch.from_numpy(np.require(values, requirements=("C", "W")))
 
 
 def check_finite(values: np.ndarray, key: str, episode_index: np.ndarray) -> None:
@@ -94,8 +95,8 @@ def read_images(dataset: LeRobotDataset, key: str, progress: Progress | None = N
     frames: Tensor | None = None
     position = 0
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        for chunk in column.chunks:
-            encoded = zip(chunk.field("bytes").to_pylist(), chunk.field("path").to_pylist(), strict=True)
+        for rows in _few_rows(column):
+            encoded = zip(rows.field("bytes").to_pylist(), rows.field("path").to_pylist(), strict=True)
             for image in pool.map(lambda row: _decode_image(row, mode), encoded):
                 if frames is None:
                     frames = torch.empty((len(column), *image.shape), dtype=torch.uint8)
@@ -180,6 +181,12 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None) -> None:
             ) from error
     if not any(folder.glob("data/*/*.parquet")):
         raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
+
+
+def _few_rows(column: pa.ChunkedArray) -> Iterator[pa.StructArray]:
+    """The column in parts: what is decoded ahead of being stored would otherwise be the whole column once more."""
+    for chunk in column.chunks:
+        yield from (chunk.slice(first, _ROWS_AT_ONCE) for first in range(0, len(chunk), _ROWS_AT_ONCE))
 
 
 def _decode_image(row: tuple[bytes | None, str | None], mode: str) -> np.ndarray:
