@@ -38,6 +38,7 @@ class Corrected:
         updates: Of HG-DAgger, and of the control.
         control: The percentage of successes of the control.
         minutes: Of HG-DAgger with its evaluations, and of the control's training.
+        seconds: Where the time of the rounds that made updates went, in all; `total_s` is their length.
         commands: What was run, in order.
         versions: Of the libraries that matter.
     """
@@ -53,6 +54,7 @@ class Corrected:
     updates: int
     control: float
     minutes: dict[str, float]
+    seconds: dict[str, float]
     commands: list[str]
     versions: dict[str, str] = field(default_factory=library_versions)
 
@@ -83,6 +85,8 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
     spent = _clocked(dagger, folder, threads)
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     updates = max(line["step"] for line in lines)
+    rounds = [line for line in lines if line["kind"] == "round" and "n_updates" in line]
+    parts = {name for line in rounds for name in line if name.endswith("_s")}
     kept, evaluations, attempts = 0, [], []
     for line in lines:
         if line["kind"] == "attempt":
@@ -107,9 +111,8 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
         f"--seed={job.training_seed}",
         "--wandb.enable=false",
     ]
-    control_spent = 0.0
-    if not control_job.checkpoint.exists():
-        control_spent = _clocked(go_on, RUNS / "train" / control_job.name, threads)
+    clock = RUNS / "train" / control_job.name
+    control_spent = _minutes(clock) if control_job.checkpoint.exists() else _clocked(go_on, clock, threads)
     commands = [train_command, shown(dagger), shown(go_on)]
     successes = evaluate(control_job, commands)
     return Corrected(
@@ -124,20 +127,30 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
         updates=updates,
         control=100 * sum(successes) / len(successes),
         minutes={"dagger": round(spent, 1), "control": round(control_spent, 1)},
+        seconds={name: round(sum(line.get(name, 0.0) for line in rounds), 1) for name in sorted(parts)},
         commands=commands,
     )
 
 
 def _clocked(command: list[str], folder: Path, threads: int) -> float:
     """Runs a command that can go on where it stopped; returns the minutes that it took in all."""
-    clock = folder.with_suffix(".minutes")
+    spent = _minutes(folder)
+    clock = _clock(folder)
     clock.parent.mkdir(parents=True, exist_ok=True)
-    spent = float(clock.read_text()) if clock.exists() else 0.0
     start = time.monotonic()
     run(command, RUNS / "logs" / f"{Path(command[0]).name}-{folder.name}.log", threads)
     spent += (time.monotonic() - start) / 60
     clock.write_text(str(spent))
     return spent
+
+
+def _clock(folder: Path) -> Path:
+    return folder.with_name(folder.name + ".minutes")
+
+
+def _minutes(folder: Path) -> float:
+    """What was spent on it so far."""
+    return float(_clock(folder).read_text()) if _clock(folder).exists() else 0.0
 
 
 def main() -> None:

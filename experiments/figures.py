@@ -41,7 +41,7 @@ def demonstrations(output: Path) -> None:
         if not few:
             continue
         seed = few[0].training_seed
-        results = few + [r for r in load_results(f"ablations/{task}-*.json") if r.training_seed == seed]
+        results = few + [r for r in load_results(f"ablations/{task}-*demos-*.json") if r.training_seed == seed]
         figure, axes = plt.subplots(figsize=(6, 3.6))
         for condition in ("full", "deaf"):
             points = {r.n_demonstrations: r.successes for r in results if r.condition == condition}

@@ -56,7 +56,7 @@ def demonstration_table(task: str) -> list[str]:
     if not results:
         return []
     seed = results[0].training_seed
-    results += [r for r in load_results(f"ablations/{task}-*.json") if r.training_seed == seed]
+    results += [r for r in load_results(f"ablations/{task}-*demos-*.json") if r.training_seed == seed]
     lines = [f"### {task}: demonstrations", "", "| demonstrations | full | deaf |", "|---|---|---|"]
     for n in sorted({result.n_demonstrations for result in results}):
         row = {r.condition: f"{r.rate:.0%}" for r in results if r.n_demonstrations == n}
@@ -80,6 +80,32 @@ def listening_table() -> list[str]:
     return [*lines, ""] if paths else []
 
 
+def correction_table() -> list[str]:
+    """What corrections are worth, and where the time of a round goes."""
+    reports = [json.loads(path.read_text()) for path in sorted((RESULTS / "corrections").glob("*.json"))]
+    if not reports:
+        return []
+    lines = [
+        "### Corrections",
+        "",
+        "| task, demonstrations, training seed | before | corrected | control | updates | minutes |",
+    ]
+    lines.append("|---|---|---|---|---|---|")
+    for report in reports:
+        before, after = report["evaluations"][0], report["evaluations"][-1]
+        name = f"{report['task']}, {report['n_demonstrations']}, {report['training_seed']}"
+        rates = f"{before['success']:.0f} % | **{after['success']:.0f} %** | {report['control']:.0f} %"
+        lines.append(f"| {name} | {rates} | {report['updates']} | {report['minutes']['dagger']:.0f} |")
+    names = sorted({name for report in reports for name in report["seconds"]} - {"total_s"})
+    lines += ["", f"| share of a round | {' | '.join(name.removesuffix('_s') for name in names)} | all of it |"]
+    lines.append("|---" * (len(names) + 2) + "|")
+    for report in reports:
+        total = report["seconds"]["total_s"]
+        cells = [f"{report['seconds'].get(name, 0) / total:.1%}" for name in names]
+        lines.append(f"| {report['task']} | {' | '.join(cells)} | {total:.0f} s |")
+    return [*lines, ""]
+
+
 def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
     try:
         return float(item[0]), ""
@@ -95,7 +121,7 @@ def main() -> None:
     for task in TASKS:
         lines += demonstration_table(task)
         lines += curve_table("noise", task) + curve_table("materials", task)
-    print("\n".join(lines))
+    print("\n".join(lines + correction_table()))
 
 
 if __name__ == "__main__":
