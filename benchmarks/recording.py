@@ -5,8 +5,8 @@
 
 Frames of one camera and one microphone are added as fast as they are taken, and the episode is saved: by
 `DurableWriter`, after which it survives a power cut, and by `LeRobotDataset` alone, in turns. The limit is compressing the
-pictures. With `--paced` frames come at the rate of the robot instead, for a minute each: a frame is late if writing the one
-before it took longer than a frame; the longest time that `add_frame` takes is the longest that a frame waits for the disk.
+pictures. With `--paced` frames come at the rate of the robot instead, for a minute each: the longest time that `add_frame`
+takes is the longest that a frame waits for the disk, and the next one is late if that is longer than a frame.
 """
 
 import io
@@ -97,7 +97,7 @@ def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
 
 
 def measure_paced(case: Case, root: Path) -> None:
-    waits, saves, late = [], [], 0
+    waits, saves = [], []
     encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if case.dtype == "video" else None
     with DurableWriter(
         "benchmark/recording", root, case.fps, case.features, streaming_encoding=case.streaming, rgb_encoder=encoder
@@ -106,7 +106,6 @@ def measure_paced(case: Case, root: Path) -> None:
             begun = time.perf_counter()
             for i, frame in enumerate(frames(case.features, SECONDS * case.fps, episode)):
                 due = begun + i / case.fps
-                late += time.perf_counter() > due + 1 / case.fps
                 time.sleep(max(0.0, due - time.perf_counter()))
                 started = time.perf_counter()
                 writer.add_frame(frame)
@@ -114,6 +113,7 @@ def measure_paced(case: Case, root: Path) -> None:
             started = time.perf_counter()
             writer.save_episode()
             saves.append(time.perf_counter() - started)
+    late = sum(wait > 1 / case.fps for wait in waits)
     print(
         f"{case.name}: {len(waits)} frames, {late} late; longest wait {1e3 * max(waits):.1f} ms "
         f"(99 %: {1e3 * np.quantile(waits, 0.99):.1f} ms; a frame is {1e3 / case.fps:.0f} ms); "

@@ -37,7 +37,7 @@ class VisionEncoder(nn.Module):
         # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
         stacks = stacks.contiguous(memory_format=torch.channels_last)
         acts = not self.training and not torch.is_grad_enabled() and self.mean.dtype == torch.float32
-        return self._folded.of(self.network)(stacks) if acts else self.network(stacks)
+        return self._folded.look(self.network, stacks) if acts else self.network(stacks)
 
     def train(self, mode: bool = True) -> "VisionEncoder":
         """Also forgets what was prepared for acting."""
