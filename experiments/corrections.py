@@ -3,10 +3,11 @@
     python -m experiments.corrections --task=OccludedGrasp-v0 --n_demonstrations=20
 
 1. A policy is trained on few demonstrations.
-2. `playbyear-dagger` keeps 25 attempts in which the expert had to help, and learns from them as they come.
+2. `playbyear-dagger` keeps 25 attempts in which the expert had to help, and learns from them as they come. These attempts may
+   take longer than the task's own, so that the expert has the time to search anew after a mistake.
 3. The control goes on with the same demonstrations, for as many updates at the same largest rate.
 
-All three are evaluated on the same 50 seeds. Resumes where it was interrupted.
+All three are evaluated on the same 50 seeds of the task as it is. Resumes where it was interrupted.
 """
 
 import argparse
@@ -22,6 +23,8 @@ from experiments.training import Job, evaluate, train
 STUDY = "corrections"
 SEEDS = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + 50)
 N_EPISODES = 25
+ATTEMPT_STEPS = {"OccludedGrasp-v0": 200, "OccludedPickPlace-v0": 300}
+EVERY = 7  # kept attempts between evaluations
 BATCH_SIZE = 12
 LEARNING_RATE = "3e-4"
 
@@ -72,13 +75,13 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
         f"--interventions.root={RUNS / 'datasets' / f'corrections-{job.name}'}",
         "--env.type=playbyear",
         f"--env.task={job.task}",
+        f"--env.episode_length={ATTEMPT_STEPS[job.task]}",
         f"--episodes={N_EPISODES}",
         f"--batch_size={BATCH_SIZE}",
         f"--learning_rate={LEARNING_RATE}",
-        f"--seed={SEEDS.start}",
-        f"--eval.n_episodes={len(SEEDS)}",
-        "--eval.batch_size=25",
-        "--eval_every=7",
+        f"--seed={job.training_seed}",
+        "--eval_every=0",
+        f"--save_every={EVERY}",
         f"--output_dir={folder}",
         "--resume=true",
     ]
@@ -87,13 +90,18 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
     updates = max(line["step"] for line in lines)
     rounds = [line for line in lines if line["kind"] == "round" and "n_updates" in line]
     parts = {name for line in rounds for name in line if name.endswith("_s")}
-    kept, evaluations, attempts = 0, [], []
-    for line in lines:
-        if line["kind"] == "attempt":
-            kept += line["outcome"] == "kept"
-            attempts.append({key: line[key] for key in ("seed", "outcome", "intervention_share")})
-        if line["kind"] == "eval":
-            evaluations.append({"kept": kept, "updates": line["step"], "success": line["pc_success"]})
+    attempts = [
+        {key: line[key] for key in ("seed", "outcome", "intervention_share")}
+        for line in lines
+        if line["kind"] == "attempt"
+    ]
+    commands = [train_command, shown(dagger)]
+    milestones = {line["round"]: line["step"] for line in rounds if line["round"] % EVERY == 0 or line is rounds[-1]}
+    evaluations = [{"kept": 0, "updates": 0, "success": _percentage(evaluate(job, commands, name=f"{STUDY}-0"))}]
+    for kept, step in milestones.items():
+        checkpoint = folder / "checkpoints" / f"{step:06}" / "pretrained_model"
+        successes = evaluate(job, commands, name=f"{STUDY}-{kept}", checkpoint=checkpoint)
+        evaluations.append({"kept": kept, "updates": step, "success": _percentage(successes)})
 
     control_job = replace(job, steps=updates, variant="control")  # its folder; it begins where the job's policy ended
     go_on = [
@@ -113,8 +121,8 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
     ]
     clock = RUNS / "train" / control_job.name
     control_spent = _minutes(clock) if control_job.checkpoint.exists() else _clocked(go_on, clock, threads)
-    commands = [train_command, shown(dagger), shown(go_on)]
-    successes = evaluate(control_job, commands)
+    commands.append(shown(go_on))
+    control = _percentage(evaluate(control_job, commands))
     return Corrected(
         task=job.task,
         training_seed=job.training_seed,
@@ -125,11 +133,15 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
         evaluations=evaluations,
         attempts=attempts,
         updates=updates,
-        control=100 * sum(successes) / len(successes),
+        control=control,
         minutes={"dagger": round(spent, 1), "control": round(control_spent, 1)},
         seconds={name: round(sum(line.get(name, 0.0) for line in rounds), 1) for name in sorted(parts)},
         commands=commands,
     )
+
+
+def _percentage(successes: list[bool]) -> float:
+    return 100 * sum(successes) / len(successes)
 
 
 def _clocked(command: list[str], folder: Path, threads: int) -> float:

@@ -115,7 +115,9 @@ def train(job: Job) -> tuple[str, float]:
     ), spent
 
 
-def evaluate(job: Job, commands: list[str], *environment: str, name: str | None = None) -> list[bool]:
+def evaluate(
+    job: Job, commands: list[str], *environment: str, name: str | None = None, checkpoint: Path | None = None
+) -> list[bool]:
     """Rolls a trained policy out over the job's evaluation seeds.
 
     Args:
@@ -123,12 +125,13 @@ def evaluate(job: Job, commands: list[str], *environment: str, name: str | None 
         commands: The command is appended to these.
         environment: Further options of the environment, `--env.noise_level=2`.
         name: Of this evaluation's folder and log.
+        checkpoint: Another policy than the job's.
     """
     label = f"{name or job.study}-{job.name}"
     output = RUNS / "eval" / label
     command = [
         tool("lerobot-eval"),
-        f"--policy.path={job.checkpoint}",
+        f"--policy.path={checkpoint or job.checkpoint}",
         "--env.type=playbyear",
         f"--env.task={job.task}",
         f"--eval.n_episodes={len(job.evaluation_seeds)}",

@@ -196,15 +196,16 @@ def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_pat
     assert (tmp_path / "tuned/checkpoints/000001").is_dir()
 
 
-def test_the_rate_rises_once_and_falls_in_every_round():
+def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
     cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), learning_rate=1.0, warmup_updates=4)
-    first = [cfg.rate(step, step, 10) for step in range(10)]
-    later = [cfg.rate(10 + number, number, 10) for number in range(10)]
-    assert first[:3] == [0.25, pytest.approx(0.5 * later[1]), pytest.approx(0.75 * later[2])]
-    assert first[3:] == later[3:]
-    assert later[0] == 1
-    assert later == sorted(later, reverse=True)
-    assert later[-1] < 0.05
+    cfg.episodes, cfg.warmup_episodes, cfg.updates_per_episode = 7, 3, 10
+    rounds = [[cfg.rate(10 * done + number, number, 10) for number in range(10)] for done in range(6)]
+    first, second, last = rounds[0], rounds[1], rounds[4]
+    assert cfg.total_updates == 50
+    assert first[:3] == [0.25, pytest.approx(0.5 * second[1] / second[0]), pytest.approx(0.75 * second[2] / second[0])]
+    assert all(rates[1:] == sorted(rates[1:], reverse=True) and rates[-1] < 0.05 for rates in rounds[1:])
+    assert [rates[0] for rates in rounds] == pytest.approx([0.25, 0.82, 0.64, 0.46, 0.28, 0.1])
+    assert rounds[5][0] < last[0]
     cfg.anneal = False
     assert cfg.rate(17, 7, 10) == 1
 

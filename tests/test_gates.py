@@ -72,12 +72,12 @@ def test_a_policy_as_good_as_the_expert_is_left_alone(task):
 
 
 @pytest.mark.parametrize(
-    ("name", "rescued"), [("middle", 6), ("search", 6), ("push", 5), ("still", 6), ("restless", 3)]
+    ("name", "rescued"), [("middle", 4), ("search", 5), ("push", 5), ("still", 6), ("restless", 3)]
 )
 @pytest.mark.parametrize("task", TASKS)
 def test_a_bad_policy_is_rescued(task, name, rescued):
-    """Alone these policies solve at most every fifth episode (`test_tasks.py` has the blind ones)."""
-    env = make(task)
+    """Alone these policies solve at most every fifth episode (`test_tasks.py` has the blind ones). The expert needs time."""
+    env = make(task, horizon=350)
     episodes = [roll_out(env, seed, name) for seed in range(3000, 3006)]
     env.close()
     assert sum(success for success, _, _ in episodes) >= rescued
@@ -110,8 +110,8 @@ def until(env, gate, expert, phase: str) -> None:
         env.unwrapped.advance(action)
 
 
-def at_phase(task: str, phase: str, seed: int = 1, config: GateConfig | None = None):
-    env = make(task)
+def at_phase(task: str, phase: str, seed: int = 1, config: GateConfig | None = None, **options):
+    env = make(task, **options)
     env.reset(seed=seed)
     expert = env.unwrapped.scripted_expert()
     gate = InterventionGate(env.unwrapped, env.unwrapped.scripted_expert(), config)
@@ -120,20 +120,59 @@ def at_phase(task: str, phase: str, seed: int = 1, config: GateConfig | None = N
     return env, gate
 
 
-@pytest.mark.parametrize(
-    ("task", "phase", "action", "reason", "fitting"),
-    [
-        ("OccludedGrasp-v0", "sweep", [0, 0, 0, 1], "closes", "sweep"),
-        ("OccludedGrasp-v0", "hop", [0, 0, 0, 1], "closes", "hop"),
-        ("OccludedGrasp-v0", "lift", [0, 0, 0, -1], "opens", "lift"),
-        ("OccludedPickPlace-v0", "approach", [0, 0, 0, 1], "closes", "approach"),
-        ("OccludedPickPlace-v0", "carry", [0, 0, 0, -1], "opens", "carry"),
-    ],
-)
-def test_before_a_mistake_is_final_the_expert_goes_on_where_the_policy_is(task, phase, action, reason, fitting):
-    env, gate = at_phase(task, phase)
-    assert gate.wants_control(np.array(action, float))
-    assert (gate.reason, gate.expert.phase) == (reason, fitting)
+@pytest.mark.parametrize(("task", "phase"), [("OccludedGrasp-v0", "lift"), ("OccludedPickPlace-v0", "carry")])
+def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(task, phase):
+    env, gate = at_phase(task, phase, config=GateConfig(still_steps=100), horizon=350)
+    hold, let_go = np.array([0, 0, 0, 1.0]), np.array([0, 0, 0, -1.0])
+    assert not env.unwrapped.gripper_obeys
+    assert not gate.wants_control(let_go)  # nothing happens yet: the fingers have just closed
+    while not env.unwrapped.gripper_obeys:
+        env.unwrapped.advance(hold)
+        assert not gate.wants_control(hold)
+    assert gate.wants_control(let_go)
+    assert (gate.reason, gate.expert.phase) == ("opens", phase)
+    env.close()
+
+
+def play(env, gate, action, n_steps: int) -> int:
+    """The policy does the same at every step until the expert takes over; returns how often it did."""
+    for step in range(n_steps):
+        if gate.wants_control(action):
+            return step
+        env.unwrapped.advance(action)
+    raise AssertionError(f"nobody took over in {n_steps} steps")
+
+
+def finish(env, gate) -> bool:
+    """The expert acts as long as it wants to, and a policy that lifts after it; whether the task was solved."""
+    done, info = False, {}
+    while not done:
+        up = np.array([0, 0, 0.3, 1.0])
+        _, terminated, truncated, info = env.unwrapped.advance(gate.act() if gate.wants_control(up) else up)
+        done = terminated or truncated
+    return info["is_success"]
+
+
+def test_a_hand_that_stays_on_top_of_the_cube_searches_anew():
+    env, gate = at_phase("OccludedGrasp-v0", "descend", horizon=350)
+    task_env = env.unwrapped
+    while task_env.eef_position[1] < task_env.cube_position[1] + 0.02:  # a hop that is 2 cm too long
+        task_env.advance(np.array([0, 0.15, 0.1, -1.0]))
+        assert not gate.wants_control(STAY)
+    play(env, gate, np.array([0, 0, -0.2, -1.0]), 30)
+    assert (gate.reason, gate.expert.phase) == ("landed", "retreat")
+    assert task_env.eef_position[2] > 0.8 + GateConfig().grasp_height
+    assert finish(env, gate)
+    env.close()
+
+
+def test_fingers_that_closed_on_nothing_bring_the_expert_which_waits_until_they_open():
+    env, gate = at_phase("OccludedGrasp-v0", "sweep", horizon=350)
+    taken_after = play(env, gate, np.array([0, 0, 0, 1.0]), 20)
+    assert gate.reason == "empty"
+    assert taken_after > 3
+    assert env.unwrapped.finger_positions.sum() < GateConfig().empty_opening
+    assert finish(env, gate)
     env.close()
 
 

@@ -253,6 +253,11 @@ class CartesianController:
         self.finger_target = float(fingers[-1])
         return controls
 
+    @property
+    def gripper_obeys(self) -> bool:
+        """Whether a change of the gripper's command takes effect in the next step."""
+        return self._steps_since_change >= self._cooldown_steps
+
     def _update_gripper(self, close: bool) -> None:
         self._steps_since_change += 1
         if close != self._closed and self._steps_since_change > self._cooldown_steps:

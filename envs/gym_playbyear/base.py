@@ -258,6 +258,11 @@ class PlayByEarEnv(gym.Env):
         return self.data.site_xpos[self._tcp].copy()
 
     @property
+    def gripper_obeys(self) -> bool:
+        """Whether a change of the gripper's command takes effect in the next step; for 2 s after the last one it does not."""
+        return self._controller.gripper_obeys
+
+    @property
     def cube_position(self) -> np.ndarray:
         """(3,) the cube's centre [m, world frame]."""
         return self.data.xpos[self._cube].copy()

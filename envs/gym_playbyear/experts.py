@@ -44,7 +44,12 @@ class ExpertConfig:
 
 
 CORRECTING_EXPERT = ExpertConfig(
-    sweep_step=(0.008, 0.011), pause_probability=0.0, dwell=(0, 1), rise_step=(0.013, 0.018), hover=(0, 1)
+    sweep_step=(0.008, 0.011),
+    pause_probability=0.0,
+    pause=(0, 1),
+    dwell=(0, 1),
+    rise_step=(0.013, 0.018),
+    hover=(0, 1),
 )
 """An expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
 

@@ -3,6 +3,10 @@
 The rules are the authors' (missed and moved on, late and hovering, dropped after lifting), and a few that come before a
 mistake is final: in our tasks a cube shoved over 3 cm ends the attempt, and fingers closed beside the cube stay closed for
 2 s. A gate looks at the state behind the scenes, and at the action that the policy is about to take.
+
+A policy can learn from a correction if what it senses tells it what to do. Therefore the gates wait until a mistake can be
+noticed: fingers closed on nothing, a hand that stays on top of the cube. And the expert does not go where only it knows the
+cube to be: it rises and searches anew, as in a demonstration.
 """
 
 from collections import deque
@@ -35,14 +39,15 @@ class GateConfig:
         still_steps, still_distance: The hand moved less than this in so many steps.
         shove_share, push_step: The cube was shoved by this share of what ends the attempt, and the policy goes on pushing by
             at least this much.
-        grasp_reach, grasp_height: Fingers may close when the cube is this near to their middle along the table, and their tips
-            this low.
-        land_reach: Fingers may come down when the cube is this near to their middle.
+        grasp_reach, grasp_height: The cube is between the fingers when it is this near to their middle along the table, and
+            their tips are this low.
+        landed_steps: The hand touched the cube from above for so long.
+        empty_opening: Fingers that were closed, and are this near to each other, hold nothing.
         release_reach: Fingers may open when the held cube is this near to the tray's middle.
         drop_distance: A cube that was held and is this far from the hand was dropped.
         stray_x, stray_y: How far a hand that searches on the table may be beside the line of the sweep, and before its start.
         hop_past: How far a hand that rose after the touch may go past the cube.
-        memory_steps: How long after a touch the expert may act on it; the policy hears 2 s. Later it searches anew.
+        memory_steps: How long the policy hears a touch; what it does then is judged by its result.
         search_step, travel_step: What the expert covers per step in the sweep and elsewhere, for what follows.
         grasp_steps, lift_steps, place_steps: What it needs from the touch until the fingers hold, to lift, and to release.
         slack_steps: It takes over when it has only so many steps more than it needs.
@@ -59,7 +64,8 @@ class GateConfig:
     push_step: float = 0.003
     grasp_reach: float = 0.012
     grasp_height: float = 0.034
-    land_reach: float = 0.009
+    landed_steps: int = 8
+    empty_opening: float = 0.03
     release_reach: float = 0.02
     drop_distance: float = 0.04
     stray_x: float = 0.03
@@ -89,9 +95,10 @@ class InterventionGate:
     def __init__(self, env, expert: GraspExpert, config: GateConfig | None = None):
         self.env, self.expert, self.config = env, expert, config or GateConfig()
         self.reason: str | None = None
-        self._stage = SEARCH
         self._n_steps = 0
         self._touched_at: int | None = None
+        self._on_top_for = 0  # steps
+        self._hands_back_at = CARRY + 1
         self._was_held = False
         self._first_cube = env.cube_position
         self._positions: deque[np.ndarray] = deque(maxlen=self.config.still_steps + 1)
@@ -105,13 +112,12 @@ class InterventionGate:
         """
         action = np.asarray(policy_action, dtype=float)
         self._look()
-        if self.reason is not None and _STAGES[self.expert.phase] > self._stage:
+        if self.reason is not None and _STAGES[self.expert.phase] >= self._hands_back_at:
             self.reason = None  # found, held or lifted: the policy may go on
         if self.reason is None:
             self.reason = self._find_reason(action)
             if self.reason is not None:
                 self._take_over()
-        self._stage = _STAGES[self.expert.phase]
         self._last_action = action
         self._n_steps += 1
         return self.reason is not None
@@ -120,6 +126,8 @@ class InterventionGate:
         """The expert's action (4,) for the present state."""
         if self.expert.phase == "descend" and not self._is_open():
             self.expert.phase = "hop"  # fingers that the policy closed take their time to open: wait above the cube
+        if self.expert.phase == "lower" and (self._hears() or not self._is_open()):
+            self.expert.phase = "approach"  # a new search begins as the first did: in silence
         return self.expert.act()
 
     # What there is to see
@@ -127,6 +135,7 @@ class InterventionGate:
     def _look(self) -> None:
         if self.env.contact_forces["gripper-cube"] > self.expert.config.contact_force:
             self._touched_at = self._n_steps
+        self._on_top_for = self._on_top_for + 1 if self._is_on_top() else 0
         self._was_held |= self._holds() and self._cube_height() > 0.01
         self._positions.append(self.env.eef_position)
 
@@ -157,8 +166,8 @@ class InterventionGate:
     def _touches(self) -> bool:
         return self._touched_at is not None and self._n_steps - self._touched_at < 3
 
-    def _knows(self) -> bool:
-        """Whether the last touch is recent enough to act on."""
+    def _hears(self) -> bool:
+        """Whether the policy can still hear the last touch."""
         return self._touched_at is not None and self._n_steps - self._touched_at <= self.config.memory_steps
 
     def _is_over_tray(self) -> bool:
@@ -177,15 +186,15 @@ class InterventionGate:
         holds = self._holds()
         checks = {
             "pushes": self._drags(action) if holds else self._pushes(action),
-            "lands": not holds and self._lands(action),
-            "closes": not holds and action[3] > 0 and self._is_open() and not self._is_between(),
-            "opens": holds and action[3] <= 0,
+            "landed": self._on_top_for > self.config.landed_steps,
+            "empty": not holds and self.env.finger_positions.sum() < self.config.empty_opening,
+            "opens": holds and action[3] <= 0 and self.env.gripper_obeys,
             "dropped": not holds and self._was_held and np.linalg.norm(self._offset()) > self.config.drop_distance,
             "missed": not holds and not self._was_held and self._missed(),
             "strayed": not holds and self._strayed(),
             "hovers": not holds and self._hovers(action),
             "still": self._is_still(),
-            "late": self.env._max_episode_steps - self._n_steps <= self._steps_needed() + self.config.slack_steps,
+            "late": self._is_late(),
         }
         return next((reason for reason, applies in checks.items() if applies), None)
 
@@ -204,11 +213,11 @@ class InterventionGate:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
         return bool(moved > self.config.shove_share * self.env.variant.max_shove)
 
-    def _lands(self, action: np.ndarray) -> bool:
-        """Comes down on the cube that it found, instead of around it."""
-        beside, above = np.abs(self._offset()[:2]).max(), self._height() > self.config.grasp_height
-        comes_down = self._knows() and action[2] * ACTION_SCALE < -2 * self.config.push_step
-        return bool(above and comes_down and self.config.land_reach < beside < self.expert.reach - 0.005)
+    def _is_on_top(self) -> bool:
+        """Whether the hand came down on the cube instead of around it."""
+        over = np.abs(self._offset()[:2]).max() < self.expert.reach - 0.01
+        too_high = self.config.grasp_height < self._height() < self.expert.config.clear_height - 0.01
+        return bool(over and too_high and self._touches() and not self._holds())
 
     def _missed(self) -> bool:
         """High above the table without the cube, although it was touched or should have been."""
@@ -238,6 +247,12 @@ class InterventionGate:
         full = len(self._positions) == self._positions.maxlen
         return bool(full and np.linalg.norm(last - first) < self.config.still_distance)
 
+    def _is_late(self) -> bool:
+        """Has only as many steps left as the expert needs. What comes after a touch is judged by its result."""
+        left = self.env._max_episode_steps - self._n_steps
+        is_grasping = self._hears() and not self._holds()
+        return not is_grasping and left <= self._steps_needed() + self.config.slack_steps
+
     def _steps_needed(self) -> float:
         """How many steps the expert needs from here, roughly."""
         config, expert, tray = self.config, self.expert, getattr(self.env, "bin_position", None)
@@ -246,8 +261,6 @@ class InterventionGate:
             needed += config.place_steps + abs(self.env.cube_position - tray)[1] / config.travel_step
         if self._holds():
             return needed
-        if self._knows():
-            return needed + config.grasp_steps * self._share_of_grasp_left()
         needed += config.grasp_steps
         start = np.array([expert.x, expert.sweep_start, TABLE_TOP + expert.config.sweep_height])
         sweeps_from = expert.sweep_start
@@ -257,51 +270,43 @@ class InterventionGate:
             needed += np.abs(start - self.env.eef_position).sum() / config.travel_step
         return needed + max(0.0, self.env.cube_position[1] - expert.reach - sweeps_from) / config.search_step
 
-    def _share_of_grasp_left(self) -> float:
-        if self._is_between():
-            return 0.25
-        if np.abs(self._offset()[:2]).max() < self.config.grasp_reach:
-            return 0.5
-        return 0.75 if self._height() > self.expert.config.clear_height - 0.01 else 1.0
-
     # Where to begin
 
     def _take_over(self) -> None:
-        """Starts the expert in the phase that fits what the hand is doing."""
+        """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
         self._positions.clear()
         self._was_held = self._holds()
-        self.expert.begin_at(self._fitting_phase())
+        phase = self._fitting_phase()
+        self.expert.begin_at(phase)
+        is_searching = self._touched_at is None and self.reason != "late"
+        self._hands_back_at = GRASP if is_searching else max(LIFT, _STAGES[phase] + 1)
+        if self.reason == "opens":
+            self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
 
     def _fitting_phase(self) -> str:
-        config = self.expert.config
         if self._holds():
             high = self._height() > getattr(self.expert, "carry_height", np.inf) - 0.01
             return "release" if self._is_over_tray() else "carry" if high else "lift"
-        if not self._knows():
-            return self._fitting_search_phase()
-        if self._is_between():
+        if self._is_between() and self._is_open() and self._hears():
             return "grasp"
-        if self._touches() and self._is_low():
+        if self._touches() and self._is_low() and self._offset()[1] > self.expert.reach - 0.01:
             return "dwell"
-        if self._height() > config.clear_height - 0.02:
-            return "hop"
-        return "descend" if abs(self._offset()[1]) < config.tolerance and self._is_open() else "rise"
+        return self._fitting_search_phase()
 
     def _fitting_search_phase(self) -> str:
-        config = self.expert.config
         start = np.array([self.expert.x, self.expert.sweep_start])
         if self._can_sweep():
             return "sweep"
         if np.linalg.norm(self.env.eef_position[:2] - start) < 0.02:
             return "lower"
-        is_low = self._height() < config.travel_height - 0.02
+        is_low = self._height() < self.expert.config.travel_height - 0.02
         return "retreat" if is_low and not self._before_cube() else "approach"
 
     def _can_sweep(self) -> bool:
-        """Whether the hand is on the line of the sweep, before the cube."""
+        """Whether the hand is on the line of the sweep, before the cube, and has not just touched it."""
         x, y, _ = self.env.eef_position
         on_line = abs(x - self.expert.x) < 0.015 and y > self.expert.sweep_start - self.config.stray_y
-        return bool(on_line and self._is_low() and self._before_cube())
+        return bool(on_line and self._is_low() and self._before_cube() and not self._hears())
 
     def _is_low(self) -> bool:
         return self._height() < self.expert.config.sweep_height + 0.012

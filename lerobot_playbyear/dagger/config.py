@@ -75,7 +75,8 @@ class DaggerConfig:
         learning_rate: Of Adam, the largest of each round. The schedule that the policy was trained with has ended, and its
             last rate was next to nothing.
         anneal: Whether the rate falls to 0 over the updates of each round (a cosine), so that the policy that acts next has
-            settled. Otherwise it is constant.
+            settled; and its largest over the rounds to a tenth, so that the last policy is the most settled. Otherwise it
+            is constant.
         warmup_updates: Over so many first updates of the run the rate rises, until Adam has its averages.
         seed: Of the random numbers of training, and of the first evaluation episode, as in lerobot-train.
         episode_seed: Of the first attempt; further ones take the next, but none of the evaluation's.
@@ -170,9 +171,16 @@ class DaggerConfig:
             number: Updates of the round before it.
             n_updates: Updates of the round.
         """
-        rise = min(1.0, (step + 1) / max(self.warmup_updates, 1))
-        fall = 0.5 * (1 + math.cos(math.pi * number / n_updates)) if self.anneal else 1.0
-        return self.learning_rate * rise * fall
+        rate = self.learning_rate * min(1.0, (step + 1) / max(self.warmup_updates, 1))
+        if not self.anneal:
+            return rate
+        done = min(1.0, (step - number) / self.total_updates)
+        return rate * (1 - 0.9 * done) * 0.5 * (1 + math.cos(math.pi * number / n_updates))
+
+    @property
+    def total_updates(self) -> int:
+        """Updates of a run that keeps all attempts it is asked for."""
+        return self.updates or max(self.episodes - self.warmup_episodes + 1, 1) * self.updates_per_episode
 
     def training(self) -> PlaybyearTrainConfig:
         """The same as options of playbyear-train, for what HG-DAgger shares with it."""
@@ -189,7 +197,7 @@ class DaggerConfig:
             resume=self.resume,
             seed=self.seed,
             batch_size=self.batch_size,
-            steps=self.updates or max(self.episodes - self.warmup_episodes + 1, 1) * self.updates_per_episode,
+            steps=self.total_updates,
             num_workers=0,
             env_eval_freq=0,
             optimizer=optimizer,

@@ -1,0 +1,79 @@
+"""Whether windows that share encodings teach as much as windows that do not: the same number of windows, K per run.
+
+    python -m experiments.run_length --jobs=2
+
+Every update supervises 64 windows: of 64 runs (K = 1, as in the paper), of 8 (K = 8), or of 4 (K = 16). Beside the success
+stands the loss on demonstrations that no training saw, and the minutes. A small budget, so that K = 1 is done in 20 minutes;
+the figures compare, and say nothing about what a policy can reach.
+"""
+
+import argparse
+import json
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies.factory import make_pre_post_processors
+
+from experiments.protocol import RESULTS, TASKS, TRAINING_SEEDS, Result, dataset_root, record
+from experiments.training import Job, train_and_evaluate
+from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.training import PolicyWindows
+
+STUDY = "run_length"
+N_WINDOWS = 64  # per update
+RUN_LENGTHS = (1, 8, 16)
+STEPS = 1000
+N_DEMONSTRATIONS, N_RECORDED = 50, 100  # what is recorded beyond the demonstrations is held out
+
+
+def job_of(task: str, run_length: int, seed: int) -> Job:
+    options = (f"--policy.n_supervised_steps={run_length}", f"--batch_size={N_WINDOWS // run_length}")
+    return Job(STUDY, task, "full", seed, N_DEMONSTRATIONS, STEPS, options=options, variant=f"k{run_length}")
+
+
+@torch.no_grad()
+def held_out_loss(job: Job) -> float:
+    """The mean squared error over the held-out demonstrations, as in a rollout: float32, no augmentation."""
+    policy = PlaybyearPolicy.from_pretrained(job.checkpoint).eval()
+    preprocessor, _ = make_pre_post_processors(policy.config, pretrained_path=str(job.checkpoint))
+    episodes = list(range(N_DEMONSTRATIONS, N_RECORDED))
+    dataset = LeRobotDataset(f"experiments/{job.task}", root=dataset_root(job.task), episodes=episodes)
+    policy.config.n_supervised_steps = 1  # every frame once
+    windows = PolicyWindows(policy.config, dataset.meta)
+    store = EpisodeStore.from_dataset(dataset, windows.keys)
+    losses = []
+    for part in np.array_split(np.arange(len(store)), max(1, len(store) // 256)):
+        batch = preprocessor(windows.batch(store, torch.from_numpy(part)))
+        losses.append(len(part) * policy.forward(batch)[1]["mse"])
+    return float(sum(losses) / len(store))
+
+
+def study(job: Job) -> tuple[Result, float]:
+    """Trains, evaluates, and keeps the figures: success and minutes, and the loss on held-out demonstrations."""
+    result = train_and_evaluate(job)
+    path = RESULTS / STUDY / "held_out_loss" / f"{job.name}.json"
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(held_out_loss(job)) + "\n")
+    return result, json.loads(path.read_text())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", choices=TASKS, default=TASKS[0])
+    parser.add_argument("--run_lengths", nargs="+", type=int, default=RUN_LENGTHS)
+    parser.add_argument("--seeds", nargs="+", type=int, default=TRAINING_SEEDS, help="of training")
+    parser.add_argument("--jobs", type=int, default=1, help="policies that are trained side by side")
+    options = parser.parse_args()
+    record(options.task, N_RECORDED)
+    jobs = [job_of(options.task, length, seed) for seed in options.seeds for length in options.run_lengths]
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for job, (result, loss) in zip(jobs, pool.map(study, jobs), strict=True):
+            print(f"{job.name}: {result.rate:.0%}, held-out loss {loss:.4f}, {result.minutes} min", flush=True)
+
+
+if __name__ == "__main__":
+    main()
