@@ -17,7 +17,7 @@ from reference import Reference, random_windows
 from torch import nn
 
 REFERENCE_WINDOWS = 4  # per update; its cost per window does not depend on it
-RUNS = {8: 2, 16: 2, 32: 1}  # windows per run, K, and runs per update
+RUNS = {8: 2, 16: 2, 32: 2}  # windows per run, K, and runs per update
 WANTED_AT_DEFAULT, WANTED_AT_32 = 10, 20  # times the published scheme
 OVERHEAD_WANTED = 1.3
 

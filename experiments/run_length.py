@@ -3,7 +3,7 @@
     python -m experiments.run_length --jobs=2
 
 Every update supervises 64 windows: of 64 runs (K = 1, as in the paper), of 8 (K = 8), or of 4 (K = 16). Beside the success
-stands the loss on demonstrations that no training saw, and the minutes. A small budget, so that K = 1 is done in 20 minutes;
+stands the loss on demonstrations that no training saw, and the minutes. A small budget, so that K = 1 is done in 10 minutes;
 the figures compare, and say nothing about what a policy can reach.
 """
 
@@ -25,7 +25,7 @@ from lerobot_playbyear.training import PolicyWindows
 STUDY = "run_length"
 N_WINDOWS = 64  # per update
 RUN_LENGTHS = (1, 8, 16)
-STEPS = 1000
+STEPS = 600
 N_DEMONSTRATIONS, N_RECORDED = 50, 100  # what is recorded beyond the demonstrations is held out
 
 

@@ -5,18 +5,19 @@ mistake is final: in our tasks a cube shoved over 3 cm ends the attempt, and fin
 2 s. A gate looks at the state behind the scenes, and at the action that the policy is about to take.
 
 A policy can learn from a correction if what it senses tells it what to do. Therefore the gates wait until a mistake can be
-noticed: fingers closed on nothing, a hand that stays on top of the cube. And the expert does not go where only it knows the
-cube to be: it rises and searches anew, as in a demonstration.
+noticed: a hop whose beginning the policy still remembers goes wrong, fingers closed on nothing, the hand stays on top of the
+cube. And the expert does not go where only it knows the cube to be: it ends that hop, or it rises and searches anew, as in a
+demonstration.
 """
 
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.base import ACTION_SCALE
 from gym_playbyear.experts import GraspExpert
+from gym_playbyear.gate_config import GateConfig
 
 SEARCH, GRASP, LIFT, CARRY = range(4)
 _STAGES = {
@@ -25,59 +26,6 @@ _STAGES = {
     "lift": LIFT,
     **dict.fromkeys(("carry", "release"), CARRY),
 }
-
-
-@dataclass(frozen=True)
-class GateConfig:
-    """When the expert takes over. Lengths in metres, durations in control steps, shares of the episode's steps.
-
-    Attributes:
-        missed_height: The hand is this far above the table after it touched the cube, without it: it missed and moved on.
-        search_share: From this share on, the same height without a touch counts as well.
-        hover_share, hover_distance, hover_change: From this share on, open fingers this near the cube that hardly change the
-            policy's action.
-        still_steps, still_distance: The hand moved less than this in so many steps.
-        shove_share, push_step: The cube was shoved by this share of what ends the attempt, and the policy goes on pushing by
-            at least this much.
-        grasp_reach, grasp_height: The cube is between the fingers when it is this near to their middle along the table, and
-            their tips are this low.
-        landed_steps: The hand touched the cube from above for so long.
-        empty_opening: Fingers that were closed, and are this near to each other, hold nothing.
-        release_reach: Fingers may open when the held cube is this near to the tray's middle.
-        drop_distance: A cube that was held and is this far from the hand was dropped.
-        stray_x, stray_y: How far a hand that searches on the table may be beside the line of the sweep, and before its start.
-        hop_past: How far a hand that rose after the touch may go past the cube.
-        memory_steps: How long the policy hears a touch; what it does then is judged by its result.
-        search_step, travel_step: What the expert covers per step in the sweep and elsewhere, for what follows.
-        grasp_steps, lift_steps, place_steps: What it needs from the touch until the fingers hold, to lift, and to release.
-        slack_steps: It takes over when it has only so many steps more than it needs.
-    """
-
-    missed_height: float = 0.12
-    search_share: float = 0.35
-    hover_share: float = 0.8
-    hover_distance: float = 0.05
-    hover_change: float = 0.05
-    still_steps: int = 24
-    still_distance: float = 0.005
-    shove_share: float = 0.3
-    push_step: float = 0.003
-    grasp_reach: float = 0.012
-    grasp_height: float = 0.034
-    landed_steps: int = 8
-    empty_opening: float = 0.03
-    release_reach: float = 0.02
-    drop_distance: float = 0.04
-    stray_x: float = 0.03
-    stray_y: float = 0.12
-    hop_past: float = 0.03
-    memory_steps: int = 40
-    search_step: float = 0.0085
-    travel_step: float = 0.016
-    grasp_steps: int = 25
-    lift_steps: int = 5
-    place_steps: int = 30
-    slack_steps: int = 3
 
 
 class InterventionGate:
@@ -97,6 +45,8 @@ class InterventionGate:
         self.reason: str | None = None
         self._n_steps = 0
         self._touched_at: int | None = None
+        self._touched_y = np.nan
+        self._hopped_for = 0  # steps
         self._on_top_for = 0  # steps
         self._hands_back_at = CARRY + 1
         self._was_held = False
@@ -135,6 +85,10 @@ class InterventionGate:
     def _look(self) -> None:
         if self.env.contact_forces["gripper-cube"] > self.expert.config.contact_force:
             self._touched_at = self._n_steps
+            if self._is_low():
+                self._touched_y = self.env.eef_position[1]
+        is_there = abs(self.env.eef_position[1] - self._touched_y) < self.config.touch_reach
+        self._hopped_for = 0 if is_there else self._hopped_for + 1
         self._on_top_for = self._on_top_for + 1 if self._is_on_top() else 0
         self._was_held |= self._holds() and self._cube_height() > 0.01
         self._positions.append(self.env.eef_position)
@@ -186,6 +140,7 @@ class InterventionGate:
         holds = self._holds()
         checks = {
             "pushes": self._drags(action) if holds else self._pushes(action),
+            "beside": not holds and self._goes_beside(action),
             "landed": self._on_top_for > self.config.landed_steps,
             "empty": not holds and self.env.finger_positions.sum() < self.config.empty_opening,
             "opens": holds and action[3] <= 0 and self.env.gripper_obeys,
@@ -212,6 +167,15 @@ class InterventionGate:
     def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
         return bool(moved > self.config.shove_share * self.env.variant.max_shove)
+
+    def _goes_beside(self, action: np.ndarray) -> bool:
+        """Hops too far, or comes down too early, and still remembers from where it hopped."""
+        in_the_air = self.config.grasp_height < self._height() < self.expert.config.clear_height + 0.02
+        if not (self._hears() and 0 < self._hopped_for <= self.config.hop_steps and in_the_air):
+            return False
+        along = self._offset()[1]
+        comes_down = action[2] * ACTION_SCALE < -self.config.push_step
+        return bool(along < -self.config.beside_reach or (comes_down and along > self.config.beside_reach))
 
     def _is_on_top(self) -> bool:
         """Whether the hand came down on the cube instead of around it."""
@@ -291,6 +255,8 @@ class InterventionGate:
             return "grasp"
         if self._touches() and self._is_low() and self._offset()[1] > self.expert.reach - 0.01:
             return "dwell"
+        if self.reason == "beside":
+            return "hop"
         return self._fitting_search_phase()
 
     def _fitting_search_phase(self) -> str:
