@@ -106,6 +106,26 @@ def correction_table() -> list[str]:
     return [*lines, ""]
 
 
+def run_length_table(task: str) -> list[str]:
+    """What windows that share encodings teach, beside windows that do not: as many of them, and what they took."""
+    lines = []
+    for length in (1, 8, 16):
+        results = load_results(f"run_length/{task}-full-k{length}-*.json")
+        if results:
+            paths = (RESULTS / "run_length" / "held_out_loss").glob(f"{task}-full-k{length}-*.json")
+            losses = ", ".join(f"{json.loads(path.read_text()):.4f}" for path in sorted(paths))
+            minutes = ", ".join(f"{result.minutes:.1f}" for result in results)
+            lines.append(f"| {length} | {percent(results)} | {losses} | {minutes} |")
+    if not lines:
+        return []
+    head = [
+        f"### {task}: windows per run, K",
+        "",
+        "| K | success (95 % interval) | training seeds | held-out loss | minutes |",
+    ]
+    return [*head, "|---|---|---|---|---|", *lines, ""]
+
+
 def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
     try:
         return float(item[0]), ""
@@ -120,7 +140,7 @@ def main() -> None:
     lines += listening_table()
     for task in TASKS:
         lines += demonstration_table(task)
-        lines += curve_table("noise", task) + curve_table("materials", task)
+        lines += curve_table("noise", task) + curve_table("materials", task) + run_length_table(task)
     print("\n".join(lines + correction_table()))
 
 
