@@ -36,6 +36,9 @@ results = {**norm.state_dict(), "loss": loss.detach(), "weight.grad": norm.weigh
 results |= {f"spectrogram.{key}": value for key, value in spectrogram.state_dict().items()}
 results = {key: value.clone().contiguous() for key, value in results.items()} | {"images.grad": images.grad}
 save_file(results, f"{folder}/{n_processes}.{rank}.safetensors")
+if n_processes > 1:  # gloo's threads end with their group, not with the interpreter
+    torch.distributed.barrier()
+    torch.distributed.destroy_process_group()
 """
 
 
