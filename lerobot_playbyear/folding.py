@@ -35,23 +35,17 @@ def fold_batch_norm(network: ResNet) -> ResNet:
 class PackedResNet:
     """The forward pass of a folded ResNet on a CPU, by oneDNN's convolutions as torch's own compiler calls them.
 
-    Weights are packed once, as the convolution of this size reads them; ReLU and the shortcut's sum are part of the
-    convolution. PyTorch by itself packs at every call, makes passes of their own of both, and takes another, slower
+    Weights are packed once, as the convolution of the first size seen reads them; ReLU and the shortcut's sum are part of
+    the convolution. PyTorch by itself packs at every call, makes passes of their own of both, and takes another, slower
     convolution for single small pictures.
 
     Args:
         folded: Of `fold_batch_norm`.
-        shape: Of what it looks at, (N, C, H, W); N may be another later.
     """
 
-    def __init__(self, folded: ResNet, shape: torch.Size) -> None:
+    def __init__(self, folded: ResNet) -> None:
         self._network = folded
         self._weights: dict[nn.Module, Tensor] = {}
-        convolutions = [module for module in folded.modules() if isinstance(module, nn.Conv2d)]
-        hooks = [module.register_forward_hook(self._pack) for module in convolutions]
-        folded(torch.zeros(shape).contiguous(memory_format=torch.channels_last))
-        for hook in hooks:
-            hook.remove()
 
     @staticmethod
     def suits(stacks: Tensor) -> bool:
@@ -73,23 +67,17 @@ class PackedResNet:
                 maps = self._convolve(block.conv2, inner, "relu", plus=maps)
         return network.avgpool(maps).flatten(1)
 
-    def _pack(self, module: nn.Module, inputs: tuple[Tensor], _: Tensor) -> None:
-        assert isinstance(module, nn.Conv2d)
-        geometry = _geometry(module)
-        self._weights[module] = torch.ops.mkldnn._reorder_convolution_weight(
-            module.weight.detach(), *geometry, list(inputs[0].shape)
-        )
-
     def _convolve(self, module: nn.Module, maps: Tensor, then: str, plus: Tensor | None = None) -> Tensor:
         assert isinstance(module, nn.Conv2d)
-        packed = (self._weights[module], module.bias, *_geometry(module))
+        geometry = list(module.padding), list(module.stride), list(module.dilation), module.groups
+        if module not in self._weights:
+            with torch.inference_mode(False), torch.no_grad():
+                pack = torch.ops.mkldnn._reorder_convolution_weight
+                self._weights[module] = pack(module.weight.detach(), *geometry, list(maps.shape))
+        packed = self._weights[module], module.bias, *geometry
         if plus is None:
             return torch.ops.mkldnn._convolution_pointwise(maps, *packed, then, [], "")
         return torch.ops.mkldnn._convolution_pointwise.binary(maps, plus, *packed, "add", 1.0, then, [], "")
-
-
-def _geometry(module: nn.Conv2d) -> tuple[Any, ...]:
-    return list(module.padding), list(module.stride), list(module.dilation), module.groups
 
 
 class FoldedCopy:
@@ -115,18 +103,15 @@ class FoldedCopy:
         if not PackedResNet.suits(stacks):
             return folded(stacks)
         if self._packed is None:
-            with torch.inference_mode(False), torch.no_grad():
-                self._packed = PackedResNet(folded, stacks.shape)
+            self._packed = PackedResNet(folded)
         return self._packed(stacks)
 
     def drop(self) -> None:
         """Forgets the copy."""
         self._copy = self._packed = None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "FoldedCopy":
-        return FoldedCopy()  # of another network
-
     def __getstate__(self) -> dict[str, Any]:
+        """Of a copy or a pickle: nothing, for it belongs to another network."""
         return vars(FoldedCopy())
 
 
