@@ -1,13 +1,14 @@
 """What corrections are worth: a middling policy, the same after HG-DAgger, and after as many updates without it.
 
-    python -m experiments.corrections --task=OccludedGrasp-v0 --n_demonstrations=20
+    python -m experiments.corrections --task=OccludedGrasp-v0
 
-1. A policy is trained on few demonstrations.
+1. A policy is trained on five demonstrations.
 2. `playbyear-dagger` keeps 25 attempts in which the expert had to help, and learns from them as they come. These attempts may
    take longer than the task's own, so that the expert has the time to search anew after a mistake.
 3. The control goes on with the same demonstrations, for as many updates at the same largest rate.
 
-All three are evaluated on the same 50 seeds of the task as it is. Resumes where it was interrupted.
+All three are evaluated on the same 50 seeds: in the task's own time, and in that of the attempts, which suffices for a second
+try. Resumes where it was interrupted.
 """
 
 import argparse
@@ -17,16 +18,24 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.protocol import EVALUATION_SEEDS, RUNS, TASKS, library_versions, record, run, shown, tool
+from experiments.protocol import (
+    ATTEMPT_STEPS,
+    EVALUATION_SEEDS,
+    RUNS,
+    TASKS,
+    library_versions,
+    record,
+    run,
+    shown,
+    tool,
+)
 from experiments.training import Job, evaluate, train
 
 STUDY = "corrections"
 SEEDS = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + 50)
 N_EPISODES = 25
-ATTEMPT_STEPS = {"OccludedGrasp-v0": 200, "OccludedPickPlace-v0": 300}
-EVERY = 7  # kept attempts between evaluations
+EVERY = 10  # kept attempts between evaluations
 BATCH_SIZE = 12
-LEARNING_RATE = "3e-4"
 
 
 @dataclass
@@ -36,10 +45,11 @@ class Corrected:
     Attributes:
         task, training_seed, n_demonstrations, steps: How the policy came to be that is corrected.
         first_seed, n_episodes: Of every evaluation.
-        evaluations: Over the kept attempts and the updates, the percentage of successes.
+        evaluations: Over the kept attempts and the updates, the percentages of successes: `success` in the time of the
+            attempts, `in_task_time`, of the first and the last policy, in the task's own.
         attempts: Seed, outcome and share of interventions of each.
         updates: Of HG-DAgger, and of the control.
-        control: The percentage of successes of the control.
+        control: The percentages of successes of the control.
         minutes: Of HG-DAgger with its evaluations, and of the control's training.
         seconds: Where the time of the rounds that made updates went, in all; `total_s` is their length.
         commands: What was run, in order.
@@ -55,15 +65,17 @@ class Corrected:
     evaluations: list[dict[str, float]]
     attempts: list[dict[str, Any]]
     updates: int
-    control: float
+    control: dict[str, float]
     minutes: dict[str, float]
     seconds: dict[str, float]
     commands: list[str]
     versions: dict[str, str] = field(default_factory=library_versions)
 
 
-def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
+def correct(job: Job) -> Corrected:
     """Runs all three parts, or what is missing of them."""
+    assert job.dataset is not None
+    demonstrations, threads = job.dataset, job.threads
     train_command, _ = train(job)
     folder = RUNS / "dagger" / job.name
     dagger = [
@@ -78,7 +90,6 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
         f"--env.episode_length={ATTEMPT_STEPS[job.task]}",
         f"--episodes={N_EPISODES}",
         f"--batch_size={BATCH_SIZE}",
-        f"--learning_rate={LEARNING_RATE}",
         f"--seed={job.training_seed}",
         "--eval_every=0",
         f"--save_every={EVERY}",
@@ -97,11 +108,12 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
     ]
     commands = [train_command, shown(dagger)]
     milestones = {line["round"]: line["step"] for line in rounds if line["round"] % EVERY == 0 or line is rounds[-1]}
-    evaluations = [{"kept": 0, "updates": 0, "success": _percentage(evaluate(job, commands, name=f"{STUDY}-0"))}]
+    first = _evaluations(job, commands, "0", job.checkpoint, is_end=True)
+    evaluations = [{"kept": 0, "updates": 0, **first}]
     for kept, step in milestones.items():
         checkpoint = folder / "checkpoints" / f"{step:06}" / "pretrained_model"
-        successes = evaluate(job, commands, name=f"{STUDY}-{kept}", checkpoint=checkpoint)
-        evaluations.append({"kept": kept, "updates": step, "success": _percentage(successes)})
+        success = _evaluations(job, commands, str(kept), checkpoint, is_end=kept == max(milestones))
+        evaluations.append({"kept": kept, "updates": step, **success})
 
     control_job = replace(job, steps=updates, variant="control")  # its folder; it begins where the job's policy ended
     go_on = [
@@ -114,7 +126,6 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
         f"--save_freq={updates}",
         "--env_eval_freq=0",
         f"--batch_size={BATCH_SIZE}",
-        f"--policy.optimizer_lr={LEARNING_RATE}",
         "--policy.push_to_hub=false",
         f"--seed={job.training_seed}",
         "--wandb.enable=false",
@@ -122,7 +133,7 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
     clock = RUNS / "train" / control_job.name
     control_spent = _minutes(clock) if control_job.checkpoint.exists() else _clocked(go_on, clock, threads)
     commands.append(shown(go_on))
-    control = _percentage(evaluate(control_job, commands))
+    control = _evaluations(control_job, commands, "control", control_job.checkpoint, is_end=True)
     return Corrected(
         task=job.task,
         training_seed=job.training_seed,
@@ -140,8 +151,16 @@ def correct(job: Job, demonstrations: Path, threads: int) -> Corrected:
     )
 
 
-def _percentage(successes: list[bool]) -> float:
-    return 100 * sum(successes) / len(successes)
+def _evaluations(job: Job, commands: list[str], name: str, checkpoint: Path, is_end: bool) -> dict[str, float]:
+    """Percentages of successes in the time of the attempts, and where a policy ends also in the task's own."""
+    times = {"success": (f"--env.episode_length={ATTEMPT_STEPS[job.task]}",), "in_task_time": ()}
+    rates = {}
+    for time_given, options in times.items():
+        if time_given == "success" or is_end:
+            label = f"{STUDY}-{name}-{time_given}"
+            successes = evaluate(job, commands, *options, name=label, checkpoint=checkpoint)
+            rates[time_given] = 100 * sum(successes) / len(successes)
+    return rates
 
 
 def _clocked(command: list[str], folder: Path, threads: int) -> float:
@@ -169,24 +188,25 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", choices=TASKS, default=TASKS[0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of training")
-    parser.add_argument("--n_demonstrations", type=int, default=20)
-    parser.add_argument("--steps", type=int, default=3000, help="updates of the policy that is corrected")
+    parser.add_argument("--n_demonstrations", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=1000, help="updates of the policy that is corrected")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     record(options.task, options.n_demonstrations)
     demonstrations = RUNS / "datasets" / f"{options.task}-{options.n_demonstrations}"
     record(options.task, options.n_demonstrations, demonstrations)
     for seed in options.seeds:
-        job = Job(STUDY, options.task, "full", seed, options.n_demonstrations, options.steps, options.threads, SEEDS)
+        number, steps = options.n_demonstrations, options.steps
+        job = Job(STUDY, options.task, "full", seed, number, steps, options.threads, SEEDS, dataset=demonstrations)
         if not job.result_path.exists():
-            result = correct(job, demonstrations, options.threads)
+            result = correct(job)
             job.result_path.parent.mkdir(parents=True, exist_ok=True)
             job.result_path.write_text(json.dumps(asdict(result)) + "\n")
         result = Corrected(**json.loads(job.result_path.read_text()))
         first, last = result.evaluations[0], result.evaluations[-1]
         print(
             f"{result.task} seed {seed}: {first['success']:.0f} % before, {last['success']:.0f} % with {last['kept']} "
-            f"corrected attempts and {result.updates} updates, {result.control:.0f} % with the updates alone",
+            f"corrected attempts and {result.updates} updates, {result.control['success']:.0f} % with the updates alone",
             flush=True,
         )
 

@@ -80,7 +80,7 @@ def corrections(output: Path) -> None:
         for report in reports:
             kept = [point["kept"] for point in report["evaluations"]]
             axes.plot(kept, [point["success"] for point in report["evaluations"]], marker="o", color=COLOURS["full"])
-            axes.plot(kept[-1], report["control"], marker="x", markersize=9, color=COLOURS["deaf"])
+            axes.plot(kept[-1], report["control"]["success"], marker="x", markersize=9, color=COLOURS["deaf"])
         axes.plot([], [], marker="o", color=COLOURS["full"], label="corrected")
         axes.plot([], [], marker="x", color=COLOURS["deaf"], linestyle="", label="as many updates on demonstrations")
         finish(figure, axes, "attempts with corrections", output / f"corrections-{task}.png")

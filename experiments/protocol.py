@@ -20,6 +20,8 @@ EVALUATION_SEEDS = range(70000, 70100)
 DONOR_SEEDS = range(60000, 60040)  # expert episodes whose sounds the listening probes play
 TRAINING_SEEDS = (1, 2, 3)
 N_DEMONSTRATIONS = 50
+ATTEMPT_STEPS = {"OccludedGrasp-v0": 220, "OccludedPickPlace-v0": 300}  # enough to search a second time
+RUN_LENGTHS = (1, 8, 16)  # windows per run
 STEPS = {"OccludedGrasp-v0": 3000, "OccludedPickPlace-v0": 3000}
 
 CONDITIONS: dict[str, tuple[str, ...]] = {

@@ -3,7 +3,16 @@
 import json
 from collections import defaultdict
 
-from experiments.protocol import CONDITIONS, RESULTS, TASKS, Result, load_results, wilson_interval
+from experiments.protocol import (
+    ATTEMPT_STEPS,
+    CONDITIONS,
+    RESULTS,
+    RUN_LENGTHS,
+    TASKS,
+    Result,
+    load_results,
+    wilson_interval,
+)
 
 
 def percent(results: list[Result]) -> str:
@@ -81,21 +90,23 @@ def listening_table() -> list[str]:
 
 
 def correction_table() -> list[str]:
-    """What corrections are worth, and where the time of a round goes."""
+    """What corrections are worth, in the time of the attempts and in the task's own, and where the time of a round goes."""
     reports = [json.loads(path.read_text()) for path in sorted((RESULTS / "corrections").glob("*.json"))]
     if not reports:
         return []
     lines = [
         "### Corrections",
         "",
-        "| task, demonstrations, training seed | before | corrected | control | updates | minutes |",
+        "| task, demonstrations, training seed | steps | before | corrected | control | updates | minutes |",
     ]
-    lines.append("|---|---|---|---|---|---|")
+    lines.append("|---|---|---|---|---|---|---|")
     for report in reports:
         before, after = report["evaluations"][0], report["evaluations"][-1]
         name = f"{report['task']}, {report['n_demonstrations']}, {report['training_seed']}"
-        rates = f"{before['success']:.0f} % | **{after['success']:.0f} %** | {report['control']:.0f} %"
-        lines.append(f"| {name} | {rates} | {report['updates']} | {report['minutes']['dagger']:.0f} |")
+        cost = f"{report['updates']} | {report['minutes']['dagger']:.0f}"
+        for steps, key in (("the task's own", "in_task_time"), (ATTEMPT_STEPS[report["task"]], "success")):
+            rates = f"{before[key]:.0f} % | **{after[key]:.0f} %** | {report['control'][key]:.0f} %"
+            lines.append(f"| {name} | {steps} | {rates} | {cost} |")
     names = sorted({name for report in reports for name in report["seconds"]} - {"total_s"})
     lines += ["", f"| share of a round | {' | '.join(name.removesuffix('_s') for name in names)} | all of it |"]
     lines.append("|---" * (len(names) + 2) + "|")
@@ -109,7 +120,7 @@ def correction_table() -> list[str]:
 def run_length_table(task: str) -> list[str]:
     """What windows that share encodings teach, beside windows that do not: as many of them, and what they took."""
     lines = []
-    for length in (1, 8, 16):
+    for length in RUN_LENGTHS:
         results = load_results(f"run_length/{task}-full-k{length}-*.json")
         if results:
             paths = (RESULTS / "run_length" / "held_out_loss").glob(f"{task}-full-k{length}-*.json")

@@ -16,7 +16,7 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
 
-from experiments.protocol import RESULTS, TASKS, TRAINING_SEEDS, Result, dataset_root, record
+from experiments.protocol import RESULTS, RUN_LENGTHS, TASKS, TRAINING_SEEDS, Result, dataset_root, record
 from experiments.training import Job, train_and_evaluate
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
@@ -24,7 +24,6 @@ from lerobot_playbyear.training import PolicyWindows
 
 STUDY = "run_length"
 N_WINDOWS = 64  # per update
-RUN_LENGTHS = (1, 8, 16)
 STEPS = 600
 N_DEMONSTRATIONS, N_RECORDED = 50, 100  # what is recorded beyond the demonstrations is held out
 

@@ -27,6 +27,7 @@ class Job:
         study: Folder of its result.
         options: Further options of `playbyear-train`.
         variant: What the options do, for the names of files; empty without any.
+        dataset: Folder of a dataset that holds the demonstrations and no more. None: the first ones of the task's own.
     """
 
     study: str
@@ -39,6 +40,7 @@ class Job:
     evaluation_seeds: range = EVALUATION_SEEDS
     options: tuple[str, ...] = field(default=())
     variant: str = ""
+    dataset: Path | None = None
 
     @property
     def name(self) -> str:
@@ -87,9 +89,7 @@ def train(job: Job) -> tuple[str, float]:
     command = [
         tool("playbyear-train"),
         "--preset=cpu",
-        f"--dataset.repo_id=experiments/{job.task}",
-        f"--dataset.root={dataset_root(job.task)}",
-        f"--dataset.episodes={json.dumps(list(range(job.n_demonstrations)))}",
+        *_demonstrations(job),
         f"--output_dir={folder}",
         f"--steps={job.steps}",
         "--save_freq=500",
@@ -113,6 +113,14 @@ def train(job: Job) -> tuple[str, float]:
     return shown(command).replace(
         json.dumps(list(range(job.n_demonstrations))), f"[0..{job.n_demonstrations - 1}]"
     ), spent
+
+
+def _demonstrations(job: Job) -> list[str]:
+    folder = job.dataset or dataset_root(job.task)
+    options = [f"--dataset.repo_id=experiments/{folder.name}", f"--dataset.root={folder}"]
+    if job.dataset is None:
+        options.append(f"--dataset.episodes={json.dumps(list(range(job.n_demonstrations)))}")
+    return options
 
 
 def evaluate(

@@ -15,6 +15,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.dagger import DaggerError, Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.collector import PolicyActor, collect
 from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
@@ -208,6 +209,13 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
     assert rounds[5][0] < last[0]
     cfg.anneal = False
     assert cfg.rate(17, 7, 10) == 1
+
+
+def test_without_a_rate_the_policy_says_it():
+    cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), policy=PlaybyearConfig(optimizer_lr=2e-3))
+    assert cfg.training().optimizer.lr == cfg.largest_rate == 2e-3
+    cfg.learning_rate = 1e-4
+    assert cfg.training().optimizer.lr == cfg.largest_rate == 1e-4
 
 
 # Who is kept

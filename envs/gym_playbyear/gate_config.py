@@ -17,9 +17,6 @@ class GateConfig:
             at least this much.
         grasp_reach, grasp_height: The cube is between the fingers when it is this near to their middle along the table, and
             their tips are this low.
-        beside_reach: A hop may end this far from the cube.
-        touch_reach, hop_steps: A hop begins where the hand is no longer this near to where it felt the touch (along y); for so
-            long the policy remembers where that was.
         landed_steps: The hand touched the cube from above for so long.
         empty_opening: Fingers that were closed, and are this near to each other, hold nothing.
         release_reach: Fingers may open when the held cube is this near to the tray's middle.
@@ -43,9 +40,6 @@ class GateConfig:
     push_step: float = 0.003
     grasp_reach: float = 0.012
     grasp_height: float = 0.034
-    beside_reach: float = 0.009
-    touch_reach: float = 0.012
-    hop_steps: int = 8
     landed_steps: int = 8
     empty_opening: float = 0.03
     release_reach: float = 0.02

@@ -5,9 +5,8 @@ mistake is final: in our tasks a cube shoved over 3 cm ends the attempt, and fin
 2 s. A gate looks at the state behind the scenes, and at the action that the policy is about to take.
 
 A policy can learn from a correction if what it senses tells it what to do. Therefore the gates wait until a mistake can be
-noticed: a hop whose beginning the policy still remembers goes wrong, fingers closed on nothing, the hand stays on top of the
-cube. And the expert does not go where only it knows the cube to be: it ends that hop, or it rises and searches anew, as in a
-demonstration.
+noticed: fingers closed on nothing, the hand stays on top of the cube. And the expert does not go where only it knows the cube
+to be: it rises and searches anew, as in a demonstration.
 """
 
 from collections import deque
@@ -45,8 +44,6 @@ class InterventionGate:
         self.reason: str | None = None
         self._n_steps = 0
         self._touched_at: int | None = None
-        self._touched_y = np.nan
-        self._hopped_for = 0  # steps
         self._on_top_for = 0  # steps
         self._hands_back_at = CARRY + 1
         self._was_held = False
@@ -85,10 +82,6 @@ class InterventionGate:
     def _look(self) -> None:
         if self.env.contact_forces["gripper-cube"] > self.expert.config.contact_force:
             self._touched_at = self._n_steps
-            if self._is_low():
-                self._touched_y = self.env.eef_position[1]
-        is_there = abs(self.env.eef_position[1] - self._touched_y) < self.config.touch_reach
-        self._hopped_for = 0 if is_there else self._hopped_for + 1
         self._on_top_for = self._on_top_for + 1 if self._is_on_top() else 0
         self._was_held |= self._holds() and self._cube_height() > 0.01
         self._positions.append(self.env.eef_position)
@@ -140,7 +133,6 @@ class InterventionGate:
         holds = self._holds()
         checks = {
             "pushes": self._drags(action) if holds else self._pushes(action),
-            "beside": not holds and self._goes_beside(action),
             "landed": self._on_top_for > self.config.landed_steps,
             "empty": not holds and self.env.finger_positions.sum() < self.config.empty_opening,
             "opens": holds and action[3] <= 0 and self.env.gripper_obeys,
@@ -167,15 +159,6 @@ class InterventionGate:
     def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
         return bool(moved > self.config.shove_share * self.env.variant.max_shove)
-
-    def _goes_beside(self, action: np.ndarray) -> bool:
-        """Hops too far, or comes down too early, and still remembers from where it hopped."""
-        in_the_air = self.config.grasp_height < self._height() < self.expert.config.clear_height + 0.02
-        if not (self._hears() and 0 < self._hopped_for <= self.config.hop_steps and in_the_air):
-            return False
-        along = self._offset()[1]
-        comes_down = action[2] * ACTION_SCALE < -self.config.push_step
-        return bool(along < -self.config.beside_reach or (comes_down and along > self.config.beside_reach))
 
     def _is_on_top(self) -> bool:
         """Whether the hand came down on the cube instead of around it."""
@@ -255,8 +238,6 @@ class InterventionGate:
             return "grasp"
         if self._touches() and self._is_low() and self._offset()[1] > self.expert.reach - 0.01:
             return "dwell"
-        if self.reason == "beside":
-            return "hop"
         return self._fitting_search_phase()
 
     def _fitting_search_phase(self) -> str:

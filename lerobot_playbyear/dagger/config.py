@@ -72,8 +72,8 @@ class DaggerConfig:
         warmup_episodes: Attempts that the dataset holds before the first updates.
         updates: With `episodes=0`, how many updates to make from the corrections that are there.
         batch_size: Runs of windows per update, half of them from the demonstrations.
-        learning_rate: Of Adam, the largest of each round. The schedule that the policy was trained with has ended, and its
-            last rate was next to nothing.
+        learning_rate: Of Adam, the largest of each round. None: the policy's own (`optimizer_lr`). A smaller one leaves a
+            policy that knows its demonstrations by heart where it is, and corrections are learned by heart beside them.
         anneal: Whether the rate falls to 0 over the updates of each round (a cosine), so that the policy that acts next has
             settled; and its largest over the rounds to a tenth, so that the last policy is the most settled. Otherwise it
             is constant.
@@ -103,7 +103,7 @@ class DaggerConfig:
     warmup_episodes: int = 5
     updates: int = 0
     batch_size: int = 24
-    learning_rate: float = 3e-4
+    learning_rate: float | None = None
     anneal: bool = True
     warmup_updates: int = 50
     seed: int = 1000
@@ -149,7 +149,7 @@ class DaggerConfig:
         for name, value in {**least, "max_attempts": 1, "eval_every": 0, "save_every": 0, "eval_videos": 0}.items():
             if getattr(self, name) < value:
                 raise DaggerError(f"--{name}={getattr(self, name)}: give at least {value}.")
-        if not self.learning_rate > 0:
+        if self.learning_rate is not None and not self.learning_rate > 0:
             raise DaggerError(f"--learning_rate={self.learning_rate} must be above 0.")
         if self.batch_size < 2 or self.batch_size % 2:
             raise DaggerError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
@@ -171,11 +171,19 @@ class DaggerConfig:
             number: Updates of the round before it.
             n_updates: Updates of the round.
         """
-        rate = self.learning_rate * min(1.0, (step + 1) / max(self.warmup_updates, 1))
+        rate = self.largest_rate * min(1.0, (step + 1) / max(self.warmup_updates, 1))
         if not self.anneal:
             return rate
         done = min(1.0, (step - number) / self.total_updates)
         return rate * (1 - 0.9 * done) * 0.5 * (1 + math.cos(math.pi * number / n_updates))
+
+    @property
+    def largest_rate(self) -> float:
+        """What `learning_rate` says, or else the policy."""
+        if self.learning_rate is not None:
+            return self.learning_rate
+        assert self.policy is not None
+        return float(self.policy.get_optimizer_preset().lr)
 
     @property
     def total_updates(self) -> int:
@@ -186,7 +194,7 @@ class DaggerConfig:
         """The same as options of playbyear-train, for what HG-DAgger shares with it."""
         assert self.policy is not None
         optimizer = self.policy.get_optimizer_preset()
-        optimizer.lr = self.learning_rate
+        optimizer.lr = self.largest_rate
         source = self.demos
         return PlaybyearTrainConfig(
             dataset=DatasetConfig(source.repo_id, root=source.root, video_backend=source.video_backend),
