@@ -36,6 +36,7 @@ SEEDS = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + 50)
 N_EPISODES = 25
 EVERY = 10  # kept attempts between evaluations
 BATCH_SIZE = 12
+STEPS = {"OccludedGrasp-v0": 1000, "OccludedPickPlace-v0": 3000}  # of five demonstrations, until 20 to 60 % succeed
 
 
 @dataclass
@@ -115,7 +116,7 @@ def correct(job: Job) -> Corrected:
         success = _evaluations(job, commands, str(kept), checkpoint, is_end=kept == max(milestones))
         evaluations.append({"kept": kept, "updates": step, **success})
 
-    control_job = replace(job, steps=updates, variant="control")  # its folder; it begins where the job's policy ended
+    control_job = replace(job, steps=updates, variant=f"control-of-{job.steps}steps")
     go_on = [
         tool("playbyear-train"),
         f"--policy.path={job.checkpoint}",
@@ -189,14 +190,14 @@ def main() -> None:
     parser.add_argument("--task", choices=TASKS, default=TASKS[0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of training")
     parser.add_argument("--n_demonstrations", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=1000, help="updates of the policy that is corrected")
+    parser.add_argument("--steps", type=int, help="updates of the policy that is corrected")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     record(options.task, options.n_demonstrations)
     demonstrations = RUNS / "datasets" / f"{options.task}-{options.n_demonstrations}"
     record(options.task, options.n_demonstrations, demonstrations)
     for seed in options.seeds:
-        number, steps = options.n_demonstrations, options.steps
+        number, steps = options.n_demonstrations, options.steps or STEPS[options.task]
         job = Job(STUDY, options.task, "full", seed, number, steps, options.threads, SEEDS, dataset=demonstrations)
         if not job.result_path.exists():
             result = correct(job)

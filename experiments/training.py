@@ -126,7 +126,7 @@ def _demonstrations(job: Job) -> list[str]:
 def evaluate(
     job: Job, commands: list[str], *environment: str, name: str | None = None, checkpoint: Path | None = None
 ) -> list[bool]:
-    """Rolls a trained policy out over the job's evaluation seeds.
+    """Rolls a trained policy out over the job's evaluation seeds, unless that was done since it was trained.
 
     Args:
         job: What was trained.
@@ -136,10 +136,11 @@ def evaluate(
         checkpoint: Another policy than the job's.
     """
     label = f"{name or job.study}-{job.name}"
+    policy = checkpoint or job.checkpoint
     output = RUNS / "eval" / label
     command = [
         tool("lerobot-eval"),
-        f"--policy.path={checkpoint or job.checkpoint}",
+        f"--policy.path={policy}",
         "--env.type=playbyear",
         f"--env.task={job.task}",
         f"--eval.n_episodes={len(job.evaluation_seeds)}",
@@ -149,7 +150,9 @@ def evaluate(
         f"--output_dir={output}",
         *environment,
     ]
-    run(command, RUNS / "logs" / f"eval-{label}.log", job.threads)
+    done, trained = output / "eval_info.json", policy / "model.safetensors"
+    if not done.exists() or done.stat().st_mtime < trained.stat().st_mtime:
+        run(command, RUNS / "logs" / f"eval-{label}.log", job.threads)
     commands.append(shown(command))
-    report = json.loads((output / "eval_info.json").read_text())
+    report = json.loads(done.read_text())
     return [bool(success) for success in report["per_task"][0]["metrics"]["successes"]]

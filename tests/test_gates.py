@@ -72,16 +72,19 @@ def test_a_policy_as_good_as_the_expert_is_left_alone(task):
     assert np.mean(np.concatenate([by_expert for _, by_expert, _ in episodes])) <= 0.05
 
 
-@pytest.mark.parametrize(
-    ("name", "rescued"), [("middle", 4), ("search", 5), ("push", 5), ("still", 5), ("restless", 3)]
-)
-@pytest.mark.parametrize("task", TASKS)
-def test_a_bad_policy_is_rescued(task, name, rescued):
+RESCUED = {
+    "OccludedGrasp-v0": {"middle": 6, "search": 5, "push": 5, "still": 5, "restless": 5},
+    "OccludedPickPlace-v0": {"middle": 4, "search": 5, "push": 5, "still": 6, "restless": 3},
+}  # of six episodes, at least
+
+
+@pytest.mark.parametrize(("task", "name"), [(task, name) for task, names in RESCUED.items() for name in names])
+def test_a_bad_policy_is_rescued(task, name):
     """Alone these policies solve at most every fifth episode (`test_tasks.py` has the blind ones). The expert needs time."""
     env = make(task, horizon=350)
     episodes = [roll_out(env, seed, name) for seed in range(3000, 3006)]
     env.close()
-    assert sum(success for success, _, _ in episodes) >= rescued
+    assert sum(success for success, _, _ in episodes) >= RESCUED[task][name]
     assert sum(by_expert.any() for _, by_expert, _ in episodes) >= 5
 
 

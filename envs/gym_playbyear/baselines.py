@@ -47,13 +47,17 @@ def main() -> None:
     parser.add_argument("--variant", default="default")
     parser.add_argument("--n_episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1000, help="of the first episode")
+    parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
     parser.add_argument("--output", type=Path, help="a JSON file for the rates")
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.n_episodes)
     results = []
     for task in arguments.task:
-        rates = success_rates(task, (EXPERT, *BLIND_STRATEGIES), seeds, variant=arguments.variant)
-        results.append({"task": task, "variant": arguments.variant, "seeds": [seeds[0], seeds[-1]], "success": rates})
+        rates = success_rates(
+            task, (EXPERT, *BLIND_STRATEGIES), seeds, variant=arguments.variant, horizon=arguments.horizon
+        )
+        options = {"variant": arguments.variant, "horizon": arguments.horizon}
+        results.append({"task": task, **options, "seeds": [seeds[0], seeds[-1]], "success": rates})
         print(json.dumps(results[-1]), flush=True)
     if arguments.output:
         arguments.output.write_text(json.dumps(results, indent=1) + "\n")
