@@ -36,7 +36,6 @@ SEEDS = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + 50)
 N_EPISODES = 25
 EVERY = 10  # kept attempts between evaluations
 BATCH_SIZE = 12
-STEPS = {"OccludedGrasp-v0": 1000, "OccludedPickPlace-v0": 3000}  # of five demonstrations, until 20 to 60 % succeed
 
 
 @dataclass
@@ -190,14 +189,14 @@ def main() -> None:
     parser.add_argument("--task", choices=TASKS, default=TASKS[0])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of training")
     parser.add_argument("--n_demonstrations", type=int, default=5)
-    parser.add_argument("--steps", type=int, help="updates of the policy that is corrected")
+    parser.add_argument("--steps", type=int, default=1000, help="updates of the policy that is corrected")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     record(options.task, options.n_demonstrations)
     demonstrations = RUNS / "datasets" / f"{options.task}-{options.n_demonstrations}"
     record(options.task, options.n_demonstrations, demonstrations)
     for seed in options.seeds:
-        number, steps = options.n_demonstrations, options.steps or STEPS[options.task]
+        number, steps = options.n_demonstrations, options.steps
         job = Job(STUDY, options.task, "full", seed, number, steps, options.threads, SEEDS, dataset=demonstrations)
         if not job.result_path.exists():
             result = correct(job)
