@@ -97,12 +97,12 @@ def correction_table() -> list[str]:
     lines = [
         "### Corrections",
         "",
-        "| task, demonstrations, training seed | steps | before | corrected | control | updates | minutes |",
+        "| task, demonstrations, updates, training seed | time | before | corrected | control | updates | minutes |",
     ]
     lines.append("|---|---|---|---|---|---|---|")
     for report in reports:
         before, after = report["evaluations"][0], report["evaluations"][-1]
-        name = f"{report['task']}, {report['n_demonstrations']}, {report['training_seed']}"
+        name = f"{report['task']}, {report['n_demonstrations']}, {report['steps']}, {report['training_seed']}"
         cost = f"{report['updates']} | {report['minutes']['dagger']:.0f}"
         for steps, key in (("the task's own", "in_task_time"), (ATTEMPT_STEPS[report["task"]], "success")):
             rates = f"{before[key]:.0f} % | **{after[key]:.0f} %** | {report['control'][key]:.0f} %"
