@@ -108,12 +108,12 @@ def main() -> None:
 
     reference = REFERENCE_WINDOWS / seconds["reference"]
     size, rows = f"{args.image_size} px", []
-    named = [(k, f"K={k}", " (default)" if k == default else "") for k in RUNS]
-    named += [(k, f"bfloat16 {k}", ", bfloat16 (`--policy.use_amp=true`)") for k in wanted_times]
-    for k, name, note in named:
+    named = [(k, f"K={k}", " (default)" if k == default else "", f"bare {k}") for k in RUNS]
+    named += [(k, f"bfloat16 {k}", ", bfloat16 (`--policy.use_amp=true`)", "") for k in wanted_times]
+    for k, name, note, limit in named:
         windows, wanted = RUNS[k] * k, wanted_times.get(k)
         ours = windows / seconds[name]
-        bare = windows / seconds[f"bare {k}"] if name.startswith("K") and wanted else None
+        bare = windows / seconds[limit] if limit in seconds else None
         rows.append(
             Row(
                 f"training, {size}, K = {k}{note}",

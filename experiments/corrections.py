@@ -50,7 +50,7 @@ class Corrected:
         attempts: Seed, outcome and share of interventions of each.
         updates: Of HG-DAgger, and of the control.
         control: The percentages of successes of the control.
-        minutes: Of HG-DAgger with its evaluations, and of the control's training.
+        minutes: Of HG-DAgger, and of the control's training.
         seconds: Where the time of the rounds that made updates went, in all; `total_s` is their length.
         commands: What was run, in order.
         versions: Of the libraries that matter.
@@ -153,13 +153,13 @@ def correct(job: Job) -> Corrected:
 
 def _evaluations(job: Job, commands: list[str], name: str, checkpoint: Path, is_end: bool) -> dict[str, float]:
     """Percentages of successes in the time of the attempts, and where a policy ends also in the task's own."""
-    times = {"success": (f"--env.episode_length={ATTEMPT_STEPS[job.task]}",), "in_task_time": ()}
+    times: dict[str, tuple[str, ...]] = {"success": (f"--env.episode_length={ATTEMPT_STEPS[job.task]}",)}
+    if is_end:
+        times["in_task_time"] = ()
     rates = {}
-    for time_given, options in times.items():
-        if time_given == "success" or is_end:
-            label = f"{STUDY}-{name}-{time_given}"
-            successes = evaluate(job, commands, *options, name=label, checkpoint=checkpoint)
-            rates[time_given] = 100 * sum(successes) / len(successes)
+    for key, options in times.items():
+        successes = evaluate(job, commands, *options, name=f"{STUDY}-{name}-{key}", checkpoint=checkpoint)
+        rates[key] = 100 * sum(successes) / len(successes)
     return rates
 
 

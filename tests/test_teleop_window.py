@@ -173,10 +173,10 @@ def person_corrects(screen, process, log):
     screen.focus(screen.window(_TITLE))
     screen.press("p")
     wait_for_state(Control.POLICY)
-    screen.hold("space", "Right")
+    screen.hold("Right", "space")  # the override inside the movement: what it lets through has both keys
     wait_for_state(Control.PERSON)
     threading.Event().wait(0.7)
-    screen.let_go("Right", "space")
+    screen.let_go("space", "Right")
     wait_for_state(Control.POLICY)
     screen.press("s")
 
@@ -202,10 +202,10 @@ def test_playbyear_dagger_learns_from_a_person_at_lerobots_keyboard(screen, tmp_
     changes = np.flatnonzero(np.diff(np.concatenate([[0], flags, [0]])))
     assert len(changes) == 2, "one stretch without gaps"
     first, after = changes
-    assert after - first >= 8
+    assert after - first >= 5
     by_person = np.isclose(actions[:, 0], 0.3) & (actions[:, 1:3] == 0).all(axis=1)
     assert not by_person[~flags].any()
-    assert by_person[first + 2 : after - 4].all()  # both keys go down, and one after the other up, within a few steps
+    assert by_person[first + 2 : after - 2].all()  # both keys go down within two steps, and up
     assert positions[after, 0] - positions[first, 0] > 0.02
     assert column(dataset, "next.success").ravel()[-1]
     [attempt] = metrics(tmp_path, "attempt")

@@ -73,7 +73,7 @@ class DaggerConfig:
         updates: With `episodes=0`, how many updates to make from the corrections that are there.
         batch_size: Runs of windows per update, half of them from the demonstrations.
         learning_rate: Of Adam, the largest of each round. None: the policy's own (`optimizer_lr`). A smaller one leaves a
-            policy that knows its demonstrations by heart where it is, and corrections are learned by heart beside them.
+            policy that knows its demonstrations by heart where it is.
         anneal: Whether the rate falls to 0 over the updates of each round (a cosine), so that the policy that acts next has
             settled; and its largest over the rounds to a tenth, so that the last policy is the most settled. Otherwise it
             is constant.
