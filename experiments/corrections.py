@@ -20,7 +20,9 @@ from typing import Any
 
 from experiments.protocol import (
     ATTEMPT_STEPS,
+    CONDITIONS,
     EVALUATION_SEEDS,
+    RESULTS,
     RUNS,
     TASKS,
     library_versions,
@@ -53,6 +55,7 @@ class Corrected:
         minutes: Of HG-DAgger, and of the control's training.
         seconds: Where the time of the rounds that made updates went, in all; `total_s` is their length.
         commands: What was run, in order.
+        condition: With which senses the policy learns, before and after.
         versions: Of the libraries that matter.
     """
 
@@ -69,7 +72,20 @@ class Corrected:
     minutes: dict[str, float]
     seconds: dict[str, float]
     commands: list[str]
+    condition: str = "full"
     versions: dict[str, str] = field(default_factory=library_versions)
+
+    @property
+    def kind(self) -> tuple[str, int, int]:
+        """What the policies of all training seeds have in common."""
+        return self.condition, self.n_demonstrations, self.steps
+
+
+def load_corrections(task: str) -> list[Corrected]:
+    """The saved results of a task: those of one kind follow each other, in the order of their training seeds."""
+    paths = (RESULTS / STUDY).glob(f"{task}-*.json")
+    results = [Corrected(**json.loads(path.read_text())) for path in paths]
+    return sorted(results, key=lambda result: (result.condition != "full", result.kind, result.training_seed))
 
 
 def correct(job: Job) -> Corrected:
@@ -148,6 +164,7 @@ def correct(job: Job) -> Corrected:
         minutes={"dagger": round(spent, 1), "control": round(control_spent, 1)},
         seconds={name: round(sum(line.get(name, 0.0) for line in rounds), 1) for name in sorted(parts)},
         commands=commands,
+        condition=job.condition,
     )
 
 
@@ -190,6 +207,7 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of training")
     parser.add_argument("--n_demonstrations", type=int, default=5)
     parser.add_argument("--steps", type=int, default=1000, help="updates of the policy that is corrected")
+    parser.add_argument("--condition", choices=CONDITIONS, default="full", help="senses of the policy")
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
     record(options.task, options.n_demonstrations)
@@ -197,7 +215,10 @@ def main() -> None:
     record(options.task, options.n_demonstrations, demonstrations)
     for seed in options.seeds:
         number, steps = options.n_demonstrations, options.steps
-        job = Job(STUDY, options.task, "full", seed, number, steps, options.threads, SEEDS, dataset=demonstrations)
+        job = Job(
+            *(STUDY, options.task, options.condition, seed, number, steps, options.threads, SEEDS),
+            dataset=demonstrations,
+        )
         if not job.result_path.exists():
             result = correct(job)
             job.result_path.parent.mkdir(parents=True, exist_ok=True)
@@ -205,8 +226,9 @@ def main() -> None:
         result = Corrected(**json.loads(job.result_path.read_text()))
         first, last = result.evaluations[0], result.evaluations[-1]
         print(
-            f"{result.task} seed {seed}: {first['success']:.0f} % before, {last['success']:.0f} % with {last['kept']} "
-            f"corrected attempts and {result.updates} updates, {result.control['success']:.0f} % with the updates alone",
+            f"{result.task}, {result.condition}, seed {seed}: "
+            f"{first['success']:.0f} % before, {last['success']:.0f} % with {last['kept']} corrected attempts "
+            f"and {result.updates} updates, {result.control['success']:.0f} % with the updates alone",
             flush=True,
         )
 

@@ -10,9 +10,11 @@ matplotlib.use("agg")
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
+from experiments.corrections import load_corrections
 from experiments.protocol import RESULTS, TASKS, load_results, wilson_interval
 
 COLOURS = {"full": "#1f6f8b", "deaf": "#c8553d", "blind": "#777777"}
+KINDS = ("#1f6f8b", "#d08c2e", "#7b5ea7", "#c8553d")  # of corrected policies: as they come
 
 
 def band(axes: Axes, points: dict[float, list[bool]], label: str, colour: str) -> None:
@@ -71,18 +73,27 @@ def noise(output: Path) -> None:
 
 
 def corrections(output: Path) -> None:
-    """Success over the attempts that were corrected, with the control beside it."""
+    """Success over the attempts that were corrected, with the control beside it: each training seed, and their mean."""
     for task in TASKS:
-        reports = [json.loads(path.read_text()) for path in sorted((RESULTS / "corrections").glob(f"{task}-*.json"))]
-        if not reports:
+        results = load_corrections(task)
+        if not results:
             continue
         figure, axes = plt.subplots(figsize=(6, 3.6))
-        for report in reports:
-            kept = [point["kept"] for point in report["evaluations"]]
-            axes.plot(kept, [point["success"] for point in report["evaluations"]], marker="o", color=COLOURS["full"])
-            axes.plot(kept[-1], report["control"]["success"], marker="x", markersize=9, color=COLOURS["deaf"])
-        axes.plot([], [], marker="o", color=COLOURS["full"], label="corrected")
-        axes.plot([], [], marker="x", color=COLOURS["deaf"], linestyle="", label="as many updates on demonstrations")
+        kinds = list(dict.fromkeys(result.kind for result in results))
+        for colour, kind in zip(KINDS, kinds, strict=False):
+            alike = [result for result in results if result.kind == kind]
+            curves = [{point["kept"]: point["success"] for point in result.evaluations} for result in alike]
+            controls = [result.control["success"] for result in alike]
+            for curve in curves:
+                axes.plot(list(curve), list(curve.values()), color=colour, linewidth=0.8, alpha=0.5)
+            kept = sorted(set.intersection(*(set(curve) for curve in curves)))
+            means = [sum(curve[k] for curve in curves) / len(curves) for k in kept]
+            condition, _, steps = kind
+            label = f"{condition}, trained for {steps:,} updates ({len(alike)} training seed{'s' * (len(alike) > 1)})"
+            axes.plot(kept, means, marker="o", color=colour, label=label)
+            axes.plot([kept[-1]] * len(controls), controls, marker="x", color=colour, linestyle="", alpha=0.5)
+            axes.plot(kept[-1], sum(controls) / len(controls), marker="X", markersize=9, color=colour)
+        axes.plot([], [], marker="X", color="black", linestyle="", label="as many updates on the demonstrations")
         finish(figure, axes, "attempts with corrections", output / f"corrections-{task}.png")
 
 
@@ -104,6 +115,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=Path("docs/media"))
     output = parser.parse_args().output
+    output.mkdir(parents=True, exist_ok=True)
     for draw in (demonstrations, noise, corrections):
         draw(output)
 

@@ -3,6 +3,7 @@
 import json
 from collections import defaultdict
 
+from experiments.corrections import Corrected, load_corrections
 from experiments.protocol import (
     ATTEMPT_STEPS,
     CONDITIONS,
@@ -89,32 +90,40 @@ def listening_table() -> list[str]:
     return [*lines, ""] if paths else []
 
 
-def correction_table() -> list[str]:
+def correction_table(task: str) -> list[str]:
     """What corrections are worth, in the time of the attempts and in the task's own, and where the time of a round goes."""
-    reports = [json.loads(path.read_text()) for path in sorted((RESULTS / "corrections").glob("*.json"))]
-    if not reports:
+    kinds: dict[tuple[str, int, int], list[Corrected]] = defaultdict(list)
+    for result in load_corrections(task):
+        kinds[result.kind].append(result)
+    if not kinds:
         return []
-    lines = [
-        "### Corrections",
-        "",
-        "| task, demonstrations, updates, training seed | time | before | corrected | control | updates | minutes |",
-    ]
-    lines.append("|---|---|---|---|---|---|---|")
-    for report in reports:
-        before, after = report["evaluations"][0], report["evaluations"][-1]
-        name = f"{report['task']}, {report['n_demonstrations']}, {report['steps']}, {report['training_seed']}"
-        cost = f"{report['updates']} | {report['minutes']['dagger']:.0f}"
-        for steps, key in (("the task's own", "in_task_time"), (ATTEMPT_STEPS[report["task"]], "success")):
-            rates = f"{before[key]:.0f} % | **{after[key]:.0f} %** | {report['control'][key]:.0f} %"
-            lines.append(f"| {name} | {steps} | {rates} | {cost} |")
-    names = sorted({name for report in reports for name in report["seconds"]} - {"total_s"})
+    lines = [f"### {task}: corrections", ""]
+    lines.append("| policy | demonstrations | updates | time | before | corrected | control | more updates | minutes |")
+    lines.append("|---|---|---|---|---|---|---|---|---|")
+    for kind, results in kinds.items():
+        policy = " | ".join(map(str, kind))
+        updates = ", ".join(str(result.updates) for result in results)
+        minutes = ", ".join(f"{result.minutes['dagger']:.0f}" for result in results)
+        for time, key in (("the task's own", "in_task_time"), (f"{ATTEMPT_STEPS[task]} steps", "success")):
+            first, last = ([result.evaluations[n][key] for result in results] for n in (0, -1))
+            rates = [first, last, [result.control[key] for result in results]]
+            cells = " | ".join(_mean_of_seeds(values) for values in rates)
+            lines.append(f"| {policy} | {time} | {cells} | {updates} | {minutes} |")
+    names = sorted({name for results in kinds.values() for result in results for name in result.seconds} - {"total_s"})
     lines += ["", f"| share of a round | {' | '.join(name.removesuffix('_s') for name in names)} | all of it |"]
     lines.append("|---" * (len(names) + 2) + "|")
-    for report in reports:
-        total = report["seconds"]["total_s"]
-        cells = [f"{report['seconds'].get(name, 0) / total:.1%}" for name in names]
-        lines.append(f"| {report['task']} | {' | '.join(cells)} | {total:.0f} s |")
+    for (condition, _, steps), results in kinds.items():
+        total = sum(result.seconds["total_s"] for result in results)
+        spent = [sum(result.seconds.get(name, 0.0) for result in results) for name in names]
+        cells = " | ".join(f"{value / total:.1%}" for value in spent)
+        lines.append(f"| {condition}, {steps} updates before | {cells} | {total:.0f} s |")
     return [*lines, ""]
+
+
+def _mean_of_seeds(rates: list[float]) -> str:
+    """The mean, and in brackets the rate of each training seed."""
+    mean = f"**{sum(rates) / len(rates):.0f} %**"
+    return mean if len(rates) == 1 else f"{mean} ({', '.join(f'{rate:.0f}' for rate in rates)})"
 
 
 def run_length_table(task: str) -> list[str]:
@@ -152,7 +161,8 @@ def main() -> None:
     for task in TASKS:
         lines += demonstration_table(task)
         lines += curve_table("noise", task) + curve_table("materials", task) + run_length_table(task)
-    print("\n".join(lines + correction_table()))
+        lines += correction_table(task)
+    print("\n".join(lines))
 
 
 if __name__ == "__main__":
