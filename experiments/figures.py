@@ -3,6 +3,7 @@
 import argparse
 import json
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -88,16 +89,18 @@ def corrections(output: Path) -> None:
                 axes.plot(list(curve), list(curve.values()), color=colour, linewidth=0.8, alpha=0.5)
             kept = sorted(set.intersection(*(set(curve) for curve in curves)))
             means = [sum(curve[k] for curve in curves) / len(curves) for k in kept]
-            condition, _, steps = kind
-            label = f"{condition}, trained for {steps:,} updates ({len(alike)} training seed{'s' * (len(alike) > 1)})"
+            condition, n_demonstrations, steps = kind
+            seeds = f"{len(alike)} training seed{'s' * (len(alike) > 1)}"
+            label = f"{condition}: {n_demonstrations} demonstrations, {steps:,} updates ({seeds})"
             axes.plot(kept, means, marker="o", color=colour, label=label)
             axes.plot([kept[-1]] * len(controls), controls, marker="x", color=colour, linestyle="", alpha=0.5)
             axes.plot(kept[-1], sum(controls) / len(controls), marker="X", markersize=9, color=colour)
         axes.plot([], [], marker="X", color="black", linestyle="", label="as many updates on the demonstrations")
-        finish(figure, axes, "attempts with corrections", output / f"corrections-{task}.png")
+        path = output / f"corrections-{task}.png"
+        finish(figure, axes, "attempts with corrections", path, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
-def finish(figure, axes: Axes, label: str, path: Path) -> None:
+def finish(figure, axes: Axes, label: str, path: Path, **legend: Any) -> None:
     """Axes, legend, file."""
     axes.set_xlabel(label)
     axes.set_ylabel("success [%]")
@@ -105,7 +108,7 @@ def finish(figure, axes: Axes, label: str, path: Path) -> None:
     axes.grid(alpha=0.25)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, **legend)
     figure.savefig(path, dpi=110, bbox_inches="tight")
     plt.close(figure)
     print(path)
