@@ -50,7 +50,8 @@ class PlaybyearConfig(PreTrainedConfig):
             [pixels of the original]; brightness: relative; hue: of the colour circle; degrees; translate: share of the
             size; scale: either way.
         audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]; None
-            mixes in none (the paper). Levels are drawn per item, uniformly from 20 dB below the floor up to this.
+            mixes in none (the paper). Level, colour and a hum are drawn per item, the level uniformly from 20 dB below the
+            floor up to this. It decides how loud a room the policy bears: 18 stands 8 times the background's amplitude.
         low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
             normalisation. The paper has none; without it a few dozen demonstrations are learned by heart.
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.

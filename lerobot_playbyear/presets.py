@@ -40,7 +40,7 @@ PRESETS = {
             "policy.n_supervised_steps": "16",
             "policy.optimizer_lr": "1e-3",
             "policy.low_dimensional_noise": "0.03",
-            "policy.audio_noise_db": "0",
+            "policy.audio_noise_db": "18",
             "policy.optimizer_grad_clip_norm": "1.0",
             "policy.push_to_hub": "false",
             "batch_size": "12",
