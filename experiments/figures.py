@@ -15,6 +15,10 @@ from experiments.corrections import load_corrections
 from experiments.protocol import RESULTS, TASKS, load_results, wilson_interval
 
 COLOURS = {"full": "#1f6f8b", "deaf": "#c8553d", "blind": "#777777"}
+NOISES = {
+    "noise": ("a room's noise in training, up to 18 dB above the floor", COLOURS["full"]),
+    "noise_white": ("white noise in training, up to the floor (one seed)", "#d08c2e"),
+}
 KINDS = ("#1f6f8b", "#d08c2e", "#7b5ea7", "#c8553d")  # of corrected policies: as they come
 
 
@@ -58,18 +62,23 @@ def demonstrations(output: Path) -> None:
 
 
 def noise(output: Path) -> None:
-    """Success of the full policies over the background's level."""
+    """Success of the full policies over the background's level, with the training noise of two recipes."""
     for task in TASKS:
-        by_level: dict[float, list[bool]] = {}
-        for result in load_results(f"noise/{task}-*.json"):
-            by_level.setdefault(float(result.environment["noise_level"]), []).extend(result.successes)
-        if not by_level:
+        curves: dict[str, dict[float, list[bool]]] = {}
+        for study in NOISES:
+            for result in load_results(f"{study}/{task}-*.json"):
+                level = float(result.environment["noise_level"])
+                curves.setdefault(study, {}).setdefault(level, []).extend(result.successes)
+        if not curves:
             continue
         figure, axes = plt.subplots(figsize=(6, 3.6))
-        band(axes, by_level, "full", COLOURS["full"])
+        for study, by_level in curves.items():
+            label, colour = NOISES[study]
+            band(axes, by_level, label, colour)
         blind_line(axes, task)
         axes.set_xscale("log", base=2)
-        axes.set_xticks(sorted(by_level), [f"{level:g}" for level in sorted(by_level)])
+        levels = sorted({level for by_level in curves.values() for level in by_level})
+        axes.set_xticks(levels, [f"{level:g}" for level in levels])
         finish(figure, axes, "background noise (1: as in training)", output / f"noise-{task}.png")
 
 

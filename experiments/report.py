@@ -47,13 +47,25 @@ def ablation_table(task: str) -> list[str]:
     return [*lines, ""]
 
 
+CURVES = {
+    "noise": "noise",
+    "noise_white": "noise, trained with white noise up to the recordings' own floor",
+    "materials": "materials",
+}
+
+
 def curve_table(study: str, task: str) -> list[str]:
     by_value: dict[str, list[Result]] = defaultdict(list)
     for result in load_results(f"{study}/{task}-*.json"):
         by_value[", ".join(result.environment.values())].append(result)
     if not by_value:
         return []
-    lines = [f"### {task}: {study}", "", f"| {study} | success (95 % interval) | training seeds |", "|---|---|---|"]
+    lines = [
+        f"### {task}: {CURVES[study]}",
+        "",
+        f"| {study.split('_')[0]} | success (95 % interval) | training seeds |",
+        "|---|---|---|",
+    ]
     return [
         *lines,
         *(f"| {value} | {percent(results)} |" for value, results in sorted(by_value.items(), key=_order)),
@@ -160,7 +172,8 @@ def main() -> None:
     lines += listening_table()
     for task in TASKS:
         lines += demonstration_table(task)
-        lines += curve_table("noise", task) + curve_table("materials", task) + run_length_table(task)
+        lines += curve_table("noise", task) + curve_table("noise_white", task) + curve_table("materials", task)
+        lines += run_length_table(task)
         lines += correction_table(task)
     print("\n".join(lines))
 
