@@ -1,13 +1,14 @@
 """The policy `playbyear`: what LeRobot calls, and how observations become the network's inputs."""
 
 import math
+from pathlib import Path
 from typing import Any
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.device_utils import resolve_safetensors_device
-from safetensors.torch import load_model
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -51,13 +52,20 @@ class PlaybyearPolicy(PreTrainedPolicy):
     def get_optim_params(self) -> Any:
         return self.parameters()
 
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """Writes a checkpoint, of copies: on a GPU an LSTM's weights are views of one buffer, which safetensors refuses."""
+        if state_dict is None:
+            as_saved = {"device": "cpu", "copy": True, "memory_format": torch.contiguous_format}
+            state_dict = {name: value.to(**as_saved) for name, value in self.state_dict().items()}
+        super()._save_pretrained(save_directory, state_dict=state_dict)
+
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
         """Loads a checkpoint. LeRobot's own leaves weights that it lacks at random; here that is an error."""
         hint = "Use the configuration, with the sizes and the inputs, that the checkpoint was trained with."
         try:
-            device = resolve_safetensors_device(map_location)
-            missing, unexpected = load_model(model, model_file, strict=False, device=device)
+            weights = load_file(model_file, device=resolve_safetensors_device(map_location))
+            missing, unexpected = model.load_state_dict(weights, strict=False)
         except RuntimeError as error:
             raise ValueError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
         if missing or (strict and unexpected):
