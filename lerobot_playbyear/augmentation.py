@@ -1,29 +1,34 @@
 """Images into the vision encoder: augmentation and resizing in one sampling pass."""
 
 import math
-from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 # Colour as luma and two chroma components (NTSC); turning the chroma plane turns the hue.
 _YIQ = torch.tensor([[0.299, 0.587, 0.114], [0.5959, -0.2746, -0.3213], [0.2115, -0.5227, 0.3112]])
-_RGB = torch.linalg.inv(_YIQ)
 
 
-@dataclass(frozen=True)
-class Augmentation:
-    """Strengths, as in `PlaybyearConfig`: crop [pixels], brightness, hue, degrees, translate, scale."""
+class Augmentation(nn.Module):
+    """Draws a change of colour and of position per run. It learns nothing; its constants lie where the images do.
 
-    crop: float
-    brightness: float
-    hue: float
-    degrees: float
-    translate: float
-    scale: float
+    Args:
+        crop, brightness, hue, degrees, translate, scale: Strengths, as in `PlaybyearConfig`; crop in pixels.
+    """
 
-    def __call__(self, images: Tensor, size: int) -> Tensor:
+    yiq: Tensor
+    rgb: Tensor
+
+    def __init__(self, crop: float, brightness: float, hue: float, degrees: float, translate: float, scale: float):
+        super().__init__()
+        self.crop, self.brightness, self.hue = crop, brightness, hue
+        self.degrees, self.translate, self.scale = degrees, translate, scale
+        # Buffers, for a copy to the device at every update would make the host wait for it.
+        self.register_buffer("yiq", _YIQ.clone(), persistent=False)
+        self.register_buffer("rgb", torch.linalg.inv(_YIQ), persistent=False)
+
+    def forward(self, images: Tensor, size: int) -> Tensor:
         """Augments runs of images and resizes them; all images of a run get the same draw.
 
         Args:
@@ -46,7 +51,7 @@ class Augmentation:
         turn[:, 0, 0] = 1
         turn[:, 1, 1] = turn[:, 2, 2] = angle.cos()
         turn[:, 2, 1], turn[:, 1, 2] = angle.sin(), -angle.sin()
-        matrix = brightness[:, None, None] * (_RGB.to(device) @ turn @ _YIQ.to(device))  # (B, 3, 3)
+        matrix = brightness[:, None, None] * (self.rgb.float() @ turn @ self.yiq.float())  # (B, 3, 3)
         flat = images.transpose(1, 2).flatten(2)  # (B, 3, T * H * W)
         recoloured = (matrix.to(images.dtype) @ flat).clamp_(0, 1)
         return recoloured.view(images.shape[0], 3, images.shape[1], *images.shape[3:]).transpose(1, 2)
@@ -66,11 +71,28 @@ class Augmentation:
         shift_x = self.translate * _uniform(n_runs, device) + self.crop / width * _uniform(n_runs, device)
         shift_y = self.translate * _uniform(n_runs, device) + self.crop / height * _uniform(n_runs, device)
         theta[:, 0, 2], theta[:, 1, 2] = 2 * shift_x, 2 * shift_y
-        grid = functional.affine_grid(theta, [n_runs, 1, size, size], align_corners=False).to(images.dtype)
-        warped = functional.grid_sample(
-            images.flatten(1, 2), grid, mode="bilinear", padding_mode="border", align_corners=False
-        )
-        return warped.unflatten(1, (n_frames, 3))
+        grid = functional.affine_grid(theta, [n_runs, 1, size, size], align_corners=False)
+        # In the grid's precision: 8 bits of mantissa would be a wrong place by a tenth of a pixel.
+        return sample(images.flatten(1, 2).float(), grid).to(images.dtype).unflatten(1, (n_frames, 3))
+
+
+def sample(images: Tensor, grid: Tensor) -> Tensor:
+    """Bilinear samples, with the outermost pixels repeated outwards.
+
+    That is `grid_sample`'s padding "border", which Apple's GPUs have not before torch 2.13: the coordinates end at the
+    centres of the outermost pixels.
+
+    Args:
+        images: (B, C, H, W).
+        grid: (B, size, size, 2), x and y from -1 to 1.
+
+    Returns:
+        (B, C, size, size).
+    """
+    height, width = images.shape[-2:]
+    limits = (1 - 1 / width, 1 - 1 / height)
+    inside = torch.stack([grid[..., axis].clamp(-limit, limit) for axis, limit in enumerate(limits)], dim=-1)
+    return functional.grid_sample(images, inside, mode="bilinear", padding_mode="zeros", align_corners=False)
 
 
 def resize(images: Tensor, size: int) -> Tensor:

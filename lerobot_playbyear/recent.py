@@ -8,7 +8,6 @@ from torch import Tensor
 
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.runs import newest
-from lerobot_playbyear.spectrogram import to_float_wave
 
 
 class RecentFrames:
@@ -40,8 +39,7 @@ class RecentFrames:
         if config.use_audio:
             self._n_heard = min(self._n_heard + 1, config.audio_frames)
         for key in config.audio_keys if config.use_audio else ():
-            sound = newest({key: frame[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)
-            sound = to_float_wave(sound, key)  # (B, S)
+            sound = newest({key: frame[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)  # (B, S)
             earlier = self._sound.get(key)
             if earlier is None:
                 earlier = sound.new_zeros(sound.shape[0], sound.shape[1] * config.audio_frames)

@@ -26,12 +26,12 @@ def to_float_wave(wave: Tensor, key: str) -> Tensor:
     """
     if not wave.dtype.is_floating_point:
         return wave.float() / 32768.0
-    peak = wave.abs().amax() if wave.numel() else torch.zeros(())
-    if not torch.isfinite(peak):
+    peak = float(wave.abs().amax()) if wave.numel() else 0.0  # asked once: a GPU is waited for
+    if not math.isfinite(peak):
         raise ValueError(f"{key} holds NaN or infinite samples; wanted finite ones. Check the recording.")
     if peak > 1.5:
         raise ValueError(
-            f"{key} holds float samples up to {float(peak):.4g}; wanted floats in [-1, 1], or integers as PCM at full scale."
+            f"{key} holds float samples up to {peak:.4g}; wanted floats in [-1, 1], or integers as PCM at full scale."
         )
     return wave.float()
 
@@ -164,14 +164,14 @@ class LogSpectrogram(nn.Module):
     def _update(self, levels: Tensor, real: Tensor) -> None:
         weights = real.to(levels.dtype)
         count = mean_over_processes(weights.sum())
-        if count < 2:
-            return
+        counts = count >= 2  # otherwise nothing changes; a condition in Python would wait for a GPU
+        count = count.clamp(min=2)
         mean = mean_over_processes((levels * weights).sum(dim=(0, 2))) / count
         variance = mean_over_processes(((levels - mean[:, None]).square() * weights).sum(dim=(0, 2))) / count
-        momentum = torch.where(self.n_batches == 0, 1.0, self.momentum)
+        momentum = torch.where(self.n_batches == 0, 1.0, self.momentum) * counts
         self.mean.lerp_(mean, momentum)
         self.variance.lerp_(variance, momentum)
-        self.n_batches += 1
+        self.n_batches += counts
 
 
 def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int) -> Tensor:
