@@ -4,11 +4,15 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
+import draccus
+from draccus.parsers.encoding import encode_choice
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_STATE
+
+from lerobot_playbyear.precision import DTYPES, training_dtype
 
 AUDIO_PREFIX = "observation.audio."
 
@@ -55,6 +59,9 @@ class PlaybyearConfig(PreTrainedConfig):
         low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
             normalisation. The paper has none; without it a few dozen demonstrations are learned by heart.
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
+        dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
+            the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
+            GPU means "auto". Acting always computes in float32.
         optimizer_*: Adam, and the clip of the gradient's norm.
         scheduler_*: Linear warm-up over this share of the steps, then a cosine down to this share of the rate. The paper's
             rate is constant; the schedule is what lets thousands instead of a hundred thousand updates do.
@@ -101,6 +108,7 @@ class PlaybyearConfig(PreTrainedConfig):
     audio_noise_db: float | None = None
     low_dimensional_noise: float = 0.0
     spectrogram_momentum: float = 0.01
+    dtype: str | None = None
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.0
     optimizer_grad_clip_norm: float = 1.0
@@ -121,6 +129,10 @@ class PlaybyearConfig(PreTrainedConfig):
             raise ValueError(
                 "use_vision and use_audio are both off and there is no other observation: nothing to learn from."
             )
+        if self.dtype not in (None, *DTYPES):
+            raise ValueError(f"--policy.dtype must be one of {', '.join(DTYPES)}, got {self.dtype!r}.")
+        self._asked_dtype = self.dtype
+        self.dtype = training_dtype(self.dtype, self.use_amp, str(self.device))  # LeRobot reads this, and not use_amp
 
     # Windows, in frames
 
@@ -286,3 +298,9 @@ class PlaybyearConfig(PreTrainedConfig):
             peak_lr=self.optimizer_lr,
             decay_lr=self.scheduler_final_share * self.optimizer_lr,
         )
+
+
+@draccus.encode.register(PlaybyearConfig)
+def _encode(config: PlaybyearConfig, declared_type: type | None = None) -> dict[str, Any]:
+    """For a file: with the `dtype` that was asked for, since the next machine may have other formats."""
+    return {**encode_choice(config, PreTrainedConfig), "dtype": config._asked_dtype}

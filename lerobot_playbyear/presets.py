@@ -4,11 +4,12 @@ Options on the command line win over the preset, and the preset wins over a conf
 bfloat16 the preset `cpu` switches `policy.use_amp` on.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import torch
 from lerobot.configs import parser
+
+from lerobot_playbyear.precision import computes_bfloat16
 
 
 @dataclass(frozen=True)
@@ -101,12 +102,6 @@ def apply_preset(args: Sequence[str]) -> list[str]:
     if _is_given("policy.repo_id", args):  # whoever names a place on the Hub wants it used
         options = {key: value for key, value in options.items() if key != "policy.push_to_hub"}
     return [f"--{key}={value}" for key, value in options.items() if not _is_given(key, args)] + args
-
-
-def computes_bfloat16() -> bool:
-    """Whether this CPU multiplies in bfloat16 by itself; elsewhere autocast costs more time than it saves."""
-    capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
 
 
 def _is_given(option: str, args: Sequence[str]) -> bool:
