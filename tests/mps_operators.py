@@ -11,9 +11,10 @@ _KERNELS = """
     grid_sampler_2d gt.Scalar isnan le.Scalar lerp.Scalar lerp_.Scalar lerp_.Tensor linalg_vector_norm log10 lt.Scalar
     max_pool2d_with_indices max_pool2d_with_indices_backward maximum mean.dim minimum mm mul.Tensor mul_.Tensor
     native_batch_norm native_batch_norm_backward native_layer_norm native_layer_norm_backward neg normal_ permute
-    pow.Scalar pow.Tensor_Scalar pow.Tensor_Tensor reciprocal relu relu_ repeat rsqrt scatter_add set_.source_Storage
-    set_.source_Storage_storage_offset sigmoid_ sigmoid_backward sin sqrt sqrt_ sub.Tensor sub_.Tensor sum.dim_IntList
-    tanh tanh_ tanh_backward threshold_backward unfold unfold_backward uniform_ view view_as_real where.self zero_
+    pow.Scalar pow.Tensor_Scalar pow.Tensor_Tensor reciprocal relu relu_ repeat round rsqrt scatter_add
+    set_.source_Storage set_.source_Storage_storage_offset sigmoid_ sigmoid_backward sin sqrt sqrt_ sub.Tensor
+    sub_.Tensor sum.dim_IntList tanh tanh_ tanh_backward threshold_backward unfold unfold_backward uniform_ view
+    view_as_complex view_as_real where.self zero_
 """
 KERNELS = frozenset(_KERNELS.split())
 """Operators with a kernel for MPS."""
