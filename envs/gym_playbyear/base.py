@@ -8,6 +8,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 from gymnasium import spaces
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from mujoco import rollout
 
 from gym_playbyear.arena import (
@@ -85,6 +86,9 @@ class Variant:
 class PlayByEarEnv(gym.Env):
     """Base of the tasks. A task gives its fixed bodies, places what moves, and says when it is solved.
 
+    A copy (`copy.deepcopy`, `pickle`), of the environment alone or together with an expert or a gate, goes on as the original
+    would and independently of it; what it renders with it opens itself, when it first draws.
+
     Subclasses define `VARIANTS`, `task`, `task_description`, `_scene_xml`, `_scene_bodies`, `_place` and `_is_success`.
     """
 
@@ -150,6 +154,9 @@ class PlayByEarEnv(gym.Env):
         self._camera: SceneRenderer | None = None
         self._people_camera: SceneRenderer | None = None
         self._window: Window | None = None
+        self._is_closed = False
+        self._expert_rng: np.random.Generator | None = None  # None before the first episode
+        self._peak_forces = np.zeros(len(self.pairs))
         self._n_steps = 0
         self._measured_fingers = np.zeros(2)
 
@@ -192,7 +199,16 @@ class PlayByEarEnv(gym.Env):
     # Gymnasium's interface
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        self.begin_episode(seed=seed, options=options)
+        observation = self._observe(self._rollout_sensors[0])
+        if self.render_mode == "human":
+            self.render()
+        return observation, {"is_success": False}
+
+    def begin_episode(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """`reset` without the observation, for scripts that go on with `advance`: nothing is rendered, no OpenGL is needed."""
         super().reset(seed=seed)
+        self._is_closed = False
         options = dict(options or {})
         mujoco.mj_resetData(self.model, self.data)
         spread = self.np_random.uniform(-self._start_spread, self._start_spread, 3)
@@ -200,16 +216,15 @@ class PlayByEarEnv(gym.Env):
         self.data.ctrl[:N_JOINTS] = self._controller.joints
         self.data.ctrl[N_JOINTS] = self._controller.finger_target
         self._place(options)
-        self.expert_rng = np.random.default_rng(self.np_random.integers(2**63))
+        self._expert_rng = np.random.default_rng(self.np_random.integers(2**63))
         if self._sound is not None:
             self._sound.reset(np.random.default_rng(self.np_random.integers(2**63)))
         self._n_steps = 0
         mujoco.mj_forward(self.model, self.data)
         hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)
         for _ in range(_SETTLE_STEPS):
-            sensors = self._advance(hold)
+            self._advance(hold)
         self._first_cube_position, self._was_carried = self.cube_position, False
-        return self._observe(sensors), {"is_success": False}
 
     def step(self, action):
         reward, terminated, truncated, info = self.advance(action)
@@ -220,6 +235,7 @@ class PlayByEarEnv(gym.Env):
 
     def advance(self, action) -> tuple[float, bool, bool, dict[str, Any]]:
         """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise."""
+        self._check_is_running("step")
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
@@ -232,6 +248,7 @@ class PlayByEarEnv(gym.Env):
         return float(success), success or failed, truncated, {"is_success": success}
 
     def render(self):
+        self._check_is_running("render")
         if self.render_mode == "human":
             if self._window is None:
                 self._window = Window(self.model, self.data)
@@ -245,12 +262,36 @@ class PlayByEarEnv(gym.Env):
         return self._people_camera.render(self.data, "people")
 
     def close(self):
+        """Closes window and OpenGL. Only `reset` opens them again, as in Gymnasium's own environments; until then `step` and
+        `render` raise ClosedEnvironmentError."""
+        self._is_closed = True
         for resource in (self._camera, self._people_camera, self._window):
             if resource is not None:
                 resource.close()
         self._camera = self._people_camera = self._window = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        # What is open belongs to this process and to this object: a copy opens its own.
+        return {**self.__dict__, "_camera": None, "_people_camera": None, "_window": None}
+
+    def _check_is_running(self, call: str) -> None:
+        if self._is_closed:
+            raise ClosedEnvironmentError(f"{call}() was called on a closed environment: call reset() to open it again.")
+        if self._expert_rng is None:
+            raise ResetNeeded(f"{call}() was called before the first episode: call reset() first.")
+
     # Privileged state, for experts, tests and probes
+
+    @property
+    def expert_rng(self) -> np.random.Generator:
+        """What the episode's experts draw from.
+
+        Raises:
+            ResetNeeded: There is no episode yet.
+        """
+        if self._expert_rng is None:
+            raise ResetNeeded("An expert was made before the first episode: call reset() first.")
+        return self._expert_rng
 
     @property
     def eef_position(self) -> np.ndarray:
@@ -279,13 +320,14 @@ class PlayByEarEnv(gym.Env):
 
     def cube_pixels(self) -> int:
         """How many pixels of the policy's camera show the cube (segmentation rendering)."""
+        self._check_is_running("cube_pixels")
         geom = self.model.geom("cube").id
         return int((self._front_camera().segmentation(self.data, "front") == geom).sum())
 
     # One control step
 
-    def _advance(self, controls: np.ndarray) -> np.ndarray:
-        """Runs the physics of one control step in one call. Returns the contact sensors (n_substeps, n_sensors)."""
+    def _advance(self, controls: np.ndarray) -> None:
+        """Runs the physics of one control step in one call; the contact sensors are in `_rollout_sensors`."""
         mujoco.mj_getState(self.model, self.data, self._state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
         rollout.rollout(
             self.model,
@@ -299,9 +341,7 @@ class PlayByEarEnv(gym.Env):
         )
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
-        sensors = self._rollout_sensors[0]
-        self._peak_forces = pair_forces(sensors, len(self.pairs)).max(axis=0)
-        return sensors
+        self._peak_forces = pair_forces(self._rollout_sensors[0], len(self.pairs)).max(axis=0)
 
     def _was_shoved(self) -> bool:
         self._was_carried |= bool(self.cube_position[2] > _CARRIED_HEIGHT)

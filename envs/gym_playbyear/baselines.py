@@ -28,7 +28,7 @@ def success_rates(task: str, strategies: tuple[str, ...], seeds: range, **option
     for strategy in strategies:
         successes = 0
         for seed in seeds:
-            env.reset(seed=seed)
+            task_env.begin_episode(seed=seed)
             is_expert = strategy == EXPERT
             actor = task_env.scripted_expert() if is_expert else task_env.blind_baselines()[strategy]
             done = False

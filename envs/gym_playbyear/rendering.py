@@ -1,6 +1,9 @@
 """Pictures of the scene: the policy's camera, a larger view for people, and a window."""
 
+import atexit
+import copy
 import os
+import threading
 
 import glfw
 import mujoco
@@ -52,7 +55,10 @@ class SceneRenderer:
 
 
 class Window:
-    """A live view for a person (`render_mode="human"`); needs a display."""
+    """A live view for a person (`render_mode="human"`); needs a display.
+
+    It shows a copy of the simulation: neither what the viewer computes nor what the mouse pulls at changes the episode.
+    """
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
         if not glfw.init():
@@ -60,14 +66,26 @@ class Window:
                 f"No window can be opened (DISPLAY={os.environ.get('DISPLAY', '')!r}): render_mode='human' needs a display. "
                 "Use render_mode='rgb_array' to get pictures without one."
             )
-        self._viewer = mujoco.viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False)
+        self._model, self._data = model, data
+        self._shown = copy.copy(data)
+        others = set(threading.enumerate())
+        self._viewer = mujoco.viewer.launch_passive(model, self._shown, show_left_ui=False, show_right_ui=False)
+        self._threads = set(threading.enumerate()) - others
+        # Before GLFW's own: a process that ends while the viewer's thread still draws dies of a segmentation fault.
+        atexit.register(self.close)
         with self._viewer.lock():
             self._viewer.cam.type = mujoco.mjtCamera.mjCAMERA_FIXED
             self._viewer.cam.fixedcamid = model.camera("people").id
 
     def update(self) -> None:
         if self._viewer.is_running():
+            with self._viewer.lock():
+                mujoco.mj_copyData(self._shown, self._model, self._data)
             self._viewer.sync()
 
     def close(self) -> None:
+        """Closes the window and waits until its thread has ended."""
         self._viewer.close()
+        for thread in self._threads:
+            thread.join(timeout=5)
+        atexit.unregister(self.close)

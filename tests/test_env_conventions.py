@@ -1,0 +1,253 @@
+"""What Gymnasium's users expect of an environment: copies, the order of calls, closing, windows, no screen without need."""
+
+import copy
+import json
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
+from virtual_screen import MISSING, VirtualScreen, wait_for
+
+from gym_playbyear import TASKS
+
+STAY = np.array([0, 0, 0, -1], np.float32)
+needs_screen = pytest.mark.skipif(
+    bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (Debian: apt-get install xvfb xdotool)"
+)
+
+
+def make(task: str = "OccludedGrasp-v0", **options) -> gym.Env:
+    return gym.make(f"gym_playbyear:gym_playbyear/{task}", **options)
+
+
+def arrays(observation: dict) -> list[np.ndarray]:
+    return [observation["pixels"]["front"], observation["agent_pos"], observation["audio.gripper"]]
+
+
+def assert_same(some: list[dict], others: list[dict]) -> None:
+    assert len(some) == len(others)
+    for one, other in zip(some, others, strict=True):
+        for a, b in zip(arrays(one), arrays(other), strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+# Copies
+
+COPIES: dict[str, Callable] = {"copy": copy.deepcopy, "pickle": lambda value: pickle.loads(pickle.dumps(value))}
+
+
+def play(env: gym.Env, gate, n_steps: int) -> list[dict]:
+    """The expert corrects someone who does not move; what was observed."""
+    observations = []
+    for _ in range(n_steps):
+        action = gate.act() if gate.wants_control(STAY) else STAY
+        observations.append(env.step(action)[0])
+    return observations
+
+
+@pytest.mark.parametrize("copied", COPIES)
+@pytest.mark.parametrize("task", TASKS)
+def test_a_copy_of_a_running_episode_goes_on_alike_and_by_itself(task, copied):
+    env = make(task)
+    env.reset(seed=3)
+    gate = env.unwrapped.intervention_gate()
+    heard = play(env, gate, 55)
+    assert max(np.abs(observation["audio.gripper"]).max() for observation in heard) > 1000, "nothing rings yet"
+    other, other_gate = COPIES[copied]((env, gate))
+    assert other_gate.env is other.unwrapped
+    first = [*play(env, gate, 20), env.reset()[0]]
+    env.close()
+    second = [*play(other, other_gate, 20), other.reset()[0]]
+    other.close()
+    assert gate.reason == other_gate.reason
+    assert_same(first, second)
+
+
+@pytest.mark.parametrize("copied", COPIES)
+def test_a_copy_before_the_first_episode_plays_the_same_one(copied):
+    env = make()
+    other = COPIES[copied](env)
+    assert_same([env.reset(seed=1)[0]], [other.reset(seed=1)[0]])
+
+
+def test_an_expert_is_copied_with_its_environment():
+    env = make()
+    env.reset(seed=0)
+    expert = env.unwrapped.scripted_expert()
+    other = copy.deepcopy(expert)
+    assert other.env is not env.unwrapped
+    assert other.rng is other.env.expert_rng
+    for one in (expert, other):
+        for _ in range(5):
+            one.env.step(one.act())
+    np.testing.assert_array_equal(expert.env.eef_position, other.env.eef_position)
+
+
+# The order of calls
+
+NEED_AN_EPISODE: dict[str, Callable] = {
+    "step": lambda env: env.step(STAY),
+    "advance": lambda env: env.advance(STAY),
+    "render": lambda env: env.render(),
+    "cube_pixels": lambda env: env.cube_pixels(),
+    "scripted_expert": lambda env: env.scripted_expert(),
+    "intervention_gate": lambda env: env.intervention_gate(),
+    "blind_baselines": lambda env: env.blind_baselines(),
+}
+
+
+@pytest.mark.parametrize("call", NEED_AN_EPISODE)
+def test_before_reset_everything_that_needs_an_episode_says_so(call):
+    env = make(render_mode="rgb_array").unwrapped
+    with pytest.raises(ResetNeeded, match=r"reset\(\)"):
+        NEED_AN_EPISODE[call](env)
+    env.close()
+
+
+@pytest.mark.parametrize("call", ["step", "advance", "render", "cube_pixels"])
+@pytest.mark.parametrize("was_reset", [True, False])
+def test_a_closed_environment_refuses_and_opens_nothing(call, was_reset):
+    env = make(render_mode="rgb_array").unwrapped
+    if was_reset:
+        env.reset(seed=0)
+        env.render()
+    env.close()
+    env.close()
+    with pytest.raises(ClosedEnvironmentError, match=r"closed.*reset\(\)"):
+        NEED_AN_EPISODE[call](env)
+    assert env._camera is env._people_camera is env._window is None
+
+
+def test_a_copy_of_a_closed_environment_is_closed():
+    env = make().unwrapped
+    env.reset(seed=0)
+    env.close()
+    with pytest.raises(ClosedEnvironmentError):
+        copy.deepcopy(env).step(STAY)
+
+
+def test_reset_opens_a_closed_environment_anew():
+    env = make(render_mode="rgb_array")
+    first = env.reset(seed=4)[0]
+    env.close()
+    assert_same([first], [env.reset(seed=4)[0]])
+    assert env.render().shape == (480, 480, 3)
+    env.step(STAY)
+    env.close()
+
+
+# Without a screen, and on one
+
+
+def python(code: str, *arguments: str, **environment: str) -> str:
+    """Runs a program in a process of its own, without a screen unless one is given; what it printed."""
+    kept = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")}
+    result = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**kept, **environment},
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    return result.stdout
+
+
+_BASELINES = """
+import runpy, sys
+sys.argv = ["baselines", "--n_episodes=1", "--task", "OccludedGrasp-v0"]
+runpy.run_module("gym_playbyear.baselines", run_name="__main__")
+"""
+
+
+def test_the_baselines_need_no_opengl():
+    assert json.loads(python(_BASELINES, MUJOCO_GL="disable"))["success"]["expert"] == 1.0
+
+
+def test_an_episode_that_is_not_looked_at_is_the_same_one():
+    env = make(sound="none").unwrapped
+    cubes = []
+    for begin in (env.reset, env.begin_episode):
+        begin(seed=7, options={"cube_yaw": 0.1})
+        expert = env.scripted_expert()
+        while not env.advance(expert.act())[1]:
+            pass
+        cubes.append(env.cube_position)
+    env.close()
+    np.testing.assert_array_equal(*cubes)
+
+
+@pytest.fixture(scope="module")
+def screen():
+    screen = VirtualScreen()
+    yield screen
+    screen.close()
+
+
+_WATCH = """
+import sys, gymnasium
+env = gymnasium.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0", render_mode="human", sound="none")
+for cube in (-0.25, 0.25):
+    observation, _ = env.reset(seed=0, options={"cube_position": (0.0, cube)})
+    print(observation["agent_pos"].tolist(), flush=True)
+    sys.stdin.readline()
+"""
+
+
+def panel_on(picture: np.ndarray, before: float | None) -> float | None:
+    """Where the blue panel is, as a share of the screen's width; None while there is none, or it is where it was before."""
+    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+    columns = np.flatnonzero(((blue - red > 80) & (blue - green > 80)).any(axis=0))
+    if len(columns) < 5:
+        return None
+    place = float(columns.mean() / picture.shape[1])
+    return None if before is not None and abs(place - before) < 0.05 else place
+
+
+@needs_screen
+def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen):
+    """The program does not close it: a window that is open when the process ends must not crash it either."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", _WATCH],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**screen.environment, "MUJOCO_GL": "egl"},
+    )
+    env = make(sound="none")
+    place = None
+    for cube in (-0.25, 0.25):
+        measured = json.loads(process.stdout.readline())
+        unseen = env.reset(seed=0, options={"cube_position": (0.0, cube)})[0]["agent_pos"]
+        assert measured == unseen.tolist()
+        place = wait_for(lambda before=place: panel_on(screen.picture(), before))
+        process.stdin.write("\n")
+        process.stdin.flush()
+    env.close()
+    assert process.wait(timeout=60) == 0
+
+
+_CHECK = """
+import json, sys, warnings, gymnasium
+from gymnasium.utils.env_checker import check_env
+env = gymnasium.make("gym_playbyear:gym_playbyear/" + sys.argv[1], render_mode="rgb_array").unwrapped
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    check_env(env, skip_render_check=False)
+env.close()
+print(json.dumps([str(w.message) for w in caught]))
+"""
+
+
+@needs_screen
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasiums_checker_passes_with_every_way_of_rendering(screen, task):
+    printed = python(_CHECK, task, **{**screen.environment, "MUJOCO_GL": "egl"})
+    # The state of an arm has no bounds worth naming; Gymnasium remarks on every such space.
+    assert [message for message in json.loads(printed.splitlines()[-1]) if "infinity" not in message] == []
