@@ -6,10 +6,17 @@ Discovery is for commands; there, what talks to the Hub shall have patience (`le
 
 from lerobot_playbyear import __version__
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.environment_sound import Pcm16ToFloatProcessorStep
 from lerobot_playbyear.hub.client import use_patient_client
 from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.processor_playbyear import make_playbyear_pre_post_processors
 
-__all__ = ["PlaybyearConfig", "PlaybyearPolicy", "__version__", "make_playbyear_pre_post_processors"]
+__all__ = [
+    "Pcm16ToFloatProcessorStep",
+    "PlaybyearConfig",
+    "PlaybyearPolicy",
+    "__version__",
+    "make_playbyear_pre_post_processors",
+]
 
 use_patient_client()

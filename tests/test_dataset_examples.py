@@ -20,6 +20,8 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @pytest.fixture
 def run(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)  # as where `python examples/...` is called
+
     def call(name: str, *arguments: str | Path) -> None:
         monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")

@@ -20,6 +20,9 @@ class PcmToFloatProcessorStep(ObservationProcessorStep):
     without scaling them. This step divides every `observation.audio.<mic>`, (B, S) float32 or integer, by 32768, so
     that floats are in [-1, 1] again wherever a policy sees them. It runs once per step, in `lerobot-eval` and in
     `lerobot-train`'s evaluation, both of which ask the environment's configuration for it.
+
+    For environments of other people the policy's distribution has the same step, `playbyear_pcm16_to_float`; neither of the
+    two distributions needs the other.
     """
 
     def observation(self, observation: dict) -> dict:
