@@ -11,7 +11,7 @@ from lerobot_playbyear.datasets.audio_feature import (
 from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
-from lerobot_playbyear.datasets.microphone import MicrophoneBuffer
+from lerobot_playbyear.datasets.microphone import MicrophoneBuffer, SoundCardBuffer
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 
 __all__ = [
@@ -19,6 +19,7 @@ __all__ = [
     "EpisodeStore",
     "MicrophoneBuffer",
     "RunSampler",
+    "SoundCardBuffer",
     "audio_feature",
     "audio_keys",
     "check_audio_features",
