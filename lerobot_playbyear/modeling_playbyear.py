@@ -21,7 +21,6 @@ from lerobot_playbyear.recent import RecentFrames
 from lerobot_playbyear.runs import before_episode, newest
 from lerobot_playbyear.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, segment_and_hop, to_float_wave
 
-LOSS_WEIGHT = "loss_weight"
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
 
 
@@ -79,6 +78,12 @@ class PlaybyearPolicy(PreTrainedPolicy):
         """LeRobot's card, with what the policy hears."""
         return with_hearing(super().generate_model_card(*args, **kwargs), self.config)
 
+    def keep_normalization(self) -> None:
+        """From now on sound is normalised by the statistics that the spectrograms have, in training too."""
+        for module in self.modules():
+            if isinstance(module, LogSpectrogram):
+                module.keeps_statistics = True
+
     def reset(self) -> None:
         """Forgets the episode."""
         self.model.prepare_to_act()
@@ -91,8 +96,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         Args:
             batch: `<key>` (B, T, ...) and `<key>_is_pad` (B, T) with the newest frame last. T may differ between keys and
                 be longer than needed: images need `n_image_frames`, sound `n_audio_frames`, the rest `n_run_frames`,
-                the action the last K. An optional `loss_weight` (B, K) weighs the windows; LeRobot's pre-processor
-                drops it, so it is added afterwards.
+                the action the last K. Windows whose `action_is_pad` is true are not learned from.
             reduction: "mean" for one loss, "none" for one of every item, (B,), as LeRobot's sample weights want it.
 
         Returns:
@@ -108,8 +112,6 @@ class PlaybyearPolicy(PreTrainedPolicy):
         weight = torch.ones_like(error)
         if f"{ACTION}_is_pad" in batch:
             weight = weight * ~batch[f"{ACTION}_is_pad"][:, -n_windows:]
-        if LOSS_WEIGHT in batch:
-            weight = weight * batch[LOSS_WEIGHT]
         if reduction == "none":
             losses = (error * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)  # (B,)
             return losses, {"mse": losses.mean().item()}

@@ -112,6 +112,9 @@ class LogSpectrogram(nn.Module):
         segment_s, hop_s: Length and step of the segments [s].
         n_bins: Lowest frequency bins kept; bin b is at b / segment_s Hz.
         momentum: Weight of the newest batch in the running statistics.
+
+    Attributes:
+        keeps_statistics: Whether the running statistics stay as they are in training too.
     """
 
     mean: Tensor
@@ -126,6 +129,7 @@ class LogSpectrogram(nn.Module):
                 f"n_frequency_bins={n_bins} needs a sample rate of at least {2 * n_bins / segment_s:.0f} Hz, got {sample_rate}."
             )
         self.n_bins, self.momentum = n_bins, momentum
+        self.keeps_statistics = False
         self.transform = torchaudio.transforms.Spectrogram(
             n_fft=self.segment, hop_length=self.hop, center=False, power=None, normalized=False
         )
@@ -156,7 +160,7 @@ class LogSpectrogram(nn.Module):
         levels = self.log_power(wave)
         # A segment counts if its first sample does: the episode, once begun, goes on.
         real = begun[:, : wave.shape[1] - self.segment + 1 : self.hop].unsqueeze(1)  # (B, 1, n_segments)
-        if self.training:
+        if self.training and not self.keeps_statistics:
             self._update(levels.detach(), real)
         levels = (levels - self.mean[:, None]) * torch.rsqrt(self.variance + 1e-5)[:, None]
         return levels * real

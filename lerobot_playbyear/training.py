@@ -31,7 +31,7 @@ from torch import Tensor
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
 from lerobot_playbyear.hub.pushing import push_meanwhile
-from lerobot_playbyear.modeling_playbyear import LOSS_WEIGHT
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.train_config import PlaybyearTrainConfig
 
 _DTYPES = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}
@@ -65,6 +65,11 @@ class PolicyWindows:
         policy: The policy's configuration, complete with its features.
         meta: The dataset's metadata.
         rename_map: The dataset's names of observations, with what the policy calls them.
+
+    Attributes:
+        n_windows: Windows per item that lie in a run of frames, K.
+        action_deltas: Where the actions of an item lie, in frames from its last or, of a chunk, its first one; empty for a
+            policy that learns single actions.
     """
 
     def __init__(
@@ -79,6 +84,7 @@ class PolicyWindows:
             timestamps = resolve_delta_timestamps(policy, meta) or {}
             self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
         self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
+        self.action_deltas: list[int] = self._deltas.get(ACTION, [])
 
     @property
     def keys(self) -> list[str] | None:
@@ -132,7 +138,7 @@ class TrainingParts:
         metrics, _ = update_policy(
             metrics,
             self.policy,
-            self._prepared(batch),
+            self.preprocessor(dict(batch)),
             self.optimizer,
             grad_clip_norm,
             accelerator=self.accelerator,
@@ -146,16 +152,9 @@ class TrainingParts:
         """The policy's loss on a batch, as it would be in a rollout: no augmentation, no dropout."""
         self.policy.eval()
         with self.accelerator.autocast():
-            loss, _ = self.policy.forward(self._prepared(batch))
+            loss, _ = self.policy.forward(self.preprocessor(dict(batch)))
         self.policy.train()
         return float(loss)
-
-    def _prepared(self, batch: Mapping[str, Any]) -> dict[str, Any]:
-        """The batch as the policy takes it; the windows' weights pass by LeRobot's preprocessor, which drops them."""
-        prepared = self.preprocessor(dict(batch))
-        if LOSS_WEIGHT in batch:
-            prepared[LOSS_WEIGHT] = batch[LOSS_WEIGHT].to(self.accelerator.device)
-        return prepared
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
         """Write a checkpoint where lerobot-train would, and return its folder."""
@@ -219,7 +218,8 @@ def make_training_parts(
     Args:
         cfg: The options of the run.
         meta: The dataset's metadata.
-        keep_normalization: Whether a checkpoint's statistics stay as they are; otherwise the dataset's take their place.
+        keep_normalization: Whether a checkpoint's statistics stay as they are, those of sound included; otherwise the
+            dataset's take their place.
 
     Raises:
         ValueError: If the dataset does not suit the policy, before the policy is made.
@@ -230,6 +230,8 @@ def make_training_parts(
     check_dataset_suits(policy_cfg, meta, cfg.rename_map)
     accelerator = make_accelerator(policy_cfg)
     policy = make_policy(cfg=policy_cfg, ds_meta=meta, rename_map=cfg.rename_map)
+    if keep_normalization and isinstance(policy, PlaybyearPolicy):
+        policy.keep_normalization()
     stats = None if cfg.resume or keep_normalization else meta.stats
     preprocessor, postprocessor = _make_processors(cfg, policy, stats, accelerator.device)
     optimizer, scheduler = make_optimizer_and_scheduler(cfg, policy)

@@ -170,15 +170,25 @@ def test_the_dataset_is_a_plain_one_of_successes_with_corrections(finished):
     assert dataset[0]["observation.audio.gripper"].shape == (800,)
 
 
-def test_normalisation_stays_the_checkpoints(finished):
-    tuned, base = finished / "out/checkpoints/last/pretrained_model", base_folder() / "policy"
+def check_normalisation_is_kept(tuned):
+    """Of actions, low-dimensional observations and sound. Batch norm's averages are the network's, and follow its weights."""
+    base = base_folder() / "policy"
     files = sorted(path.name for path in base.glob("policy_*processor*.safetensors"))
     assert files
     for name in files:
         before, after = load_file(base / name), load_file(tuned / name)
         assert all(torch.equal(before[key], after[key]) for key in before)
     before, after = (load_file(path / "model.safetensors") for path in (base, tuned))
-    assert any(not torch.equal(before[key], after[key]) for key in before)
+    changed = {key for key in before if not torch.equal(before[key], after[key])}
+    sound = {f"model.spectrogram.audio_gripper.{name}" for name in ("mean", "variance", "n_batches")}
+    assert sound <= set(before)
+    assert not sound & changed
+    assert any(key.endswith("bn1.running_mean") for key in changed)
+    assert any(key.endswith("weight") for key in changed)
+
+
+def test_normalisation_stays_the_checkpoints_for_sound_too(finished):
+    check_normalisation_is_kept(finished / "out/checkpoints/last/pretrained_model")
 
 
 def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_path, monkeypatch):
@@ -321,6 +331,4 @@ def test_without_an_environment_it_learns_from_what_is_there(finished, tmp_path)
     out = command(*arguments(tmp_path, *offline, env=()))
     assert [line["step"] for line in metrics(tmp_path, "round")] == [2, 4, 5]
     assert (out / "checkpoints/last").resolve().name == "000005"
-    tuned = load_file(out / "checkpoints/last/pretrained_model/model.safetensors")
-    base = load_file(base_folder() / "policy/model.safetensors")
-    assert any(not torch.equal(tuned[key], base[key]) for key in base)
+    check_normalisation_is_kept(out / "checkpoints/last/pretrained_model")

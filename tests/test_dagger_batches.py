@@ -44,9 +44,7 @@ def windows(n_windows):
 
 def supervised(batch):
     """The last frames of all windows that count, (n,)."""
-    weight = batch.get("loss_weight", torch.ones(len(batch["action"]), batch["action"].shape[1]))
-    assert not (batch["action_is_pad"] & (weight > 0)).any()
-    return batch["action"][..., 0][weight > 0].int()
+    return batch["action"][..., 0][~batch["action_is_pad"]].int()
 
 
 ATTEMPTS = "....xxxxxxxxxxxx..........xxx.....x" + "xx............" + "xxxxxxxxxx"
@@ -70,8 +68,8 @@ def test_half_of_every_batchs_windows_end_on_an_intervention_frame(n_windows):
 def test_both_halves_weigh_the_same_in_the_loss():
     batches = BalancedBatches(windows(8), store([40]), store([len(ATTEMPTS)], ATTEMPTS), batch_size=12)
     for number in range(20):
-        weight = batches.batch(number)["loss_weight"]
-        assert weight[:6].sum() == weight[6:].sum() > 0
+        is_learned = ~batches.batch(number)["action_is_pad"]
+        assert is_learned[:6].sum() == is_learned[6:].sum() > 0
 
 
 def test_every_intervention_frame_is_learned_from_alike():
@@ -92,6 +90,7 @@ def test_every_intervention_frame_is_learned_from_alike():
     ("marks", "runs"),
     [
         ("......xxxxx...", {9: 2.5, 10: 2.5}),  # inside: two runs of four, which hold its ends
+        ("......xxxx....", {9: 4.0}),  # exactly a run
         ("......xx......", {7: 4.0}),  # shorter than a run: one run that ends with it
         ("x.............", {3: 4.0}),  # at the start: a run that holds it and does not reach before
         (".............x", {13: 4.0}),
@@ -126,7 +125,7 @@ def test_a_batch_is_given_by_its_number_alone():
         BalancedBatches(windows(4), store([40]), store([len(ATTEMPTS)], ATTEMPTS), 8, seed=3) for _ in range(2)
     )
     expected = [first.batch(number) for number in range(5)]
-    for key in ("action", "loss_weight"):
+    for key in ("action", "action_is_pad"):
         assert torch.equal(again.batch(4)[key], expected[4][key])
         assert not torch.equal(expected[3][key], expected[4][key])
 
@@ -148,18 +147,43 @@ def test_half_a_batch_must_be_a_whole_number():
         BalancedBatches(windows(4), store([40]), None, 7)
 
 
-def test_other_policies_get_lerobots_items_and_the_same_halves(tmp_path):
-    """ACT, say: one window per item, and no weights, which it does not know."""
+def other_policys_windows(tmp_path, action_delta_indices):
+    """What a policy of LeRobot's own is trained on: windows, demonstrations, attempts with random corrections."""
     make_dataset(tmp_path / "demos", (12, 9), image_size=8)
-    make_dataset(tmp_path / "attempts", (15,), image_size=8, seed=1)
+    make_dataset(tmp_path / "attempts", (15, 3), image_size=8, seed=1)
     demos, attempts = (LeRobotDataset("a/b", root=tmp_path / name) for name in ("demos", "attempts"))
     policy = SimpleNamespace(
-        type="other", observation_delta_indices=None, action_delta_indices=[0, 1, 2], reward_delta_indices=None
+        type="other",
+        observation_delta_indices=None,
+        action_delta_indices=action_delta_indices,
+        reward_delta_indices=None,
     )
     policy_windows = PolicyWindows(policy, demos.meta)
-    stores = [EpisodeStore.from_dataset(dataset, policy_windows.keys, "cpu") for dataset in (demos, attempts)]
-    batch = BalancedBatches(policy_windows, *stores, batch_size=8).batch(0)
-    assert "loss_weight" not in batch
-    assert batch["action"].shape == (8, 3, 4)
+    return policy_windows, *(
+        EpisodeStore.from_dataset(dataset, policy_windows.keys, "cpu") for dataset in (demos, attempts)
+    )
+
+
+@pytest.mark.parametrize("deltas", [[0, 1, 2], [-1, 0, 1, 2, 3]], ids=["from now on", "from the last frame on"])
+def test_of_a_chunk_only_what_the_expert_chose_is_learned(tmp_path, deltas):
+    """ACT's chunks, say, and Diffusion's, which begin before the frame they are for."""
+    policy_windows, demos, attempts = other_policys_windows(tmp_path, deltas)
+    by_expert = attempts.column("intervention").flatten()
+    batches = BalancedBatches(policy_windows, demos, attempts, batch_size=8)
+    for number in range(20):
+        batch = batches.batch(number)
+        is_learned = ~batch["action_is_pad"]
+        assert batch["action"].shape == (8, len(deltas), 4)
+        assert batch["intervention"][4:].all()
+        assert len(batch["task"]) == 8
+        assert is_learned[:4].sum() == is_learned[4:].sum() > 0
+        for actions, mask in zip(batch["action"][4:], is_learned[4:], strict=True):
+            for action in actions[mask]:
+                assert by_expert[(attempts.column("action") == action).all(dim=1)].all()
+
+
+def test_single_actions_need_no_mask(tmp_path):
+    policy_windows, demos, attempts = other_policys_windows(tmp_path, None)
+    batch = BalancedBatches(policy_windows, demos, attempts, batch_size=8).batch(0)
+    assert batch["action"].shape == (8, 4)
     assert batch["intervention"][4:].all()
-    assert len(batch["task"]) == 8

@@ -174,14 +174,14 @@ def test_sample_weights_get_one_loss_per_item():
             torch.testing.assert_close(policy.forward(alone)[0], loss)
 
 
-def test_window_weights_weigh_the_loss():
+def test_masked_windows_do_not_count():
     policy = make_policy(n_supervised_steps=3)
     batch = batch_of(policy)
     with torch.no_grad():
         error = (policy.predict_run(batch) - batch["action"]).square().mean(-1)
-        batch["loss_weight"] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 3.0, 0.0]])
+        batch["action_is_pad"] = torch.tensor([[True, True, False], [True, False, True]])
         loss, _ = policy.forward(batch)
-    torch.testing.assert_close(loss, (error[0, 2] + 3 * error[1, 1]) / 4)
+    torch.testing.assert_close(loss, (error[0, 2] + error[1, 1]) / 2)
 
 
 def test_a_rollout_with_another_sample_rate_is_refused():

@@ -77,6 +77,17 @@ def test_statistics_stand_still_in_evaluation_and_without_real_sound():
         torch.testing.assert_close(buffer, before[name], rtol=0, atol=0)
 
 
+def test_kept_statistics_stand_still_in_training_which_then_hears_what_acting_does():
+    spectrogram = make_spectrogram(16000)
+    loud, begun = 5 * noise(2, 32000), torch.ones(2, 32000, dtype=torch.bool)
+    spectrogram.train()(noise(2, 32000), begun)
+    before = {name: buffer.clone() for name, buffer in spectrogram.state_dict().items()}
+    spectrogram.keeps_statistics = True
+    in_training = spectrogram.train()(loud, begun)
+    assert torch.equal(in_training, spectrogram.eval()(loud, begun))
+    assert all(torch.equal(buffer, before[name]) for name, buffer in spectrogram.state_dict().items())
+
+
 def test_integers_are_pcm_at_full_scale_and_floats_are_already_scaled():
     half = torch.full((1, 8), 16384)
     for dtype in (torch.int16, torch.int64):

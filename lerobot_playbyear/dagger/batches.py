@@ -1,8 +1,8 @@
 """Balanced batches: half of the windows from demonstrations, half from moments in which an expert was in control.
 
-A training item is a run of K windows that share encodings (`RunSampler`). An expert's stretch of control rarely begins or
-ends where a run does, so windows are masked one by one: as many demonstration windows are supervised as there are windows
-that end on an intervention frame, and all weigh the same.
+A training item holds several actions: of K windows that share encodings (`RunSampler`), or of a chunk. An expert's stretch of
+control rarely begins or ends where an item does, so actions are masked one by one, by LeRobot's `action_is_pad`: as many
+actions of demonstrations are supervised as there are actions that the expert chose, and all weigh the same.
 """
 
 from typing import Any
@@ -13,9 +13,10 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
-from lerobot_playbyear.modeling_playbyear import LOSS_WEIGHT
 from lerobot_playbyear.recording import INTERVENTION
 from lerobot_playbyear.training import PolicyWindows
+
+_IS_PAD = f"{ACTION}_is_pad"
 
 
 class BalancedBatches:
@@ -49,7 +50,7 @@ class BalancedBatches:
             )
         self._windows, self._seed, self._n_half = windows, seed, batch_size // 2
         self._demonstrations, self._interventions = demonstrations, interventions
-        self._deltas = {INTERVENTION: list(range(1 - windows.n_windows, 1))}
+        self._deltas = {INTERVENTION: windows.action_deltas}
         self._from_demonstrations = RunSampler(run_weights(demonstrations, windows.n_windows), seed)
         self._from_interventions: RunSampler | None = None
         if interventions is not None:
@@ -77,7 +78,8 @@ class BalancedBatches:
         """The batch of that number, counted from 0: the first half are demonstrations.
 
         Returns:
-            What `PolicyWindows.batch` gives, and with more than one window per run `loss_weight` (B, K), 0 or 1.
+            What `PolicyWindows.batch` gives; with several actions per item `action_is_pad` (B, K) is also true where an
+            action is not to be learned.
         """
         assert self._interventions is not None
         assert self._from_interventions is not None
@@ -86,12 +88,12 @@ class BalancedBatches:
         ]
         demonstrations = self._windows.batch(self._demonstrations, lasts[0])
         interventions = self._windows.batch(self._interventions, lasts[1])
-        if self._windows.n_windows > 1:
+        if len(self._windows.action_deltas) > 1:
             by_expert = self._by_expert(self._interventions, lasts[1])  # (B/2, K)
-            is_learned = ~demonstrations[f"{ACTION}_is_pad"]
+            is_learned = ~demonstrations[_IS_PAD]
             n, generator = int(min(is_learned.sum(), by_expert.sum())), self._generator(number)
-            demonstrations[LOSS_WEIGHT] = _keep(is_learned, n, generator).float()
-            interventions[LOSS_WEIGHT] = _keep(by_expert, n, generator).float()
+            demonstrations[_IS_PAD] = ~_keep(is_learned, n, generator)
+            interventions[_IS_PAD] = ~_keep(by_expert, n, generator)
         common = [key for key in demonstrations if key in interventions]
         return {key: _concatenate(demonstrations[key], interventions[key]) for key in common}
 
@@ -101,7 +103,7 @@ class BalancedBatches:
         return ({k: v[: self._n_half] for k, v in batch.items()}, {k: v[self._n_half :] for k, v in batch.items()})
 
     def _by_expert(self, store: EpisodeStore, last: Tensor) -> Tensor:
-        """Which of the K windows of each run end on an intervention frame inside their episode, (B/2, K) bool."""
+        """Which of the K actions of each item the expert chose, inside its episode, (B/2, K) bool."""
         flags = store.windows(last, self._deltas)
         return flags[INTERVENTION].flatten(1) & ~flags[f"{INTERVENTION}_is_pad"]
 
@@ -133,7 +135,8 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
                 weights[min(max(after, start + n_windows), end) - 1] += n_windows
                 continue
             weights[first + n_windows - 1 : after] += 1
-            weights[[first + n_windows - 1, after - 1]] += (n_windows - 1) / 2  # see `run_weights`
+            for end_of_run in (first + n_windows - 1, after - 1):  # the same one if the stretch is a single run
+                weights[end_of_run] += (n_windows - 1) / 2  # see `run_weights`
     return torch.from_numpy(weights)
 
 

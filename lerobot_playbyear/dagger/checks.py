@@ -3,13 +3,17 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
+from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.dagger.config import DaggerError
+from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.recording import INTERVENTION
-from lerobot_playbyear.training import check_dataset_suits, dataset_names
+from lerobot_playbyear.training import PolicyWindows, TrainingParts, check_dataset_suits, dataset_names
 
 Features = Mapping[str, Mapping[str, Any]]
 
@@ -85,6 +89,35 @@ def check_corrections(meta: LeRobotDatasetMetadata) -> None:
             f"The dataset '{meta.repo_id}' does not say which frames an expert chose: wanted '{INTERVENTION}', bool (1,), and "
             f"there is {seen}. Give one that playbyear-dagger or lerobot-rollout --strategy.type=dagger wrote."
         )
+
+
+def check_actions_can_be_masked(parts: TrainingParts, windows: PolicyWindows, demonstrations: EpisodeStore) -> None:
+    """Refuse a policy that learns several actions at once and cannot leave out those that it chose by itself.
+
+    Whether it can is tried: with all actions masked by `action_is_pad`, no action may matter to the loss.
+
+    Raises:
+        DaggerError: It cannot; with what to do.
+    """
+    n_actions = len(windows.action_deltas)
+    if n_actions <= 1:
+        return
+    batch = windows.batch(demonstrations, torch.tensor([demonstrations.starts[0], demonstrations.ends[0] - 1]))
+    batch[f"{ACTION}_is_pad"] = torch.ones_like(batch[f"{ACTION}_is_pad"])
+    losses = []
+    for actions in (batch[ACTION], batch[ACTION] + 1):
+        set_seed(0)  # of what the loss draws
+        losses.append(parts.loss({**batch, ACTION: actions}))
+    if np.array_equal(losses[0], losses[1], equal_nan=True):  # a mean over no action may be NaN
+        return
+    config = parts.accelerator.unwrap_model(parts.policy).config
+    remedy = "Take a policy whose loss does, such as act, or one of single actions."
+    if getattr(config, "do_mask_loss_for_padding", True) is False:
+        remedy = "Give --policy.do_mask_loss_for_padding=true."
+    raise DaggerError(
+        f"The policy '{config.type}' learns chunks of {n_actions} actions, and its loss does not leave out those that "
+        f"'{ACTION}_is_pad' masks: what the policy itself did before and after a correction would be imitated. {remedy}"
+    )
 
 
 def _signature(feature: Mapping[str, Any]) -> str:

@@ -13,7 +13,7 @@ from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import init_logging, inside_slurm
 
 from lerobot_playbyear.dagger.batches import BalancedBatches
-from lerobot_playbyear.dagger.checks import check_alike, check_dataset
+from lerobot_playbyear.dagger.checks import check_actions_can_be_masked, check_alike, check_dataset
 from lerobot_playbyear.dagger.collector import PolicyActor
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError, differences
 from lerobot_playbyear.dagger.corrections import Corrections
@@ -127,6 +127,7 @@ def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack
     parts = make_training_parts(training, demos.meta, keep_normalization=True)
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = _read(demos, windows, cfg)
+    check_actions_can_be_masked(parts, windows, demonstrations)
     corrections.read(windows.keys, demonstrations.device)
     batches = BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed)
 
