@@ -9,10 +9,10 @@ from draccus.parsers.encoding import encode_choice
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
-from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_playbyear.precision import DTYPES, training_dtype
+from lerobot_playbyear.schedule import PlaybyearSchedulerConfig
 
 AUDIO_PREFIX = "observation.audio."
 
@@ -46,6 +46,8 @@ class PlaybyearConfig(PreTrainedConfig):
             without parameters). Off is the paper's plain concatenation.
         low_dimensional_gain: Factor on the normalised low-dimensional observations before the fusion. With 1, the paper's, the
             seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
+        action_range: How far actions reach, in units of the normalised ones. With 1, the paper's, and normalisation to [-1, 1],
+            no action lies outside of the demonstrations'; 1.5 reaches a quarter of their range further at both ends.
 
     Training:
         n_supervised_steps: Windows, K, that a training item supervises: the windows that end on its last K frames. They
@@ -62,9 +64,9 @@ class PlaybyearConfig(PreTrainedConfig):
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
-        optimizer_*: Adam, and the clip of the gradient's norm.
+        optimizer_*: Adam, and the clip of the gradient's norm; 0, the paper's, clips nothing.
         scheduler_*: Linear warm-up over this share of the steps, then a cosine down to this share of the rate. The paper's
-            rate is constant; the schedule is what lets thousands instead of a hundred thousand updates do.
+            rate is constant (0 and 1); the schedule is what lets thousands instead of a hundred thousand updates do.
     """
 
     # Inputs
@@ -96,6 +98,7 @@ class PlaybyearConfig(PreTrainedConfig):
     embedding_size: int = 50
     normalize_encodings: bool = True
     low_dimensional_gain: float = 4.0
+    action_range: float = 1.0
 
     # Training
     n_supervised_steps: int = 8
@@ -120,6 +123,8 @@ class PlaybyearConfig(PreTrainedConfig):
         for name in ("fps", "n_frame_stack", "n_memory_steps", "n_supervised_steps", "vision_width", "image_size"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
+        if not self.action_range > 0:
+            raise ValueError(f"--policy.action_range must be above 0, got {self.action_range}.")
         if self.audio_window_s < self.segment_s or self.hop_s <= 0:
             raise ValueError(
                 f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "
@@ -289,10 +294,12 @@ class PlaybyearConfig(PreTrainedConfig):
             grad_clip_norm=self.optimizer_grad_clip_norm,
         )
 
-    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+    def get_scheduler_preset(self) -> PlaybyearSchedulerConfig | None:
+        if self.scheduler_warmup_share == 0 and self.scheduler_final_share == 1:
+            return None  # a constant rate
         # LeRobot shrinks both numbers together when a run is shorter than the decay.
         steps = 10**6
-        return CosineDecayWithWarmupSchedulerConfig(
+        return PlaybyearSchedulerConfig(
             num_warmup_steps=max(1, round(self.scheduler_warmup_share * steps)),
             num_decay_steps=steps,
             peak_lr=self.optimizer_lr,

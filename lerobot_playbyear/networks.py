@@ -124,7 +124,7 @@ class MemoryHead(nn.Module):
 
     def __init__(self, config: PlaybyearConfig, n_actions: int):
         super().__init__()
-        self.memory_steps = config.memory_steps
+        self.memory_steps, self.action_range = config.memory_steps, config.action_range
         self.lstm = nn.LSTM(config.embedding_size, config.embedding_size, batch_first=True)
         self.head = _mlp(config.embedding_size, config.hidden_size, n_actions)
 
@@ -135,10 +135,11 @@ class MemoryHead(nn.Module):
             encodings: (B, R, D) consecutive frames' joint encodings.
 
         Returns:
-            (B, R - H + 1, n_actions), in [-1, 1].
+            (B, R - H + 1, n_actions), in [-1, 1] times the action range.
         """
         windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
         n_items, n_windows = windows.shape[:2]
         outputs, _ = self.lstm(windows.flatten(0, 1))  # (B * K, H, D)
-        actions = torch.tanh(self.head(outputs[:, -1]).float())  # whatever autocast computed in
+        actions = self.head(outputs[:, -1]).float()  # whatever autocast computed in
+        actions = self.action_range * torch.tanh(actions / self.action_range)
         return actions.unflatten(0, (n_items, n_windows))

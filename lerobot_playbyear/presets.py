@@ -51,7 +51,7 @@ PRESETS = {
             "env_eval_freq": "3000",
         },
     ),
-    "paper": Preset(
+    "paper": Preset(  # what it is, and what differs from the publication on purpose: docs/training.md
         purpose="the published experiment: 1.6 million windows at 224 pixels, for a GPU",
         network={
             "policy.type": "playbyear",
@@ -62,7 +62,11 @@ PRESETS = {
         },
         training={
             "policy.n_supervised_steps": "1",
+            "policy.low_dimensional_noise": "0",
             "policy.optimizer_lr": "1e-3",
+            "policy.optimizer_grad_clip_norm": "0",
+            "policy.scheduler_warmup_share": "0",
+            "policy.scheduler_final_share": "1",
             "policy.push_to_hub": "false",
             "batch_size": "16",
             "steps": "100000",

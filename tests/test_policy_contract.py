@@ -74,6 +74,7 @@ def step_through(policy, episodes):
         {"n_supervised_steps": 1},
         {"n_supervised_steps": 6},
         {"normalize_encodings": False, "low_dimensional_gain": 1.0},
+        {"action_range": 2.0},
         {"use_audio": False},
         {"use_vision": False},
         {"use_memory": False},

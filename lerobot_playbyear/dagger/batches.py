@@ -125,7 +125,7 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
     Returns:
         (N,) float64, 0 for frames at which no run ends.
     """
-    by_expert = store.column(INTERVENTION).reshape(len(store), -1)[:, 0].cpu().numpy().astype(bool)
+    by_expert = frames_by_expert(store).cpu().numpy()
     weights = np.zeros(len(store))
     for start, end in zip(store.starts, store.ends, strict=True):
         changes = np.flatnonzero(np.diff(np.concatenate([[False], by_expert[start:end], [False]])))
@@ -138,6 +138,11 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
             for end_of_run in (first + n_windows - 1, after - 1):  # the same one if the stretch is a single run
                 weights[end_of_run] += (n_windows - 1) / 2  # see `run_weights`
     return torch.from_numpy(weights)
+
+
+def frames_by_expert(store: EpisodeStore) -> Tensor:
+    """Which frames of attempts have an action that the expert chose, (N,) bool."""
+    return store.column(INTERVENTION).reshape(len(store), -1)[:, 0].bool()
 
 
 def _draw(sampler: RunSampler, number: int, n: int) -> Tensor:

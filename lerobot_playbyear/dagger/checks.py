@@ -91,6 +91,25 @@ def check_corrections(meta: LeRobotDatasetMetadata) -> None:
         )
 
 
+def check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig) -> None:
+    """Refuse a policy whose actions would all become larger, or smaller, before it has learned anything.
+
+    Args:
+        policy: As it shall be improved.
+        trained: As its checkpoint says.
+
+    Raises:
+        DaggerError: Their action ranges differ.
+    """
+    wanted, seen = (getattr(config, "action_range", None) for config in (policy, trained))
+    if wanted != seen:
+        raise DaggerError(
+            f"--policy.action_range={wanted}: the policy was trained with {seen}, and would act differently from now on. "
+            f"Train it on its demonstrations first: playbyear-train --policy.path={policy.pretrained_path} "
+            f"--policy.action_range={wanted}."
+        )
+
+
 def check_actions_can_be_masked(parts: TrainingParts, windows: PolicyWindows, demonstrations: EpisodeStore) -> None:
     """Refuse a policy that learns several actions at once and cannot leave out those that it chose by itself.
 

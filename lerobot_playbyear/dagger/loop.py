@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from lerobot.common.train_utils import get_step_identifier
 from lerobot.utils.random_utils import set_seed
 
@@ -19,6 +20,7 @@ from lerobot_playbyear.dagger.expert import Expert, Verdict
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.reach import Reach
 from lerobot_playbyear.tracking import make_tracker
 from lerobot_playbyear.train_config import PlaybyearTrainConfig
 from lerobot_playbyear.training import TrainingParts
@@ -40,6 +42,7 @@ class Loop:
         demonstrations: Half of each batch.
         corrections: The other half.
         batches: Draws from both.
+        reach: Knows which corrections the policy cannot learn.
         report: Tells how it goes.
         scene: The environment, the policy in it, and the expert; None to learn from recorded corrections alone.
     """
@@ -54,12 +57,13 @@ class Loop:
         demonstrations: EpisodeStore,
         corrections: Corrections,
         batches: BalancedBatches,
+        reach: Reach,
         report: Report,
         scene: tuple[gym.Env, PolicyActor, Expert] | None,
     ) -> None:
         self._cfg, self._training = cfg, training
         self._folder, self._state = folder, state
-        self._parts, self._batches = parts, batches
+        self._parts, self._batches, self._reach = parts, batches, reach
         self._demonstrations, self._corrections = demonstrations, corrections
         self._report, self._scene = report, scene
 
@@ -121,6 +125,8 @@ class Loop:
             seconds.add(spent)
             if attempt.is_kept:
                 self._report.advance()
+                by_expert = torch.from_numpy(attempt.episode.actions[attempt.episode.interventions])
+                self._reach.warn(by_expert, f"the corrections of attempt {self._state.attempts}")
                 return True
         if outcomes.count("failed") > len(outcomes) / 2:
             raise DaggerError(

@@ -9,11 +9,11 @@ from pathlib import Path
 import gymnasium as gym
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.datasets import LeRobotDataset
-from lerobot.utils.constants import LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import init_logging, inside_slurm
 
-from lerobot_playbyear.dagger.batches import BalancedBatches
-from lerobot_playbyear.dagger.checks import check_actions_can_be_masked, check_alike, check_dataset
+from lerobot_playbyear.dagger.batches import BalancedBatches, frames_by_expert
+from lerobot_playbyear.dagger.checks import check_action_range, check_actions_can_be_masked, check_alike, check_dataset
 from lerobot_playbyear.dagger.collector import PolicyActor
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError, differences
 from lerobot_playbyear.dagger.corrections import Corrections
@@ -24,6 +24,7 @@ from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.durable import DatasetWriteError
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
+from lerobot_playbyear.reach import Reach, action_names
 from lerobot_playbyear.recording import dataset_features, env_spec, next_seed
 from lerobot_playbyear.rollouts import RolloutError, env_facts
 from lerobot_playbyear.tracking import METRICS_NAME
@@ -89,6 +90,8 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
         overrides = state.policy_overrides
     cfg.policy = PreTrainedConfig.from_pretrained(source, cli_overrides=overrides)
     cfg.policy.pretrained_path = source  # type: ignore[assignment]
+    if overrides:
+        check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise DaggerError(
             "--policy.push_to_hub=true needs a name: give --policy.repo_id, or --policy.push_to_hub=false."
@@ -129,6 +132,10 @@ def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack
     demonstrations = _read(demos, windows, cfg)
     check_actions_can_be_masked(parts, windows, demonstrations)
     corrections.read(windows.keys, demonstrations.device)
+    reach = Reach(cfg.policy, parts.preprocessor, action_names(demos.meta.features[ACTION]))
+    reach.warn(demonstrations.column(ACTION), "the demonstrations")
+    if corrections.store is not None:
+        reach.warn(corrections.store.column(ACTION)[frames_by_expert(corrections.store)], "the corrections")
     batches = BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed)
 
     folder.begin(cfg, state)
@@ -138,7 +145,7 @@ def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack
         policy = parts.accelerator.unwrap_model(parts.policy)
         actor = PolicyActor(policy, cfg.env, parts.preprocessor, parts.postprocessor, parts.accelerator.autocast)
         scene = (env, actor, expert)
-    Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, report, scene).run()
+    Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, reach, report, scene).run()
 
 
 def _make_env(cfg: DaggerConfig, stack: ExitStack) -> gym.Env:

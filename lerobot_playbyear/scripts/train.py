@@ -21,6 +21,7 @@ import torch
 from lerobot.common.wandb_utils import WandBLogger
 from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset, make_train_eval_datasets
+from lerobot.utils.constants import ACTION
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
@@ -41,6 +42,7 @@ from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.memory import keep_freed_memory
 from lerobot_playbyear.presets import apply_preset
+from lerobot_playbyear.reach import Reach, action_names
 from lerobot_playbyear.tracking import METRICS_NAME, make_tracker
 from lerobot_playbyear.train_config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training import PolicyWindows, TrainingParts, make_training_parts
@@ -79,6 +81,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         store = _read(dataset, windows, cfg)
         validation_store = None if held_out is None or cfg.eval_steps <= 0 else _read(held_out, windows, cfg)
 
+    reach = Reach(parts.policy.config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
+    reach.warn(store.column(ACTION), f"the dataset '{cfg.dataset.repo_id}'")
     weights = run_weights(store, windows.n_windows, frame_weights(store, cfg.sampling))
     sampler = RunSampler(weights, cfg.seed or 0)
     sampler.load_state_dict({**sampler.state_dict(), "n_batches": parts.step})

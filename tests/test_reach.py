@@ -1,0 +1,229 @@
+"""Actions that no demonstration holds: a policy says which of them it cannot learn, and learns them with a larger range."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+from dagger_factory import ENV, QUICK, SMALL, command
+from dataset_factory import TASK, dataset_features, random_frame
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.dagger import DaggerError
+from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.reach import Reach
+from lerobot_playbyear.scripts.train import train
+
+FEATURES = dataset_features(image_size=16)
+FEATURES["action"]["names"] = ["pan", "lift", "elbow", "gripper"]
+TINY = (
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+    "--policy.use_vision=false",
+    "--policy.use_audio=false",
+    "--policy.n_supervised_steps=4",
+    "--policy.hidden_size=32",
+    "--num_workers=0",
+    "--batch_size=2",
+    "--steps=1",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    register_third_party_plugins()
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+def write(root, actions, by_expert=None):
+    """A dataset of one episode with these actions (T, 4)."""
+    dataset = LeRobotDataset.create("tests/reach", 20, FEATURES, root=root, use_videos=False)
+    rng = np.random.default_rng(0)
+    for t, action in enumerate(np.asarray(actions, np.float32)):
+        frame = {**random_frame(FEATURES, rng), "action": action, "task": TASK}
+        frame["intervention"] = np.array([by_expert is None or bool(by_expert[t])])
+        dataset.add_frame(frame)
+    dataset.save_episode()
+    dataset.finalize()
+
+
+def run_training(*options):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train", *TINY, *map(str, options)])
+        train()
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    """`demos`, whose actions lie in [-0.1, 0.1], and `policy`, a checkpoint of a policy that was trained on them."""
+    folder = tmp_path_factory.mktemp("base")
+    actions = np.random.default_rng(0).uniform(-0.1, 0.1, (30, 4))
+    actions[:2] = [[-0.1] * 4, [0.1] * 4]
+    write(folder / "demos", actions)
+    data = ("--dataset.repo_id=tests/reach", f"--dataset.root={folder / 'demos'}")
+    run_training("--policy.type=playbyear", *data, f"--output_dir={folder / 'train'}")
+    (folder / "policy").symlink_to(folder / "train/checkpoints/last/pretrained_model")
+    return folder
+
+
+def dagger(base, folder, *options, policy=None):
+    return command(
+        f"--policy.path={policy or base / 'policy'}",
+        "--demos.repo_id=tests/reach",
+        f"--demos.root={base / 'demos'}",
+        "--interventions.repo_id=tests/corrections",
+        f"--interventions.root={folder / 'corrections'}",
+        f"--output_dir={folder / 'out'}",
+        *SMALL,
+        *options,
+    )
+
+
+def warnings(capfd):
+    return [line for line in "\n".join(capfd.readouterr()).splitlines() if "out of the policy's reach" in line]
+
+
+def small_config(**options):
+    return PlaybyearConfig(
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+        use_vision=False,
+        use_audio=False,
+        n_supervised_steps=1,
+        hidden_size=32,
+        device="cpu",
+        push_to_hub=False,
+        **options,
+    )
+
+
+STATS = {
+    "action": {"min": [0.0, -1.0], "max": [2.0, 1.0], "mean": [1.0, 0.0], "std": [0.5, 0.5]},
+    "observation.state": {"mean": [0.0] * 3, "std": [1.0] * 3},
+}
+
+
+def processors(config):
+    stats = {key: {name: torch.tensor(value) for name, value in entry.items()} for key, entry in STATS.items()}
+    return make_pre_post_processors(config, dataset_stats=stats)
+
+
+# What can be learned
+
+
+@pytest.mark.parametrize(("action_range", "learned"), [(1.0, 2.0), (2.0, 2.5)])
+def test_an_action_outside_the_demonstrations_is_learned_only_within_the_range(action_range, learned):
+    """The expert wants 2.5 where the demonstrations end at 2."""
+    torch.manual_seed(0)
+    config = small_config(action_range=action_range)
+    policy, (before, after) = PlaybyearPolicy(config), processors(config)
+    batch = before({"observation.state": torch.randn(8, 10, 3), "action": torch.tensor([2.5, 0.5]).expand(8, 1, 2)})
+    optimizer = torch.optim.Adam(policy.parameters(), 3e-3)
+    for _ in range(150):
+        optimizer.zero_grad()
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+    action = after(policy.predict_run(batch)[0, -1:].detach())[0]
+    torch.testing.assert_close(action, torch.tensor([learned, 0.5]), atol=0.03, rtol=0)
+
+
+def test_a_range_of_one_is_the_papers_tanh():
+    torch.manual_seed(0)
+    config = small_config()
+    policy = PlaybyearPolicy(config)
+    encodings = torch.randn(3, 10, config.embedding_size)
+    head = policy.model.memory_head
+    assert torch.equal(head(encodings)[:, 0], torch.tanh(head.head(head.lstm(encodings)[0][:, -1])))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_a_range_must_be_positive(value):
+    with pytest.raises(ValueError, match=rf"--policy.action_range must be above 0, got {value}"):
+        small_config(action_range=value)
+
+
+# What is said
+
+
+def test_shares_are_told_by_dimension_and_what_would_reach_them():
+    config = small_config()
+    reach = Reach(config, processors(config)[0], ["pan", "gripper"])
+    actions = torch.tensor([[1.0, 0.0], [2.0, -1.0], [2.5, 0.0], [-1.0, 1.0]])  # normalised: 0, 1, 1.5, -2
+    text = reach.warning(actions, "the corrections")
+    assert "the corrections" in text
+    assert "'pan' in 50.0 % of 4 frames" in text
+    assert "gripper" not in text
+    assert "--policy.action_range=2.2" in text
+    assert reach.warning(actions[:2], "the corrections") is None
+    assert Reach(small_config(action_range=2.2), processors(config)[0], None).warning(actions, "x") is None
+
+
+def test_what_never_moved_in_the_demonstrations_is_told_apart():
+    config = small_config()
+    stats = {"action": {"min": torch.tensor([0.0, 0.0]), "max": torch.tensor([2.0, 0.0])}}
+    reach = Reach(config, make_pre_post_processors(config, dataset_stats=stats)[0], None)
+    text = reach.warning(torch.tensor([[1.0, 0.5], [2.5, 0.0]]), "the corrections")
+    assert "'action[0]' in 50.0 %, 'action[1]' in 50.0 % of 2 frames" in text
+    assert "--policy.action_range=1.7" in text
+    assert "'action[1]' hardly moves in the demonstrations" in text
+
+
+def test_other_policies_reach_everything():
+    assert Reach(object(), None, None).warning(torch.full((3, 2), 9.0), "x") is None
+
+
+def test_training_says_it_where_a_standard_deviation_is_the_end(base, tmp_path, capfd):
+    """With statistics of mean and standard deviation tanh would end at one of it."""
+    data = ("--dataset.repo_id=tests/reach", f"--dataset.root={base / 'demos'}")
+    mapping = '--policy.normalization_mapping={"STATE": "MEAN_STD", "ACTION": "MEAN_STD"}'
+    run_training("--policy.type=playbyear", mapping, *data, f"--output_dir={tmp_path / 'out'}")
+    (message,) = warnings(capfd)
+    assert "the dataset 'tests/reach'" in message
+    assert all(f"'{name}' in " in message for name in FEATURES["action"]["names"])
+
+
+def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wider_policy_takes_them(
+    base, tmp_path, capfd
+):
+    actions, by_expert = np.zeros((20, 4)), np.arange(20) >= 10
+    actions[:10] = 0.9  # the policy's own: not learned
+    actions[10:15, 1] = 0.14
+    write(tmp_path / "corrections", actions, by_expert)
+    offline = ("--episodes=0", "--updates=1")
+
+    dagger(base, tmp_path, *offline)
+    (message,) = warnings(capfd)
+    assert "the corrections" in message
+    assert "'lift' in 50.0 % of 10 frames" in message
+    assert "--policy.action_range=1.6" in message
+
+    data = ("--dataset.repo_id=tests/reach", f"--dataset.root={base / 'demos'}")
+    wider = ("--policy.action_range=1.6", f"--policy.path={base / 'policy'}")
+    run_training(*wider, *data, f"--output_dir={tmp_path / 'wide'}")
+    policy = tmp_path / "wide/checkpoints/last/pretrained_model"
+    assert json.loads((policy / "config.json").read_text())["action_range"] == 1.6
+    dagger(base, tmp_path, *offline, f"--output_dir={tmp_path / 'out_wide'}", policy=policy)
+    assert warnings(capfd) == []
+
+
+def test_the_range_of_a_trained_policy_is_not_changed_while_it_acts(base, tmp_path):
+    with pytest.raises(DaggerError, match=r"action_range=2.0.*trained with 1.0.*playbyear-train --policy.path"):
+        dagger(base, tmp_path, *ENV, *QUICK, "--policy.action_range=2.0")
+    assert not (tmp_path / "out").exists()
+
+
+def test_corrections_that_arrive_are_told_once_per_round(base, tmp_path, capfd):
+    """The expert of these tests does 0.2, 0.1 and -0.2, and closes the gripper with -1."""
+    dagger(base, tmp_path, *ENV, *QUICK, "--episodes=2")
+    messages = warnings(capfd)
+    assert len(messages) == 2
+    for message in messages:
+        assert "'pan' in 100.0 %, 'elbow' in 100.0 %, 'gripper' in 100.0 % of 3 frames" in message

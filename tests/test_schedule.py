@@ -1,0 +1,163 @@
+"""The published recipe to the letter, and what becomes of the learning rate of a run that is to go on for longer."""
+
+import json
+import sys
+
+import pytest
+import torch
+from dataset_factory import dataset_features, make_dataset
+from lerobot.scripts import lerobot_train
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.presets import apply_preset
+from lerobot_playbyear.scripts.train import train
+from lerobot_playbyear.train_config import PlaybyearTrainConfig
+
+TINY = ("--policy.device=cpu", "--policy.push_to_hub=false", "--policy.audio_window_s=0.9", "--num_workers=0")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    register_third_party_plugins()
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+@pytest.fixture
+def command(monkeypatch):
+    """Runs a training script in this process, as the command line would."""
+
+    def run(function, *arguments):
+        monkeypatch.setattr(sys, "argv", ["train", *apply_preset(list(map(str, arguments)))])
+        return function()
+
+    return run
+
+
+# The published recipe
+
+PUBLISHED = {
+    # inputs
+    "use_vision": True,
+    "use_audio": True,
+    "use_memory": True,
+    "image_size": 224,
+    "n_frame_stack": 3,
+    "n_memory_steps": 10,
+    "audio_window_s": 2.0,
+    "segment_s": 0.040,
+    "hop_s": 0.035,
+    "n_frequency_bins": 160,
+    # network: ResNet-18, 160 -> 64 -> 32 -> 16 -> 8 channels, plain concatenation, 2 x 1,024 -> 50
+    "vision_width": 64,
+    "audio_channels": (64, 32, 16, 8),
+    "normalize_encodings": False,
+    "low_dimensional_gain": 1.0,
+    "hidden_size": 1024,
+    "embedding_size": 50,
+    # the last action of one window; augmentation of images alone
+    "n_supervised_steps": 1,
+    "augmentation_crop": 4.0,
+    "augmentation_brightness": 0.05,
+    "augmentation_hue": 0.05,
+    "augmentation_degrees": 5.0,
+    "augmentation_translate": 0.05,
+    "augmentation_scale": 0.05,
+    "audio_noise_db": None,
+    "low_dimensional_noise": 0.0,
+    # Adam
+    "optimizer_lr": 1e-3,
+    "optimizer_weight_decay": 0.0,
+    "use_amp": False,
+}
+
+
+def test_the_preset_paper_is_the_published_recipe_to_the_letter(command, monkeypatch):
+    seen = []
+    monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        command(train, "--preset=paper", "--dataset.repo_id=tests/noise")
+    (cfg,) = seen
+    assert {name: getattr(cfg.policy, name) for name in PUBLISHED} == PUBLISHED
+    assert (cfg.batch_size, cfg.steps) == (16, 100_000)
+    assert (cfg.sampling.start_weight, cfg.sampling.loud_weight) == (1, 1)
+
+
+def test_the_preset_paper_keeps_adams_rate_constant_and_never_clips(command, tmp_path):
+    make_dataset(tmp_path / "data", (15, 12), image_size=16)
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={tmp_path / 'data'}")
+    small = (
+        "--policy.image_size=16",
+        "--policy.vision_width=4",
+        "--policy.hidden_size=32",
+        "--steps=4",
+        "--log_freq=1",
+    )
+
+    command(train, "--preset=paper", *TINY, *data, *small, f"--output_dir={tmp_path / 'out'}")
+
+    lines = [json.loads(line) for line in (tmp_path / "out/metrics.jsonl").read_text().splitlines()]
+    saved = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/train_config.json").read_text())
+    assert [line["lr"] for line in lines] == [1e-3] * 4
+    assert saved["scheduler"] is None
+    assert saved["optimizer"] == {
+        "type": "adam",
+        "lr": 1e-3,
+        "betas": [0.9, 0.999],
+        "eps": 1e-8,
+        "weight_decay": 0.0,
+        "grad_clip_norm": 0.0,
+    }
+
+
+# Going on for longer
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A dataset, and the `train_config.json` of the last checkpoint of a run of ten updates, whose rate has fallen."""
+    folder = tmp_path_factory.mktemp("run")
+    make_dataset(folder / "data", (15, 12), features=dataset_features(cameras=(), microphones=()))
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={folder / 'data'}")
+    blind_and_deaf = ("--policy.type=playbyear", "--policy.use_vision=false", "--policy.use_audio=false")
+    run = ("--policy.n_supervised_steps=2", "--steps=10", "--save_freq=5", "--batch_size=2", "--log_freq=1")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train", *TINY, *data, *blind_and_deaf, *run, f"--output_dir={folder / 'out'}"])
+        train()
+    return folder / "out/checkpoints/last/pretrained_model/train_config.json"
+
+
+def jumps(capfd):
+    """The warnings since the last time; LeRobot's logging writes them."""
+    return [line for line in "\n".join(capfd.readouterr()).splitlines() if "The learning rate rises" in line]
+
+
+@pytest.mark.parametrize("script", [train, lerobot_train.train], ids=["playbyear-train", "lerobot-train"])
+def test_a_rate_that_rises_because_the_run_shall_be_longer_is_said(script, trained, command, tmp_path, capfd):
+    resumed = ("--resume=true", f"--config_path={trained}", "--steps=20")
+
+    command(script, *resumed, f"--output_dir={tmp_path / 'out'}")
+
+    (message,) = jumps(capfd)
+    assert "planned for 10 updates" in message
+    assert "from 1e-05 to 0.000505" in message
+    advice = message.split("add ")[1].split()
+    assert advice[:2] == ["--scheduler.num_warmup_steps=0", "--scheduler.num_decay_steps=10"]
+    command(script, *resumed, *advice[:2], f"--output_dir={tmp_path / 'low'}")
+    assert not jumps(capfd)
+    state = json.loads((tmp_path / "low/checkpoints/last/training_state/scheduler_state.json").read_text())
+    assert state["_last_lr"] == [pytest.approx(1e-5)]
+
+
+def test_a_run_that_goes_on_as_planned_says_nothing(trained, command, tmp_path, capfd):
+    half = trained.parents[2] / "000005/pretrained_model/train_config.json"
+    command(train, "--resume=true", f"--config_path={half}", f"--output_dir={tmp_path / 'out'}")
+    assert not jumps(capfd)
+
+
+def test_a_constant_rate_needs_no_plan():
+    assert PlaybyearConfig(scheduler_warmup_share=0, scheduler_final_share=1).get_scheduler_preset() is None
+    assert PlaybyearConfig().get_scheduler_preset() is not None
