@@ -31,7 +31,9 @@ def to_float_wave(wave: Tensor, key: str) -> Tensor:
         raise ValueError(f"{key} holds NaN or infinite samples; wanted finite ones. Check the recording.")
     if peak > 1.5:
         raise ValueError(
-            f"{key} holds float samples up to {peak:.4g}; wanted floats in [-1, 1], or integers as PCM at full scale."
+            f"{key} holds float samples up to {peak:.4g}; wanted floats in [-1, 1], or integers as PCM at full scale. "
+            "Where an environment's int16 sound was made floats of, let its configuration's get_env_processors name "
+            "Pcm16ToFloatProcessorStep (docs/dataset.md)."
         )
     return wave.float()
 
