@@ -26,11 +26,14 @@ from lerobot.utils.constants import (
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
-from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, check_root
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.existing import check_root
 from lerobot_playbyear.hub.client import use_patient_client
 from lerobot_playbyear.hub.datasets import push_dataset
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.rollouts import EnvFacts, EnvSpec, Episode, Observation, RolloutError, RolloutPool
+from lerobot_playbyear.saving import save_or_ask
 
 INTERVENTION = "intervention"
 SEED = "seed"
@@ -138,6 +141,10 @@ def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = Non
                 summary = f"{writer.num_episodes} episodes, {writer.num_frames} frames"
     except (DatasetWriteError, RolloutError, FileExistsError, ValueError) as error:
         raise RecordError(str(error)) from error
+    except MemoryError as error:
+        raise RecordError(
+            f"There is not enough memory to record to {root}. What was saved before is complete."
+        ) from error
     except OSError as error:
         raise RecordError(f"Cannot write to {root}: {error}") from error
     print(f"\nDataset: {root} ({summary})")
@@ -230,7 +237,7 @@ def _record_episodes(cfg: RecordConfig, pool: Rollouts, writer: DurableWriter) -
             if episode.success:
                 for frame in episode_frames(episode, writer.features):
                     writer.add_frame(frame)
-                writer.save_episode()
+                save_or_ask(writer)
                 successes += 1
                 progress.update()
             progress.set_postfix_str(f"success rate {successes / attempts:.0%} of {attempts} attempts")
@@ -269,6 +276,10 @@ def _observation_boxes(space: gym.spaces.Dict) -> dict[str, gym.spaces.Box]:
     for key, box in boxes.items():
         if not isinstance(box, gym.spaces.Box) or (key.startswith(AUDIO_PREFIX) and box.dtype != np.int16):
             raise ValueError(f"The observation {key!r} cannot be recorded: its space is {box}.")
+        if key.startswith(AUDIO_PREFIX) and len(box.shape) != 1:
+            raise ValueError(
+                f"The observation {key!r} has shape {box.shape}; wanted (S,): every microphone is its own key."
+            )
     return boxes
 
 

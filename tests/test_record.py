@@ -12,9 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
-from recording_factory import FEATURES
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, RecordError, env_spec, record
 from lerobot_playbyear.rollouts import RolloutError, RolloutPool
@@ -132,7 +132,9 @@ def test_resuming_with_other_settings_names_the_difference(recorded):
     with pytest.raises(RecordError, match=r"observation\.audio\.gripper is int16 \(800,\) at 16000 Hz there and"):
         record(config(recorded, 4, resume=True, env=PlaybyearEnvConfig(sample_rate=48000)))
     with pytest.raises(ValueError, match="fps is 20 there and 30 here"):
-        DurableWriter("test/recorded", recorded, 30, FEATURES, resume=True)
+        DurableWriter(
+            "test/recorded", recorded, 30, {"observation.audio.gripper": audio_feature(1500, 30)}, resume=True
+        )
 
 
 def test_a_folder_with_other_files_is_refused(tmp_path):

@@ -144,15 +144,12 @@ def test_a_recording_that_lerobot_could_not_finish_is_whole_again(copy, original
 
 
 def test_recording_goes_on_where_lerobot_was_killed(copy):
+    """After the repair that it asks for."""
     root = copy("killed")
-    with DurableWriter(
-        REPO_ID, root, FPS, RICH_FEATURES, resume=True, rgb_encoder=RGBEncoderConfig(**ENCODER)
-    ) as writer:
-        assert writer.repair is not None
-        assert writer.num_episodes == N_EPISODES
-        for frame in episode_frames(N_EPISODES, RICH_FEATURES):
-            writer.add_frame(frame)
-        writer.save_episode()
+    with pytest.raises(DatasetDamagedError, match=r"(?s)no valid end.*playbyear-repair --root="):
+        write_ours(root, RICH_FEATURES, range(N_EPISODES, N_EPISODES + 1))
+    repair_dataset(root)
+    write_ours(root, RICH_FEATURES, range(N_EPISODES, N_EPISODES + 1))
     assert not differences(load(root), {n: n for n in range(N_EPISODES + 1)}, RICH_FEATURES)
     assert check_dataset(root).is_sound
 
@@ -256,14 +253,19 @@ def test_a_feature_of_another_name_is_not_believed(copy):
     check_kept(root, report, FEATURES)
 
 
-def test_the_recorder_repairs_what_it_continues_and_says_so(copy, caplog):
+def test_the_recorder_asks_for_the_repair_of_what_it_continues(copy):
     root = copy("ours")
     first = sorted(root.glob("data/*/*"))[0]
     lost = episodes_in(root, first.relative_to(root))
     first.unlink()
+    said = (
+        rf"(?s)its frames are lost.*Can be kept: {N_EPISODES - len(lost)} complete episodes.*playbyear-repair --root="
+    )
+    with pytest.raises(DatasetDamagedError, match=said):
+        write_ours(root, RICH_FEATURES, range(20, 21))
+    assert not list(root.parent.glob("*.damaged"))
+    repair_dataset(root)
     write_ours(root, RICH_FEATURES, range(20, 21))
-    assert f"Kept: {N_EPISODES - len(lost)} complete episodes" in caplog.text
-    assert "its frames are lost" in caplog.text
     kept = [number for number in range(N_EPISODES) if number not in lost]
     assert not differences(load(root), dict(enumerate([*kept, 20])), RICH_FEATURES)
 

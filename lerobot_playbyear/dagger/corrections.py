@@ -13,6 +13,7 @@ from lerobot_playbyear.dagger.config import DaggerError, DatasetSource
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.recording import INTERVENTION, SEED, episode_frames
+from lerobot_playbyear.saving import save_or_ask
 
 
 class Corrections:
@@ -97,7 +98,7 @@ class Corrections:
         frames = episode_frames(attempt.episode, self._writer.features)
         for frame in frames:
             self._writer.add_frame(frame)
-        self._writer.save_episode()
+        save_or_ask(self._writer)
         if self.store is None:
             self._read()
         else:

@@ -21,7 +21,7 @@ from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.dagger.loop import Loop
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
-from lerobot_playbyear.datasets.durable import DatasetWriteError
+from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.reach import Reach, action_names

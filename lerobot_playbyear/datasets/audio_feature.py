@@ -114,6 +114,8 @@ def _check_one(key: str, feature: Mapping[str, Any], fps: int) -> int:
             f'\'{key}\' does not say its sample rate: add "info": {{"sample_rate": <Hz>, "encoding": "{PCM_S16}"}} '
             "to this feature in the dataset's meta/info.json."
         )
+    if isinstance(sample_rate, bool) or not isinstance(sample_rate, int | float) or sample_rate % 1 != 0:
+        raise ValueError(f"'{key}' has sample_rate {sample_rate!r}; wanted a whole number of Hz, such as 16000.")
     wanted = (samples_per_frame(int(sample_rate), fps, key),)
     if tuple(feature["shape"]) != wanted:
         raise ValueError(

@@ -6,44 +6,45 @@ real one and then moves the finished files over, so that the dataset on disk is 
 """
 
 import contextlib
+import json
 import logging
 import shutil
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.utils.constants import DEFAULT_FEATURES
 
-from lerobot_playbyear.datasets.journal import JOURNAL, LOCK, SCRATCH, STAGING, finish_journal, publish
-from lerobot_playbyear.datasets.repair import RepairReport, repair_dataset
+from lerobot_playbyear.datasets.episode_checks import IncompleteEpisodeError, LostFramesError
+from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.existing import check_compatible, check_root, check_undamaged, has_dataset
+from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, publish
+from lerobot_playbyear.datasets.locking import DatasetLock
 from lerobot_playbyear.datasets.repair.repairing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
-from lerobot_playbyear.datasets.staging import IncompleteEpisodeError, Staging
+from lerobot_playbyear.datasets.staging import Staging, remove_leftovers
+from lerobot_playbyear.datasets.writable import check_features
 
 logger = logging.getLogger(__name__)
 
 _LOW_DISK_BYTES = 64 * 2**20
 
 
-class DatasetWriteError(RuntimeError):
-    """An episode could not be written; the episodes saved before it are complete on disk."""
-
-
 class DurableWriter:
     """Appends episodes to a LeRobotDataset v3.0; each is on disk for good when `save_episode` returns.
 
-    Protocol: LeRobot writes the episode, all but its sound, into a staging dataset inside the root and closes its
-    files; the sound is added; a journal that
-    names these files is written (from here on the episode counts); the files are moved into place one by one,
+    Protocol: LeRobot writes the episode, all but its sound, into a dataset inside the root's scratch folder and closes
+    its files; of these and the sound the files are made that the dataset shall hold; a journal that
+    names them is written (from here on the episode counts); they are moved into place one by one,
     `meta/info.json` last; the journal is removed. After a crash the next writer finishes the moves of a journal it
     finds and throws other staged files away. The dataset loads with plain LeRobot between any two of these steps.
     Files and folders are synchronised with the disk before they are referred to, so that this holds for a power cut.
 
-    A dataset that another tool left half-written is repaired when it is opened (`repair_dataset`), and what was found
-    is logged as a warning and kept in `repair`.
+    A save that fails keeps the episode: make room, and call `save_episode` again.
+
+    A dataset with any other damage is refused, and nothing in it is touched: to repair it may cost episodes, and is for
+    `playbyear-repair`.
 
     Args:
         repo_id: Name of the dataset, `user/name`.
@@ -53,18 +54,17 @@ class DurableWriter:
         resume: Append to the dataset in `root` if there is one. Otherwise an existing one is an error.
         robot_type: Noted in a new dataset's metadata.
         image_writer_threads: Threads that compress pictures. 0: `add_frame` does it.
-        streaming_encoding: Encode video while frames come in, not in `save_episode`. An episode of which the encoder
-            dropped a frame is refused.
+        streaming_encoding: Encode video while frames come in, not in `save_episode`. The pictures are then nowhere but
+            in the video: an episode of which the encoder dropped a frame, or failed, is refused and cannot be saved.
         rgb_encoder: Codec and quality of video. None: LeRobot's default.
-
-    Attributes:
-        repair: What was repaired when the dataset was opened; None if nothing was.
 
     Raises:
         FileExistsError: `root` holds a dataset, or other files, and `resume` is off.
-        ValueError: The dataset in `root` has another fps or other features; the message names the differences.
-        DatasetWriteError: `root` cannot be written, or another process is writing to it.
-        DatasetDamagedError: The dataset in `root` is damaged beyond repair; the message says what is missing.
+        ValueError: Nothing can be recorded with these features; or the dataset in `root` has another fps or other
+            features. The message names them.
+        DatasetWriteError: `root` cannot be read or written, or another process is writing to it.
+        DatasetDamagedError: The dataset in `root` is damaged; the message says how, and what to do.
+        JournalError: What the dataset's scratch folder says is to be moved lies outside the dataset.
     """
 
     def __init__(
@@ -80,10 +80,10 @@ class DurableWriter:
         streaming_encoding: bool = False,
         rgb_encoder: RGBEncoderConfig | None = None,
     ):
+        check_features(features, fps)
         self.repo_id = repo_id
         self.root = Path(root)
         self.features = features
-        self.repair: RepairReport | None = None
         self._create_options: dict[str, Any] = {
             "fps": fps,
             "features": deepcopy(features),
@@ -96,16 +96,24 @@ class DurableWriter:
             "streaming_encoding": streaming_encoding,
             "rgb_encoder": rgb_encoder,
         }
+        self._n_episodes = self._n_frames = 0
         self._episode: Staging | None = None
-        self._lock: FileLock | None = None
+        self._lock: DatasetLock | None = None
         try:
             finish_repair(self.root)
             check_root(self.root, resume=resume)
-            self._lock = self._acquire_lock()
+            self._lock = DatasetLock(self.root)
             finish_journal(self.root)
             if has_dataset(self.root):
-                self._check_and_repair(fps, features)
-            self._meta = self._staging.dataset.meta
+                check_undamaged(self.root)
+                check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features)
+            self._count()
+            if remove_leftovers(self.root):
+                logger.warning(
+                    f"{self.root}: an episode that had not been saved was removed; the {self.num_episodes} episodes "
+                    "before it are complete."
+                )
+            self._staging  # noqa: B018  (so that what goes wrong with it goes wrong now)
         except BaseException as error:
             if self._lock is not None:
                 self._lock.release()
@@ -116,25 +124,34 @@ class DurableWriter:
     @property
     def num_episodes(self) -> int:
         """Episodes on disk."""
-        return self._meta.total_episodes
+        return self._n_episodes
 
     @property
     def num_frames(self) -> int:
         """Frames on disk, without those of the episode in progress."""
-        return self._meta.total_frames
+        return self._n_frames
 
     def add_frame(self, frame: dict[str, Any]) -> None:
-        """Adds one frame to the episode in progress.
+        """Adds one frame to the episode in progress. After an error it is not part of it, and the episode goes on.
 
         Args:
             frame: A value per feature (numpy arrays of exactly the feature's dtype and shape) and `task`, a string.
 
         Raises:
-            ValueError: The frame does not fit the features.
-            DatasetWriteError: The disk does not take it.
+            ValueError: The frame does not fit the features, or its sound is none.
+            DatasetWriteError: The disk does not take it; or the episode before is not saved yet.
         """
         try:
-            self._staging.add_frame(frame)
+            staging = self._staging
+            if staging.is_complete:
+                raise DatasetWriteError(
+                    f"Episode {staging.index} is not saved yet: call save_episode again, or give it up with "
+                    "discard_episode.",
+                    can_be_repeated=True,
+                )
+            staging.add_frame(frame)
+        except DatasetWriteError:
+            raise
         except (OSError, RuntimeError) as error:
             raise DatasetWriteError(self._describe_failure(self.num_episodes, error)) from error
 
@@ -142,36 +159,52 @@ class DurableWriter:
         """Writes the episode in progress. Returns its index.
 
         Raises:
-            DatasetWriteError: It could not be written (disk full, permissions). The dataset is as it was before.
+            DatasetWriteError: It could not be written (disk full, permissions). The dataset is as it was before. Where
+                the error's `can_be_repeated` is true, so is the episode: call this again once the cause is gone.
         """
-        index, episode = self.num_episodes, self._staging
+        if self._episode is None or self._episode.length == 0:
+            raise DatasetWriteError(f"Episode {self.num_episodes} has no frames: add some before it is saved.")
+        episode = self._episode
         try:
-            sound = episode.save()
-            publish(self.root, settle_episode(self.root, episode, sound))
-        except Exception as error:
+            self._save(episode)
+        except LostFramesError as error:
             self._drop_staging()
-            raise DatasetWriteError(self._describe_failure(index, error)) from error
+            raise DatasetWriteError(self._describe_failure(episode.index, error)) from error
+        except Exception as error:
+            raise DatasetWriteError(self._describe_failure(episode.index, error), can_be_repeated=True) from error
+        finally:
+            with contextlib.suppress(OSError):
+                self._count()
         self._episode = None
-        self._meta = episode.dataset.meta
         with contextlib.suppress(OSError):  # the next frame tries again, and says why it cannot
-            self._meta = self._staging.dataset.meta
-        return index
+            self._staging  # noqa: B018
+        return episode.index
 
     def discard_episode(self) -> None:
-        """Forgets the episode in progress."""
-        self._staging.discard()
+        """Forgets the episode in progress.
+
+        Raises:
+            DatasetWriteError: It is complete on disk already, and only has to be moved to its place.
+        """
+        if (self.root / JOURNAL).exists():
+            raise DatasetWriteError(
+                f"Episode {self.num_episodes} is complete on disk already: call save_episode again.",
+                can_be_repeated=True,
+            )
+        if self._episode is not None and self._episode.is_complete:
+            self._drop_staging()
+        else:
+            self._staging.discard()
 
     def close(self) -> None:
         """Drops an episode in progress and removes what was needed only for writing. Safe to call twice."""
-        if self._lock is None or not self._lock.is_locked:
+        if self._lock is None or not self._lock.is_held:
             return
         self._drop_staging()
-        if not (self.root / JOURNAL).exists():
-            shutil.rmtree(self.root / STAGING, ignore_errors=True)
+        with contextlib.suppress(OSError):  # the next writer tries again
+            finish_journal(self.root)
+            remove_leftovers(self.root)
         self._lock.release()
-        with contextlib.suppress(OSError):
-            (self.root / LOCK).unlink(missing_ok=True)
-            (self.root / SCRATCH).rmdir()
 
     def __enter__(self) -> "DurableWriter":
         return self
@@ -179,32 +212,33 @@ class DurableWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _acquire_lock(self) -> FileLock:
-        (self.root / SCRATCH).mkdir(parents=True, exist_ok=True)
-        lock = FileLock(self.root / LOCK, timeout=0)
-        try:
-            lock.acquire()
-        except Timeout:
-            raise DatasetWriteError(f"Another process is writing to {self.root}: wait until it has ended.") from None
-        return lock
+    def _save(self, episode: Staging) -> None:
+        """Does what is left to be done of a save; after a failure, or an interrupt, it can be called again."""
+        self._count()
+        if (self.root / JOURNAL).exists():
+            finish_journal(self.root)
+        elif self.num_episodes == episode.index:
+            publish(self.root, settle_episode(self.root, episode, episode.save()))
+        elif self.num_episodes != episode.index + 1:
+            raise _another_count(self.root, self.num_episodes, episode.index)
 
-    def _check_and_repair(self, fps: int, features: dict[str, dict]) -> None:
-        report = repair_dataset(self.root, fps=fps, features=features, thorough=False, has_lock=True)
-        if report.changed:
-            logger.warning("%s", report)
-            self.repair = report
-            if self._lock is not None:
-                self._lock.release()  # of the folder that was put aside
-            self._lock = self._acquire_lock()
-        check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features)
+    def _count(self) -> None:
+        """Takes the numbers from the disk: those of LeRobot's staging dataset are ahead of it while it saves."""
+        path = self.root / INFO
+        if self._n_episodes or path.is_file():
+            info = json.loads(path.read_text())
+            self._n_episodes, self._n_frames = info["total_episodes"], info["total_frames"]
 
     @property
     def _staging(self) -> Staging:
         """The episode in progress; a fresh one after every episode that was saved."""
         if self._episode is None:
             finish_journal(self.root)
-            folder = self.root / STAGING
-            self._episode = Staging(self.repo_id, self.root, folder, self._create_options, self._write_options)
+            episode = Staging(self.repo_id, self.root, self._create_options, self._write_options)
+            if episode.index != self.num_episodes:
+                episode.drop()
+                raise _another_count(self.root, episode.index, self.num_episodes)
+            self._episode = episode
         return self._episode
 
     def _drop_staging(self) -> None:
@@ -220,60 +254,22 @@ class DurableWriter:
         if (self.root / JOURNAL).exists():
             return (
                 f"Episode {index} is complete on disk, but could not be moved to its place in {self.root}: {reason}. "
-                "It is there as soon as the dataset is opened with resume=true and the cause is gone."
+                "It is there as soon as save_episode is called again, or the dataset is opened with resume=true, and the "
+                "cause is gone."
             )
+        remedy = (
+            "It cannot be saved any more: record it again"
+            if isinstance(error, LostFramesError)
+            else "Once the cause is gone, call save_episode again; a program that has ended goes on with resume=true, and "
+            "records this episode again"
+        )
         return (
             f"Episode {index} could not be written to {self.root}: {reason}. "
-            f"The {index} episodes before it are complete; go on with resume=true once the cause is gone."
+            f"The {index} episodes before it are complete. {remedy}."
         )
 
 
-def check_root(root: Path, *, resume: bool) -> None:
-    """Whether a dataset can be written to `root`.
-
-    Raises:
-        FileExistsError: It holds a dataset and `resume` is off, or it holds other files.
-        DatasetWriteError: It is a file.
-    """
-    if root.exists() and not root.is_dir():
-        raise DatasetWriteError(f"Cannot write a dataset to {root}: it is a file.")
-    if has_dataset(root) or (root / JOURNAL).is_file():
-        if not resume:
-            raise FileExistsError(
-                f"{root} already holds a dataset. Append to it with resume=true, or choose another root."
-            )
-    elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
-        raise FileExistsError(f"{root} is not empty and holds no dataset. Choose another root.")
-
-
-def has_dataset(root: Path) -> bool:
-    """Whether a folder holds a LeRobotDataset, however damaged."""
-    return (root / INFO).is_file() or any(root.glob("data/chunk-*/file-*")) or any(root.glob("meta/episodes/*/*"))
-
-
-def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str, dict]) -> None:
-    """Whether frames of `features` at `fps` can be appended to an existing dataset.
-
-    Raises:
-        ValueError: With every difference in the message.
-    """
-    differences = []
-    if meta.fps != fps:
-        differences.append(f"fps is {meta.fps} there and {fps} here")
-    there = {key: _signature(value) for key, value in meta.features.items() if key not in DEFAULT_FEATURES}
-    here = {key: _signature(value) for key, value in features.items() if key not in DEFAULT_FEATURES}
-    differences += [
-        f"{key} is {there.get(key, 'absent')} there and {here.get(key, 'absent')} here"
-        for key in sorted(there.keys() | here.keys())
-        if there.get(key) != here.get(key)
-    ]
-    if differences:
-        raise ValueError(
-            f"The dataset in {meta.root} does not fit what is to be appended: {'; '.join(differences)}. "
-            "Record with the same settings, or choose another root."
-        )
-
-
-def _signature(feature: dict) -> str:
-    rate = (feature.get("info") or {}).get("sample_rate")
-    return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
+def _another_count(root: Path, found: int, wanted: int) -> OSError:
+    return OSError(
+        f"{root} holds {found} episodes where {wanted} were before: something else changed it, or its drive is gone"
+    )

@@ -1,4 +1,4 @@
-"""Turns the episode that LeRobot wrote into the staging folder into its place in the dataset.
+"""Turns the episode that LeRobot wrote into the files that the dataset shall hold with it.
 
 LeRobot begins new files whenever a recording is continued. Here small files are continued instead: the staged file
 takes over what the last one of the dataset holds, and replaces it in one step. So a dataset of a thousand short
@@ -7,6 +7,8 @@ episodes has some files of several MB each, and one table of episodes.
 
 import dataclasses
 import logging
+import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import write_info
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DatasetInfo
 
+from lerobot_playbyear.datasets.journal import STAGING
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
     fit_to_schema,
@@ -28,7 +31,7 @@ from lerobot_playbyear.datasets.parquet_files import (
 from lerobot_playbyear.datasets.staging import Staging
 from lerobot_playbyear.datasets.statistics import add_stats, read_stats, sound_stats, with_sound_stats
 from lerobot_playbyear.datasets.statistics import write_stats as write_dataset_stats
-from lerobot_playbyear.datasets.video_seal import seal
+from lerobot_playbyear.datasets.video_seal import is_intact, seal
 
 logger = logging.getLogger(__name__)
 
@@ -37,42 +40,59 @@ _SMALL_DATA_BYTES = 8 * 2**20  # a data file below this is continued
 _SMALL_TABLE_BYTES = 2 * 2**20  # a table of episodes below this is continued
 
 
-def settle_episode(root: Path, staging: Staging, waveforms: Mapping[str, np.ndarray]) -> list[Path]:
-    """Makes the staged files of one episode what the dataset in `root` shall hold.
+def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndarray]) -> list[Path]:
+    """Makes of one episode's files what the dataset in `root` shall hold, in its staging folder.
+
+    LeRobot's files are left as they are, but for films, which are moved: after a failure this can be called again.
 
     Args:
-        root: The dataset's folder; only read.
-        staging: The episode, written and closed by LeRobot.
+        root: The dataset's folder.
+        episode: The episode, written and closed by LeRobot.
         waveforms: Its sound, (n_frames, S) per microphone.
 
     Returns:
         The files to publish, relative to the staging folder, in the order in which they may be moved one by one.
     """
-    folder, meta = staging.folder, staging.dataset.meta
-    (row_file,) = _new_files(staging, "meta/episodes")
+    source, folder, meta = episode.folder, root / STAGING, episode.dataset.meta
+    for part in ("data", "meta"):
+        shutil.rmtree(folder / part, ignore_errors=True)  # of a try that failed
+    (folder / "meta").mkdir(parents=True)
+    (row_file,) = _new_files(episode, "meta/episodes")
     info = dataclasses.replace(
-        meta.info, features={key: meta.features.get(key, feature) for key, feature in staging.features.items()}
+        meta.info, features={key: meta.features.get(key, feature) for key, feature in episode.features.items()}
     )
     write_info(info, folder)
     last = _last_row(root)
     sound = {key: sound_stats(waveform) for key, waveform in waveforms.items()}
-    row = with_sound_stats(pq.read_table(folder / row_file), sound)
-    row = _settle_data(root, folder, info, row, last, waveforms)
+    row = with_sound_stats(pq.read_table(source / row_file), sound)
+    row, data_file = _settle_data(root, episode, info, row, last, waveforms)
     row_file = _settle_row(root, folder, row, row_file, last)
+    tables = [name for name in _new_files(episode, "meta") if len(name.parts) == 2 and name != INFO]
+    for name in tables:
+        shutil.copyfile(source / name, folder / name)
     if meta.stats is not None and sound:
         known = {key: stats for key, stats in (read_stats(root) or {}).items() if key in sound}
         write_dataset_stats({**meta.stats, **add_stats(known, [sound], sound)}, folder)
-    names = [name for part in ("data", "videos") for name in _new_files(staging, part)]
-    for name in names:
-        if name.suffix == ".mp4":
-            seal(folder / name)
-    tables = [name for name in _new_files(staging, "meta") if name not in (row_file, INFO)]
-    return [*names, *tables, row_file, INFO]
+    return [data_file, *_settle_films(episode, folder), *tables, row_file, INFO]
 
 
-def _new_files(staging: Staging, part: str) -> list[Path]:
-    paths = (path for path in sorted((staging.folder / part).rglob("*")) if path.is_file())
-    return [name for path in paths if (name := path.relative_to(staging.folder)) not in staging.before]
+def _new_files(episode: Staging, part: str) -> list[Path]:
+    names = (path.relative_to(episode.folder) for path in _files(episode.folder / part))
+    return [name for name in names if name not in episode.before]
+
+
+def _files(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
+
+
+def _settle_films(episode: Staging, folder: Path) -> list[Path]:
+    """Seals the films and moves them; those that an earlier try moved are there already. Returns all their names."""
+    for name in _new_files(episode, "videos"):
+        if not is_intact(episode.folder / name):
+            seal(episode.folder / name)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(episode.folder / name, folder / name)
+    return [path.relative_to(folder) for path in _files(folder / "videos")]
 
 
 def _last_row(root: Path) -> dict | None:
@@ -86,15 +106,19 @@ def _last_row(root: Path) -> dict | None:
 
 def _settle_data(
     root: Path,
-    staging: Path,
+    episode: Staging,
     info: DatasetInfo,
     row: pa.Table,
     last: dict | None,
     waveforms: Mapping[str, np.ndarray],
-) -> pa.Table:
-    """Writes the episode's frames as our files are written, behind those of the last small file. Returns its row."""
+) -> tuple[pa.Table, Path]:
+    """Writes the episode's frames as our files are written, behind those of the last small file.
+
+    Returns:
+        The episode's row, and the file's name.
+    """
     name = _data_file(info, row.to_pylist()[0])
-    frames = _with_sound(pq.read_table(staging / name), info, waveforms)
+    frames = _with_sound(pq.read_table(episode.folder / name), info, waveforms)
     target, tables = name, [frames]
     if last is not None and _is_small(root / _data_file(info, last), _SMALL_DATA_BYTES):
         try:
@@ -102,13 +126,12 @@ def _settle_data(
             target = _data_file(info, last)
         except (ParquetDamageError, pa.ArrowException) as error:
             logger.warning("%s is not continued: %s.", root / _data_file(info, last), error)
-    (staging / name).unlink()
-    write_tables(staging / target, tables, frames.schema)
+    write_tables(root / STAGING / target, tables, frames.schema)
     if target != name:
         assert last is not None
         for key in ("data/chunk_index", "data/file_index"):
             row = row.set_column(row.column_names.index(key), key, pa.array([last[key]], row.schema.field(key).type))
-    return row
+    return row, target
 
 
 def _with_sound(frames: pa.Table, info: DatasetInfo, waveforms: Mapping[str, np.ndarray]) -> pa.Table:
@@ -126,7 +149,6 @@ def _with_sound(frames: pa.Table, info: DatasetInfo, waveforms: Mapping[str, np.
 
 def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict | None) -> Path:
     """Puts the episode's row behind those of the last small table of episodes."""
-    (staging / name).unlink()
     table = row
     if last is not None:
         keys = ("meta/episodes/chunk_index", "meta/episodes/file_index")

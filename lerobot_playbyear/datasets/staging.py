@@ -2,31 +2,27 @@
 
 import contextlib
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-import av
 import datasets
 import numpy as np
 import pyarrow.parquet as pq
-from lerobot.datasets.feature_utils import validate_frame
+from lerobot.datasets.dataset_writer import DatasetWriter
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import DEFAULT_IMAGE_PATH, INFO_PATH
+from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot.utils.utils import SuppressProgressBars
 from torch import Tensor
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
-
-_PNG_END = b"IEND\xaeB`\x82"
-
-
-class IncompleteEpisodeError(RuntimeError):
-    """A camera's frames did not all reach the disk."""
+from lerobot_playbyear.datasets.episode_checks import check_pictures, check_videos
+from lerobot_playbyear.datasets.films import Film, FinishedFilms, finish_films, link
+from lerobot_playbyear.datasets.journal import EPISODE, PICTURES, SCRATCH, STAGING
+from lerobot_playbyear.datasets.writable import check_frame
 
 
 class Staging:
@@ -36,10 +32,13 @@ class Staging:
     every sample would become a Python number and every sample index get statistics: it is kept here, and
     `settle_episode` adds it.
 
+    LeRobot's saving uses up the frames as it goes. So they are put aside before, pictures as second links to their
+    files: a save that failed begins again with a dataset as fresh as the first one, and all frames.
+
     Args:
         repo_id: The dataset's name.
-        root: The real dataset's folder. Where it holds none, the staging dataset is a new one.
-        folder: The staging dataset's folder, emptied.
+        root: The real dataset's folder. Where it holds none, the staging dataset is a new one. What is left of another
+            episode in progress there is removed.
         create_options: For `LeRobotDataset.create`, besides `write_options`.
         write_options: For `LeRobotDataset.create` and `LeRobotDataset.resume`.
 
@@ -47,57 +46,76 @@ class Staging:
         folder: The staging dataset's folder.
         dataset: The staging dataset.
         features: All features, as `meta/info.json` has them.
+        index: The episode's number.
         before: Files that were put there for LeRobot to continue from, relative to `folder`.
     """
 
-    def __init__(
-        self, repo_id: str, root: Path, folder: Path, create_options: dict[str, Any], write_options: dict[str, Any]
-    ) -> None:
-        self.folder = folder
-        self.before: set[Path] = set()
-        self._is_streaming = bool(write_options.get("streaming_encoding"))
-        shutil.rmtree(folder, ignore_errors=True)
-        if (root / INFO_PATH).is_file():
-            self.features = self._copy_metadata(root)
-            with _datasets_cache_in(folder / ".cache"), SuppressProgressBars():
-                self.dataset = LeRobotDataset.resume(repo_id, root=folder, **write_options)
-        else:
-            self.features = {**deepcopy(create_options["features"]), **DEFAULT_FEATURES}
-            own = {**create_options, "features": _without_sound(create_options["features"])}
-            self.dataset = LeRobotDataset.create(repo_id, root=folder, **own, **write_options)
+    def __init__(self, repo_id: str, root: Path, create_options: dict[str, Any], write_options: dict[str, Any]) -> None:
+        self.folder = root / EPISODE
+        self._repo_id, self._root, self._pictures = repo_id, root, root / PICTURES
+        self._create_options, self._write_options = create_options, write_options
+        self._frames: dict[str, Any] | None = None  # what LeRobot had of the episode before it was first saved
+        self._films: dict[str, Film] = {}
+        self._is_saved = False
+        remove_leftovers(root)
+        self._open()
+        self.index = self.dataset.meta.total_episodes
         self._blocks: dict[str, list[np.ndarray]] = {key: [] for key in audio_keys(self.features)}
 
     @property
     def length(self) -> int:
         """The frames of the episode so far."""
-        writer = self.dataset.writer
-        return 0 if writer is None or writer.episode_buffer is None else writer.episode_buffer["size"]
+        if self._frames is not None:
+            return self._frames["size"]
+        return 0 if self._writer.episode_buffer is None else self._writer.episode_buffer["size"]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether saving has begun, so that no frame can be added any more."""
+        return self._frames is not None
+
+    @property
+    def _writer(self) -> DatasetWriter:
+        return cast(DatasetWriter, self.dataset.writer)
 
     def add_frame(self, frame: dict[str, Any]) -> None:
-        """Adds one frame.
+        """Adds one frame, or none of it where that fails.
 
         Raises:
             ValueError: It does not fit the features.
         """
         values = {key: value.numpy() if isinstance(value, Tensor) else value for key, value in frame.items()}
-        validate_frame(values, self.features)
-        self.dataset.add_frame({key: value for key, value in values.items() if key not in self._blocks})
+        check_frame(values, self.features)
+        try:
+            self.dataset.add_frame({key: value for key, value in values.items() if key not in self._blocks})
+        except BaseException:
+            self._forget_half_frame()
+            raise
         for key, blocks in self._blocks.items():
             blocks.append(values[key].copy())  # a sound card may use its buffer again
 
     def save(self) -> dict[str, np.ndarray]:
-        """Has LeRobot write the episode and close its files. Returns the sound of each microphone, (n_frames, S).
+        """Has LeRobot write the episode and close its files. After a failure it can be called again.
+
+        Returns:
+            The sound of each microphone, (n_frames, S).
 
         Raises:
-            IncompleteEpisodeError: Pictures are missing.
+            LostFramesError: Pictures are missing; calling it again will not do.
+            IncompleteEpisodeError: Pictures did not get into a video.
         """
-        length = self.length
-        check_pictures(self.dataset, streaming=self._is_streaming)
-        with SuppressProgressBars():
-            self.dataset.save_episode(parallel_encoding=False)
-        self.dataset.finalize()
-        check_videos(self.dataset, length)
-        return {key: np.stack(blocks).reshape(length, -1) for key, blocks in self._blocks.items()}
+        if self._frames is None:
+            self._put_frames_aside()
+        elif not self._is_saved:
+            self._begin_again()
+        if not self._is_saved:
+            with SuppressProgressBars():
+                self.dataset.save_episode(parallel_encoding=False)
+            self.dataset.finalize()
+            check_videos(self.dataset, self.length)
+            self._is_saved = True
+        shutil.rmtree(self._pictures, ignore_errors=True)  # LeRobot's files hold them now
+        return {key: np.stack(blocks).reshape(self.length, -1) for key, blocks in self._blocks.items()}
 
     def discard(self) -> None:
         """Forgets the episode."""
@@ -106,12 +124,53 @@ class Staging:
             blocks.clear()
 
     def drop(self) -> None:
-        """Closes what is open, so that LeRobot writes nothing more; for an episode that failed."""
+        """Closes what is open, so that LeRobot writes nothing more; for an episode that is given up."""
         with contextlib.suppress(Exception):
             self.dataset.clear_episode_buffer()
         self.dataset.meta._metadata_buffer.clear()  # or LeRobot writes the row of an episode that is not there
         with contextlib.suppress(Exception):
             self.dataset.finalize()
+
+    def _put_frames_aside(self) -> None:
+        is_streaming = self._writer._streaming_encoder is not None
+        check_pictures(self.dataset, is_streaming)
+        shutil.rmtree(self._pictures / SCRATCH, ignore_errors=True)  # of a try that was interrupted
+        if (self.folder / SCRATCH).is_dir():
+            shutil.copytree(self.folder / SCRATCH, self._pictures / SCRATCH, copy_function=link)
+        if is_streaming:
+            if not self._films:
+                self._films = finish_films(self._writer._streaming_encoder, self._pictures / "films", self.length)
+            self._writer._streaming_encoder = FinishedFilms(self._films, self.folder)
+        self._frames = dict(self._writer.episode_buffer)
+
+    def _begin_again(self) -> None:
+        """Gives the frames to a fresh dataset; LeRobot's cannot be used any more after an error."""
+        self.drop()
+        shutil.rmtree(self.folder)
+        self._open()
+        if (self._pictures / SCRATCH).is_dir():
+            shutil.copytree(self._pictures / SCRATCH, self.folder / SCRATCH, copy_function=link)
+        if self._films:
+            self._writer._streaming_encoder = FinishedFilms(self._films, self.folder)
+        assert self._frames is not None
+        self._writer.episode_buffer = dict(self._frames)
+
+    def _forget_half_frame(self) -> None:
+        buffer = self._writer.episode_buffer
+        for values in (buffer or {}).values():
+            if isinstance(values, list):
+                del values[buffer["size"] :]
+
+    def _open(self) -> None:
+        self.before: set[Path] = set()
+        if (self._root / INFO_PATH).is_file():
+            self.features = self._copy_metadata(self._root)
+            with _datasets_cache_in(self.folder / ".cache"), SuppressProgressBars():
+                self.dataset = LeRobotDataset.resume(self._repo_id, root=self.folder, **self._write_options)
+        else:
+            self.features = {**deepcopy(self._create_options["features"]), **DEFAULT_FEATURES}
+            own = {**self._create_options, "features": _without_sound(self._create_options["features"])}
+            self.dataset = LeRobotDataset.create(self._repo_id, root=self.folder, **own, **self._write_options)
 
     def _copy_metadata(self, root: Path) -> dict[str, Any]:
         """Copies what LeRobot needs in order to continue a dataset. Returns the dataset's features."""
@@ -135,57 +194,12 @@ def _without_sound(features: dict[str, Any]) -> dict[str, Any]:
     return {key: deepcopy(feature) for key, feature in features.items() if key not in microphones}
 
 
-def check_pictures(dataset: LeRobotDataset, streaming: bool) -> None:
-    """Whether every picture of the episode in progress is on the disk, whole; LeRobot only logs when one is not.
-
-    Args:
-        dataset: The staging dataset.
-        streaming: Whether pictures for videos go to the encoder instead of the disk.
-
-    Raises:
-        IncompleteEpisodeError: Naming the first one that is not.
-    """
-    assert dataset.writer is not None
-    if dataset.writer.image_writer is not None:
-        dataset.writer.image_writer.wait_until_done()
-    keys = dataset.meta.image_keys if streaming else dataset.meta.camera_keys
-    for key in set(keys) - set(dataset.meta.depth_keys):
-        for index in range(dataset.writer.episode_buffer["size"]):
-            name = DEFAULT_IMAGE_PATH.format(
-                image_key=key, episode_index=dataset.meta.total_episodes, frame_index=index
-            )
-            if not _ends_with(dataset.root / name, _PNG_END):
-                raise IncompleteEpisodeError(f"frame {index} of '{key}' did not reach the disk")
-
-
-def check_videos(dataset: LeRobotDataset, length: int) -> None:
-    """Whether every video of a staged episode has as many frames as the episode; LeRobot may drop some.
-
-    Args:
-        dataset: The staging dataset, with one episode saved.
-        length: The episode's frames.
-
-    Raises:
-        IncompleteEpisodeError: Naming the camera and the numbers.
-    """
-    for key in dataset.meta.video_keys:
-        for path in (dataset.root / "videos" / key).rglob("*.mp4"):
-            with av.open(str(path)) as container:
-                frames = sum(1 for packet in container.demux(video=0) if packet.size)
-            if frames != length:
-                raise IncompleteEpisodeError(
-                    f"the video of '{key}' has {frames} frames where {length} were recorded: the encoder did not "
-                    "keep up, or the disk is full"
-                )
-
-
-def _ends_with(path: Path, ending: bytes) -> bool:
-    try:
-        with path.open("rb") as file:
-            file.seek(-len(ending), os.SEEK_END)
-            return file.read() == ending
-    except OSError:
-        return False
+def remove_leftovers(root: Path) -> bool:
+    """Removes an episode in progress from a dataset's scratch folder. Returns whether there was one."""
+    folders = [root / name for name in (EPISODE, PICTURES, STAGING) if (root / name).exists()]
+    for folder in folders:
+        shutil.rmtree(folder)
+    return bool(folders)
 
 
 def _copy_last_episode(source: Path, target: Path) -> None:

@@ -16,10 +16,15 @@ _SIZE = len(_HEAD) + hashlib.sha256().digest_size
 
 
 def seal(path: Path) -> None:
-    """Appends the checksum to a finished mp4 file."""
-    digest = _digest(path, path.stat().st_size)
-    with path.open("ab") as file:
-        file.write(_HEAD + digest)
+    """Appends the checksum to a finished mp4 file, or leaves it as it was where the disk does not take it."""
+    size = path.stat().st_size
+    digest = _digest(path, size)
+    try:
+        with path.open("ab") as file:
+            file.write(_HEAD + digest)
+    except BaseException:
+        os.truncate(path, size)
+        raise
 
 
 def is_intact(path: Path) -> bool | None:

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
-from filelock import FileLock, Timeout
 from lerobot.datasets.utils import STATS_PATH, DatasetInfo
 
-from lerobot_playbyear.datasets.journal import JOURNAL, LOCK, SCRATCH, finish_journal, flush
+from lerobot_playbyear.datasets.journal import finish_journal, flush
+from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
 from lerobot_playbyear.datasets.repair.copying import Kept, write_copy
 from lerobot_playbyear.datasets.repair.episodes import (
     Row,
@@ -249,17 +249,11 @@ def _lock(root: Path):
     if not root.is_dir():
         yield
         return
-    (root / SCRATCH).mkdir(exist_ok=True)
-    lock = FileLock(root / LOCK, timeout=0)
     try:
-        lock.acquire()
-    except Timeout:
-        raise DatasetDamagedError(f"Another process is writing to {root}: wait until it has ended.") from None
+        lock = DatasetLock(root)
+    except DatasetLockedError as error:
+        raise DatasetDamagedError(str(error)) from None
     try:
         yield
     finally:
         lock.release()
-        with contextlib.suppress(OSError):
-            (root / LOCK).unlink(missing_ok=True)
-            if not (root / JOURNAL).exists():
-                (root / SCRATCH).rmdir()

@@ -1,0 +1,92 @@
+"""What is in a folder already, and whether episodes can be appended to it."""
+
+import json
+import shlex
+from pathlib import Path
+
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.utils.constants import DEFAULT_FEATURES
+
+from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, is_inside
+from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
+from lerobot_playbyear.datasets.settling import INFO
+
+
+def check_root(root: Path, *, resume: bool) -> None:
+    """Whether a dataset can be written to `root`.
+
+    Raises:
+        FileExistsError: It holds a dataset and `resume` is off, or it holds other files.
+        DatasetWriteError: It is a file.
+    """
+    if root.exists() and not root.is_dir():
+        raise DatasetWriteError(f"Cannot write a dataset to {root}: it is a file.")
+    if has_dataset(root) or (root / JOURNAL).is_file():
+        if not resume:
+            raise FileExistsError(
+                f"{root} already holds a dataset. Append to it with resume=true, or choose another root."
+            )
+    elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
+        raise FileExistsError(f"{root} is not empty and holds no dataset. Choose another root.")
+
+
+def has_dataset(root: Path) -> bool:
+    """Whether a folder holds a LeRobotDataset, however damaged."""
+    return (root / INFO).is_file() or any(root.glob("data/chunk-*/file-*")) or any(root.glob("meta/episodes/*/*"))
+
+
+def check_undamaged(root: Path) -> None:
+    """Whether a dataset can be continued as it is. Nothing is changed; a quick look, without pictures and sound.
+
+    Raises:
+        DatasetDamagedError: It is damaged; with what is wrong, and the command that repairs it.
+        DatasetWriteError: It cannot be read.
+    """
+    try:
+        report = check_dataset(root, thorough=False)
+        info = json.loads((root / INFO).read_text()) if report.is_sound else {}
+    except OSError as error:
+        raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
+    if not report.is_sound:
+        command = f"playbyear-repair --root={shlex.quote(str(root))}"
+        raise DatasetDamagedError(
+            f"{report}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "
+            f"again, more closely, and `{command}` repairs it; episodes that are not whole are lost then, and those after "
+            "them move up."
+        )
+    for key in ("data_path", "video_path"):
+        try:
+            place = (info.get(key) or "data/x").format(video_key="camera", chunk_index=0, file_index=0)
+        except (LookupError, ValueError, AttributeError):
+            place = ""
+        if not is_inside(place):
+            raise DatasetDamagedError(f"{root / INFO}: {key} is {info[key]!r}, which leads out of the dataset.")
+
+
+def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str, dict]) -> None:
+    """Whether frames of `features` at `fps` can be appended to an existing dataset.
+
+    Raises:
+        ValueError: With every difference in the message.
+    """
+    differences = []
+    if meta.fps != fps:
+        differences.append(f"fps is {meta.fps} there and {fps} here")
+    there = {key: _signature(value) for key, value in meta.features.items() if key not in DEFAULT_FEATURES}
+    here = {key: _signature(value) for key, value in features.items() if key not in DEFAULT_FEATURES}
+    differences += [
+        f"{key} is {there.get(key, 'absent')} there and {here.get(key, 'absent')} here"
+        for key in sorted(there.keys() | here.keys())
+        if there.get(key) != here.get(key)
+    ]
+    if differences:
+        raise ValueError(
+            f"The dataset in {meta.root} does not fit what is to be appended: {'; '.join(differences)}. "
+            "Record with the same settings, or choose another root."
+        )
+
+
+def _signature(feature: dict) -> str:
+    rate = (feature.get("info") or {}).get("sample_rate")
+    return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")

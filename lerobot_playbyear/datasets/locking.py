@@ -1,0 +1,84 @@
+"""At most one process writes to a dataset."""
+
+import contextlib
+import os
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.journal import LOCK, SCRATCH, check_scratch
+
+_MOST_TRIES = 100  # each loses against another process that lets the lock go at this very moment
+
+
+class DatasetLockedError(DatasetWriteError):
+    """Another process writes to the dataset."""
+
+
+class DatasetLock:
+    """Held from its making until `release`; the operating system lets go of it when the process ends, however it does.
+
+    The lock's file is removed by the process that holds it, before it lets go. So a file that was locked may be one
+    that is gone already, and who locks one looks whether it is still the one that the others will find.
+
+    Args:
+        root: The dataset's folder; it is made where it is missing.
+
+    Raises:
+        DatasetLockedError: Another process holds it.
+        JournalError: The folder it lies in is a link.
+        OSError: It cannot be written.
+    """
+
+    def __init__(self, root: Path) -> None:
+        check_scratch(root)
+        self._path = root / LOCK
+        for _ in range(_MOST_TRIES):
+            try:
+                (root / SCRATCH).mkdir(parents=True, exist_ok=True)
+                lock = self._take()
+            except FileNotFoundError:  # whoever let go removed the folder
+                continue
+            except FileExistsError:  # it was there, and is gone again
+                if (root / SCRATCH).is_file():
+                    raise
+                continue
+            except Timeout:
+                break
+            if lock is not None:
+                self._lock = lock
+                return
+        raise DatasetLockedError(f"Another process is writing to {root}: wait until it has ended.")
+
+    @property
+    def is_held(self) -> bool:
+        """Whether it was not released yet."""
+        return self._lock.is_locked
+
+    def release(self) -> None:
+        """Lets go, and leaves nothing behind. Safe to call twice."""
+        if not self._lock.is_locked:
+            return
+        with contextlib.suppress(OSError):  # Windows removes no open file: there it stays
+            self._path.unlink()
+            self._path.parent.rmdir()
+        self._lock.release()
+
+    def _take(self) -> FileLock | None:
+        """Locks the file; None where it was another one than is there now.
+
+        A file that is open keeps its number, and one that was removed never gets its name back: what has the name
+        before and after was locked.
+        """
+        before = os.open(self._path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        try:
+            lock = FileLock(self._path, timeout=0)
+            lock.acquire()
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(before), os.stat(self._path)):
+                    return lock
+            lock.release()
+            return None
+        finally:
+            os.close(before)

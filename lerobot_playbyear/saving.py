@@ -1,0 +1,33 @@
+"""Saving an episode that a person may have made by hand: a full disk is a reason to ask, not to lose it."""
+
+import sys
+
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.errors import DatasetWriteError
+
+
+def save_or_ask(writer: DurableWriter) -> int:
+    """Saves the episode in progress; where that fails and somebody sits at the terminal, as often as they want it.
+
+    Args:
+        writer: With an episode in progress.
+
+    Returns:
+        The episode's index.
+
+    Raises:
+        DatasetWriteError: It could not be written, and nobody is there to make room, or they gave it up.
+    """
+    while True:
+        try:
+            return writer.save_episode()
+        except DatasetWriteError as error:
+            if not error.can_be_repeated or sys.stdin is None or not sys.stdin.isatty():
+                raise
+            print(f"\n{error}", file=sys.stderr)
+            try:
+                answer = input("Press Enter to save it again once there is room, or type q to give it up: ")
+            except EOFError:
+                raise error from None
+            if answer.strip().lower() == "q":
+                raise

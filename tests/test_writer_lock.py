@@ -1,0 +1,135 @@
+"""At most one process writes to a dataset, whatever the order in which locks are let go and taken."""
+
+import contextlib
+import multiprocessing
+import os
+import time
+from pathlib import Path
+
+import pytest
+from recording_factory import FEATURES, FPS, REPO_ID
+
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.journal import LOCK, SCRATCH
+from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
+
+
+def hold(root: str, seconds: float, answers) -> None:
+    """Takes the lock again and again, and notes when another one has it as well."""
+    end = time.monotonic() + seconds
+    taken = doubled = 0
+    marker = Path(root) / "held"
+    while time.monotonic() < end:
+        try:
+            lock = DatasetLock(Path(root))
+        except DatasetLockedError:
+            continue
+        except BaseException as error:
+            answers.put(error)
+            raise
+        try:
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+        except FileExistsError:
+            doubled += 1
+        else:
+            taken += 1
+            time.sleep(0.0005)
+            marker.unlink()
+        lock.release()
+    answers.put((taken, doubled))
+
+
+def try_to_take(root: str, answers) -> None:
+    try:
+        lock = DatasetLock(Path(root))
+    except DatasetLockedError:
+        answers.put("locked")
+    else:
+        answers.put("taken")
+        lock.release()
+
+
+@pytest.fixture(scope="module")
+def processes():
+    return multiprocessing.get_context("fork")
+
+
+def test_who_lets_a_lock_go_does_not_take_it_from_the_next(tmp_path, processes):
+    """One lets go, the next takes it while the first one tidies up: a third gets nothing."""
+    first = DatasetLock(tmp_path)
+    seconds: list[DatasetLock] = []
+    real = os.unlink
+
+    def unlink(path, *args, **kwargs):
+        with contextlib.suppress(DatasetLockedError):
+            seconds.append(DatasetLock(tmp_path))
+        real(path, *args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "unlink", unlink)
+        first.release()
+    if not seconds:
+        seconds.append(DatasetLock(tmp_path))
+    answers = processes.Queue()
+    third = processes.Process(target=try_to_take, args=(str(tmp_path), answers))
+    third.start()
+    assert answers.get(timeout=30) == "locked"
+    third.join()
+    seconds[0].release()
+
+
+def test_a_writer_that_closes_does_not_let_two_others_in(tmp_path):
+    """The second one opens the dataset at the moment in which the first one removes the lock's file."""
+    root = tmp_path / "dataset"
+
+    def open_writer() -> DurableWriter:
+        return DurableWriter(REPO_ID, root, FPS, FEATURES, resume=True)
+
+    first = open_writer()
+    seconds: list[DurableWriter] = []
+    real, is_first = os.unlink, iter([True])
+
+    def unlink(path, *args, **kwargs):
+        if Path(path) == root / LOCK and next(is_first, False):
+            with contextlib.suppress(DatasetWriteError):
+                seconds.append(open_writer())
+        real(path, *args, **kwargs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "unlink", unlink)
+        first.close()
+    second = seconds[0] if seconds else open_writer()
+    with pytest.raises(DatasetWriteError, match="Another process is writing"):
+        open_writer()
+    second.close()
+
+
+def test_two_processes_never_hold_it_at_once(tmp_path, processes):
+    answers = processes.Queue()
+    workers = [processes.Process(target=hold, args=(str(tmp_path), 3.0, answers)) for _ in range(4)]
+    for worker in workers:
+        worker.start()
+    found = [answers.get(timeout=30) for _ in workers]
+    for worker in workers:
+        worker.join()
+    assert not [answer for answer in found if isinstance(answer, BaseException)]
+    assert sum(taken for taken, _ in found) > 20
+    assert sum(doubled for _, doubled in found) == 0
+
+
+def test_nothing_stays_of_a_lock(tmp_path):
+    lock = DatasetLock(tmp_path)
+    assert (tmp_path / LOCK).exists()
+    with pytest.raises(DatasetLockedError, match="Another process is writing"):
+        DatasetLock(tmp_path)
+    lock.release()
+    lock.release()
+    assert not (tmp_path / SCRATCH).exists()
+
+
+def test_frames_of_another_tool_stay_where_they_are(tmp_path):
+    (tmp_path / SCRATCH / "camera").mkdir(parents=True)
+    DatasetLock(tmp_path).release()
+    assert (tmp_path / SCRATCH / "camera").is_dir()
+    assert not (tmp_path / LOCK).exists()
