@@ -219,6 +219,16 @@ def test_what_a_process_could_not_save_is_rolled_back_by_the_next(tmp_path, capl
     assert {path.name for path in root.iterdir()} == {"data", "meta"}
 
 
+def test_a_process_that_was_killed_between_two_episodes_left_nothing_to_be_told(tmp_path, caplog):
+    root = tmp_path / "dataset"
+    target = writer(root, FEATURES)
+    write_episode(target, 0)
+    target._lock.release()  # as at the end of a process that was killed
+    with writer(root, FEATURES) as target:
+        assert target.num_episodes == 1
+    assert "removed" not in caplog.text
+
+
 def test_an_episode_that_was_published_in_vain_is_there_after_closing(tmp_path, monkeypatch):
     """The journal stood: closing makes the moves that are left."""
     root = tmp_path / "dataset"

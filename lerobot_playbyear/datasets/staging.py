@@ -195,11 +195,12 @@ def _without_sound(features: dict[str, Any]) -> dict[str, Any]:
 
 
 def remove_leftovers(root: Path) -> bool:
-    """Removes an episode in progress from a dataset's scratch folder. Returns whether there was one."""
-    folders = [root / name for name in (EPISODE, PICTURES, STAGING) if (root / name).exists()]
-    for folder in folders:
-        shutil.rmtree(folder)
-    return bool(folders)
+    """Removes an episode in progress from a dataset's scratch folder. Returns whether anything of one was there."""
+    has_frames = any((root / name).exists() for name in (EPISODE / "images", EPISODE / "data", PICTURES, STAGING))
+    for folder in (root / EPISODE, root / PICTURES, root / STAGING):
+        if folder.exists():
+            shutil.rmtree(folder)
+    return has_frames
 
 
 def _copy_last_episode(source: Path, target: Path) -> None:
