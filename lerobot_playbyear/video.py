@@ -156,7 +156,7 @@ def write_film(
                 if audio is not None:
                     first, end = (round(i * sample_rate / fps) for i in (index, index + 1))
                     if first < len(sound):
-                        film.mux(audio.encode(_audio_frame(sound[first:end], sample_rate, first)))
+                        film.mux(audio.encode(audio_frame(sound[first:end], sample_rate, first)))
             if video is None:
                 raise ValueError("A film needs at least one frame.")
             for stream in (video, audio):
@@ -185,7 +185,8 @@ def _add_audio_stream(film, sample_rate: int, n_channels: int):
     return stream
 
 
-def _audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av.AudioFrame:
+def audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av.AudioFrame:
+    """Samples (n, 1 or 2) of 16-bit PCM [Hz: `sample_rate`] as FFmpeg takes them, from the place `first_sample` on."""
     layout = "stereo" if samples.shape[1] == 2 else "mono"
     frame = av.AudioFrame.from_ndarray(samples.astype(np.int16).reshape(1, -1), format="s16", layout=layout)
     frame.sample_rate, frame.pts, frame.time_base = sample_rate, first_sample, Fraction(1, sample_rate)

@@ -20,6 +20,7 @@ from tqdm import tqdm
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.audio_files import AudioFileError, cut_into_frames, read_audio, resample
 from lerobot_playbyear.datasets.columns import check_dataset_files, column_to_numpy
+from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups, write_tables
 from lerobot_playbyear.datasets.settling import write_rows
@@ -130,7 +131,9 @@ def _open(place: DatasetPlace) -> LeRobotDataset:
         raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
     try:
         check_dataset_files(place.repo_id, place.root)
-        return LeRobotDataset(place.repo_id, root=place.root, video_backend="pyav")
+        dataset = LeRobotDataset(place.repo_id, root=place.root, video_backend="pyav")
+        check_links(Path(dataset.root))  # the copy would hold what they lead to
+        return dataset
     except Exception as error:  # also what the Hub's client raises
         raise AttachError(f"The dataset '{place.repo_id}' cannot be opened: {error}") from error
 

@@ -22,6 +22,7 @@ AUDIO_PREFIX = "observation.audio."
 PCM_S16 = "pcm_s16"
 _PCM_S16_FULL_SCALE = 32768
 _DTYPES = ("int16", "float32", "float64")
+_MOST_SAMPLES_PER_S = 1_000_000
 
 
 def samples_per_frame(sample_rate: int, fps: int, key: str = AUDIO_PREFIX + "<microphone>") -> int:
@@ -116,6 +117,11 @@ def _check_one(key: str, feature: Mapping[str, Any], fps: int) -> int:
         )
     if isinstance(sample_rate, bool) or not isinstance(sample_rate, int | float) or sample_rate % 1 != 0:
         raise ValueError(f"'{key}' has sample_rate {sample_rate!r}; wanted a whole number of Hz, such as 16000.")
+    if int(sample_rate) > _MOST_SAMPLES_PER_S:
+        raise ValueError(
+            f"'{key}' says that its sample rate is {sample_rate} Hz; wanted at most {_MOST_SAMPLES_PER_S} Hz. Correct it, "
+            "and fps, in the dataset's meta/info.json."
+        )
     wanted = (samples_per_frame(int(sample_rate), fps, key),)
     if tuple(feature["shape"]) != wanted:
         raise ValueError(

@@ -4,9 +4,8 @@ LeRobot reads row by row, and every row passes through Python lists. Here a parq
 through Arrow, an image column is decoded by a few threads, and a video is decoded from its first frame to its last.
 """
 
-import io
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
-from lerobot.datasets import LeRobotDataset
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import HF_LEROBOT_HOME
-from PIL import Image
 from torch import Tensor
+
+from lerobot_playbyear.datasets.confines import check_info, file_inside, open_picture
 
 _ROWS_AT_ONCE = 128  # images
 Progress = Callable[[str, int], Any]
@@ -88,16 +88,16 @@ def read_images(dataset: LeRobotDataset, key: str, progress: Progress | None = N
     """All frames of an image column, (N, C, H, W) uint8.
 
     Raises:
-        ValueError: If a frame has another size than the first, or is empty.
+        ValueError: If a frame has another size than the feature, is empty, or lies outside the dataset's folder.
     """
     column = dataset.hf_dataset.data.column(key)
-    mode = "L" if 1 in _channel_candidates(dataset.meta.features[key]) else "RGB"
+    root, feature = Path(dataset.root), dataset.meta.features[key]
+    mode = "L" if 1 in _channel_candidates(feature) else "RGB"
     frames: Tensor | None = None
     position = 0
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for rows in _few_rows(column):
-            encoded = zip(rows.field("bytes").to_pylist(), rows.field("path").to_pylist(), strict=True)
-            for image in pool.map(lambda row: _decode_image(row, mode), encoded):
+            for image in pool.map(lambda row: _decode_image(row, root, key, feature, mode), rows.to_pylist()):
                 if frames is None:
                     frames = torch.empty((len(column), *image.shape), dtype=torch.uint8)
                 if image.shape != frames.shape[1:]:
@@ -130,7 +130,7 @@ def read_videos(
     frames: Tensor | None = None
     for start, end in zip(*episode_bounds(episode_index), strict=True):
         episode = int(episode_index[start])
-        path = Path(dataset.root) / dataset.meta.get_video_file_path(episode, key)
+        path = file_inside(Path(dataset.root), dataset.meta.get_video_file_path(episode, key))
         offset = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
         decoded = decode_video_frames(
             path,
@@ -156,31 +156,37 @@ def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
     return starts, [*starts[1:], len(episode_index)]
 
 
-def check_dataset_files(repo_id: str, root: str | Path | None = None) -> None:
-    """Refuse a local dataset that is empty or was cut off while it was written.
+def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: str | None = None) -> None:
+    """Refuse a local dataset that is empty or was cut off while it was written, or that no one should trust.
 
-    Does nothing where no local dataset is: LeRobot then fetches it from the Hub.
+    Where no local dataset is, what the Hub's says about itself is fetched and checked; the rest LeRobot fetches later.
 
     Args:
         repo_id: The dataset's name.
         root: Its folder; None means LeRobot's own place for `repo_id`.
+        revision: Of the dataset on the Hub, as LeRobot takes it.
 
     Raises:
-        ValueError: Naming the file that cannot be read, or the folder without data.
+        ValueError: Naming the file that cannot be read, the folder without data, or what leads out of the folder or
+            claims more than is there.
     """
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
     if not (folder / "meta" / "info.json").is_file():
+        meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+        check_info(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return
+    footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
     for path in sorted([*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]):
         try:
-            pq.read_metadata(path)
+            footers[path.relative_to(folder).parts[0]].append(pq.read_metadata(path))
         except (pa.ArrowInvalid, OSError) as error:
             raise ValueError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
                 f"killed, its episodes can be saved: playbyear-repair --root={folder}"
             ) from error
-    if not any(folder.glob("data/*/*.parquet")):
+    if not footers["data"]:
         raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
+    check_info(folder, footers["data"], sum(footer.num_rows for footer in footers["meta"]))
 
 
 def _few_rows(column: pa.ChunkedArray) -> Iterator[pa.StructArray]:
@@ -189,9 +195,8 @@ def _few_rows(column: pa.ChunkedArray) -> Iterator[pa.StructArray]:
         yield from (chunk.slice(first, _ROWS_AT_ONCE) for first in range(0, len(chunk), _ROWS_AT_ONCE))
 
 
-def _decode_image(row: tuple[bytes | None, str | None], mode: str) -> np.ndarray:
-    data, path = row
-    with Image.open(io.BytesIO(data) if data is not None else str(path)) as image:
+def _decode_image(row: Mapping[str, Any], root: Path, key: str, feature: Mapping[str, Any], mode: str) -> np.ndarray:
+    with open_picture(row, root, key, feature) as image:
         pixels = np.asarray(image.convert(mode))
     return pixels[None] if pixels.ndim == 2 else pixels.transpose(2, 0, 1)  # (C, H, W)
 

@@ -5,12 +5,11 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import av
 import numpy as np
-import torch
-import torchaudio
 from PIL import Image
 
-from lerobot_playbyear.video import episode_sound, write_film
+from lerobot_playbyear.video import audio_frame, episode_sound, write_film
 
 _AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 _NOT_READ = 96  # grey level of a picture that could not be read
@@ -71,12 +70,21 @@ def encode(pictures: Iterator[np.ndarray], fps: int, sound: Sequence[np.ndarray]
 
 
 def at_a_rate_of_aac(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, int]:
-    """Resamples (n, channels) to the next higher rate that AAC has, where that is necessary."""
+    """Resamples (n, at most 2 channels) int16 to the next higher rate that AAC has, where that is necessary."""
     if samples.shape[1] == 0 or sample_rate in _AAC_RATES:
         return samples, sample_rate or _AAC_RATES[-1]
     rate = next((rate for rate in _AAC_RATES if rate > sample_rate), _AAC_RATES[-1])
-    resampled = torchaudio.functional.resample(torch.from_numpy(samples.T.astype(np.float32)), sample_rate, rate)
-    return np.clip(resampled.T.numpy(), -32768, 32767).astype(np.int16), rate
+    n_channels = samples.shape[1]
+    # FFmpeg's: torchaudio's filter for rates with no common divisor takes gigabytes.
+    resampler = av.AudioResampler(format="s16", layout=("mono", "stereo")[n_channels - 1], rate=rate)
+    parts: list[np.ndarray] = []
+    for first in range(0, len(samples) + sample_rate, sample_rate):
+        part = samples[first : first + sample_rate]
+        frames = resampler.resample(audio_frame(part, sample_rate, first) if len(part) else None)
+        parts.extend(frame.to_ndarray().reshape(-1, n_channels) for frame in frames)
+        if not len(part):
+            break
+    return np.concatenate(parts), rate
 
 
 def _fitted(size: int, limit: int) -> int:

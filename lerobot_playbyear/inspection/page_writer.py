@@ -5,6 +5,7 @@ import hashlib
 import html
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.resources import files
@@ -105,16 +106,15 @@ def _skeleton(title: str) -> str:
     """The page without data. Its policy allows its own script and style by their hashes, and no connection."""
     folder = files("lerobot_playbyear.inspection") / "page"
     style = (folder / "page.css").read_text(encoding="utf-8")
-    parts = [(folder / name).read_text(encoding="utf-8") for name in _SCRIPTS]
-    script = '"use strict";\n(() => {\n' + "\n".join(parts) + "\n})();\n"
+    scripts = [(folder / name).read_text(encoding="utf-8") for name in _SCRIPTS]
+    script = '"use strict";\n(() => {\n' + "\n".join(scripts) + "\n})();\n"
     policy = (
         f"default-src 'none'; script-src '{_hash(script)}'; style-src '{_hash(style)}'; img-src data:; "
         "media-src blob:; base-uri 'none'; form-action 'none'"
     )
     page = (folder / "page.html").read_text(encoding="utf-8")
-    for name, text in (("title", html.escape(title)), ("policy", policy), ("style", style), ("script", script)):
-        page = page.replace("{{" + name + "}}", text)
-    return page
+    parts = {"title": html.escape(title), "policy": policy, "style": style, "script": script}
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], page)  # in one go: a title may hold a mark, too
 
 
 def _hash(text: str) -> str:

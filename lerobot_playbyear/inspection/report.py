@@ -31,15 +31,15 @@ def as_text(source: DatasetSource, verdicts: Sequence[Verdict], colour: bool = F
     facts = dataset_facts(source)
     name_width = max(len(verdict.check) for verdict in verdicts)
     lines = [
-        f"{facts['repo_id']} in {facts['root']}",
+        _printable(f"{facts['repo_id']} in {facts['root']}"),
         f"{facts['episodes']} episodes, {facts['frames']:,} frames, {facts['seconds']:,.1f} s at {facts['fps']} Hz; "
-        f"cameras: {_names(source.cameras)}; microphones: {_names(source.microphones)}",
+        f"cameras: {_printable(_names(source.cameras))}; microphones: {_printable(_names(source.microphones))}",
         "",
     ]
     for verdict in verdicts:
         level = f"\033[{_COLOURS[verdict.level]}m{verdict.level:<7}\033[0m" if colour else f"{verdict.level:<7}"
         feature = f"{verdict.feature}: " if verdict.feature else ""
-        lines.append(f"{level}  {verdict.check:<{name_width}}  {feature}{verdict.message}")
+        lines.append(f"{level}  {verdict.check:<{name_width}}  {_printable(feature + verdict.message)}")
     return "\n".join([*lines, "", summary(verdicts)])
 
 
@@ -65,3 +65,8 @@ def _plural(level: str, count: int) -> str:
 
 def _names(keys: Sequence[str]) -> str:
     return ", ".join(key.split(".", 2)[-1] for key in keys) or "none"
+
+
+def _printable(text: str) -> str:
+    """Without the characters that command a terminal; names and messages may be a stranger's."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)

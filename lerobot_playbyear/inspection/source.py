@@ -3,7 +3,6 @@
 Unlike training, inspection has to read what is wrong: NaN is a finding here, not an error.
 """
 
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,10 +14,10 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.language import LANGUAGE_COLUMNS
 from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
-from PIL import Image
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import check_dataset_files, column_to_numpy, episode_bounds
+from lerobot_playbyear.datasets.confines import ClaimError, OutsideError, file_inside, open_picture
 from lerobot_playbyear.inspection.damage import find_damage
 
 SUCCESS = "next.success"
@@ -100,6 +99,8 @@ class DatasetSource:
             dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, video_backend=video_backend)
             source = cls(dataset, video_backend)
             n_episodes = len(source.episodes)
+        except (OutsideError, ClaimError) as error:
+            raise InspectionError(str(error)) from error
         except Exception as error:  # whatever LeRobot, Arrow or the network may raise
             where = f"in '{folder}'" if root is not None else f"'{repo_id}' (neither in '{folder}' nor from the Hub)"
             reason = find_damage(folder) or " ".join(str(error.__cause__ or error).split()) or type(error).__name__
@@ -167,12 +168,12 @@ class DatasetSource:
         column = self._table.column(camera).slice(episode.start, len(episode))
         for chunk in column.chunks:
             for row in chunk.to_pylist():
-                with Image.open(io.BytesIO(row["bytes"]) if row["bytes"] is not None else row["path"]) as image:
+                with open_picture(row, Path(self.dataset.root), camera, self.features[camera]) as image:
                     yield np.asarray(image.convert("RGB"))
 
     def _video(self, episode: Episode, camera: str) -> Iterator[np.ndarray]:
         meta = self.dataset.meta
-        path = Path(self.dataset.root) / meta.get_video_file_path(episode.index, camera)
+        path = file_inside(Path(self.dataset.root), meta.get_video_file_path(episode.index, camera))
         offset = meta.episodes[episode.index][f"videos/{camera}/from_timestamp"]
         times = [offset + float(time) for time in self.values("timestamp")[episode.rows]]
         for first in range(0, len(times), _PICTURES_AT_ONCE):

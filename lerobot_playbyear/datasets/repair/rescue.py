@@ -90,14 +90,28 @@ def _templates(schema: pa.Schema) -> list[_Template]:
         return []  # lists of no fixed length: where a row ends does not follow from the pages' headers
     templates = []
     for options in ({"compression": "snappy", "use_dictionary": True}, writer_options(schema)):
-        buffer = io.BytesIO()
-        row = pa.Table.from_arrays([_one_row(field.type) for field in schema], schema=schema)
-        pq.write_table(row, buffer, **options)
-        data = buffer.getvalue()
-        footer, _ = thrift.read_struct(data, len(data) - 8 - int.from_bytes(data[-8:-4], "little"))
-        chunks = footer.value(4).values[0].value(1).values
+        # The lengths of lists stand in the schema alone, and may be those that a stranger claims: the row has short ones.
+        short = pa.schema([field.with_type(_shortened(field.type)) for field in schema])
+        row = pa.Table.from_arrays([_one_row(field.type) for field in short], schema=short)
+        chunks = _footer(row, options).value(4).values[0].value(1).values
+        footer = _footer(schema.empty_table(), options)
         templates.append(_Template(footer, [chunk.value(3) for chunk in chunks], sizes))
     return templates
+
+
+def _footer(table: pa.Table, options: dict) -> Struct:
+    buffer = io.BytesIO()
+    pq.write_table(table, buffer, **options)
+    data = buffer.getvalue()
+    footer, _ = thrift.read_struct(data, len(data) - 8 - int.from_bytes(data[-8:-4], "little"))
+    return footer
+
+
+def _shortened(kind: pa.DataType) -> pa.DataType:
+    """A type of lists with one value each: its columns are described alike."""
+    if pa.types.is_fixed_size_list(kind):
+        return pa.list_(kind.value_field.with_type(_shortened(kind.value_type)), 1)
+    return kind
 
 
 def _values_per_row(kind: pa.DataType) -> list[int]:
