@@ -15,7 +15,7 @@ from torch.nn import functional
 from lerobot_playbyear.augmentation import Augmentation, resize
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.distributed import mean_over_processes
-from lerobot_playbyear.hub.policy_card import with_hearing
+from lerobot_playbyear.hub.policy_card import with_hearing, write_card
 from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
 from lerobot_playbyear.recent import RecentFrames
 from lerobot_playbyear.runs import before_episode, newest
@@ -76,7 +76,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> Any:
         """LeRobot's card, with what the policy hears."""
-        return with_hearing(super().generate_model_card(*args, **kwargs), self.config)
+        return with_hearing(write_card(super().generate_model_card, self.config, *args, **kwargs), self.config)
 
     def keep_normalization(self) -> None:
         """From now on sound is normalised by the statistics that the spectrograms have, in training too."""

@@ -29,7 +29,6 @@ from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_root
-from lerobot_playbyear.hub.client import use_patient_client
 from lerobot_playbyear.hub.datasets import push_dataset
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.rollouts import EnvFacts, EnvSpec, Episode, Observation, RolloutError, RolloutPool
@@ -297,7 +296,6 @@ def _flat_observation(observation: Observation) -> dict[str, Any]:
 
 
 def _push(dataset: RecordDatasetConfig) -> None:
-    use_patient_client()
     try:
         url = push_dataset(dataset.repo_id, dataset.root, private=dataset.private, tags=dataset.tags)
     except HubError as error:

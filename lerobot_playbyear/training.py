@@ -12,7 +12,6 @@ from lerobot.common.train_utils import (
     get_step_checkpoint_dir,
     get_step_identifier,
     load_training_state,
-    push_checkpoint_to_hub,
     save_checkpoint,
     update_last_checkpoint,
 )
@@ -30,6 +29,7 @@ from torch import Tensor
 
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
+from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
 from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.train_config import PlaybyearTrainConfig
@@ -162,9 +162,7 @@ class TrainingParts:
         self.write_checkpoint(folder, cfg)
         update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
-            push_meanwhile(
-                partial(push_checkpoint_to_hub, folder, cfg.policy.repo_id, private=cfg.policy.private), folder
-            )
+            push_meanwhile(partial(push_checkpoint, folder, cfg.policy.repo_id, cfg.policy.private), folder)
         return folder
 
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:

@@ -1,13 +1,11 @@
-"""The module that LeRobot's plugin discovery imports: it registers the policy `playbyear`.
+"""The module that LeRobot's plugin discovery imports: it registers the policy `playbyear`, and changes nothing else.
 
-Discovery is for commands; there, what talks to the Hub shall have patience (`lerobot_playbyear.hub.client`). Import
-`lerobot_playbyear` in programs of your own.
+Import `lerobot_playbyear` in programs of your own.
 """
 
 from lerobot_playbyear import __version__
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.environment_sound import Pcm16ToFloatProcessorStep
-from lerobot_playbyear.hub.client import use_patient_client
 from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.processor_playbyear import make_playbyear_pre_post_processors
 
@@ -18,5 +16,3 @@ __all__ = [
     "__version__",
     "make_playbyear_pre_post_processors",
 ]
-
-use_patient_client()

@@ -25,10 +25,10 @@ COMMANDS = {
         for name in ("record", "push", "inspect", "train", "dagger")
     },
     **{f"lerobot-{name}": f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval")},
+    "hub-clients": "hub_clients",
 }
 _IMPORTED_LATER = (
     "lerobot_playbyear.teleoperation.demonstrations",
-    "lerobot_policy_playbyear",
     "lerobot_env_playbyear",
 )
 

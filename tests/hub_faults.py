@@ -2,11 +2,13 @@
 
 import itertools
 import random
+import re
 from collections.abc import Callable
 
 Fault = Callable[[str, str], str | None]
 """Given method and path, what goes wrong: "unavailable" (status 503), "cut" (no answer, and nothing is done), "lost" (it is
-done, and half of the answer arrives), "slow", or None."""
+done, and half of the answer arrives), "late" (status 504, and it is done when the next commit comes), "slow", or
+None."""
 
 
 def nothing_fails(method: str, path: str) -> None:
@@ -36,3 +38,9 @@ def down_after(n: int) -> Fault:
         return "cut" if is_down else None
 
     return fault
+
+
+def every_second(kind: str, method: str, pattern: str) -> Fault:
+    """What goes wrong with the first, the third, ... request to the paths that match."""
+    count = itertools.count()
+    return lambda asked, path: kind if asked == method and re.search(pattern, path) and next(count) % 2 == 0 else None

@@ -75,6 +75,8 @@ class Repository:
             key, value = line["key"], line["value"]
             if key == "header":
                 message = value["summary"]
+                if value.get("parentCommit", self.branches[branch]) != self.branches[branch]:
+                    raise HubAnswerError(412, message="A commit has happened since. Please refresh and try again.")
             elif key == "file":
                 data = base64.b64decode(value["content"])
                 files[value["path"]] = File(git_oid(data), data, is_large=False)
@@ -83,7 +85,8 @@ class Repository:
                     raise HubAnswerError(400, message=f"{value['path']} was never uploaded")
                 files[value["path"]] = File(value["oid"], objects[value["oid"]], is_large=True)
             elif key == "deletedFile":
-                del files[value["path"]]
+                if files.pop(value["path"], None) is None:
+                    raise HubAnswerError(404, "EntryNotFound", "A file with this name doesn't exist")
             else:
                 raise HubAnswerError(400, message=f"unknown line {key}")
         self.branches[branch] = self._add_commit(files, message)

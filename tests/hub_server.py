@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -45,6 +46,7 @@ class HubServer:
         repositories: By (kind, name), kind "models" or "datasets".
         objects: Large files by their SHA-256.
         arrivals: How many times each large file came up as a whole.
+        jobs: What was asked to be run.
         requests: Method, path and what went wrong, of every request.
         fault: Decides what goes wrong.
     """
@@ -53,9 +55,11 @@ class HubServer:
         self.repositories: dict[tuple[str, str], Repository] = {}
         self.objects: dict[str, bytes] = {}
         self.arrivals: Counter[str] = Counter()
+        self.jobs: list[dict[str, Any]] = []
         self.requests: list[tuple[str, str, str | None]] = []
         self.fault: Fault = nothing_fails
         self.lock = threading.Lock()
+        self.late: list[Callable[[], Answer]] = []
         hub = self
 
         class Handler(_Handler):
@@ -187,6 +191,16 @@ class HubServer:
     def fetch(self, request: "_Handler", oid: str) -> Answer:
         return request.part_of(self.objects[oid], {"ETag": f'"{oid}"'})
 
+    def start_job(self, request: "_Handler") -> Answer:
+        self.jobs.append(request.json())
+        job = {
+            "id": f"job-{len(self.jobs)}",
+            "createdAt": "2025-01-01T00:00:00.000Z",
+            "status": {"stage": "RUNNING", "message": None},
+            "owner": {"id": "1", "name": USER, "type": "user"},
+        }
+        return Answer({**request.json(), **job})
+
     def whoami(self, request: "_Handler") -> Answer:
         return Answer({"type": "user", "name": USER, "orgs": [], "auth": {"type": "access_token"}})
 
@@ -200,6 +214,7 @@ _ROUTES: list[tuple[str, str, Callable[..., Answer]]] = [
     ("POST", r"/api/repos/create", HubServer.create),
     ("POST", r"/api/validate-yaml", HubServer.validate_card),
     ("GET", r"/api/whoami-v2", HubServer.whoami),
+    ("POST", rf"/api/jobs/{USER}", HubServer.start_job),
     ("POST", rf"/api/{_REPO}/preupload/(?P<revision>[^/]+)", HubServer.preupload),
     ("POST", rf"/api/{_REPO}/commit/(?P<revision>[^/]+)", HubServer.commit),
     ("POST DELETE", rf"/api/{_REPO}/tag/(?P<revision>[^/]+)", HubServer.tag),
@@ -245,6 +260,12 @@ class _Handler(BaseHTTPRequestHandler):
         if fault == "slow":
             time.sleep(_SLOW_S)
         with hub.lock:
+            if fault == "late":
+                hub.late.append(partial(self._answer, path))
+                return self._write(Answer(status=504, data=b"<html>Gateway timeout</html>"))
+            if self.command == "POST" and "/commit/" in path:
+                while hub.late:
+                    hub.late.pop()()
             answer = self._answer(path)
         self._write(answer, half=fault == "lost")
 

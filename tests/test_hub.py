@@ -1,16 +1,22 @@
 """Datasets and policies go to the Hub and come back, through the real client and an HTTP server on loopback."""
 
+import itertools
 import json
 import shlex
 from pathlib import Path
 
 import av
+import httpx
 import pytest
 import yaml
 from hub_client import HubClient, Result
-from hub_faults import down_after, everything_fails, nothing_fails, one_in
-from hub_repositories import File, git_oid
+from hub_faults import down_after, every_second, everything_fails, nothing_fails, one_in
+from hub_repositories import File, Repository, git_oid
 from hub_server import TOKEN, HubServer
+from huggingface_hub import HfApi, get_session, set_client_factory
+from huggingface_hub.utils import _http
+
+from lerobot_playbyear.hub.client import patient_hub
 
 DATASET = "tester/grasp"
 POLICY = "tester/hearing"
@@ -195,13 +201,11 @@ def test_what_cannot_be_pushed_is_refused(pushed, hub, client, options, message)
     assert not hub.requests
 
 
-def test_lerobot_trains_on_a_dataset_from_the_hub_although_one_request_in_ten_fails(pushed, hub, client, tmp_path):
-    hub.fault = one_in(10, seed=2)
+def test_lerobot_trains_on_a_dataset_from_the_hub(pushed, hub, client, tmp_path):
     run = (*TINY, "--policy.push_to_hub=false", "--steps=2", f"--output_dir={tmp_path / 'out'}")
     assert_well(client.run("lerobot-train", f"--dataset.repo_id={DATASET}", *run))
     assert content(client.snapshot(DATASET)) == content(pushed)
     assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
-    assert hub.faults()
 
 
 def test_our_commands_load_a_dataset_from_the_hub_although_one_request_in_ten_fails(pushed, hub, client, tmp_path):
@@ -263,10 +267,10 @@ def test_a_dataset_goes_up_and_comes_back_although_one_request_in_ten_fails(push
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10, 20))
-def test_lerobot_train_loads_from_a_bad_line(pushed, hub, client, tmp_path, seed):
+def test_our_training_loads_from_a_bad_line(pushed, hub, client, tmp_path, seed):
     hub.fault = one_in(10, seed=seed)
     run = (*TINY, "--policy.push_to_hub=false", "--steps=1", f"--output_dir={tmp_path / 'train'}")
-    assert_well(client.run("lerobot-train", f"--dataset.repo_id={DATASET}", *run, fresh=True))
+    assert_well(client.run("playbyear-train", f"--dataset.repo_id={DATASET}", *run, fresh=True))
     assert content(client.snapshot(DATASET)) == content(pushed)
 
 
@@ -291,3 +295,91 @@ def test_a_corrected_policy_goes_up_from_dagger(pushed, hub, client, tmp_path):
     weights = (tmp_path / "dagger" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
     assert hub.model("tester/corrected").files()["model.safetensors"].data == weights
     assert "## Hearing" in hub.model("tester/corrected").files()["README.md"].data.decode()
+
+
+def test_a_dataset_on_the_hub_that_claims_too_much_is_refused_before_its_data_comes(pushed, hub, client):
+    files = dict(hub.dataset(DATASET).files("v3.0"))
+    info = {**json.loads(files["meta/info.json"].data), "total_episodes": 50_000_000}
+    data = json.dumps(info).encode()
+    hostile = hub.repositories["datasets", "tester/hostile"] = Repository("datasets", "tester/hostile")
+    hostile.commits[hostile.resolve("main")] = {**files, "meta/info.json": File(git_oid(data), data, is_large=False)}
+    hostile.tags["v3.0"] = hostile.resolve("main")
+    result = client.run("playbyear-inspect", "--dataset.repo_id=tester/hostile")
+    assert result.status == 2
+    assert "total_episodes is 50,000,000, but meta/episodes has 2" in result.output
+    assert not [path for _, path, _ in hub.requests if "/data/" in path]
+
+
+@pytest.mark.parametrize("command", ["lerobot-train", "lerobot-eval"])
+def test_to_discover_the_plugin_changes_nothing_for_other_commands(client, hub, command):
+    result = client.run("hub-clients", command, "--help")
+    assert "the plugin is there, and huggingface_hub has the same client" in result.output, result.output[-3000:]
+
+
+def test_a_job_whose_answer_is_lost_is_started_once(pushed, hub, client, tmp_path):
+    hub.fault = lambda method, path: "lost" if path.startswith("/api/jobs/") else None
+    job = ("--job.target=cpu-basic", "--job.detach=true", f"--output_dir={tmp_path / 'out'}")
+    result = client.run("lerobot-train", f"--dataset.repo_id={DATASET}", *TINY, *job)
+    assert "Submitting job" in result.output, result.output[-3000:]
+    assert result.status == 1
+    assert len(hub.jobs) == 1
+
+
+@pytest.mark.parametrize("kind", ["lost", "late", "cut"])
+def test_a_commit_whose_answer_is_lost_happens_once(pushed, hub, client, kind):
+    hub.repositories.pop(("datasets", "tester/once"), None)
+    hub.fault = every_second(kind, "POST", "/commit/")
+    assert_well(client.run("playbyear-push", "--dataset.repo_id=tester/once", f"--dataset.root={pushed}"))
+    assert content_on(hub, "tester/once") == content(pushed)
+    assert hub.dataset("tester/once").messages == ["initial commit", "Upload dataset", "Upload card"]
+
+
+def test_checkpoints_go_up_once_although_answers_are_lost(pushed, hub, client, tmp_path):
+    hub.fault = every_second("lost", "POST", "/commit/|/tag/|/create")
+    run = (*TINY, "--policy.push_to_hub=true", "--policy.repo_id=tester/steps", "--steps=2", "--save_freq=1")
+    more = ("--save_checkpoint_to_hub=true", f"--output_dir={tmp_path / 'out'}")
+    result = client.run("playbyear-train", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}", *run, *more)
+    assert_well(result)
+    assert "was not uploaded" not in result.output
+    repository = hub.model("tester/steps")
+    assert repository.messages == ["initial commit", "checkpoint 000001", "checkpoint 000002", "Upload policy"]
+    weights = repository.files("000001")["checkpoints/000001/pretrained_model/model.safetensors"].data
+    assert weights == (tmp_path / "out/checkpoints/000001/pretrained_model/model.safetensors").read_bytes()
+
+
+def test_in_our_own_commands_only_what_asks_is_repeated(hub):
+    api, fails = HfApi(endpoint=hub.url, token=TOKEN), itertools.count()
+    hub.fault = lambda method, path: "lost" if next(fails) < 2 else None
+    before = _http._GLOBAL_CLIENT_FACTORY
+    with patient_hub():
+        assert api.whoami()["name"] == "tester"
+        assert len(hub.requests) == 3
+        hub.fault = lambda method, path: "lost"
+        for start in (
+            lambda: api.run_job(image="python", command=["true"], namespace="tester"),
+            lambda: api.create_tag(DATASET, tag="new", repo_type="dataset"),
+            lambda: api.delete_tag(DATASET, tag="new", repo_type="dataset"),
+        ):
+            hub.requests.clear()
+            with pytest.raises(httpx.TransportError):
+                start()
+            assert len(hub.requests) == 1
+    assert _http._GLOBAL_CLIENT_FACTORY is before
+
+
+def test_the_patient_client_goes_when_the_work_is_done_or_failed(hub):
+    def work():
+        request = get_session().build_request("GET", hub.url)
+        assert request.headers["x-proxy"] == "mine"  # what others configured stays
+        raise KeyboardInterrupt
+
+    before = _http._GLOBAL_CLIENT_FACTORY
+    own = httpx.Client(headers={"x-proxy": "mine"})
+    try:
+        set_client_factory(lambda: own)
+        factory = _http._GLOBAL_CLIENT_FACTORY
+        with pytest.raises(KeyboardInterrupt), patient_hub(), patient_hub():
+            work()
+        assert _http._GLOBAL_CLIENT_FACTORY is factory
+    finally:
+        set_client_factory(before)

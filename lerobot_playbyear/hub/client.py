@@ -1,35 +1,50 @@
-"""The Hub's client, with patience: a request that failed for a passing reason is made again.
+"""The Hub's client, with patience: what only asks is asked again when it failed for a passing reason.
 
-`huggingface_hub` repeats some requests (parts of files) and not others (looking a repository up, making a commit), so that
-one lost request ends an upload or a download of hundreds.
+`huggingface_hub` repeats some requests (preparing an upload, parts of files) and not others (looking a repository up), so
+that one lost request ends a download of hundreds. What starts, creates or changes something is never repeated here: its
+answer may have been lost after it was done. `pushing` knows which of these can be done again, and how.
 """
 
 import time
-from functools import partial
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import httpx
 from huggingface_hub import constants, set_client_factory
-from huggingface_hub.utils import get_session
+from huggingface_hub.utils import _http
 
 _WAITS_S = (0.5, 1.0, 2.0)
 _PASSING = (500, 502, 503, 504)
+_ASKING = ("GET", "HEAD", "OPTIONS")
+_CARD_CHECK = "/api/validate-yaml"  # a POST that changes nothing
 _PUBLIC_HUB = "huggingface.co"
 
 
 class PatientClient(httpx.Client):
-    """Makes a request up to four times while the network or the server fails.
+    """Makes requests through another client; one that only asks up to four times while the network or the server fails.
 
     Cards are validated at huggingface.co, whatever `HF_ENDPOINT` says; here they are validated where they go.
+
+    Args:
+        usual: The other client: its proxies, certificates, headers and hooks stay in use.
     """
 
+    def __init__(self, usual: httpx.Client) -> None:
+        super().__init__()
+        self._usual = usual
+
+    def build_request(self, *args: Any, **kwargs: Any) -> httpx.Request:
+        """As the other client builds it."""
+        return self._usual.build_request(*args, **kwargs)
+
     def send(self, request: httpx.Request, **kwargs: Any) -> httpx.Response:
-        """As `httpx.Client.send`. A body that is read from a file while it is sent is not sent again: the caller does that."""
+        """As `httpx.Client.send`."""
         _address_endpoint(request)
-        waits = list(_WAITS_S) if _is_repeatable(request) else []
+        waits = list(_WAITS_S) if _only_asks(request) else []
         while True:
             try:
-                response = super().send(request, **kwargs)
+                response = self._usual.send(request, **kwargs)
             except httpx.TransportError:
                 if not waits:
                     raise
@@ -39,21 +54,42 @@ class PatientClient(httpx.Client):
                 response.close()
             time.sleep(waits.pop(0))
 
-
-def use_patient_client() -> None:
-    """Lets everything in this process that talks to the Hub do so with patience. For commands, not for libraries."""
-    usual = get_session()
-    if not isinstance(usual, PatientClient):
-        hooks, follow, timeout = usual.event_hooks, usual.follow_redirects, usual.timeout
-        set_client_factory(partial(PatientClient, event_hooks=hooks, follow_redirects=follow, timeout=timeout))
+    def close(self) -> None:
+        """Closes the other client, too."""
+        self._usual.close()
+        super().close()
 
 
-def _is_repeatable(request: httpx.Request) -> bool:
+class _PatientFactory:
+    """Makes patient clients.
+
+    Args:
+        usual: Makes the clients that they use.
+    """
+
+    def __init__(self, usual: _http.CLIENT_FACTORY_T) -> None:
+        self._usual = usual
+
+    def __call__(self) -> httpx.Client:
+        return PatientClient(self._usual())
+
+
+@contextmanager
+def patient_hub() -> Iterator[None]:
+    """Lets what talks to the Hub in this process do so with patience, until the work is done or has failed."""
+    before = _http._GLOBAL_CLIENT_FACTORY  # the library has a function to set it, and none to ask for it
+    if isinstance(before, _PatientFactory):
+        yield
+        return
+    set_client_factory(_PatientFactory(before))
     try:
-        _ = request.content
-    except httpx.RequestNotRead:
-        return False
-    return True
+        yield
+    finally:
+        set_client_factory(before)
+
+
+def _only_asks(request: httpx.Request) -> bool:
+    return request.method in _ASKING or (request.method == "POST" and request.url.path == _CARD_CHECK)
 
 
 def _address_endpoint(request: httpx.Request) -> None:

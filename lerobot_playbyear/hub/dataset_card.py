@@ -1,9 +1,11 @@
 """What the card of a dataset says: what is in it, how it looks and sounds, and how to use it."""
 
+import json
 import shlex
 
 import numpy as np
 
+from lerobot_playbyear.hub.markdown import code, text
 from lerobot_playbyear.hub.preview import Preview
 from lerobot_playbyear.inspection.source import INTERVENTION, SUCCESS, DatasetSource
 
@@ -16,8 +18,8 @@ _LISTEN = """```python
 from lerobot.datasets import LeRobotDataset
 from lerobot_playbyear.datasets import episode_waveform, write_audio
 
-dataset = LeRobotDataset("{repo_id}")
-waveform, sample_rate = episode_waveform(dataset, 0, "{microphone}")  # int16
+dataset = LeRobotDataset({repo_id})
+waveform, sample_rate = episode_waveform(dataset, 0, {microphone})  # int16
 write_audio("episode_0.wav", waveform, sample_rate)
 ```"""
 
@@ -46,7 +48,7 @@ def describe_dataset(source: DatasetSource, repo_id: str, film_url: str | None, 
         parts += [
             "A plain LeRobotDataset: every tool that knows LeRobot reads it. A microphone's row holds the samples heard "
             "since the previous frame. To hear an episode, with the plugin lerobot-playbyear:",
-            _LISTEN.format(repo_id=repo_id, microphone=source.microphones[0]),
+            _LISTEN.format(repo_id=_quoted(repo_id), microphone=_quoted(source.microphones[0])),
             "To train a policy that hears:",
             f"```bash\nplaybyear-train --policy.type=playbyear --policy.fps={source.fps} --policy.push_to_hub=false "
             f"--dataset.repo_id={shlex.quote(repo_id)}\n```",
@@ -59,7 +61,7 @@ def describe_dataset(source: DatasetSource, repo_id: str, film_url: str | None, 
 def _caption(source: DatasetSource, preview: Preview) -> str:
     sound = "without sound"
     if preview.microphones:
-        names = " (left) and ".join(f"`{_short(key)}`" for key in preview.microphones)
+        names = " (left) and ".join(code(_short(key)) for key in preview.microphones)
         right = " (right)" if len(preview.microphones) == 2 else ""
         sound = f"with the sound of {names}{right}, amplified; below the picture its spectrogram"
     part = "Episode" if preview.is_whole else "The beginning of episode"
@@ -76,13 +78,13 @@ def _facts(source: DatasetSource) -> str:
         ("Frame rate", f"{source.fps} Hz"),
         ("Cameras", "<br>".join(_camera(source, key) for key in source.cameras) or "none"),
         ("Microphones", "<br>".join(_microphone(source, key) for key in source.microphones) or "none"),
-        ("Robot", source.dataset.meta.robot_type),
+        ("Robot", text(str(source.dataset.meta.robot_type or ""))),
     ]
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows if value)])
 
 
 def _tasks(source: DatasetSource) -> str:
-    tasks = sorted({_cell(source.task(episode)) for episode in source.episodes} - {""})
+    tasks = sorted({text(source.task(episode)) for episode in source.episodes} - {""})
     more = f" and {len(tasks) - _MOST_TASKS} more" if len(tasks) > _MOST_TASKS else ""
     return "; ".join(tasks[:_MOST_TASKS]) + more
 
@@ -102,20 +104,20 @@ def _interventions(source: DatasetSource) -> str:
 
 def _camera(source: DatasetSource, key: str) -> str:
     feature = source.features[key]
-    return f"`{key}`: {' x '.join(str(size) for size in feature['shape'])}, {feature['dtype']}"
+    return f"{code(key)}: {' x '.join(str(size) for size in feature['shape'])}, {text(feature['dtype'])}"
 
 
 def _microphone(source: DatasetSource, key: str) -> str:
     feature = source.features[key]
     rate = (feature.get("info") or {}).get("sample_rate")
     known = f"{int(rate):,} Hz, " if rate else "sample rate unknown, "
-    return f"`{key}`: {known}{feature['shape'][0]:,} samples a frame, {feature['dtype']}"
+    return f"{code(key)}: {known}{feature['shape'][0]:,} samples a frame, {text(feature['dtype'])}"
 
 
 def _short(key: str) -> str:
     return key.rsplit(".", 1)[-1]
 
 
-def _cell(text: str) -> str:
-    """Text that does not end a table's cell or line."""
-    return " ".join(text.split()).replace("|", "\\|")
+def _quoted(name: str) -> str:
+    """A name as Python and JSON write it: on one line, so that it cannot end the block of code."""
+    return json.dumps(name, ensure_ascii=False)

@@ -1,27 +1,27 @@
 """Uploads a dataset: LeRobot's files, its card with a film beside it, and the tag that LeRobot looks for."""
 
-import contextlib
 import logging
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from huggingface_hub import CommitOperationAdd, HfApi
-from huggingface_hub.errors import RevisionNotFoundError
+from huggingface_hub import HfApi
 from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
 from lerobot.datasets.utils import create_lerobot_dataset_card
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_playbyear.datasets.confines import OutsideError, check_links, entries_below
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview
 from lerobot_playbyear.hub.pushing import HubError, push_patiently
+from lerobot_playbyear.hub.repository import HubRepository
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
 CARD = "README.md"
 FILM = "preview.mp4"
 
-_CONTENT = ["data/*", "meta/*", "videos/*"]
-_LEFT_OUT = ["images/", CARD, FILM, ".gitattributes"]  # LeRobot's scratch folder; and what is made anew or is the Hub's
+_CONTENT = ("data/", "meta/", "videos/")
+_LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratch; what is made anew; what is the Hub's
 
 logger = logging.getLogger(__name__)
 
@@ -60,12 +60,14 @@ def push_dataset(
         raise HubError(f"preview={film}: there is no such file.")
     try:
         source = DatasetSource.open(repo_id, folder)
-    except InspectionError as error:
+        check_links(folder)
+    except (InspectionError, OutsideError) as error:
         raise HubError(f"Not pushed. {error}") from error
+    files = _files(folder)
     with TemporaryDirectory() as scratch:
         card = _make_card(source, repo_id, Path(scratch), film, tags, license)
         return push_patiently(
-            partial(_push, HfApi(), repo_id, folder, card, private),
+            partial(_push, repo_id, files, card, private),
             f"The dataset is complete in {folder}",
             _command(repo_id, root, private, tags, license, film),
         )
@@ -80,6 +82,8 @@ def _make_card(
         try:
             preview = film_preview(source, scratch / FILM)
             film = preview.path
+        except OutsideError as error:
+            raise HubError(f"Not pushed. {error}") from error
         except Exception:  # a film is not worth an upload
             logger.warning("No film could be made for the dataset's card", exc_info=True)
     url = f"{HfApi().endpoint}/datasets/{repo_id}/resolve/main/{FILM}" if film is not None else None
@@ -94,22 +98,19 @@ def _make_card(
     return {CARD: scratch / CARD} | ({FILM: film} if film is not None else {})
 
 
-def _push(api: HfApi, repo_id: str, folder: Path, card: dict[str, Path], private: bool | None) -> str:
-    url = api.create_repo(repo_id, repo_type="dataset", private=private, exist_ok=True)
-    api.upload_folder(
-        repo_id=repo_id,
-        repo_type="dataset",
-        folder_path=folder,
-        commit_message="Upload dataset",
-        ignore_patterns=list(_LEFT_OUT),
-        delete_patterns=_CONTENT,  # LeRobot reads every file in data/: one that is no longer there must go
-    )
-    additions = [CommitOperationAdd(name, path) for name, path in card.items()]
-    api.create_commit(repo_id, additions, repo_type="dataset", commit_message="Upload card")
-    with contextlib.suppress(RevisionNotFoundError):
-        api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset")
-    api.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
-    return str(url)
+def _push(repo_id: str, files: dict[str, Path], card: dict[str, Path], private: bool | None) -> str:
+    repository = HubRepository(repo_id, "dataset", private)
+    # LeRobot reads every file in data/: one that is no longer there must go.
+    repository.commit(files, "Upload dataset", is_stale=lambda name: name.startswith(_CONTENT))
+    repository.commit(card, "Upload card")
+    repository.set_tag(CODEBASE_VERSION, move=True)
+    return str(repository.url)
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    """What goes up, by the names there."""
+    names = {path.relative_to(folder): path for path in entries_below(folder) if path.is_file()}
+    return {name.as_posix(): path for name, path in names.items() if name.parts[0] not in _LEFT_OUT}
 
 
 def _command(

@@ -4,7 +4,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from huggingface_hub import HfApi, ModelCard
+from huggingface_hub import ModelCard
 from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
@@ -13,8 +13,10 @@ from lerobot.policies import get_policy_class
 from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
 from lerobot_playbyear.hub.datasets import CARD, FILM
-from lerobot_playbyear.hub.policy_card import with_evaluation, with_film
+from lerobot_playbyear.hub.markdown import word
+from lerobot_playbyear.hub.policy_card import with_evaluation, with_film, write_card
 from lerobot_playbyear.hub.pushing import HubError, push_patiently
+from lerobot_playbyear.hub.repository import HubRepository
 from lerobot_playbyear.train_config import PlaybyearTrainConfig
 
 _FILES = ("*.safetensors", "*.json", "*.yaml")  # as LeRobot uploads them
@@ -50,24 +52,24 @@ def push_policy(
     if film is not None and not film.is_file():
         raise HubError(f"preview={film}: there is no such file.")
     config = PreTrainedConfig.from_pretrained(folder)
-    config.repo_id, config.license, config.device = repo_id, license or config.license, "cpu"
+    config.repo_id, config.device = repo_id, "cpu"
+    config.license = license or (word(config.license) if config.license else None)
     config.tags = [*(config.tags or []), *(tags or [])]
     policy = get_policy_class(config.type).from_pretrained(folder, config=config)
 
     def push() -> str:
-        api = HfApi()
-        url = api.create_repo(repo_id, private=private, exist_ok=True)
-        config.repo_id = url.repo_id  # with the user's name, for the card
+        repository = HubRepository(repo_id, "model", private)
+        config.repo_id = repository.repo_id  # with the user's name, for the card
         with TemporaryDirectory() as scratch:
-            for file in [file for pattern in _FILES for file in folder.glob(pattern)]:
-                (Path(scratch) / file.name).symlink_to(file.resolve())
+            files = {file.name: file for pattern in _FILES for file in folder.glob(pattern)}
             card = _make_card(policy, folder)
             if film is not None:
-                (Path(scratch) / FILM).symlink_to(film.resolve())
-                with_film(card, f"{api.endpoint}/{url.repo_id}/resolve/main/{FILM}")
-            card.save(Path(scratch) / CARD)
-            api.upload_folder(repo_id=url.repo_id, folder_path=scratch, commit_message="Upload policy")
-        return str(url)
+                files[FILM] = film
+                with_film(card, f"{repository.api.endpoint}/{repository.repo_id}/resolve/main/{FILM}")
+            files[CARD] = Path(scratch) / CARD
+            card.save(files[CARD])
+            repository.commit(files, "Upload policy")
+        return str(repository.url)
 
     later = ["playbyear-push", f"--policy.path={path}", f"--policy.repo_id={repo_id}"]
     later += [f"--private={str(private).lower()}"] if private is not None else []
@@ -75,6 +77,20 @@ def push_policy(
     later += [f"--license={license}"] if license is not None else []
     later += [f"--preview={film}"] if film is not None else []
     return push_patiently(push, f"The policy is complete in {folder}", later)
+
+
+def push_checkpoint(folder: Path, repo_id: str, private: bool | None = None) -> None:
+    """Uploads a checkpoint in the middle of a training, where and as LeRobot puts it, so that a run can resume from there.
+
+    Args:
+        folder: The checkpoint's; its name, the step, becomes a tag.
+        repo_id: The policy's name on the Hub.
+        private: Whether a repository that is created is private. None: as the account's default says.
+    """
+    repository = HubRepository(repo_id, "model", private)
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    files = {f"{CHECKPOINTS_DIR}/{folder.name}/{path.relative_to(folder).as_posix()}": path for path in paths}
+    repository.set_tag(folder.name, repository.commit(files, f"checkpoint {folder.name}"))
 
 
 def find_checkpoint(path: Path) -> Path:
@@ -101,7 +117,9 @@ def _make_card(policy: Any, folder: Path) -> ModelCard:
         root = Path(dataset.root) if dataset.root else HF_LEROBOT_HOME / dataset.repo_id
         if (root / "meta" / "info.json").is_file():
             meta = LeRobotDatasetMetadata(dataset.repo_id, root=root)
-    card = policy.generate_model_card(
+    card = write_card(
+        policy.generate_model_card,
+        config,
         dataset.repo_id if dataset is not None else None,
         config.type,
         config.license,

@@ -1,15 +1,48 @@
 """What the card of a policy says beside LeRobot's template: what it hears, and how to try it."""
 
 import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 from huggingface_hub import ModelCard
+from lerobot.configs import PreTrainedConfig
 
 from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.hub.markdown import code, plain, repository_name, word
 from lerobot_playbyear.tracking import METRICS_NAME
 
 _BEFORE = "## Model Details"
 _NO_RESULTS = "_No evaluation results have been provided for this policy yet._"
+
+_PLAIN_NAME = re.compile(r"[\w ./-]+")
+
+
+def write_card(
+    generate: Callable[..., ModelCard],
+    config: PreTrainedConfig,
+    dataset_repo_id: str | None,
+    *args: Any,
+    dataset_meta: Any = None,
+    **kwargs: Any,
+) -> ModelCard:
+    """LeRobot's card of a policy. What a stranger's dataset is called and says is shown there, and nothing more.
+
+    Args:
+        generate: LeRobot's `generate_model_card`.
+        config: The policy's configuration.
+        dataset_repo_id: As LeRobot's function takes it, like all that follows.
+    """
+    facts = _DatasetFacts.of(dataset_meta) if dataset_meta is not None else None
+    card = generate(repository_name(dataset_repo_id), *args, dataset_meta=facts, **kwargs)
+    names = [*(config.input_features or {}), *(config.output_features or {})]
+    for name in sorted(names, key=len, reverse=True):
+        if not _PLAIN_NAME.fullmatch(name):
+            card.text = card.text.replace(f"`{name}`", code(name))
+    return card
 
 
 def with_hearing(card: ModelCard, config: PlaybyearConfig) -> ModelCard:
@@ -53,12 +86,12 @@ def _section(config: PlaybyearConfig) -> str:
     features = config.input_features or {}
     if config.use_audio:
         heard = [
-            f"`{key}`: {config.sample_rate:,} Hz, {features[key].shape[0]:,} samples a step"
+            f"{code(key)}: {config.sample_rate:,} Hz, {features[key].shape[0]:,} samples a step"
             for key in config.audio_keys
         ]
     else:
         heard = []
-    seen = [f"`{key}`" for key in config.camera_keys] if config.use_vision else []
+    seen = [code(key) for key in config.camera_keys] if config.use_vision else []
     rows = [
         ("Microphones", "<br>".join(heard) or "none: it is deaf"),
         ("Cameras", "<br>".join(seen) or "none: it is blind"),
@@ -95,3 +128,30 @@ def _evaluation(checkpoint: Path) -> dict[str, float] | None:
     lines = [json.loads(line) for line in metrics.read_text().splitlines() if line.strip()]
     found = [line for line in lines if line.get("kind") == "eval" and line.get("step") == step and "pc_success" in line]
     return found[-1] if found else None
+
+
+@dataclass(frozen=True)
+class _DatasetFacts:
+    """What LeRobot's card asks of a dataset's metadata, in words that mean nothing to Markdown, HTML or a shell."""
+
+    repo_id: str
+    total_episodes: int
+    total_frames: int
+    fps: int
+    tasks: pd.DataFrame
+    robot_type: str | None
+    camera_keys: list[str]
+
+    @classmethod
+    def of(cls, meta: Any) -> "_DatasetFacts":
+        """From a `LeRobotDatasetMetadata`."""
+        texts = [] if meta.tasks is None else [plain(str(task)) for task in meta.tasks.index]
+        return cls(
+            repo_id=repository_name(meta.repo_id) or word(meta.repo_id),
+            total_episodes=int(meta.total_episodes),
+            total_frames=int(meta.total_frames),
+            fps=int(meta.fps),
+            tasks=pd.DataFrame(index=texts),
+            robot_type=word(meta.robot_type) if meta.robot_type else None,
+            camera_keys=[plain(key) for key in meta.camera_keys],
+        )

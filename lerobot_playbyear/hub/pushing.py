@@ -1,4 +1,4 @@
-"""One upload: repeated while the Hub fails for a passing reason, and ended with what to do when it does not come back."""
+"""Uploads: their steps repeated while the Hub fails for a passing reason, and what to do when it does not come back."""
 
 import json
 import logging
@@ -11,8 +11,16 @@ import httpx
 from huggingface_hub import constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 
-_WAITS_S = (2, 5)
-_PASSING = (408, 409, 425, 429)  # besides all from 500
+from lerobot_playbyear.hub.client import patient_hub
+
+_WAITS_S = (1, 2, 5)
+_PASSING = (
+    408,
+    409,
+    412,
+    425,
+    429,
+)  # besides all from 500; 412: there is a newer commit than the one that this one follows
 
 logger = logging.getLogger(__name__)
 
@@ -25,7 +33,7 @@ def push_patiently(push: Callable[[], str], what: str, later: Sequence[str]) -> 
     """Uploads something.
 
     Args:
-        push: Uploads it. Called again after a failure, it sends what has not arrived.
+        push: Uploads it, in steps that `insist`. Called again later, it sends what has not arrived.
         what: Where it is safe on this machine, "The dataset is complete in outputs/demo".
         later: The command that uploads it later.
 
@@ -35,17 +43,30 @@ def push_patiently(push: Callable[[], str], what: str, later: Sequence[str]) -> 
     Raises:
         HubError: The Hub cannot be reached, or refuses.
     """
+    try:
+        with patient_hub():
+            return push()
+    except Exception as error:  # whatever the client, its Rust extension or the file system raise
+        raise HubError(
+            f"{what}, but it could not be uploaded: {reason(error)}. Upload it later with\n"
+            f"  {shlex.join(later)}\nwhich does not send again what has arrived."
+        ) from error
+
+
+def insist[T](step: Callable[[], T]) -> T:
+    """Does a step of an upload again while it fails for a passing reason.
+
+    Args:
+        step: Something that can be done twice: its failure does not tell whether it was done.
+    """
     waits = list(_WAITS_S)
     while True:
         try:
-            return push()
-        except Exception as error:  # whatever the client, its Rust extension or the file system raise
+            return step()
+        except Exception as error:  # as in `push_patiently`
             if not waits or not _is_passing(error):
-                raise HubError(
-                    f"{what}, but it could not be uploaded: {reason(error)}. Upload it later with\n"
-                    f"  {shlex.join(later)}\nwhich does not send again what has arrived."
-                ) from error
-            logger.warning("The upload failed (%s); once more in %d s", reason(error), waits[0])
+                raise
+            logger.warning("The Hub failed (%s); once more in %d s", reason(error), waits[0])
         time.sleep(waits.pop(0))
 
 
@@ -57,7 +78,8 @@ def push_meanwhile(push: Callable[[], object], path: Path) -> None:
         path: Where it is safe on this machine.
     """
     try:
-        push()
+        with patient_hub():
+            push()
     except Exception as error:  # as in `push_patiently`
         logger.warning("%s was not uploaded (%s). Work goes on without", path, reason(error))
 

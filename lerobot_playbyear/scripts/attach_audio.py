@@ -14,6 +14,7 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, attach_audio
+from lerobot_playbyear.hub.client import patient_hub
 
 
 @parser.wrap()
@@ -25,7 +26,8 @@ def main() -> None:
     """The command."""
     register_third_party_plugins()
     try:
-        _run()
+        with patient_hub():
+            _run()
     except AttachError as error:
         sys.exit(f"error: {error}")
     except OSError as error:

@@ -15,7 +15,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_playbyear.dagger import DaggerConfig, DaggerError, run_dagger
 from lerobot_playbyear.dagger.config import with_saved_options
-from lerobot_playbyear.hub.client import use_patient_client
+from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.memory import keep_freed_memory
 from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
 
@@ -30,10 +30,10 @@ def main() -> None:
     """The command."""
     keep_freed_memory()
     register_third_party_plugins()
-    use_patient_client()
     sys.argv[1:] = with_saved_options(sys.argv[1:])
     try:
-        dagger()
+        with patient_hub():
+            dagger()
     except DaggerError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -20,7 +20,7 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from tqdm import tqdm
 
-from lerobot_playbyear.hub.client import use_patient_client
+from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.inspection import DatasetSource, InspectionError, PictureChecks, Verdict, check_numbers, worst
 from lerobot_playbyear.inspection.page_writer import PageWriter
 from lerobot_playbyear.inspection.report import as_dict, as_text
@@ -128,10 +128,10 @@ def main() -> None:
     """The command."""
     logging.basicConfig(level=logging.WARNING)
     register_third_party_plugins()
-    use_patient_client()
     sys.argv[1:] = ["--json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
     try:
-        verdicts = _run()
+        with patient_hub():
+            verdicts = _run()
     except InspectionError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

@@ -14,7 +14,6 @@ from pathlib import Path
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_playbyear.hub.client import use_patient_client
 from lerobot_playbyear.hub.datasets import push_dataset
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError
@@ -104,7 +103,6 @@ def main() -> None:
     """The command."""
     logging.basicConfig(level=logging.WARNING)
     register_third_party_plugins()
-    use_patient_client()
     try:
         _run()
     except HubError as error:

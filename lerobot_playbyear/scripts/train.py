@@ -37,7 +37,7 @@ from lerobot_playbyear.datasets import (
     run_weights,
     start_frames,
 )
-from lerobot_playbyear.hub.client import use_patient_client
+from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.memory import keep_freed_memory
@@ -69,7 +69,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     init_logging()
     with _errors_of_input():
         cfg.validate()
-        check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root)
+        check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
         if cfg.policy is not None and cfg.policy.push_to_hub:
             warn_without_login()
         if cfg.seed is not None:
@@ -274,11 +274,11 @@ def main() -> None:
     """The command."""
     keep_freed_memory()
     register_third_party_plugins()
-    use_patient_client()
     try:
         with _errors_of_input():
             sys.argv[1:] = apply_preset(sys.argv[1:])
-        train()
+        with patient_hub():
+            train()
     except TrainError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

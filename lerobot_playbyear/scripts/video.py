@@ -16,6 +16,7 @@ from lerobot.envs import EnvConfig, close_envs, make_env
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_playbyear.acting import load_for_rollout
+from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.recording import env_spec
 from lerobot_playbyear.rollouts import RolloutError
 from lerobot_playbyear.takes import policy_takes, script_takes, write_take
@@ -97,7 +98,8 @@ def main() -> None:
     logging.basicConfig(level=logging.WARNING)
     register_third_party_plugins()
     try:
-        _run()
+        with patient_hub():
+            _run()
     except (RolloutError, ValueError, OSError) as error:
         sys.exit(f"error: {error}")
 

@@ -1,0 +1,492 @@
+"""Datasets that a stranger made: they show no file of this machine, run nothing, and take no memory that they do not fill."""
+
+import ast
+import html.parser
+import io
+import json
+import os
+import re
+import resource
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from dataset_factory import CAMERA, MICROPHONE, TASK, dataset_features, make_dataset
+from hub_server import HubServer
+from lerobot.datasets import LeRobotDatasetMetadata
+from PIL import Image
+
+from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets.confines import check_links
+from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.hub.client import patient_hub
+from lerobot_playbyear.hub.dataset_card import describe_dataset
+from lerobot_playbyear.hub.datasets import _files, push_dataset
+from lerobot_playbyear.hub.pushing import HubError
+from lerobot_playbyear.inspection.film import at_a_rate_of_aac
+from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
+from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect
+
+SECRET = (250, 5, 120)  # a colour that no other picture has
+EVIL = (
+    "Lift <img src=x onerror=alert(1)> ![p](http://evil/p.png) | [l](http://evil)\n---\n# Head\n```\n"
+    '`x` "; rm -rf ~; $(id) {{script}}'
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    root = tmp_path_factory.mktemp("made") / "set"
+    make_dataset(root, (6, 5), image_size=16)
+    return root
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory):
+    root = tmp_path_factory.mktemp("filmed") / "set"
+    make_dataset(root, (6, 5), image_size=16, use_videos=True)
+    return root
+
+
+@pytest.fixture
+def root(made, tmp_path):
+    shutil.copytree(made, tmp_path / "set")
+    return tmp_path / "set"
+
+
+@pytest.fixture
+def videos(filmed, tmp_path):
+    shutil.copytree(filmed, tmp_path / "set")
+    return tmp_path / "set"
+
+
+@pytest.fixture
+def hub(monkeypatch):
+    """A Hub on loopback, which checks cards."""
+    with HubServer() as hub, patient_hub():
+        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.url)
+        yield hub
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """A picture of this machine, beside the dataset."""
+    path = tmp_path / "secret.png"
+    Image.new("RGB", (16, 16), SECRET).save(path)
+    return path
+
+
+def edit_info(root: Path, change) -> None:
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    change(info)
+    path.write_text(json.dumps(info))
+
+
+def edit_column(root: Path, key: str, change) -> None:
+    """`change` gets the column's values, row by row."""
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    field = table.schema.field(key)
+    values = pa.array([change(value) for value in table.column(key).to_pylist()], field.type)
+    pq.write_table(table.set_column(table.column_names.index(key), field, values), path)
+
+
+def point_to(root: Path, name: str) -> None:
+    edit_column(root, CAMERA, lambda picture: {"bytes": None, "path": name})
+
+
+def rename_task(root: Path, text: str) -> None:
+    tasks = pd.read_parquet(root / "meta" / "tasks.parquet").rename(index={TASK: text})
+    tasks.to_parquet(root / "meta" / "tasks.parquet")
+
+
+def rename_feature(root: Path, old: str, new: str) -> None:
+    def rename(info):
+        info["features"] = {new if key == old else key: value for key, value in info["features"].items()}
+
+    edit_info(root, rename)
+    for path in [*root.glob("data/*/*.parquet"), *root.glob("meta/episodes/*/*.parquet")]:
+        table = pq.read_table(path)
+        names = [
+            re.sub(rf"^(stats/|)({re.escape(old)})(?=/|$)", lambda m: m[1] + new, name) for name in table.column_names
+        ]
+        pq.write_table(table.rename_columns(names).replace_schema_metadata({}), path)
+    stats = json.loads((root / "meta" / "stats.json").read_text())
+    (root / "meta" / "stats.json").write_text(json.dumps({new if key == old else key: v for key, v in stats.items()}))
+
+
+def looked(root: Path, tmp_path: Path) -> tuple[list, str]:
+    page = tmp_path / "page.html"
+    return inspect(InspectConfig(InspectDatasetConfig("a/b", str(root)), html=page)), page.read_text()
+
+
+def outsides(tmp_path: Path) -> list[str]:
+    return [str(tmp_path / "secret.png"), "../secret.png", "images/link.png"]
+
+
+@pytest.mark.parametrize("which", range(3), ids=["absolute", "parent", "link"])
+def test_a_picture_outside_the_folder_is_shown_nowhere(root, secret, tmp_path, monkeypatch, which):
+    (root / "images").mkdir(exist_ok=True)
+    (root / "images" / "link.png").symlink_to(secret)
+    name = outsides(tmp_path)[which]
+    point_to(root, name)
+    monkeypatch.chdir(root / "meta")  # from where "../secret.png" is nothing: names are the dataset's
+    source = DatasetSource.open("a/b", root)
+    with pytest.raises(ValueError, match="outside its folder"):
+        list(source.pictures(source.episodes[0], CAMERA))
+    with pytest.raises(ValueError, match="outside its folder"):
+        EpisodeStore.load("a/b", str(root), device="cpu")
+    verdicts, _ = looked(root, tmp_path)
+    (verdict,) = [v for v in verdicts if v.check == "pictures"]
+    assert verdict.level == "error"
+    assert "outside its folder" in verdict.message
+
+
+@pytest.mark.parametrize("which", range(3), ids=["absolute", "parent", "link"])
+def test_a_picture_outside_the_folder_is_in_no_film_that_is_pushed(root, secret, hub, tmp_path, monkeypatch, which):
+    (root / "images").mkdir(exist_ok=True)
+    (root / "images" / "link.png").symlink_to(secret)
+    point_to(root, outsides(tmp_path)[which])
+    (root / "images" / "link.png").unlink() if which != 2 else None
+    monkeypatch.chdir(root)
+    with pytest.raises(HubError, match=r"Not pushed.*outside"):
+        push_dataset("me/hostile", root)
+    assert not hub.requests
+
+
+def test_a_picture_in_a_file_of_the_dataset_is_read(root, tmp_path, monkeypatch):
+    (root / "pictures").mkdir()
+    Image.new("RGB", (16, 16), SECRET).save(root / "pictures" / "one.png")
+    point_to(root, "pictures/one.png")
+    monkeypatch.chdir(tmp_path)
+    assert (EpisodeStore.load("a/b", str(root), device="cpu").column(CAMERA)[0, :, 0, 0].numpy() == SECRET).all()
+    source = DatasetSource.open("a/b", root)
+    assert (next(source.pictures(source.episodes[0], CAMERA))[0, 0] == SECRET).all()
+
+
+def test_only_pictures_are_read_as_pictures(root):
+    postscript = io.BytesIO()
+    Image.new("RGB", (16, 16), SECRET).save(postscript, "EPS")
+    edit_column(root, CAMERA, lambda picture: {"bytes": postscript.getvalue(), "path": None})
+    with pytest.raises(OSError, match="cannot identify"):
+        EpisodeStore.load("a/b", str(root), device="cpu")
+
+
+def test_a_picture_of_another_size_is_refused_before_it_is_decoded(root):
+    bomb = io.BytesIO()
+    Image.new("L", (12_000, 7_000)).save(bomb, "PNG")  # 100 kB, 250 MB when decoded as RGB
+    edit_column(root, CAMERA, lambda picture: {"bytes": bomb.getvalue(), "path": None})
+    with pytest.raises(ValueError, match="12000 x 7000 pixels"):
+        EpisodeStore.load("a/b", str(root), device="cpu")
+
+
+@pytest.mark.parametrize(
+    "template",
+    [
+        "../other/{video_key}-{chunk_index}-{file_index}.mp4",
+        "{root}/{video_key}.mp4",
+        "videos/{video_key.__class__}/{file_index}.mp4",
+        "videos/{video_key}/{chunk_index:999999999d}.mp4",
+    ],
+)
+def test_a_template_that_leads_elsewhere_is_refused(videos, tmp_path, template):
+    template = template.replace("{root}", str(tmp_path))
+    for name in ("video_path", "data_path"):
+        before = (videos / "meta" / "info.json").read_text()
+        edit_info(videos, lambda info, name=name: info.update({name: template}))
+        said = f"info.json: {name}|not in its folder"
+        with pytest.raises(InspectionError, match=said):
+            DatasetSource.open("a/b", videos)
+        with pytest.raises(ValueError, match=said):
+            EpisodeStore.load("a/b", str(videos), device="cpu")
+        (videos / "meta" / "info.json").write_text(before)
+
+
+def test_a_camera_whose_name_leads_elsewhere_is_refused(videos):
+    rename_feature(videos, CAMERA, "../../secret")
+    with pytest.raises(InspectionError, match="not in its folder"):
+        DatasetSource.open("a/b", videos)
+
+
+def test_an_episode_whose_file_number_is_a_path_is_refused(videos, tmp_path):
+    edit_info(videos, lambda info: info.update(video_path="videos/{video_key}/{chunk_index}/{file_index}.mp4"))
+    (path,) = videos.glob("meta/episodes/*/*.parquet")
+    table = pq.read_table(path).replace_schema_metadata({})
+    name = f"videos/{CAMERA}/file_index"
+    table = table.set_column(table.column_names.index(name), name, pa.array(["../../../../secret"] * len(table)))
+    pq.write_table(table, path)
+    (videos / "videos" / CAMERA / "0").mkdir()
+    (video,) = videos.rglob("*.mp4")
+    video.rename(tmp_path / "secret.mp4")
+    verdicts, _ = looked(videos, tmp_path)
+    (verdict,) = [v for v in verdicts if v.check == "pictures"]
+    assert "not in its folder" in verdict.message
+
+
+@pytest.mark.parametrize("name", ["videos/more/x.mp4", "notes.txt", "meta/extra"])
+def test_a_link_out_of_the_folder_is_never_uploaded_or_copied(root, secret, hub, tmp_path, name):
+    link = root / name
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(secret if name != "meta/extra" else tmp_path)
+    with pytest.raises(HubError, match=f"Not pushed.*{link}' is a link to"):
+        push_dataset("me/hostile", root)
+    assert not hub.requests
+    output = DatasetPlace("a/c", str(tmp_path / "copy"))
+    with pytest.raises(AttachError, match="is a link to"):
+        attach_audio(AttachAudioConfig(DatasetPlace("a/b", str(root)), output, files="{episode}.wav", microphone="new"))
+
+
+def test_links_in_a_circle_and_pipes_hold_no_upload_up(root):
+    (root / "meta" / "loop").symlink_to("..")
+    os.mkfifo(root / "meta" / "pipe")
+    check_links(root)
+    names = _files(root)
+    assert "meta/info.json" in names
+    assert not [name for name in names if "loop" in name or "pipe" in name]
+
+
+def test_a_snapshot_of_the_hubs_cache_may_be_links_into_the_cache(root, tmp_path):
+    cache = tmp_path / "hub" / "datasets--a--b"
+    snapshot = cache / "snapshots" / "abc"
+    (cache / "blobs").mkdir(parents=True)
+    for number, path in enumerate(path for path in root.rglob("*") if path.is_file()):
+        place = snapshot / path.relative_to(root)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(cache / "blobs" / str(number))
+        place.symlink_to(os.path.relpath(cache / "blobs" / str(number), place.parent))
+    output = DatasetPlace("a/c", str(tmp_path / "copy"))
+    with pytest.raises(AttachError, match="Nothing was written"):  # only the sound is missing
+        attach_audio(
+            AttachAudioConfig(DatasetPlace("a/b", str(snapshot)), output, files="{episode}.wav", microphone="new")
+        )
+
+
+class _Markup(html.parser.HTMLParser):
+    """What a browser makes of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+
+
+def test_the_page_shows_names_as_they_are(root, tmp_path):
+    rename_task(root, EVIL + "</script><script>alert(1)</script><!-- episodes -->")
+    page = tmp_path / "page.html"
+    name = "a/{{script}}{{style}}{{policy}}<b>"
+    inspect(InspectConfig(InspectDatasetConfig(name, str(root)), html=page))
+    text = page.read_text()
+    assert "<title>a/{{script}}{{style}}{{policy}}&lt;b&gt;</title>" in text
+    assert text.count('"use strict"') == 1
+    assert _Markup(text).tags.count("b") == 0
+    assert (
+        len([tag for tag in _Markup(text).tags if tag == "script"]) == 2 * 2 + 2
+    )  # of each episode; of all, the page's
+    data = json.loads(re.search(r'id="dataset">(.*?)</script>', text)[1])
+    assert data["episodes"][0]["task"].startswith(EVIL)
+
+
+def test_a_report_sends_no_commands_to_the_terminal(root, tmp_path, capsys):
+    rename_feature(root, MICROPHONE, "observation.audio.\x1b]0;owned\x07\x1b[2J")
+    inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
+    out = capsys.readouterr().out
+    assert "\x1b" not in out
+    assert "\x07" not in out
+    assert "owned" in out
+
+
+def assert_harmless(card: str, head: int = 1) -> None:
+    """What Markdown's rules make of a card: no HTML, no link, no picture, no heading or block that a stranger made."""
+    assert card.count("\n---\n") == head
+    assert "# Head" not in [line.strip() for line in card.splitlines()]
+    rest = re.sub(r"^```.*?^```$", "", card, flags=re.DOTALL | re.MULTILINE)  # blocks of code
+    rest = re.sub(r"(`+)(?!`).*?(?<!`)\1(?!`)", "", rest)  # and code in a line
+    assert not re.search(r"(?<!\\)<img src=x", rest)
+    assert not re.search(r"(?<!\\)\]\(http://evil", rest)
+    assert not re.search(r"(?<!\\)://evil", rest)
+    assert not re.search(r"(?<!\\)!\[p", rest)
+
+
+def test_the_card_of_a_dataset_shows_names_as_they_are(root):
+    rename_task(root, EVIL)
+    rename_feature(root, MICROPHONE, 'observation.audio.a`<img src=x>|"\n```\n# Head')
+    edit_info(root, lambda info: info.update(robot_type=EVIL))
+    card = describe_dataset(DatasetSource.open("a/b", root), "me/hostile", None, None)
+    assert_harmless(card, head=0)
+    rows = [line for line in card.splitlines() if line.startswith("| ")]
+    assert all(len(re.findall(r"(?<!\\)\|", row)) == 3 for row in rows), rows
+    code = re.search(r"^```python\n(.*?)^```$", card, re.DOTALL | re.MULTILINE)[1]
+    names = [node.value for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Constant)]
+    assert 'observation.audio.a`<img src=x>|"\n```\n# Head' in names
+
+
+def test_the_card_of_a_policy_shows_names_as_they_are(root, hub):
+    rename_task(root, EVIL)
+    edit_info(root, lambda info: info.update(robot_type=EVIL))
+    odd = "observation.images.a`|<img src=x>"
+    policy = _policy(odd)
+    meta = LeRobotDatasetMetadata("a/b", root=root)
+    card = policy.generate_model_card("me/x\n---\n# Head", "playbyear", "mit", [], cfg=None, dataset_meta=meta)
+    assert_harmless(str(card).split("---\n", 2)[2], head=str(_clean_card(policy)).count("\n---\n") - 1)
+    assert "Lift" in card.text
+    command = re.search(r"lerobot-rollout(.*?)```", card.text, re.DOTALL)[1]
+    arguments = shlex.split(command.replace("\\\n", " "), comments=False)
+    task = next(argument for argument in arguments if argument.startswith("--task="))
+    assert "rm -rf" in task  # as a word of the task, and no command
+    assert not {"$", "`", ";"} & set(task) - {";"}
+    assert re.fullmatch(r"--robot\.type=[\w.-]+", next(a for a in arguments if a.startswith("--robot.type")))
+
+
+def _policy(camera: str):
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+    from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+
+    config = PlaybyearConfig(
+        input_features={
+            camera: PolicyFeature(FeatureType.VISUAL, (3, 16, 16)),
+            MICROPHONE: PolicyFeature(FeatureType.STATE, (800,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
+        sample_rate=16000,
+        image_size=16,
+        vision_width=4,
+        hidden_size=32,
+        device="cpu",
+        push_to_hub=False,
+    )
+    return PlaybyearPolicy(config)
+
+
+def _clean_card(policy):
+    meta = SimpleNamespace(
+        repo_id="a/b",
+        total_episodes=1,
+        total_frames=1,
+        fps=20,
+        robot_type="x",
+        camera_keys=[],
+        tasks=pd.DataFrame(index=["Lift"]),
+    )
+    return policy.generate_model_card("me/x", "playbyear", "mit", [], cfg=None, dataset_meta=meta)
+
+
+def _claims(kind: str, root: Path) -> None:
+    """What the dataset in `root` claims; `cut` is a data file without its end, as a killed recording leaves it."""
+    if kind == "cut":
+        (path,) = root.glob("data/*/*.parquet")
+        path.write_bytes(path.read_bytes()[:-300])
+
+    def claim(info):
+        if kind in ("sound", "cut"):
+            feature = info["features"][MICROPHONE]
+            feature["shape"] = [400_000_000]
+            feature["info"]["sample_rate"] = 400_000_000 * info["fps"]
+        elif kind == "state":
+            info["features"]["observation.state"]["shape"] = [400_000_000]
+        elif kind == "picture":
+            info["features"][CAMERA]["shape"] = [100_000, 100_000, 3]
+        elif kind == "fps":
+            info["fps"] = 20_000_000
+            info["features"][MICROPHONE]["info"]["sample_rate"] = 800 * 20_000_000
+        elif kind == "episodes":
+            info["total_episodes"] = 50_000_000
+
+    edit_info(root, claim)
+
+
+_OPEN = """
+import resource, sys
+from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.datasets.confines import check_links
+from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
+from lerobot_playbyear.inspection.source import InspectionError
+from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect
+
+def attempt(name, work):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        work()
+        said = "nothing"
+    except (ValueError, MemoryError, InspectionError, DatasetDamagedError) as error:
+        said = " ".join(str(error).split())
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    print(f"{grown:.0f} MB|{name}|{said}", flush=True)
+
+attempt("warm", lambda: EpisodeStore.load("a/b", sys.argv[1], device="cpu"))
+attempt("warm", lambda: inspect(InspectConfig(InspectDatasetConfig("a/b", sys.argv[1]))))
+for root in sys.argv[2:]:
+    attempt(f"store {root}", lambda: EpisodeStore.load("a/b", root, device="cpu"))
+    attempt(f"inspect {root}", lambda: inspect(InspectConfig(InspectDatasetConfig("a/b", root))))
+    attempt(f"check {root}", lambda: check_dataset(root))
+"""
+
+
+def test_claims_that_ask_for_gigabytes_get_none(made, tmp_path):
+    kinds = ("sound", "cut", "state", "picture", "fps", "episodes")
+    for kind in kinds:
+        shutil.copytree(made, tmp_path / kind)
+        _claims(kind, tmp_path / kind)
+    result = subprocess.run(
+        [sys.executable, "-c", _OPEN, str(made), *(str(tmp_path / kind) for kind in kinds)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+        check=False,
+    )
+    lines = [line for line in result.stdout.splitlines() if " MB|" in line]
+    assert len(lines) == 2 + 3 * len(kinds), result.stdout[-3000:] + result.stderr[-3000:]
+    for line in lines[2:]:
+        grown, name, said = line.split("|", 2)
+        assert float(grown.removesuffix(" MB")) < 150, line
+        if name.startswith(("store", "inspect")) and "/picture" not in name:
+            assert "info.json" in said or "playbyear-repair" in said, line
+
+
+def test_a_rate_without_a_common_divisor_takes_no_gigabytes():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    rate = 44_101
+    tone = (8000 * np.sin(2 * np.pi * 440 * np.arange(rate) / rate)).astype(np.int16)
+    samples, higher = at_a_rate_of_aac(np.stack([tone, -tone], axis=1), rate)
+    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024 < 300
+    assert higher == 48_000
+    assert samples.shape == (pytest.approx(48_000, abs=50), 2)
+    spectrum = np.abs(np.fft.rfft(samples[:, 0] * np.hanning(len(samples))))
+    assert np.argmax(spectrum) * higher / len(samples) == pytest.approx(440, abs=2)
+    assert np.abs(samples[1000:-1000, 0].astype(int) + samples[1000:-1000, 1]).max() <= 2
+    assert np.abs(samples[1000:-1000]).max() == pytest.approx(8000, rel=0.02)
+
+
+def test_a_check_never_reads_what_a_picture_points_to(root, secret):
+    point_to(root, str(secret))
+    secret.unlink()
+    os.mkfifo(secret)  # who reads it waits for ever
+    check_dataset(root)
+
+
+def test_features_of_an_honest_dataset_are_believed(tmp_path):
+    features = dataset_features(image_size=16)
+    features["observation.grid"] = {"dtype": "float32", "shape": (4, 5), "names": None}
+    features["observation.cube"] = {"dtype": "float32", "shape": (2, 3, 4), "names": None}
+    make_dataset(tmp_path / "set", (3, 4), features=features)
+    assert EpisodeStore.load("a/b", str(tmp_path / "set"), device="cpu").column("observation.cube").shape == (
+        7,
+        2,
+        3,
+        4,
+    )
+    assert len(DatasetSource.open("a/b", tmp_path / "set").episodes) == 2
