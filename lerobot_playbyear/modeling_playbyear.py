@@ -239,6 +239,7 @@ class PlaybyearNetwork(nn.Module):
         sound = newest(batch, key, n_heard, config.feature_shape(key))  # (B, T, S)
         wave = to_float_wave(sound.flatten(1), key)
         if self.training and config.audio_noise_db is not None:
+            assert config.sample_rate is not None
             wave = mix_in_noise(wave, config.audio_noise_db, config.sample_rate)
         begun = torch.ones_like(wave, dtype=torch.bool)
         is_pad = before_episode(batch, key, n_heard)
