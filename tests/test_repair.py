@@ -281,14 +281,6 @@ def test_nothing_is_changed_where_nothing_would_be_left(copy):
     assert not list(root.parent.glob(".*"))
 
 
-def test_a_repair_that_was_killed_is_finished(copy):
-    """Between the two renames that put the repaired copy in the dataset's place."""
-    root = copy("one file")
-    root.rename(root.with_name(".dataset.repairing"))
-    write_ours(root, FEATURES, range(N_EPISODES, N_EPISODES + 1))
-    assert load(root).num_episodes == N_EPISODES + 1
-
-
 # Folders of other tools
 
 

@@ -20,6 +20,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 
 from lerobot_playbyear.datasets.confines import check_info, file_inside, open_picture
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, parsing
 
 _ROWS_AT_ONCE = 128  # images
 Progress = Callable[[str, int], Any]
@@ -167,8 +168,9 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
         revision: Of the dataset on the Hub, as LeRobot takes it.
 
     Raises:
-        ValueError: Naming the file that cannot be read, the folder without data, or what leads out of the folder or
-            claims more than is there.
+        ValueError: Naming the file that is damaged, the folder without data, or what leads out of the folder or claims
+            more than is there.
+        OSError: A file cannot be read now, which says nothing about what it holds.
     """
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
     if not (folder / "meta" / "info.json").is_file():
@@ -178,8 +180,9 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
     footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
     for path in sorted([*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]):
         try:
-            footers[path.relative_to(folder).parts[0]].append(pq.read_metadata(path))
-        except (pa.ArrowInvalid, OSError) as error:
+            with parsing(path):
+                footers[path.relative_to(folder).parts[0]].append(pq.read_metadata(path))
+        except ParquetDamageError as error:
             raise ValueError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
                 f"killed, its episodes can be saved: playbyear-repair --root={folder}"

@@ -56,6 +56,10 @@ class DatasetLock:
         """Whether it was not released yet."""
         return self._lock.is_locked
 
+    def moved_to(self, root: Path) -> None:
+        """Says that the dataset's folder, and the lock in it, has another name now."""
+        self._path = root / LOCK
+
     def release(self) -> None:
         """Lets go, and leaves nothing behind. Safe to call twice."""
         if not self._lock.is_locked:

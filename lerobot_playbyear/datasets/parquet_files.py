@@ -5,6 +5,9 @@ parquet understands: PCM is stored as the differences of neighbouring samples, i
 every page carries a checksum, so that a flipped bit is found instead of heard.
 """
 
+import contextlib
+import os
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -16,8 +19,32 @@ class ParquetDamageError(ValueError):
     """A parquet file, or a part of it, does not hold what was written."""
 
 
-READ_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
-"""What pyarrow raises for damaged files."""
+_PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
+_LARGEST_RATIO = 10_000  # of what a part of a file takes in memory to the file's own size
+
+
+@contextlib.contextmanager
+def parsing(path: Path | None = None) -> Iterator[None]:
+    """Tells bytes that are wrong from bytes that cannot be read now, in whatever pyarrow does within.
+
+    Args:
+        path: The file that is read; None where it lies in memory.
+
+    Raises:
+        ParquetDamageError: The bytes were read, and are not what a parquet file holds.
+        OSError: They could not be read, which says nothing about the file.
+        MemoryError: There is no room for them.
+    """
+    try:
+        yield
+    except _PARSE_ERRORS as error:
+        if isinstance(error, ParquetDamageError):
+            raise
+        if isinstance(error, OSError) and error.errno:  # pyarrow sets it where the system refused
+            raise OSError(error.errno, os.strerror(error.errno), error.filename or (path and str(path))) from error
+        if isinstance(error, MemoryError) and not _asks_for_the_impossible(error, path):
+            raise
+        raise ParquetDamageError(_first_line(error)) from error
 
 
 def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
@@ -67,41 +94,50 @@ def open_checked(path: Path) -> pq.ParquetFile:
 
     Raises:
         ParquetDamageError: It is not a complete parquet file.
+        OSError: It cannot be read now; nor may later reads, see `parsing`.
     """
-    try:
+    with parsing(path):
         with path.open("rb") as file:
             if file.read(4) != b"PAR1":
                 raise ParquetDamageError("it does not begin as a parquet file does")
         return pq.ParquetFile(path, page_checksum_verification=True)
-    except READ_ERRORS as error:
-        raise ParquetDamageError(_first_line(error)) from error
 
 
-def read_row_groups(file: pq.ParquetFile, columns: list[str] | None = None) -> Iterator[pa.Table | ParquetDamageError]:
-    """Every row group of a file as a table; in place of one that cannot be read, what is wrong with it."""
+def read_row_groups(
+    file: pq.ParquetFile, columns: list[str] | None = None, path: Path | None = None
+) -> Iterator[pa.Table | ParquetDamageError]:
+    """Every row group of a file as a table; in place of one that is damaged, what is wrong with it.
+
+    Args:
+        file: An opened file.
+        columns: Which to read; None: all.
+        path: Its name, for errors.
+
+    Raises:
+        OSError: The file cannot be read now.
+        MemoryError: There is no room for a row group.
+    """
     for index in range(file.num_row_groups):
         try:
-            table = file.read_row_group(index, columns=columns, use_threads=False)
-            table.validate(full=True)
+            with parsing(path):
+                table = file.read_row_group(index, columns=columns, use_threads=False)
+                table.validate(full=True)
+        except ParquetDamageError as error:
+            yield error
+        else:
             yield table
-        except READ_ERRORS as error:
-            yield ParquetDamageError(_first_line(error))
 
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Reads a whole file, with checksums.
 
     Raises:
-        ParquetDamageError: A part of it cannot be read.
+        ParquetDamageError: A part of it is damaged.
+        OSError: It cannot be read now.
     """
-    file = open_checked(path)
-    try:
+    with open_checked(path) as file, parsing(path):
         table = file.read(columns=columns, use_threads=False)
         table.validate(full=True)
-    except READ_ERRORS as error:
-        raise ParquetDamageError(_first_line(error)) from error
-    finally:
-        file.close()
     return table
 
 
@@ -118,6 +154,13 @@ def fit_to_schema(table: pa.Table, schema: pa.Schema) -> pa.Table:
         for field in schema
     ]
     return pa.Table.from_arrays(columns, schema=schema)
+
+
+def _asks_for_the_impossible(error: MemoryError, path: Path | None) -> bool:
+    """Whether more memory was asked for than any part of the file can take: a size in it was misread."""
+    asked = re.search(r"alloc of size (\d+) failed", str(error))
+    limit = 2**40 if path is None else 2**30 + _LARGEST_RATIO * path.stat().st_size
+    return asked is not None and int(asked[1]) > limit
 
 
 def _first_line(error: BaseException) -> str:

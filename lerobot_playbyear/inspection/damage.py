@@ -20,8 +20,10 @@ def find_damage(folder: Path) -> str | None:
         return None
     try:
         report = check_dataset(folder, thorough=False)
-    except (DatasetDamagedError, OSError) as error:
+    except DatasetDamagedError as error:
         return " ".join(str(error).split())
+    except (OSError, MemoryError) as error:
+        return f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
     lost = [f"episode {number} is lost: {reason}" for number, reason in sorted(report.dropped.items())]
     lines = [*report.findings, *lost]
     if not lines:

@@ -3,7 +3,8 @@
     playbyear-repair --root=outputs/grasp                  # a recording that was killed, for example
     playbyear-repair --root=outputs/grasp --dry_run=true   # only looks
 
-Every complete episode is kept bit for bit; the damaged dataset stays in a folder beside the repaired one.
+Every complete episode is kept bit for bit; the damaged dataset stays in a folder beside the repaired one. Where something
+cannot be read now, because the disk or the network fails, nothing is changed.
 """
 
 import json
@@ -39,7 +40,8 @@ def repair(cfg: RepairConfig) -> RepairReport:
 
     Raises:
         DatasetDamagedError: It cannot be repaired.
-        OSError: `like` cannot be read, or the repaired copy cannot be written.
+        OSError: `like` or the dataset cannot be read now, or the repaired copy cannot be written. Nothing was changed.
+        MemoryError: There is not enough of it. Nothing was changed.
     """
     known = {}
     if cfg.like is not None:
@@ -60,7 +62,12 @@ def main() -> None:
     """The command; it fails where damage is left."""
     try:
         report = _run()
-    except (DatasetDamagedError, OSError, ValueError) as error:
+    except (OSError, MemoryError) as error:
+        sys.exit(
+            f"error: {str(error) or 'there is not enough memory'}\n"
+            "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
+        )
+    except (DatasetDamagedError, ValueError) as error:
         sys.exit(f"error: {error}")
     sys.exit(0 if report.is_sound or report.changed else 1)
 

@@ -1,26 +1,41 @@
 """Writes the repaired copy of a dataset: what is whole is taken over as it is, the rest is written anew."""
 
+import contextlib
+import errno
+import glob
 import os
 import shutil
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from lerobot.datasets.io_utils import write_info, write_tasks
-from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DatasetInfo
+from lerobot.datasets.io_utils import write_tasks
+from lerobot.datasets.utils import (
+    DEFAULT_EPISODES_PATH,
+    DEFAULT_TASKS_PATH,
+    EPISODES_DIR,
+    INFO_PATH,
+    STATS_PATH,
+    DatasetInfo,
+)
 
-from lerobot_playbyear.datasets.audio_feature import audio_keys
-from lerobot_playbyear.datasets.parquet_files import open_checked, write_tables
+from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.journal import JOURNAL, LOCK, SCRATCH, STAGING
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, write_tables
 from lerobot_playbyear.datasets.repair.episodes import Row
-from lerobot_playbyear.datasets.repair.frames import DataFile, Run
+from lerobot_playbyear.datasets.repair.frames import Run
+from lerobot_playbyear.datasets.repair.metadata import settle_stats, write_own_info
+from lerobot_playbyear.datasets.repair.replacing import MARKS
 from lerobot_playbyear.datasets.repair.statistics import episode_stats
+from lerobot_playbyear.datasets.repair.tasks import own_tasks
 from lerobot_playbyear.datasets.settling import write_rows
-from lerobot_playbyear.datasets.statistics import add_stats, row_stats, write_stats
+from lerobot_playbyear.datasets.statistics import write_stats
 
+_SCRATCH_NAMES = {LOCK.name, JOURNAL.name, STAGING.name, JOURNAL.with_suffix(".partial").name, *MARKS}
 _SHIFTED = ("min", "max", "mean", "q01", "q10", "q50", "q90", "q99")
 
 
@@ -41,7 +56,16 @@ class Kept:
     row: Row
 
 
-def write_copy(root: Path, target: Path, info: DatasetInfo, tasks: pd.DataFrame, episodes: list[Kept]) -> None:
+def write_copy(
+    root: Path,
+    target: Path,
+    info: DatasetInfo,
+    tasks: pd.DataFrame,
+    episodes: list[Kept],
+    rows_before: list[Row],
+    *,
+    tables_stay: bool,
+) -> list[str]:
     """Writes a whole dataset.
 
     Args:
@@ -50,10 +74,16 @@ def write_copy(root: Path, target: Path, info: DatasetInfo, tasks: pd.DataFrame,
         info: What the dataset says about itself; its counts are set.
         tasks: Its tasks, as LeRobot keeps them.
         episodes: In the order of their numbers.
+        rows_before: All rows of its tables of episodes, those of lost episodes as well.
+        tables_stay: Nothing is wrong with these tables; they may stay if no row changes.
+
+    Returns:
+        What is other than it was, or stays behind, a line each.
+
+    Raises:
+        OSError: Something cannot be read now, or written.
     """
-    _take_over_rest(root, target)
-    for name in sorted({path.relative_to(root) for path in (root / "videos").rglob("*") if path.is_file()}):
-        _take_over(root / name, target / name)
+    notes = _take_over_rest(root, target, info)
     by_file: dict[Path, list[Kept]] = defaultdict(list)
     for kept in episodes:
         by_file[kept.run.file.name].append(kept)
@@ -61,16 +91,55 @@ def write_copy(root: Path, target: Path, info: DatasetInfo, tasks: pd.DataFrame,
     for own in by_file.values():
         rows += _write_data(root, target, info, tasks, own)
     rows.sort(key=lambda row: row["episode_index"])
-    columns = list(dict.fromkeys(column for row in rows for column in row))
-    table = pa.table({column: [row.get(column) for row in rows] for column in columns})
-    write_rows(table, target / DEFAULT_EPISODES_PATH.format(chunk_index=0, file_index=0))
-    write_tasks(tasks, target)
-    write_stats(add_stats(None, [row_stats(row) for row in rows], audio_keys(info.features)), target)
-    info.total_episodes = len(rows)
     info.total_frames = sum(row["length"] for row in rows)
     info.total_tasks = len(tasks)
-    info.splits = {"train": f"0:{len(rows)}"}
-    write_info(info, target)
+    (target / "meta").mkdir(exist_ok=True)
+    write_own_info(root, target, info, [kept.run.episode for kept in episodes], notes)
+    stats = settle_stats(root, info, rows, rows_before, notes)
+    if stats is None:
+        _take_over(root / STATS_PATH, target / STATS_PATH)
+    else:
+        write_stats(stats, target)
+    _write_tasks(root, target, tasks, notes)
+    if tables_stay and all("length" in kept.row and _stays(kept) for kept in episodes):
+        for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
+            _take_over(path, target / path.relative_to(root))
+    else:
+        _write_rows(root, target, rows, notes)
+    return notes
+
+
+def _write_tasks(root: Path, target: Path, tasks: pd.DataFrame, notes: list[str]) -> None:
+    old, _ = own_tasks(root)
+    if old is not None and old.equals(tasks):
+        _take_over(root / DEFAULT_TASKS_PATH, target / DEFAULT_TASKS_PATH)
+        return
+    write_tasks(tasks, target)
+    lost = "" if old is not None else "; what it held that no episode says is lost"
+    notes.append(f"{DEFAULT_TASKS_PATH}: made anew from the episodes{lost}")
+
+
+def _write_rows(root: Path, target: Path, rows: list[Row], notes: list[str]) -> None:
+    """Writes one table of episodes, with the columns and types of those that there were."""
+    kinds: dict[str, pa.DataType] = {}
+    for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
+        with contextlib.suppress(ParquetDamageError), open_checked(path) as file:
+            kinds = {**{field.name: field.type for field in file.schema_arrow}, **kinds}
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    table = pa.table({name: _column([row.get(name) for row in rows], kinds.get(name)) for name in columns})
+    write_rows(table, target / DEFAULT_EPISODES_PATH.format(chunk_index=0, file_index=0))
+    lost = sorted(set(kinds) - set(columns)) if rows else []
+    notes.append("meta/episodes: made anew, as one table" + (f" without {', '.join(lost)}" if lost else ""))
+
+
+def _column(values: list, kind: pa.DataType | None) -> pa.Array:
+    with contextlib.suppress(pa.ArrowException, TypeError, ValueError):
+        return pa.array(values, kind)
+    return pa.array(values)
+
+
+def _stays(kept: Kept) -> bool:
+    return kept.number == kept.run.episode and kept.first_index == kept.run.first_index
 
 
 def _write_data(
@@ -78,10 +147,11 @@ def _write_data(
 ) -> Iterable[Row]:
     """Writes the episodes of one data file, and makes their rows."""
     file = episodes[0].run.file
-    numbers_stay = all(
-        kept.number == kept.run.episode and kept.first_index == kept.run.first_index for kept in episodes
+    is_whole = (
+        file.is_whole
+        and all(_stays(kept) for kept in episodes)
+        and sum(kept.run.length for kept in episodes) == file.n_rows
     )
-    is_whole = file.is_whole and numbers_stay and sum(kept.run.length for kept in episodes) == _n_rows(file)
     table = None if is_whole and all("length" in kept.row for kept in episodes) else file.read()
     if is_whole:
         _take_over(root / file.name, target / file.name)
@@ -95,12 +165,6 @@ def _write_data(
         else:
             assert table is not None
             yield _new_row(root, info, tasks, kept, table.slice(kept.run.start, kept.run.length))
-
-
-def _n_rows(file: DataFile) -> int:
-    assert isinstance(file.source, Path)
-    with open_checked(file.source) as opened:
-        return opened.metadata.num_rows
 
 
 def _renumbered(table: pa.Table, kept: Kept) -> pa.Table:
@@ -155,21 +219,73 @@ def _places(kept: Kept) -> Row:
     }
 
 
-def _take_over_rest(root: Path, target: Path) -> None:
-    """Everything that LeRobot does not know: a card, notes, other folders."""
-    for path in root.iterdir():
-        if path.name in ("data", "videos", "meta", "images"):
-            continue
-        if path.is_dir():
-            shutil.copytree(path, target / path.name, symlinks=True)
+_REMADE = (INFO_PATH, STATS_PATH, DEFAULT_TASKS_PATH)
+
+
+def _take_over_rest(root: Path, target: Path, info: DatasetInfo) -> list[str]:
+    """Everything but the frames and the tables of `meta/`: videos, a card, notes, files of other tools.
+
+    Returns:
+        What stays behind.
+    """
+    notes = []
+    for path in sorted(root.iterdir()):
+        new = target / path.name
+        if path.name in ("data", "meta", SCRATCH.name) and path.is_dir():
+            if path.is_symlink():
+                notes.append(f"{path.name} was a link to {path.readlink()}; it is now a folder")
+            leave = _pictures_in_progress(path, info, notes) if path.name == SCRATCH.name else _ours_in(path)
+            shutil.copytree(path, new, symlinks=True, dirs_exist_ok=True, ignore=leave)
+        elif path.is_symlink():
+            new.symlink_to(path.readlink())
+        elif path.is_dir():
+            # Nobody changes a film in place; of a user's own files that is not known.
+            copy = _take_over if path.name == "videos" else shutil.copy2
+            shutil.copytree(path, new, symlinks=True, copy_function=copy)
         else:
-            shutil.copy2(path, target / path.name, follow_symlinks=False)
+            shutil.copy2(path, new)
+    return notes
 
 
-def _take_over(source: Path, target: Path) -> None:
+def _ours_in(folder: Path) -> Callable[[str, list[str]], set[str]]:
+    """What is written in another way: the frames in `data`, and the tables in `meta`."""
+
+    def leave(where: str, names: list[str]) -> set[str]:
+        place = Path(folder.name) / Path(where).relative_to(folder)
+        paths = [place / name for name in names]
+        return {
+            path.name
+            for path in paths
+            if path.as_posix() in _REMADE or path.match("data/*/*.parquet") or path.match(f"{EPISODES_DIR}/*/*.parquet")
+        }
+
+    return leave
+
+
+def _pictures_in_progress(folder: Path, info: DatasetInfo, notes: list[str]) -> Callable[[str, list[str]], set[str]]:
+    """What was only needed while an episode was written: LeRobot would take leftovers of it for the next one's."""
+
+    def leave(where: str, names: list[str]) -> set[str]:
+        if Path(where) != folder:
+            return set()
+        cameras = {name for name in names if name in info.features}
+        notes.extend(
+            f"images/{name}: pictures of an episode that was not saved stay behind"
+            for name in sorted(cameras)
+            if list_files(folder, f"{glob.escape(name)}/*/*")
+        )
+        return cameras | {name for name in names if name in _SCRATCH_NAMES}
+
+    return leave
+
+
+def _take_over(source: str | Path, target: str | Path) -> None:
     """A second name for a file that nobody changes in place, or a copy where there can be none."""
+    source, target = Path(source), Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)
     except OSError:
         shutil.copy2(source, target)
+        if source.stat().st_size != target.stat().st_size:
+            raise OSError(errno.EIO, "it could not be copied as a whole", str(source)) from None

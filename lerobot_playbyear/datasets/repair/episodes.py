@@ -1,15 +1,15 @@
 """The episodes of a dataset: what the tables in `meta/` say of them, held against the frames that are there."""
 
 import contextlib
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-from lerobot.datasets.utils import DEFAULT_TASKS_PATH, EPISODES_DIR, DatasetInfo
+from lerobot.datasets.utils import EPISODES_DIR, DatasetInfo
 
-from lerobot_playbyear.datasets.parquet_files import READ_ERRORS, ParquetDamageError, open_checked, read_table
+from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing, read_table
 from lerobot_playbyear.datasets.repair.frames import Run
 
 Row = dict[str, Any]
@@ -19,9 +19,13 @@ _PARTIAL = "is partial"
 
 
 def read_rows(root: Path, findings: list[str]) -> dict[int, Row]:
-    """The rows of all tables of episodes that can be read, by the episode's number."""
+    """The rows of all tables of episodes that can be read, by the episode's number.
+
+    Raises:
+        OSError: A table cannot be read now.
+    """
     rows: dict[int, Row] = {}
-    for path in sorted((root / EPISODES_DIR).glob("*/*.parquet")):
+    for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
         name = path.relative_to(root)
         try:
             found = read_table(path).to_pylist()
@@ -46,7 +50,7 @@ def _readable_parts(path: Path) -> list[Row]:
         with open_checked(path) as file:
             for column in file.schema_arrow.names:
                 if not column.startswith("stats/"):
-                    with contextlib.suppress(*READ_ERRORS):
+                    with contextlib.suppress(ParquetDamageError), parsing(path):
                         parts[column] = file.read(columns=[column], use_threads=False).column(column).to_pylist()
     except ParquetDamageError:
         return []
@@ -115,42 +119,6 @@ def trusted_rows(rows: dict[int, Row], runs: dict[int, Run], info: DatasetInfo, 
     return trusted
 
 
-def read_tasks(root: Path, rows: dict[int, Row], runs: dict[int, Run], findings: list[str]) -> pd.DataFrame:
-    """The texts of the tasks, as LeRobot keeps them; where they are lost or wrong, from the rows of the episodes."""
-    if not runs and not (root / DEFAULT_TASKS_PATH).exists():
-        return pd.DataFrame({"task_index": []}, index=pd.Index([], name="task"))
-    votes: dict[int, Counter[str]] = defaultdict(Counter)
-    for episode, run in runs.items():
-        texts = rows.get(episode, {}).get("tasks")
-        if isinstance(texts, list) and len(texts) == 1 and len(run.tasks) == 1:
-            votes[run.tasks[0]][str(texts[0])] += 1
-    known: dict[int, str] = {}
-    try:
-        table = pd.read_parquet(root / DEFAULT_TASKS_PATH)
-        known = {int(number): str(text) for text, number in zip(table.index, table["task_index"], strict=True)}
-    except READ_ERRORS as error:
-        reason = "is missing" if isinstance(error, FileNotFoundError) else f"cannot be read: {error}"
-        findings.append(f"{DEFAULT_TASKS_PATH} {reason}")
-    needed = {task for run in runs.values() for task in run.tasks}
-    for number in sorted(needed | set(votes)):
-        text = votes[number].most_common(1)[0][0] if votes[number] else known.get(number)
-        if text is None or text in (known.get(other) for other in known if other != number):
-            text = known.get(number) or _by_elimination(number, rows, runs, known) or f"unknown task {number}"
-        if number in known and not _is_misread(known[number], text):
-            text = known[number]  # somebody gave the task another name
-        elif number in known and known[number] != text:
-            findings.append(f"{DEFAULT_TASKS_PATH}: task {number} read {known[number]!r}; the episodes say {text!r}")
-        elif number not in known and text == f"unknown task {number}":
-            findings.append(f"{DEFAULT_TASKS_PATH}: the text of task {number} is lost; it now reads {text!r}")
-        known[number] = text
-    numbers = sorted(known)
-    if numbers != list(range(len(numbers))):  # LeRobot finds a task by its place
-        numbers = list(range(max(numbers, default=-1) + 1))
-        known = {number: known.get(number, f"unknown task {number}") for number in numbers}
-    texts = pd.Index([known[number] for number in numbers], name="task")
-    return pd.DataFrame({"task_index": numbers}, index=texts)
-
-
 def name_episodes(numbers: Iterable[int]) -> str:
     """`episode 3`, or `episodes 3, 5 to 9 and 12`."""
     spans: list[list[int]] = []
@@ -162,11 +130,6 @@ def name_episodes(numbers: Iterable[int]) -> str:
     parts = [str(first) if first == last else f"{first} to {last}" for first, last in spans]
     listed = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
     return f"episode{'s' if len(spans) > 1 or spans[0][0] != spans[0][1] else ''} {listed}"
-
-
-def _is_misread(one: str, other: str) -> bool:
-    """Whether two texts differ in no more than one character, as a flipped bit makes them."""
-    return len(one) == len(other) and sum(a != b for a, b in zip(one, other, strict=True)) <= 1
 
 
 def _contradiction(row: Row, run: Run, info: DatasetInfo) -> str | None:
@@ -194,15 +157,4 @@ def _contradiction(row: Row, run: Run, info: DatasetInfo) -> str | None:
             for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
         ):
             return f"it does not say where the video of '{key}' is"
-    return None
-
-
-def _by_elimination(number: int, rows: dict[int, Row], runs: dict[int, Run], known: dict[int, str]) -> str | None:
-    """The one text of an episode with this task that no other of its tasks has."""
-    for episode, run in runs.items():
-        if number in run.tasks:
-            others = {known.get(task) for task in run.tasks if task != number}
-            texts = [text for text in rows.get(episode, {}).get("tasks") or [] if text not in others]
-            if len(texts) == 1 and None not in others:
-                return str(texts[0])
     return None

@@ -13,7 +13,8 @@ from lerobot.datasets.utils import DatasetInfo
 from lerobot.utils.constants import DEFAULT_FEATURES
 from PIL import Image
 
-from lerobot_playbyear.datasets.parquet_files import READ_ERRORS, open_checked
+from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing
 from lerobot_playbyear.datasets.repair.info import DatasetDamagedError
 
 
@@ -28,9 +29,10 @@ def settle_features(root: Path, info: DatasetInfo, features: dict[str, dict] | N
 
     Raises:
         DatasetDamagedError: The files hold other columns than the features say, and nobody knows better.
+        OSError: A file cannot be read now.
     """
     known = {**features, **DEFAULT_FEATURES} if features else None
-    schemas = [schema for path in sorted(root.glob("data/*/*.parquet")) if (schema := _own_schema(path)) is not None]
+    schemas = [schema for path in list_files(root, "data/*/*.parquet") if (schema := _own_schema(path)) is not None]
     reasons = [_disagreement(schema, info.features) for schema in schemas]
     if (reasons and all(reasons)) or (not reasons and _disagreement(None, info.features)):
         if known is None or any(_disagreement(schema, known) for schema in schemas):
@@ -72,12 +74,12 @@ def _agree(found: pa.DataType, wanted: pa.DataType) -> bool:
 def _own_schema(path: Path) -> pa.Schema | None:
     """A data file's columns, if its end is whole: what it says twice, to Arrow and to `datasets`, must agree."""
     try:
-        with open_checked(path) as file:
+        with open_checked(path) as file, parsing(path):
             schema = file.schema_arrow
             described = json.loads((schema.metadata or {}).get(b"huggingface", b"{}"))
             names = described.get("info", {}).get("features", dict.fromkeys(schema.names))
             return schema if set(names) == set(schema.names) else None
-    except (*READ_ERRORS, AttributeError):
+    except (ParquetDamageError, AttributeError, TypeError):
         return None
 
 
@@ -92,9 +94,20 @@ def _disagreement(schema: pa.Schema | None, features: dict[str, dict]) -> str | 
 
 def _picture_size(root: Path, key: str) -> tuple[int, int] | None:
     """Height and width of the first picture of a camera."""
-    for path in sorted(root.glob("data/*/*.parquet")):
-        with contextlib.suppress(*READ_ERRORS, SyntaxError, TypeError), open_checked(path) as file:
-            picture = file.read_row_group(0, columns=[key]).column(key)[0].as_py()
-            with Image.open(io.BytesIO(picture["bytes"])) as image:
-                return image.height, image.width
+    for path in list_files(root, "data/*/*.parquet"):
+        data = _first_picture(path, key)
+        with contextlib.suppress(OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+            if data is not None:
+                with Image.open(io.BytesIO(data)) as image:
+                    return image.height, image.width
     return None
+
+
+def _first_picture(path: Path, key: str) -> bytes | None:
+    """The first picture of a file, encoded; None where there is none, or damage."""
+    try:
+        with open_checked(path) as file, parsing(path):
+            picture = file.read_row_group(0, columns=[key]).column(key)[0].as_py()
+            return picture["bytes"]
+    except (ParquetDamageError, TypeError):
+        return None

@@ -1,5 +1,6 @@
 """The frames of a dataset: which rows of which data file can be read, and which episode they belong to."""
 
+import errno
 import io
 import itertools
 from dataclasses import dataclass
@@ -11,10 +12,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import DatasetInfo
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from lerobot_playbyear.datasets.columns import column_to_numpy
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
+from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing, read_row_groups
 from lerobot_playbyear.datasets.repair.features import check_columns
 from lerobot_playbyear.datasets.repair.rescue import rescue
 
@@ -29,17 +31,33 @@ class DataFile:
         name: Relative to the dataset's folder.
         source: What is read: the file, or a copy in memory that was given a new footer.
         is_whole: Whether the file can be taken over as it is.
+        n_rows: How many rows can be read.
     """
 
     name: Path
     source: Path | pa.BufferReader
     is_whole: bool
+    n_rows: int = 0
 
     def read(self) -> pa.Table:
-        """All rows that can be read, one after the other."""
+        """All rows that can be read, one after the other.
+
+        Raises:
+            OSError: They cannot be read now, or are others than they were.
+        """
         with _open(self.source) as file:
-            tables = [table for table in read_row_groups(file) if isinstance(table, pa.Table)]
-            return pa.concat_tables(tables) if tables else file.schema_arrow.empty_table()
+            tables = [table for table in read_row_groups(file, path=self.path) if isinstance(table, pa.Table)]
+            table = pa.concat_tables(tables) if tables else file.schema_arrow.empty_table()
+        if len(table) != self.n_rows:
+            raise OSError(
+                errno.EIO, f"{self.n_rows} of its rows could be read before, and now {len(table)}", str(self.name)
+            )
+        return table
+
+    @property
+    def path(self) -> Path | None:
+        """The file; None where it lies in memory."""
+        return self.source if isinstance(self.source, Path) else None
 
 
 @dataclass
@@ -91,13 +109,15 @@ def read_frames(root: Path, info: DatasetInfo, thorough: bool, findings: list[st
         thorough: Read everything, with checksums, and look at every picture; otherwise only the index columns.
         findings: Gets what was found wrong.
 
+    Raises:
+        OSError: A file cannot be read now.
     """
     schema = get_hf_features_from_features(info.features).arrow_schema
     pictures = [key for key, feature in info.features.items() if feature["dtype"] == "image"] if thorough else []
     files: list[DataFile] = []
     runs: list[Run] = []
     steps: list[float] = []
-    for path in sorted(root.glob("data/*/*.parquet")):
+    for path in list_files(root, "data/*/*.parquet"):
         name = path.relative_to(root)
         try:
             file = _find_source(path, name, schema)
@@ -138,7 +158,7 @@ def _read_file(
     spoilt: dict[int, str] = {}
     n_rows = 0
     with _open(file.source) as opened:
-        for number, table in enumerate(read_row_groups(opened, columns)):
+        for number, table in enumerate(read_row_groups(opened, columns, file.path)):
             if isinstance(table, ParquetDamageError):
                 findings.append(f"{file.name}: row group {number} is damaged: {table}")
                 file.is_whole = False
@@ -152,6 +172,7 @@ def _read_file(
             for key in pictures:
                 spoilt.update({n_rows + row: what for row, what in _spoilt_pictures(table.column(key), key)})
             n_rows += len(table)
+    file.n_rows = n_rows
     if spoilt:
         file.is_whole = False
         findings.append(f"{file.name}: {len(spoilt)} pictures are damaged")
@@ -187,10 +208,15 @@ def _spoilt_pictures(column: pa.ChunkedArray, key: str) -> list[tuple[int, str]]
             if picture["bytes"] is not None:
                 with Image.open(io.BytesIO(picture["bytes"])) as image:
                     image.verify()
-        except (OSError, SyntaxError, ValueError, TypeError) as error:
+        except UnidentifiedImageError:
+            spoilt.append((row, f"a picture of '{key}' is damaged (it is none)"))
+        except (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError) as error:
             spoilt.append((row, f"a picture of '{key}' is damaged ({error})"))
     return spoilt
 
 
 def _open(source: Any) -> pq.ParquetFile:
-    return open_checked(source) if isinstance(source, Path) else pq.ParquetFile(source, page_checksum_verification=True)
+    if isinstance(source, Path):
+        return open_checked(source)
+    with parsing():
+        return pq.ParquetFile(source, page_checksum_verification=True)

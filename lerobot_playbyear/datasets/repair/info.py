@@ -1,5 +1,6 @@
 """What a dataset says about itself in `meta/info.json`, checked, and made anew where it is lost."""
 
+import dataclasses
 import json
 import re
 from copy import deepcopy
@@ -19,6 +20,9 @@ from lerobot.datasets.utils import (
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
+from lerobot_playbyear.datasets.files import is_listed, list_files, naming
+
+_KEPT: dict[str, type] = {"robot_type": str, "splits": dict, "tools": list}  # where the rest is made anew
 
 
 class DatasetDamagedError(ValueError):
@@ -36,12 +40,15 @@ def read_info(root: Path, fps: int | None, features: dict[str, dict] | None, fin
 
     Raises:
         DatasetDamagedError: It is unreadable and the caller does not know the features, or it is of another version.
+        OSError: It cannot be read now.
     """
-    try:
-        info = DatasetInfo.from_dict(_checked(json.loads((root / INFO_PATH).read_text())))
-    except FileNotFoundError:
+    if not is_listed(root, INFO_PATH):
         return _new_info(root, "is missing", fps, features, findings)
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    with naming(root / INFO_PATH):
+        data = (root / INFO_PATH).read_bytes()
+    try:
+        info = _known(_checked(json.loads(data)))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         return _new_info(root, f"is damaged ({error})", fps, features, findings)
     _check_version(root, info, findings)
     for name, wanted in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
@@ -50,6 +57,23 @@ def read_info(root: Path, fps: int | None, features: dict[str, dict] | None, fin
             findings.append(f"{INFO_PATH}: {name} was {getattr(info, name)!r}, where nothing is")
             setattr(info, name, wanted)
     return info
+
+
+def own_info(root: Path) -> dict[str, Any]:
+    """Everything that `meta/info.json` holds, as far as it is JSON; LeRobot's reader leaves unknown fields out.
+
+    Raises:
+        OSError: It cannot be read now.
+    """
+    if not is_listed(root, INFO_PATH):
+        return {}
+    with naming(root / INFO_PATH):
+        data = (root / INFO_PATH).read_bytes()
+    try:
+        raw = json.loads(data)
+    except (ValueError, RecursionError):
+        return {}
+    return raw if isinstance(raw, dict) else {}
 
 
 def correct_rates(info: DatasetInfo, frame_seconds: float | None, findings: list[str]) -> None:
@@ -75,6 +99,13 @@ def correct_rates(info: DatasetInfo, frame_seconds: float | None, findings: list
                     f"samples per frame at {info.fps} frames per second are {rate} Hz"
                 )
                 feature["info"] = {**details, "sample_rate": rate}
+
+
+def _known(raw: dict[str, Any]) -> DatasetInfo:
+    """As `DatasetInfo.from_dict`, without its warning that other fields are lost: here they are not."""
+    return DatasetInfo(
+        **{field.name: raw[field.name] for field in dataclasses.fields(DatasetInfo) if field.name in raw}
+    )
 
 
 def _checked(raw: Any) -> dict[str, Any]:
@@ -110,9 +141,11 @@ def _check_version(root: Path, info: DatasetInfo, findings: list[str]) -> None:
     version = re.fullmatch(r"v(\d+)\.(\d+)(\..*)?", info.codebase_version)
     if version and version[1] == "3":
         return
-    has_our_layout = any(root.glob("meta/episodes/*/*.parquet")) or any(root.glob("data/chunk-*/file-*.parquet"))
+    has_our_layout = any(
+        list_files(root, name) for name in ("meta/episodes/*/*.parquet", "data/chunk-*/file-*.parquet")
+    )
     is_older = version is not None and int(version[1]) < 3
-    if any((root / name).exists() for name in (LEGACY_EPISODES_PATH, LEGACY_TASKS_PATH)) or (
+    if any(is_listed(root, name) for name in (LEGACY_EPISODES_PATH, LEGACY_TASKS_PATH)) or (
         is_older and not has_our_layout
     ):
         raise DatasetDamagedError(
@@ -131,22 +164,31 @@ def _check_version(root: Path, info: DatasetInfo, findings: list[str]) -> None:
 def _new_info(
     root: Path, reason: str, fps: int | None, features: dict[str, dict] | None, findings: list[str]
 ) -> DatasetInfo:
-    if not any(root.glob("data/*/*.parquet")):
+    if not list_files(root, "data/*/*.parquet"):
         raise DatasetDamagedError(f"{root} holds no LeRobotDataset: {INFO_PATH} {reason}, and there is no data.")
     if fps is None or features is None:
         raise DatasetDamagedError(
             f"{root / INFO_PATH} {reason}, and nothing else says what the features are. Put it back from a copy, or "
             "repair with --like=<folder of a dataset that was recorded with the same settings>."
         )
-    findings.append(f"{INFO_PATH} {reason}: made anew from the settings of this recording")
     use_videos = any(feature["dtype"] == "video" for feature in features.values())
-    return create_empty_dataset_info(CODEBASE_VERSION, fps, {**deepcopy(features), **DEFAULT_FEATURES}, use_videos)
+    info = create_empty_dataset_info(CODEBASE_VERSION, fps, {**deepcopy(features), **DEFAULT_FEATURES}, use_videos)
+    old = own_info(root)
+    for name, kind in _KEPT.items():
+        if isinstance(old.get(name), kind):
+            setattr(info, name, old[name])
+    rest = "; robot_type, splits and all other fields are those that it had" if old else ""
+    findings.append(
+        f"{INFO_PATH} {reason}: made anew from the settings of this recording"
+        f"{rest or '; robot_type, splits, and what else it held besides them, is lost'}"
+    )
+    return info
 
 
 def _leads_somewhere(root: Path, template: str | None) -> bool:
     if not isinstance(template, str):
         return False
     try:
-        return any(root.glob(re.sub(r"\{[^{}]*\}", "*", template)))
-    except (ValueError, NotImplementedError):
+        return bool(list_files(root, re.sub(r"\{[^{}]*\}", "*", template)))
+    except ValueError:  # no name of a file, for example one with a null byte
         return False

@@ -1,31 +1,29 @@
 """Finding out what is wrong with a dataset on disk, and putting it right beside the original."""
 
 import contextlib
-import itertools
+import errno
 import os
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pandas as pd
 from lerobot.datasets.utils import STATS_PATH, DatasetInfo
 
-from lerobot_playbyear.datasets.journal import finish_journal, flush
+from lerobot_playbyear.datasets.journal import finish_journal
 from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
 from lerobot_playbyear.datasets.repair.copying import Kept, write_copy
-from lerobot_playbyear.datasets.repair.episodes import (
-    Row,
-    choose_runs,
-    plausible,
-    read_rows,
-    read_tasks,
-    trusted_rows,
-)
+from lerobot_playbyear.datasets.repair.episodes import Row, choose_runs, plausible, read_rows, trusted_rows
 from lerobot_playbyear.datasets.repair.features import settle_features
 from lerobot_playbyear.datasets.repair.frames import Run, read_frames
 from lerobot_playbyear.datasets.repair.info import DatasetDamagedError, correct_rates, read_info
+from lerobot_playbyear.datasets.repair.metadata import read_own_stats
+from lerobot_playbyear.datasets.repair.replacing import begin_copy, fingerprint, finish_repair, replace
+from lerobot_playbyear.datasets.repair.tasks import read_tasks
 from lerobot_playbyear.datasets.repair.videos import check_videos
-from lerobot_playbyear.datasets.statistics import read_stats
+
+__all__ = ["RepairReport", "check_dataset", "finish_repair", "repair_dataset"]
 
 _MOST_EPISODES = 10_000  # that are believed to be lost; a larger number was misread
 
@@ -39,6 +37,7 @@ class RepairReport:
         findings: What was wrong, a line each; empty for a sound dataset.
         kept: Where each complete episode is now: its number before, and now.
         dropped: The episodes that are not complete: their number before, and why.
+        remade: What of the rest was made anew, is other than it was, or stays behind in `original`, a line each.
         original: Where the damaged dataset was put; None where nothing was changed.
     """
 
@@ -46,6 +45,7 @@ class RepairReport:
     findings: list[str] = field(default_factory=list)
     kept: dict[int, int] = field(default_factory=dict)
     dropped: dict[int, str] = field(default_factory=dict)
+    remade: list[str] = field(default_factory=list)
     original: Path | None = None
 
     @property
@@ -69,6 +69,7 @@ class RepairReport:
         if moved:
             pairs = ", ".join(f"{old} is now {new}" for old, new in sorted(moved.items())[:20])
             lines.append(f"Numbered anew: {pairs}{' ...' if len(moved) > 20 else ''}.")
+        lines += [f"  - {what}" for what in self.remade]
         if self.changed:
             lines.append(f"The damaged dataset is untouched in {self.original}; delete it when you no longer need it.")
         return "\n".join(lines)
@@ -80,6 +81,8 @@ class _Survey:
     tasks: pd.DataFrame
     runs: dict[int, Run]
     rows: dict[int, Row]
+    rows_before: dict[int, Row]
+    tables_are_whole: bool
     report: RepairReport
 
 
@@ -102,7 +105,11 @@ def repair_dataset(
 
     A recording that was killed has lost its tables' ends, which are made anew from what is there; so are damaged or
     deleted tables in `meta/`. Where frames or pictures are lost, their episodes are dropped and those after them
-    move up. The repaired dataset is written beside the damaged one and then takes its place.
+    move up. The repaired dataset is written beside the damaged one and then takes its place; of a link, the folder
+    takes it that the link leads to.
+
+    Only what is proven is damage: bytes that were read, and are wrong both times they are read, and files that a
+    folder which can be listed does not have. A file that cannot be read now is an error.
 
     Args:
         root: The dataset's folder.
@@ -117,35 +124,59 @@ def repair_dataset(
 
     Raises:
         DatasetDamagedError: It cannot be repaired, or no episode would be left. Nothing was changed.
-        OSError: The repaired copy cannot be written. Nothing was changed.
+        OSError: Something cannot be read now, or the repaired copy cannot be written. Nothing was changed.
+        MemoryError: There is no room for something. Nothing was changed.
     """
     root = Path(root)
     finish_repair(root)
-    with contextlib.nullcontext() if has_lock else _lock(root):
+    with contextlib.nullcontext() if has_lock else _lock(root) as lock:
         finish_journal(root)
         survey = _survey(root, fps, features, thorough)
         report = survey.report
         if report.is_sound:
             return report
+        source = fingerprint(root)
+        _confirm(report, _survey(root, fps, features, thorough).report)
         if not report.kept:
             raise DatasetDamagedError(f"{report}\nNo complete episode is left in {root}; nothing was changed.")
-        copy = _copy_of(root)
-        shutil.rmtree(copy, ignore_errors=True)  # of a repair that was killed
+        copy = begin_copy(root)
         try:
-            copy.mkdir()
-            write_copy(root, copy, survey.info, survey.tasks, _kept(survey))
+            report.remade += write_copy(
+                root,
+                copy,
+                survey.info,
+                survey.tasks,
+                _kept(survey),
+                list(survey.rows_before.values()),
+                tables_stay=survey.tables_are_whole and not report.dropped,
+            )
             again = check_dataset(copy, thorough=False)
             if not again.is_sound:
                 raise DatasetDamagedError(f"The repaired copy of {root} is not sound; nothing was changed. {again}")
-            _flush_all(copy)
+            report.original = replace(root, copy, source)
         except BaseException:
-            shutil.rmtree(copy, ignore_errors=True)
+            if os.path.lexists(root.resolve()):  # otherwise it was stopped in the last step, which can be finished
+                shutil.rmtree(copy, ignore_errors=True)
             raise
-        report.original = _unused(root)
-        os.rename(root, report.original)
-        os.rename(copy, root)
-        flush(root.absolute().parent)
+        if lock is not None:
+            lock.moved_to(report.original)
     return report
+
+
+def _confirm(first: RepairReport, second: RepairReport) -> None:
+    """Whether a second look at a dataset finds the same damage.
+
+    Raises:
+        OSError: It does not: what is read changes, so that nothing is proven.
+    """
+    if (first.findings, first.kept, first.dropped) != (second.findings, second.kept, second.dropped):
+        lines = {*first.findings, *first.dropped.values()} ^ {*second.findings, *second.dropped.values()}
+        raise OSError(
+            errno.EIO,
+            "what is read changes from one time to the next, so that it may be the disk or the network that fails, and "
+            f"not the dataset ({'; '.join(sorted(lines)[:3])})",
+            str(first.root),
+        )
 
 
 def _survey(root: Path, fps: int | None, features: dict[str, dict] | None, thorough: bool) -> _Survey:
@@ -157,8 +188,11 @@ def _survey(root: Path, fps: int | None, features: dict[str, dict] | None, thoro
     settle_features(root, info, features, findings)
     frames = read_frames(root, info, thorough, findings)
     correct_rates(info, frames.frame_seconds, findings)
+    n_before = len(findings)
     rows = read_rows(root, findings)
     rows, found = plausible(rows, frames.runs, findings)
+    tables_are_whole = len(findings) == n_before
+    rows_before = rows
     runs = choose_runs(found, rows, reasons)
     tasks = read_tasks(root, rows, runs, findings)
     rows = trusted_rows(rows, runs, info, findings)
@@ -166,7 +200,7 @@ def _survey(root: Path, fps: int | None, features: dict[str, dict] | None, thoro
     _check_counts(info, runs, reasons, findings)
     _check_stats(root, info, runs, findings)
     report = RepairReport(root, findings, {old: new for new, old in enumerate(sorted(runs))}, reasons)
-    return _Survey(info, tasks, runs, rows, report)
+    return _Survey(info, tasks, runs, rows, rows_before, tables_are_whole, report)
 
 
 def _check_counts(info: DatasetInfo, runs: dict[int, Run], reasons: dict[int, str], findings: list[str]) -> None:
@@ -189,19 +223,9 @@ def _check_counts(info: DatasetInfo, runs: dict[int, Run], reasons: dict[int, st
 
 
 def _check_stats(root: Path, info: DatasetInfo, runs: dict[int, Run], findings: list[str]) -> None:
-    try:
-        stats = read_stats(root)
-    except (OSError, ValueError, TypeError, AttributeError) as error:
-        findings.append(f"{STATS_PATH} cannot be read: {error}")
-        return
-    if stats is None:
-        if runs:
-            findings.append(f"{STATS_PATH} is missing")
-        return
-    for key, own in stats.items():
-        shape = info.features.get(key, {}).get("shape", ())
-        if not isinstance(own, dict) or any(value.dtype.kind not in "fiub" for value in own.values()):
-            findings.append(f"{STATS_PATH}: the entries of '{key}' are no numbers of shape {tuple(shape)}")
+    stats, problems = read_own_stats(root, info.features)
+    if stats is not None or runs or problems != ["is missing"]:
+        findings.extend(f"{STATS_PATH}{':' if stats is not None else ''} {problem}" for problem in problems)
 
 
 def _n_frames(runs: dict[int, Run]) -> int:
@@ -218,42 +242,16 @@ def _kept(survey: _Survey) -> list[Kept]:
     return kept
 
 
-def finish_repair(root: Path) -> None:
-    """Puts a repaired copy in the place of the dataset, if that is all that was left to do when a repair was killed."""
-    copy = _copy_of(root)
-    if copy.is_dir() and not root.exists():
-        os.rename(copy, root)
-        flush(root.absolute().parent)
-
-
-def _copy_of(root: Path) -> Path:
-    root = root.absolute()
-    return root.with_name(f".{root.name}.repairing")
-
-
-def _unused(root: Path) -> Path:
-    """A name beside the dataset for what it was before."""
-    root = root.absolute()
-    names = (root.with_name(f"{root.name}.damaged{f'-{number}' if number else ''}") for number in itertools.count())
-    return next(name for name in names if not name.exists())
-
-
-def _flush_all(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        flush(path)
-    flush(folder)
-
-
 @contextlib.contextmanager
-def _lock(root: Path):
+def _lock(root: Path) -> Iterator[DatasetLock | None]:
     if not root.is_dir():
-        yield
+        yield None
         return
     try:
         lock = DatasetLock(root)
     except DatasetLockedError as error:
         raise DatasetDamagedError(str(error)) from None
     try:
-        yield
+        yield lock
     finally:
         lock.release()

@@ -13,7 +13,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_playbyear.datasets.parquet_files import READ_ERRORS, leaf_columns, writer_options
+from lerobot_playbyear.datasets.files import naming
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, leaf_columns, parsing, writer_options
 from lerobot_playbyear.datasets.repair import thrift
 from lerobot_playbyear.datasets.repair.thrift import Elements, Struct, ThriftError
 
@@ -44,8 +45,12 @@ def rescue(path: Path, schema: pa.Schema) -> pa.BufferReader | None:
 
     Returns:
         The file with a footer that names every complete row group; None where there is none.
+
+    Raises:
+        OSError: The file cannot be read now.
     """
-    data = path.read_bytes()
+    with naming(path):
+        data = path.read_bytes()
     pages = _pages(data)
     for template in _templates(schema):
         groups = _row_groups(pages, template)
@@ -60,8 +65,9 @@ def rescue(path: Path, schema: pa.Schema) -> pa.BufferReader | None:
             encoded = thrift.write_struct(footer)
             whole = data[: end.start + end.stored] + encoded + len(encoded).to_bytes(4, "little") + _MAGIC
             try:
-                pq.ParquetFile(pa.BufferReader(whole))
-            except READ_ERRORS as error:
+                with parsing():
+                    pq.ParquetFile(pa.BufferReader(whole))
+            except ParquetDamageError as error:
                 logger.debug("%s: the footer that was made for it is not accepted: %s", path, error)
                 continue
             return pa.BufferReader(whole)

@@ -1,10 +1,12 @@
 """The videos of a dataset: whether each episode's pictures are in them, and where."""
 
+import glob
 from pathlib import Path
 
 import numpy as np
 from lerobot.datasets.utils import DatasetInfo
 
+from lerobot_playbyear.datasets.files import is_listed, list_files, naming
 from lerobot_playbyear.datasets.repair.episodes import Row, name_episodes
 from lerobot_playbyear.datasets.repair.frames import Run
 from lerobot_playbyear.datasets.repair.video_times import picture_times
@@ -33,6 +35,9 @@ def check_videos(
         thorough: Read every video to its end; otherwise only look whether it is cut off.
         reasons: Gets, for each episode that is removed, why.
         findings: Gets what was found wrong.
+
+    Raises:
+        OSError: A video cannot be read now.
     """
     for key, feature in info.features.items():
         if feature["dtype"] != "video":
@@ -62,7 +67,8 @@ class _Camera:
 
     def __init__(self, root: Path, info: DatasetInfo, key: str, thorough: bool) -> None:
         self.key, self.fps = key, info.fps
-        self.names = sorted(path.relative_to(root) for path in (root / "videos" / key).glob("*/*.mp4"))
+        paths = list_files(root, f"videos/{glob.escape(key)}/*/*.mp4")
+        self.names = [path.relative_to(root) for path in paths]
         self._root, self._info, self._thorough = root, info, thorough
         self._problems: dict[Path, str | None] = {}
         self._sealed: set[Path] = set()
@@ -76,14 +82,20 @@ class _Camera:
     def problem(self, name: Path) -> str | None:
         """What is wrong with a file as a whole."""
         if name not in self._problems:
-            self._problems[name] = _cut_off(self._root / name)
-            if self._thorough and self._problems[name] is None:
-                intact = is_intact(self._root / name)
-                if intact:
-                    self._sealed.add(name)
-                elif intact is False:
-                    self._problems[name] = "is not what was recorded: its checksum differs"
+            with naming(self._root / name):
+                self._problems[name] = self._find_problem(name)
         return self._problems[name]
+
+    def _find_problem(self, name: Path) -> str | None:
+        if not is_listed(self._root, name):
+            return "is missing"
+        problem = _cut_off(self._root / name)
+        if problem or not self._thorough:
+            return problem
+        intact = is_intact(self._root / name)
+        if intact:
+            self._sealed.add(name)
+        return "is not what was recorded: its checksum differs" if intact is False else None
 
     def shows(self, name: Path, start: float, length: int, certainly: bool = False) -> bool:
         """Whether a file has a picture for each frame of an episode that begins at `start` [s].
@@ -131,23 +143,18 @@ def _problem(camera: _Camera, row: Row, length: int) -> str | None:
 
 def _cut_off(path: Path) -> str | None:
     """Whether the boxes that an mp4 file is made of are all there; this takes no time."""
-    try:
-        size, at, kinds = path.stat().st_size, 0, set()
-        with path.open("rb") as file:
-            while at < size:
-                file.seek(at)
-                head = file.read(2 * _BOX_HEADER)
-                length = int.from_bytes(head[:4], "big")
-                if length == 1:
-                    length = int.from_bytes(head[8:16], "big")
-                kinds.add(head[4:8])
-                if length < _BOX_HEADER or at + length > size:
-                    return "is cut off"
-                at += length
-    except FileNotFoundError:
-        return "is missing"
-    except OSError as error:
-        return f"cannot be read ({error.strerror or error})"
+    size, at, kinds = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while at < size:
+            file.seek(at)
+            head = file.read(2 * _BOX_HEADER)
+            length = int.from_bytes(head[:4], "big")
+            if length == 1:
+                length = int.from_bytes(head[8:16], "big")
+            kinds.add(head[4:8])
+            if length < _BOX_HEADER or at + length > size:
+                return "is cut off"
+            at += length
     return None if b"moov" in kinds else "is cut off"
 
 

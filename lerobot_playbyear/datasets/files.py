@@ -1,0 +1,59 @@
+"""Which files a folder has, held apart from which of its files cannot be seen now.
+
+What a damaged dataset lacks is dropped. So a file counts as missing only where its folder can be listed and does not
+name it; a folder that cannot be listed is an error, never an empty one.
+"""
+
+import contextlib
+import fnmatch
+import glob
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+
+def list_files(root: Path, pattern: str) -> list[Path]:
+    """What matches a pattern, in order, like `sorted(root.glob(pattern))`.
+
+    Args:
+        root: A folder.
+        pattern: Parts with wildcards, one for each level below it.
+
+    Raises:
+        OSError: A folder on the way cannot be listed.
+    """
+    found = [root]
+    for part in Path(pattern).parts:
+        found = [path / name for path in found for name in _names(path) if fnmatch.fnmatchcase(name, part)]
+    return sorted(found)
+
+
+def is_listed(root: Path, name: str | Path) -> bool:
+    """Whether a folder has a file, which is not yet to say that it can be read.
+
+    Raises:
+        OSError: A folder on the way cannot be listed.
+    """
+    return bool(list_files(root, glob.escape(Path(name).as_posix())))
+
+
+@contextlib.contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Puts a file's name into errors that do not say it, as those of reading from an open file.
+
+    Raises:
+        OSError: With the name.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None or not error.errno:
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except NotADirectoryError:
+        return []
