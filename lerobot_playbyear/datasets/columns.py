@@ -20,7 +20,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 
 from lerobot_playbyear.datasets.confines import check_info, file_inside, open_picture
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, parsing
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked
 
 _ROWS_AT_ONCE = 128  # images
 Progress = Callable[[str, int], Any]
@@ -180,8 +180,8 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
     footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
     for path in sorted([*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]):
         try:
-            with parsing(path):
-                footers[path.relative_to(folder).parts[0]].append(pq.read_metadata(path))
+            with open_checked(path) as file:
+                footers[path.relative_to(folder).parts[0]].append(file.metadata)
         except ParquetDamageError as error:
             raise ValueError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "

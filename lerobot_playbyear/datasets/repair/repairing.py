@@ -99,7 +99,6 @@ def repair_dataset(
     fps: int | None = None,
     features: dict[str, dict] | None = None,
     thorough: bool = True,
-    has_lock: bool = False,
 ) -> RepairReport:
     """Repairs a local dataset of ours or of LeRobot's; every complete episode is kept, bit for bit.
 
@@ -117,7 +116,6 @@ def repair_dataset(
         features: Its features, if known; needed only where `meta/info.json` is lost.
         thorough: Read everything, with checksums, and decode all pictures. Otherwise only what tells whether the
             dataset can be opened and continued: this takes seconds, whatever its size.
-        has_lock: The caller is the one that writes to this dataset.
 
     Returns:
         What was found and done.
@@ -129,7 +127,7 @@ def repair_dataset(
     """
     root = Path(root)
     finish_repair(root)
-    with contextlib.nullcontext() if has_lock else _lock(root) as lock:
+    with _lock(root) as lock:
         finish_journal(root)
         survey = _survey(root, fps, features, thorough)
         report = survey.report
