@@ -20,6 +20,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 
 from lerobot_playbyear.datasets.confines import check_info, file_inside, open_picture
+from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked
 
 _ROWS_AT_ONCE = 128  # images
@@ -178,7 +179,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
         check_info(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return
     footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
-    for path in sorted([*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]):
+    for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, "meta/episodes/*/*.parquet")]:
         try:
             with open_checked(path) as file:
                 footers[path.relative_to(folder).parts[0]].append(file.metadata)

@@ -1,6 +1,7 @@
 """The metadata of a repaired dataset: what is right stays as it is, and what is made anew is named."""
 
 import bisect
+import contextlib
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -114,7 +115,9 @@ def settle_stats(
     if old is None:
         notes.append(f"{STATS_PATH}: made anew from the episodes; what it held that is not theirs is lost")
         return made
-    before = add_stats(None, [row_stats(row) for row in rows_before], microphones)
+    before: Stats = {}
+    with contextlib.suppress(ValueError, TypeError, AttributeError, KeyError):  # of rows that may be damaged
+        before = add_stats(None, [row_stats(row) for row in rows_before], microphones)
     settled: Stats = dict(made)
     anew: list[str] = []
     by_hand: list[str] = []
