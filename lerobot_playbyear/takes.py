@@ -81,7 +81,7 @@ def write_take(take: Take, path: Path, fps: int) -> None:
     """Writes a film with its sound, as loud as it can be, and the spectrogram below the picture."""
     sample_rate = take.blocks.shape[1] * fps or 16000
     sound = amplify(episode_sound(take.blocks))
-    write_film(path, compose(take.pictures, sound, sample_rate), fps, sound, sample_rate)
+    write_film(path, compose(take.pictures, len(take.pictures), sound, sample_rate), fps, sound, sample_rate)
 
 
 def _first_camera(observation: dict[str, Any]) -> np.ndarray | None:

@@ -9,6 +9,8 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw
 
+from lerobot_playbyear.datasets.audio_files import Channels
+
 _VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of FFmpeg has
 _AUDIO_CODECS = ("aac", "libmp3lame")
 _STRIP_HEIGHT = 120  # pixels
@@ -92,11 +94,14 @@ def inset(picture: np.ndarray, view: np.ndarray, label: str = "policy's camera")
     return np.asarray(framed)
 
 
-def compose(pictures: Sequence[np.ndarray], sound: np.ndarray, sample_rate: int) -> Iterator[np.ndarray]:
+def compose(
+    pictures: Iterable[np.ndarray], n_pictures: int, sound: np.ndarray, sample_rate: int
+) -> Iterator[np.ndarray]:
     """Puts each picture above the spectrogram strip, with a cursor at the picture's time.
 
     Args:
         pictures: T + 1 pictures (H, W, 3) uint8; H and W even.
+        n_pictures: T + 1.
         sound: (n, n_microphones) int16, as long as the film. The strip shows the first microphone; without a
             microphone there is no strip.
         sample_rate: [Hz].
@@ -104,14 +109,16 @@ def compose(pictures: Sequence[np.ndarray], sound: np.ndarray, sample_rate: int)
     Returns:
         The film's frames, (H + 120, W, 3) uint8.
     """
-    width = pictures[0].shape[1]
     if not sound.shape[1]:
         yield from pictures
         return
-    strip = spectrogram_strip(sound[:, 0], sample_rate, width, _STRIP_HEIGHT)
-    strip = _label(strip, f"{min(_TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz")
+    strip = None
     for index, picture in enumerate(pictures):
-        cursor = min(round(width * (index + 1) / len(pictures)), width - 1)
+        width = picture.shape[1]
+        if strip is None:
+            strip = spectrogram_strip(sound[:, 0], sample_rate, width, _STRIP_HEIGHT)
+            strip = _label(strip, f"{min(_TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz")
+        cursor = min(round(width * (index + 1) / n_pictures), width - 1)
         shown = strip.copy()
         shown[:, cursor:] = (shown[:, cursor:] * _DIMMED).astype(np.uint8)
         shown[:, max(cursor - 1, 0) : cursor + 1] = 255
@@ -122,7 +129,7 @@ def write_film(
     path: str | Path,
     frames: Iterable[np.ndarray],
     fps: int,
-    sound: np.ndarray,
+    sound: Channels,
     sample_rate: int,
     x264_options: Mapping[str, str] | None = None,
 ) -> Path:
@@ -132,8 +139,8 @@ def write_film(
         path: Of the file; its folder is made.
         frames: (H, W, 3) uint8, H and W even.
         fps: Frames per second.
-        sound: (n, n_microphones) int16. One microphone is mono, two are left and right, of more only the first two
-            are heard; none makes a silent film.
+        sound: (n, n_microphones) int16; it is read frame by frame. One microphone is mono, two are left and right, of
+            more only the first two are heard; none makes a silent film.
         sample_rate: [Hz].
         x264_options: Of the H.264 encoder, besides its preset; by default constant quality 20.
 
@@ -143,10 +150,10 @@ def write_film(
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    sound = sound[:, :2]
+    n_channels = min(sound.shape[1], 2)
     try:
         with av.open(str(partial), "w", options={"movflags": "+faststart"}) as film:
-            audio = _add_audio_stream(film, sample_rate, sound.shape[1]) if sound.shape[1] else None
+            audio = _add_audio_stream(film, sample_rate, n_channels) if n_channels else None
             video = None
             for index, picture in enumerate(frames):
                 if video is None:
@@ -156,7 +163,7 @@ def write_film(
                 if audio is not None:
                     first, end = (round(i * sample_rate / fps) for i in (index, index + 1))
                     if first < len(sound):
-                        film.mux(audio.encode(audio_frame(sound[first:end], sample_rate, first)))
+                        film.mux(audio.encode(_audio_frame(sound[first:end][:, :2], sample_rate, first)))
             if video is None:
                 raise ValueError("A film needs at least one frame.")
             for stream in (video, audio):
@@ -185,7 +192,7 @@ def _add_audio_stream(film, sample_rate: int, n_channels: int):
     return stream
 
 
-def audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av.AudioFrame:
+def _audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av.AudioFrame:
     """Samples (n, 1 or 2) of 16-bit PCM [Hz: `sample_rate`] as FFmpeg takes them, from the place `first_sample` on."""
     layout = "stereo" if samples.shape[1] == 2 else "mono"
     frame = av.AudioFrame.from_ndarray(samples.astype(np.int16).reshape(1, -1), format="s16", layout=layout)

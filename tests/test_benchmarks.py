@@ -93,3 +93,33 @@ def test_a_helper_answers_and_tells_why_it_cannot():
     helper.close()
     with pytest.raises(RuntimeError, match="no such thing"):
         Helper(sys.executable, "-c", "raise SystemExit('no such thing')").measure()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are Linux's")
+@pytest.mark.parametrize(
+    ("work", "wanted"),
+    [
+        ("b = bytearray(200 << 20); b[::4096] = b'1' * len(b[::4096]); import time; time.sleep(1)", ""),
+        ("b = bytearray(2000 << 20)", "status 1: MemoryError"),
+        ("raise SystemExit('nothing there')", "status 1: nothing there"),
+    ],
+)
+def test_the_memory_of_a_command_is_limited_and_measured(tmp_path, work, wanted):
+    from memory import GIB, measure, table
+
+    result = measure("work", [sys.executable, "-c", work], 1, GIB, {"HF_HOME": str(tmp_path / "home")})
+    assert result.failure == wanted
+    if not wanted:
+        assert 0.19 < result.own_gib <= result.peak_gib < 0.4
+        assert result.seconds >= 1
+    assert ("**failed**" in table([result])[-1]) == bool(wanted)
+
+
+@pytest.mark.slow
+def test_every_command_reads_an_episode_as_the_memory_benchmark_makes_it(tmp_path):
+    from memory import COMMANDS, GIB, run
+
+    results = run(tmp_path, 0.05, 4 * GIB, None, tmp_path / "bench.json")
+    assert [result.command for result in results] == list(COMMANDS)
+    assert [result.failure for result in results] == [""] * len(COMMANDS)
+    assert json.loads((tmp_path / "bench.json").read_text())["memory"].keys() == COMMANDS.keys()

@@ -50,7 +50,7 @@ def test_a_click_is_heard_when_it_is_seen(tmp_path):
     pictures = [np.zeros((32, 32, 3), np.uint8)] * 40
     sound = episode_sound(blocks)
     assert sound.shape == (40 * BLOCK, 1)
-    path = write_film(tmp_path / "click.mp4", compose(pictures, sound, SAMPLE_RATE), FPS, sound, SAMPLE_RATE)
+    path = write_film(tmp_path / "click.mp4", compose(pictures, 40, sound, SAMPLE_RATE), FPS, sound, SAMPLE_RATE)
     _, heard = decode(path)
     assert np.abs(heard[0]).argmax() / SAMPLE_RATE == pytest.approx(20 / FPS, abs=0.01)
 

@@ -1,10 +1,12 @@
 """`playbyear-attach-audio`: a copy of a LeRobotDataset with sound from files that were recorded beside it."""
 
+import itertools
 import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +20,20 @@ from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
-from lerobot_playbyear.datasets.audio_files import AudioFileError, cut_into_frames, read_audio, resample
-from lerobot_playbyear.datasets.columns import check_dataset_files, column_to_numpy
+from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled, audio_pieces
+from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.journal import flush
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups, write_tables
+from lerobot_playbyear.datasets.opening import LongDataset, open_dataset, scratch_folder
+from lerobot_playbyear.datasets.parquet_files import (
+    PIECE_BYTES,
+    ParquetDamageError,
+    open_checked,
+    read_row_groups,
+    write_tables,
+)
 from lerobot_playbyear.datasets.settling import write_rows
-from lerobot_playbyear.datasets.statistics import Stats, add_stats, read_stats, sound_stats, write_stats
+from lerobot_playbyear.datasets.statistics import Stats, add_stats, read_stats, repeated_stats, write_stats
 
 _MOST_ERRORS = 10  # that are listed
 
@@ -75,19 +84,66 @@ class AttachAudioConfig:
     pad: bool = False
 
 
+class _Spooled:
+    """The samples of a sound file, (n, channels) int16, decoded to a file of their own.
+
+    Args:
+        path: That file.
+        n_channels: Of the samples in it.
+    """
+
+    def __init__(self, path: Path, n_channels: int) -> None:
+        self._path = path
+        self.shape = (path.stat().st_size // (2 * n_channels), n_channels)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, span: slice) -> np.ndarray:
+        start, stop, _ = span.indices(len(self))
+        n_channels = self.shape[1]
+        values = np.fromfile(self._path, np.int16, max(stop - start, 0) * n_channels, offset=2 * start * n_channels)
+        return values.reshape(-1, n_channels)
+
+
 @dataclass
 class _Sound:
-    """The blocks of all episodes.
+    """The sound of all episodes.
 
     Args:
         sample_rate: [Hz].
         keys: The columns.
-        blocks: For each episode and column, (n_frames, S) int16.
+        samples_per_frame: S.
+        episodes: For each episode (n_frames * S, columns) int16, read where it is indexed.
     """
 
     sample_rate: int
     keys: list[str]
-    blocks: list[list[np.ndarray]] = field(default_factory=list)
+    samples_per_frame: int
+    episodes: list[Cut]
+
+    @property
+    def rows_at_once(self) -> int:
+        """How many frames' sound is in memory together."""
+        return max(PIECE_BYTES // (2 * self.samples_per_frame * len(self.keys)), 1)
+
+    def blocks(self, episode: int, start: int, stop: int) -> np.ndarray:
+        """Of some of an episode's frames, (n, S, columns) int16."""
+        size = self.samples_per_frame
+        return self.episodes[episode][start * size : stop * size].reshape(-1, size, len(self.keys))
+
+    def stats(self, episode: int) -> Stats:
+        """An episode's statistics."""
+        n_frames = len(self.episodes[episode]) // self.samples_per_frame
+
+        def pieces(column: int) -> Iterator[np.ndarray]:
+            for start in range(0, n_frames, self.rows_at_once):
+                yield self.blocks(episode, start, min(start + self.rows_at_once, n_frames))[..., column]
+
+        return {
+            key: repeated_stats(partial(pieces, column), n_frames, self.samples_per_frame)
+            for column, key in enumerate(self.keys)
+        }
 
 
 def attach_audio(cfg: AttachAudioConfig) -> Path:
@@ -108,37 +164,42 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         raise AttachError(f"{target} is there already. Choose another --output.root, or delete it.")
     dataset = _open(cfg.dataset)
     keys = _keys(cfg, dataset)
-    sound = _read_sound(cfg, dataset, keys)
-    partial = target.absolute().with_name(f".{target.name}.attaching")
-    shutil.rmtree(partial, ignore_errors=True)  # of one that was killed
-    try:
-        partial.mkdir(parents=True)
-        _write_copy(Path(dataset.root), partial, dataset, sound)
-        for path in [*partial.rglob("*"), partial]:
-            flush(path)
-        os.rename(partial, target)
-        flush(target.absolute().parent)
-    except ParquetDamageError as error:
-        raise AttachError(f"{error} Repair it first: playbyear-repair --root={dataset.root}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+    with scratch_folder() as scratch:
+        sound = _read_sound(cfg, dataset, keys, Path(scratch))
+        _write(Path(dataset.root), target, sound)
     print(f"\nDataset: {target} ({dataset.num_episodes} episodes with {', '.join(keys)} at {sound.sample_rate} Hz)")
     return target
 
 
-def _open(place: DatasetPlace) -> LeRobotDataset:
+def _write(root: Path, target: Path, sound: _Sound) -> None:
+    """The copy, which is there only when it is complete."""
+    unfinished = target.absolute().with_name(f".{target.name}.attaching")
+    shutil.rmtree(unfinished, ignore_errors=True)  # of one that was killed
+    try:
+        unfinished.mkdir(parents=True)
+        _write_copy(root, unfinished, sound)
+        for path in [*unfinished.rglob("*"), unfinished]:
+            flush(path)
+        os.rename(unfinished, target)
+        flush(target.absolute().parent)
+    except ParquetDamageError as error:
+        raise AttachError(f"{error} Repair it first: playbyear-repair --root={root}") from error
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def _open(place: DatasetPlace) -> LeRobotDataset | LongDataset:
     if place.root is not None and not (Path(place.root) / INFO_PATH).is_file():
         raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
     try:
-        check_dataset_files(place.repo_id, place.root)
-        dataset = LeRobotDataset(place.repo_id, root=place.root, video_backend="pyav")
+        dataset = open_dataset(place.repo_id, place.root, video_backend="pyav")
         check_links(Path(dataset.root))  # the copy would hold what they lead to
         return dataset
     except Exception as error:  # also what the Hub's client raises
         raise AttachError(f"The dataset '{place.repo_id}' cannot be opened: {error}") from error
 
 
-def _keys(cfg: AttachAudioConfig, dataset: LeRobotDataset) -> list[str]:
+def _keys(cfg: AttachAudioConfig, dataset: LeRobotDataset | LongDataset) -> list[str]:
     names = [name.strip() for name in cfg.microphone.split(",")]
     keys = [name if name.startswith(AUDIO_PREFIX) else AUDIO_PREFIX + name for name in names]
     for key in keys:
@@ -153,30 +214,27 @@ def _keys(cfg: AttachAudioConfig, dataset: LeRobotDataset) -> list[str]:
     return keys
 
 
-def _read_sound(cfg: AttachAudioConfig, dataset: LeRobotDataset, keys: list[str]) -> _Sound:
+def _read_sound(
+    cfg: AttachAudioConfig, dataset: LeRobotDataset | LongDataset, keys: list[str], scratch: Path
+) -> _Sound:
+    """Decodes all files, so that what is wrong with them is known before anything is written."""
     offsets = _offsets(cfg, dataset.num_episodes)
     lengths = [int(length) for length in dataset.meta.episodes["length"]]
     errors: list[str] = []
     rates: dict[int, int] = {}
-    blocks: list[list[np.ndarray]] = []
+    episodes: list[Cut] = []
     for episode, length in enumerate(tqdm(lengths, desc="Reading sound", unit="episode")):
         path = Path(_format(cfg.files, episode))
         try:
-            samples, rate = read_audio(path)
-            samples = _choose_channels(cfg, samples, len(keys))
+            samples, rate = _spool(cfg, path, len(keys), scratch / str(episode))
             rates[episode] = cfg.sample_rate or rate
-            samples = resample(samples, rate, rates[episode])
             if rates[episode] % dataset.fps:
                 raise AudioFileError(
                     f"it has {rate} samples per second, which is no multiple of {dataset.fps} frames per second. "
                     f"Resample it, for example with --sample_rate={max(1, round(rate / dataset.fps)) * dataset.fps}."
                 )
-            blocks.append(
-                [
-                    cut_into_frames(samples[:, i], rates[episode], dataset.fps, length, offsets[episode], cfg.pad)
-                    for i in range(len(keys))
-                ]
-            )
+            resampled = Resampled(samples, rate, rates[episode])
+            episodes.append(Cut(resampled, rates[episode], dataset.fps, length, offsets[episode], cfg.pad))
         except (AudioFileError, ValueError) as error:
             errors.append(f"episode {episode}, {path}: {error}")
     if len(set(rates.values())) > 1:
@@ -187,7 +245,17 @@ def _read_sound(cfg: AttachAudioConfig, dataset: LeRobotDataset, keys: list[str]
     if errors:
         more = f"\n  ... and {len(errors) - _MOST_ERRORS} more" if len(errors) > _MOST_ERRORS else ""
         raise AttachError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
-    return _Sound(rates[0], keys, blocks)
+    return _Sound(rates[0], keys, rates[0] // dataset.fps, episodes)
+
+
+def _spool(cfg: AttachAudioConfig, path: Path, n_microphones: int, target: Path) -> tuple[_Spooled, int]:
+    """Decodes the channels of a file that are wanted; the samples, and their rate [Hz]."""
+    rate = 0
+    with target.open("wb") as file:
+        for samples, found in audio_pieces(path):
+            rate = found
+            file.write(np.ascontiguousarray(_choose_channels(cfg, samples, n_microphones)).tobytes())
+    return _Spooled(target, n_microphones), rate
 
 
 def _format(pattern: str, episode: int) -> str:
@@ -225,13 +293,11 @@ def _choose_channels(cfg: AttachAudioConfig, samples: np.ndarray, n_microphones:
     return samples
 
 
-def _write_copy(root: Path, target: Path, dataset: LeRobotDataset, sound: _Sound) -> None:
+def _write_copy(root: Path, target: Path, sound: _Sound) -> None:
     info = DatasetInfo.from_dict(json.loads((root / INFO_PATH).read_text()))
     info.features = _with_microphones(info.features, sound, info.fps)
     schema = get_hf_features_from_features(info.features).arrow_schema
-    stats: list[Stats] = [
-        {key: sound_stats(blocks) for key, blocks in zip(sound.keys, own, strict=True)} for own in sound.blocks
-    ]
+    stats = [sound.stats(episode) for episode in range(len(sound.episodes))]
     paths = sorted(path for path in root.rglob("*") if path.is_file() and not _is_scratch(path.relative_to(root)))
     for path in tqdm(paths, desc="Writing", unit="file"):
         name = path.relative_to(root)
@@ -267,24 +333,28 @@ def _write_data(source: Path, target: Path, schema: pa.Schema, sound: _Sound) ->
             metadata = {**metadata, **(schema.metadata or {})}
         first = file.schema_arrow.empty_table()
         add: Callable[[pa.Table], pa.Table] = lambda table: _with_columns(table, schema, sound, metadata)  # noqa: E731
-        write_tables(target, map(add, _tables(file, source)), add(first).schema)
+        write_tables(target, map(add, _tables(file, source, sound.rows_at_once)), add(first).schema)
 
 
-def _tables(file: Any, source: Path) -> Iterator[pa.Table]:
+def _tables(file: Any, source: Path, rows: int) -> Iterator[pa.Table]:
     for table in read_row_groups(file):
         if isinstance(table, ParquetDamageError):
             raise ParquetDamageError(f"{source} is damaged: {table}.")
-        yield table
+        for start in range(0, len(table), rows):
+            yield table.slice(start, rows)
 
 
 def _with_columns(table: pa.Table, schema: pa.Schema, sound: _Sound, metadata: dict[bytes, bytes]) -> pa.Table:
     episodes = column_to_numpy(table.column("episode_index"))
     frames = column_to_numpy(table.column("frame_index"))
+    edges = np.flatnonzero((np.diff(episodes) != 0) | (np.diff(frames) != 1)) + 1
+    spans = itertools.pairwise([0, *edges.tolist(), len(table)]) if len(table) else ()
+    parts = [sound.blocks(int(episodes[a]), int(frames[a]), int(frames[a]) + b - a) for a, b in spans]
+    blocks = np.concatenate(parts) if parts else np.zeros((0, sound.samples_per_frame, len(sound.keys)), np.int16)
     for i, key in enumerate(sound.keys):
         kind = schema.field(key).type
-        rows = [sound.blocks[episode][i][frame] for episode, frame in zip(episodes, frames, strict=True)]
-        samples = np.concatenate(rows) if rows else np.zeros(0, np.int16)
-        column = pa.FixedSizeListArray.from_arrays(pa.array(samples), kind.list_size).cast(kind)
+        samples = pa.array(np.ascontiguousarray(blocks[..., i]).reshape(-1))
+        column = pa.FixedSizeListArray.from_arrays(samples, kind.list_size).cast(kind)
         table = table.append_column(pa.field(key, kind), column)
     return table.replace_schema_metadata(metadata)
 

@@ -1,7 +1,9 @@
 """Sound in files: WAV, FLAC and the sound tracks of videos in, WAV and FLAC out, and how a recording meets frames."""
 
+import math
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import av
 import numpy as np
@@ -12,10 +14,22 @@ from lerobot_playbyear.datasets.audio_feature import samples_per_frame, to_pcm_s
 
 _GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
 _FLAC_BLOCK = 4096  # samples
+_FILTER_WIDTH, _ROLLOFF = 64, 0.9475937167399596  # of the resampler
 
 
 class AudioFileError(ValueError):
     """A sound file cannot be used; the message says why, and what to do."""
+
+
+class Channels(Protocol):
+    """What is needed of sound that may not be in memory: its shape (n, channels), and slices of it."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, span: slice, /) -> np.ndarray: ...
 
 
 def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
@@ -31,10 +45,19 @@ def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
     Raises:
         AudioFileError: The file is missing, or holds no sound that can be decoded.
     """
+    parts = list(audio_pieces(path))
+    return np.concatenate([samples for samples, _ in parts]), parts[0][1]
+
+
+def audio_pieces(path: str | Path) -> Iterator[tuple[np.ndarray, int]]:
+    """As `read_audio`, in pieces of less than a second, each with the sample rate; a late sound track's silence is one.
+
+    Raises:
+        AudioFileError: The file is missing, or holds no sound that can be decoded.
+    """
     path = Path(path)
     if not path.is_file():
         raise AudioFileError(f"There is no sound file {path}.")
-    parts: list[np.ndarray] = []
     position = rate = 0
     try:
         with av.open(str(path)) as container:
@@ -47,17 +70,16 @@ def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
                 if position == 0 and start < 0:
                     samples, start = samples[-start:], 0
                 if start - position > (_GAP_SECONDS * rate if position else 0):
-                    parts.append(np.zeros((start - position, samples.shape[1]), np.int16))
+                    yield np.zeros((start - position, samples.shape[1]), np.int16), rate
                     position = start
-                parts.append(samples)
                 position += len(samples)
+                yield samples, rate
     except (av.FFmpegError, ValueError) as error:
         if isinstance(error, AudioFileError):
             raise
         raise AudioFileError(f"The sound of {path} cannot be decoded: {error}.") from error
-    if not parts:
+    if not position:
         raise AudioFileError(f"{path} holds no samples.")
-    return np.concatenate(parts), rate
 
 
 def write_audio(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
@@ -117,13 +139,45 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
         channels_first,
         sample_rate,
         new_sample_rate,
-        lowpass_filter_width=64,
-        rolloff=0.9475937167399596,
+        lowpass_filter_width=_FILTER_WIDTH,
+        rolloff=_ROLLOFF,
         resampling_method="sinc_interp_kaiser",
         beta=14.769656459379492,
     )
     result = converted.T.reshape(-1, *waveform.shape[1:]).numpy()
     return to_pcm_s16(result) if is_pcm else result.astype(waveform.dtype)
+
+
+class Resampled:
+    """Sound at another sample rate, as `resample` makes it, computed where it is indexed.
+
+    Args:
+        sound: (n, channels) int16 PCM.
+        sample_rate: What it has [Hz].
+        new_sample_rate: What it shall have [Hz].
+    """
+
+    def __init__(self, sound: Channels, sample_rate: int, new_sample_rate: int) -> None:
+        divisor = math.gcd(sample_rate, new_sample_rate)
+        self._sound, self._rates = sound, (sample_rate, new_sample_rate)
+        self._old, self._new = sample_rate // divisor, new_sample_rate // divisor
+        reach = _FILTER_WIDTH * self._old / (min(self._old, self._new) * _ROLLOFF)  # samples on each side of one
+        self._margin = math.ceil(reach / self._old + 1) * self._old
+        self.shape = (-(-len(sound) * self._new // self._old), sound.shape[1])
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, span: slice) -> np.ndarray:
+        start, stop, _ = span.indices(len(self))
+        if self._old == self._new or start >= stop:
+            return self._sound[start:stop]
+        first = start // self._new * self._old - self._margin
+        last = -(-stop // self._new) * self._old + self._margin
+        inside = self._sound[max(first, 0) : last]
+        padded = np.pad(inside, ((max(-first, 0), last - max(first, 0) - len(inside)), (0, 0)))
+        skipped = (self._margin // self._old) * self._new + start % self._new
+        return resample(padded, *self._rates)[skipped : skipped + stop - start]
 
 
 def cut_into_frames(
@@ -149,24 +203,48 @@ def cut_into_frames(
         ValueError: The frame rate does not divide the sample rate.
         AudioFileError: The file begins too late or ends too early, and `pad` is off.
     """
-    size = samples_per_frame(sample_rate, fps)
-    start = round(offset * sample_rate) - size
-    stop = start + n_frames * size
-    missing_before, missing_after = max(-start - size, 0), max(stop - len(waveform), 0)
-    if (missing_before or missing_after) and not pad:
-        lacks = [
-            f"{missing / sample_rate:.3f} s at its {end}"
-            for missing, end in ((missing_before, "beginning"), (missing_after, "end"))
-            if missing
-        ]
-        raise AudioFileError(
-            f"it lasts {len(waveform) / sample_rate:.3f} s; {n_frames} frames at {fps} per second from {offset:.3f} s on "
-            f"need {' and '.join(lacks)} more. Correct the offset, or fill with silence: pad=true."
-        )
-    found = waveform[max(start, 0) : max(stop, 0)]
-    before = min(max(-start, 0), stop - start)
-    after = n_frames * size - before - len(found)
-    return np.pad(found, (before, after)).reshape(n_frames, size)
+    cut = Cut(waveform[:, None], sample_rate, fps, n_frames, offset, pad)
+    return cut[:].reshape(n_frames, -1)
+
+
+class Cut:
+    """The sound of an episode's frames, (n_frames * S, channels), as `cut_into_frames` has it, read where it is indexed.
+
+    Args:
+        sound: (n, channels), the file's samples.
+        sample_rate, fps, n_frames, offset, pad: As for `cut_into_frames`.
+
+    Raises:
+        ValueError, AudioFileError: As for `cut_into_frames`.
+    """
+
+    def __init__(
+        self, sound: Channels, sample_rate: int, fps: int, n_frames: int, offset: float = 0.0, pad: bool = False
+    ) -> None:
+        size = samples_per_frame(sample_rate, fps)
+        self._sound, self._start = sound, round(offset * sample_rate) - size
+        self.shape = (n_frames * size, sound.shape[1])
+        missing_before = max(-self._start - size, 0)
+        missing_after = max(self._start + n_frames * size - len(sound), 0)
+        if (missing_before or missing_after) and not pad:
+            lacks = [
+                f"{missing / sample_rate:.3f} s at its {end}"
+                for missing, end in ((missing_before, "beginning"), (missing_after, "end"))
+                if missing
+            ]
+            raise AudioFileError(
+                f"it lasts {len(sound) / sample_rate:.3f} s; {n_frames} frames at {fps} per second from {offset:.3f} s on "
+                f"need {' and '.join(lacks)} more. Correct the offset, or fill with silence: pad=true."
+            )
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, span: slice) -> np.ndarray:
+        start, stop, _ = (edge + self._start for edge in span.indices(len(self)))
+        found = self._sound[max(start, 0) : max(stop, 0)]
+        before = min(max(-start, 0), stop - start)
+        return np.pad(found, ((before, stop - start - before - len(found)), (0, 0)))
 
 
 def _to_samples(frame: Any) -> np.ndarray:

@@ -2,28 +2,34 @@
 
 LeRobot reads row by row, and every row passes through Python lists. Here a parquet column becomes one numpy array
 through Arrow, an image column is decoded by a few threads, and a video is decoded from its first frame to its last.
+Besides the tensor that is asked for, only a bounded piece is in memory at a time.
 """
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
-from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from torch import Tensor
 
 from lerobot_playbyear.datasets.confines import check_info, file_inside, open_picture
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked
+from lerobot_playbyear.datasets.video_pictures import video_pictures
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.datasets.opening import LongDataset
 
 _ROWS_AT_ONCE = 128  # images
+_VALUES_AT_ONCE = 2**22
 Progress = Callable[[str, int], Any]
 """Called with a key and the number of its frames that were just decoded."""
 
@@ -43,7 +49,7 @@ def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
     return flat.reshape(len(column), -1)
 
 
-def read_values(dataset: LeRobotDataset, key: str) -> Tensor:
+def read_values(dataset: "LeRobotDataset | LongDataset", key: str) -> Tensor:
     """A numeric column, (N,) or (N, *shape): floats as float32, integers and booleans as they are stored.
 
     Raises:
@@ -52,41 +58,51 @@ def read_values(dataset: LeRobotDataset, key: str) -> Tensor:
     shape = tuple(dataset.meta.features[key]["shape"])
     shape = () if shape == (1,) else shape  # LeRobot keeps one value per row as a scalar
     column = dataset.hf_dataset.data.column(key)
-    try:
-        values = column_to_numpy(column).reshape(len(column), *shape)
-    except ValueError as error:
-        raise ValueError(
-            f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
-            "Record the damaged episodes again, or leave them out with --dataset.episodes."
-        ) from error
-    if np.issubdtype(values.dtype, np.floating):
-        check_finite(values, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
-        values = values.astype(np.float32, copy=False)
-    return torch.from_numpy(np.require(values, requirements=("C", "W")))
+    rows = max(_VALUES_AT_ONCE // max(math.prod(shape), 1), 1)
+    values: np.ndarray | None = None
+    finite = np.ones(len(column), bool)
+    for first in range(0, len(column), rows):
+        part = column.slice(first, rows)
+        try:
+            read = column_to_numpy(part).reshape(len(part), *shape)
+        except ValueError as error:
+            raise ValueError(
+                f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
+                "Record the damaged episodes again, or leave them out with --dataset.episodes."
+            ) from error
+        is_float = np.issubdtype(read.dtype, np.floating)
+        if values is None:
+            values = np.empty((len(column), *shape), np.float32 if is_float else read.dtype)
+        if is_float:
+            finite[first : first + rows] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
+        values[first : first + rows] = read
+    if values is None:
+        raise ValueError(f"'{key}' of dataset '{dataset.repo_id}' has no rows.")
+    check_finite(finite, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
+    return torch.from_numpy(values)
 
 
-def check_finite(values: np.ndarray, key: str, episode_index: np.ndarray) -> None:
+def check_finite(finite: np.ndarray, key: str, episode_index: np.ndarray) -> None:
     """Refuse NaN and infinite values, naming the episodes that hold them.
 
     Args:
-        values: (N, ...) floats.
+        finite: (N,) whether all values of a row are finite.
         key: The feature, for the message.
         episode_index: (N,) the episode of each row, for the message.
 
     Raises:
         ValueError: If a value is not finite.
     """
-    bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-    if bad.any():
-        episodes = np.unique(episode_index[bad]).tolist()
+    if not finite.all():
+        episodes = np.unique(episode_index[~finite]).tolist()
         raise ValueError(
-            f"'{key}' holds NaN or infinite values in {int(bad.sum())} of {len(values)} frames (episodes "
+            f"'{key}' holds NaN or infinite values in {int((~finite).sum())} of {len(finite)} frames (episodes "
             f"{episodes[:10]}{'...' if len(episodes) > 10 else ''}); wanted finite numbers. Record these episodes "
             "again, or leave them out with --dataset.episodes."
         )
 
 
-def read_images(dataset: LeRobotDataset, key: str, progress: Progress | None = None) -> Tensor:
+def read_images(dataset: "LeRobotDataset | LongDataset", key: str, progress: Progress | None = None) -> Tensor:
     """All frames of an image column, (N, C, H, W) uint8.
 
     Raises:
@@ -117,7 +133,10 @@ def read_images(dataset: LeRobotDataset, key: str, progress: Progress | None = N
 
 
 def read_videos(
-    dataset: LeRobotDataset, key: str, video_backend: str | None = None, progress: Progress | None = None
+    dataset: "LeRobotDataset | LongDataset",
+    key: str,
+    video_backend: str | None = None,
+    progress: Progress | None = None,
 ) -> Tensor:
     """All frames of a video feature, (N, C, H, W) uint8, decoded episode by episode as LeRobot decodes them.
 
@@ -134,16 +153,12 @@ def read_videos(
         episode = int(episode_index[start])
         path = file_inside(Path(dataset.root), dataset.meta.get_video_file_path(episode, key))
         offset = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
-        decoded = decode_video_frames(
-            path,
-            [offset + float(timestamp) for timestamp in timestamps[start:end]],
-            dataset.tolerance_s,
-            video_backend,
-            return_uint8=True,
-        )  # (n, C, H, W)
-        if frames is None:
-            frames = torch.empty((len(episode_index), *decoded.shape[1:]), dtype=torch.uint8)
-        frames[start:end] = decoded
+        times = [offset + float(timestamp) for timestamp in timestamps[start:end]]
+        for position, picture in enumerate(video_pictures(path, times, dataset.tolerance_s, video_backend), start):
+            pixels = torch.from_numpy(picture).permute(2, 0, 1)  # (C, H, W)
+            if frames is None:
+                frames = torch.empty((len(episode_index), *pixels.shape), dtype=torch.uint8)
+            frames[position] = pixels
         if progress:
             progress(key, end - start)
     if frames is None:

@@ -8,7 +8,7 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from torch import Tensor
 
-from lerobot_playbyear.datasets.columns import check_dataset_files
+from lerobot_playbyear.datasets.opening import LongDataset, open_dataset
 from lerobot_playbyear.datasets.reading import INDEX_KEYS, read_dataset
 
 _GROWTH = 1.5
@@ -59,7 +59,7 @@ class EpisodeStore:
     @classmethod
     def from_dataset(
         cls,
-        dataset: LeRobotDataset,
+        dataset: LeRobotDataset | LongDataset,
         keys: Iterable[str] | None = None,
         device: str | torch.device | None = None,
         video_backend: str | None = None,
@@ -93,9 +93,7 @@ class EpisodeStore:
         Raises:
             ValueError: Also if a file of the dataset is truncated.
         """
-        check_dataset_files(repo_id, root)
-        dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, video_backend=kwargs.get("video_backend"))
-        return cls.from_dataset(dataset, **kwargs)
+        return cls.from_dataset(open_dataset(repo_id, root, episodes, kwargs.get("video_backend")), **kwargs)
 
     def __len__(self) -> int:
         """The number of frames, N."""

@@ -6,6 +6,7 @@ every page carries a checksum, so that a flipped bit is found instead of heard.
 """
 
 import contextlib
+import errno
 import os
 import re
 from collections.abc import Iterable, Iterator
@@ -19,6 +20,11 @@ class ParquetDamageError(ValueError):
     """A parquet file, or a part of it, does not hold what was written."""
 
 
+PIECE_BYTES = 2**26
+"""Of the rows that are in memory together, about: more is read and written in parts."""
+
+_BUFFER_BYTES = 2**20
+_VALUE_BYTES = {"BOOLEAN": 1, "INT32": 2, "INT64": 8, "FLOAT": 4, "DOUBLE": 8}  # at least; 16-bit sound is an INT32
 _PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
 _LARGEST_RATIO = 10_000  # of what a part of a file takes in memory to the file's own size
 
@@ -48,7 +54,7 @@ def parsing(path: Path | None = None) -> Iterator[None]:
 
 
 def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
-    """Writes a file with one row group per table.
+    """Writes a file with one row group per table, or several where a table is large: readers hold a whole one.
 
     Args:
         path: The file; its folder is made.
@@ -58,7 +64,7 @@ def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> N
     path.parent.mkdir(parents=True, exist_ok=True)
     with pq.ParquetWriter(path, schema, **writer_options(schema)) as writer:
         for table in tables:
-            writer.write_table(table, row_group_size=max(len(table), 1))
+            writer.write_table(table, row_group_size=_rows_within(PIECE_BYTES, table.nbytes, len(table)))
 
 
 def writer_options(schema: pa.Schema) -> dict:
@@ -100,13 +106,18 @@ def open_checked(path: Path) -> pq.ParquetFile:
         with path.open("rb") as file:
             if file.read(4) != b"PAR1":
                 raise ParquetDamageError("it does not begin as a parquet file does")
-        return pq.ParquetFile(path, page_checksum_verification=True)
+        return open_parquet(path)
+
+
+def open_parquet(source: Path | pa.NativeFile) -> pq.ParquetFile:
+    """Opens a file for reading as it is needed, with its pages' checksums verified, where it has them."""
+    return pq.ParquetFile(source, page_checksum_verification=True, pre_buffer=False, buffer_size=_BUFFER_BYTES)
 
 
 def read_row_groups(
     file: pq.ParquetFile, columns: list[str] | None = None, path: Path | None = None
 ) -> Iterator[pa.Table | ParquetDamageError]:
-    """Every row group of a file as a table; in place of one that is damaged, what is wrong with it.
+    """Every row group of a file as a table, or as several where it is large; in place of a damaged one, what is wrong.
 
     Args:
         file: An opened file.
@@ -115,17 +126,62 @@ def read_row_groups(
 
     Raises:
         OSError: The file cannot be read now.
-        MemoryError: There is no room for a row group.
+        MemoryError: There is no room for a part of it.
     """
     for index in range(file.num_row_groups):
         try:
             with parsing(path):
-                table = file.read_row_group(index, columns=columns, use_threads=False)
-                table.validate(full=True)
+                if _is_large(file, index, columns):  # it is read to its end first: of a damaged one nothing is given
+                    for _ in row_group_parts(file, index, columns):
+                        pass
+                    parts = row_group_parts(file, index, columns)
+                else:
+                    table = file.read_row_group(index, columns=columns, use_threads=False)
+                    table.validate(full=True)
+                    parts = iter([table])
         except ParquetDamageError as error:
             yield error
         else:
-            yield table
+            yield from _as_before(parts, path)
+
+
+def row_group_parts(file: pq.ParquetFile, index: int, columns: list[str] | None = None) -> Iterator[pa.Table]:
+    """A row group in parts of bounded size. Raises what pyarrow raises where it cannot be read."""
+    group = file.metadata.row_group(index)
+    rows = _rows_within(PIECE_BYTES, _row_group_bytes(file, index, columns), group.num_rows)
+    for batch in file.iter_batches(rows, row_groups=[index], columns=columns, use_threads=False):
+        table = pa.Table.from_batches([batch])
+        table.validate(full=True)
+        yield table
+
+
+def _as_before(parts: Iterator[pa.Table], path: Path | None) -> Iterator[pa.Table]:
+    """Parts that could be read a moment ago."""
+    try:
+        with parsing(path):
+            yield from parts
+    except ParquetDamageError as error:
+        raise OSError(errno.EIO, f"what could be read before cannot be read now ({error})", path and str(path)) from error
+
+
+def _is_large(file: pq.ParquetFile, index: int, columns: list[str] | None) -> bool:
+    return _row_group_bytes(file, index, columns) > 2 * PIECE_BYTES
+
+
+def _row_group_bytes(file: pq.ParquetFile, index: int, columns: list[str] | None) -> int:
+    """About what a row group takes in memory."""
+    group = file.metadata.row_group(index)
+    chunks = (group.column(i) for i in range(group.num_columns))
+    return sum(
+        max(chunk.total_uncompressed_size, chunk.num_values * _VALUE_BYTES.get(chunk.physical_type, 1))
+        for chunk in chunks
+        if columns is None or chunk.path_in_schema.split(".")[0] in columns
+    )
+
+
+def _rows_within(limit: int, n_bytes: int, n_rows: int) -> int:
+    """How many rows take so many bytes, where `n_rows` take `n_bytes`; at least one."""
+    return max(min(n_rows, limit * n_rows // max(n_bytes, 1)), 1)
 
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:

@@ -1,6 +1,5 @@
 """A whole LeRobotDataset as one tensor per feature, on the device where there is room for it."""
 
-import os
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -13,6 +12,8 @@ from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_feature import check_audio_features
 from lerobot_playbyear.datasets.columns import episode_bounds, read_images, read_values, read_videos
+from lerobot_playbyear.datasets.opening import LongDataset
+from lerobot_playbyear.memory import available_memory
 
 INDEX_KEYS = ("index", "episode_index", "frame_index", "task_index", "timestamp")
 """The columns that every LeRobotDataset has."""
@@ -22,7 +23,7 @@ _GPU_SHARE = 0.5  # of the free memory: the network and its gradients need the r
 
 
 def read_dataset(
-    dataset: LeRobotDataset,
+    dataset: LeRobotDataset | LongDataset,
     keys: Iterable[str] | None = None,
     device: str | torch.device | None = None,
     video_backend: str | None = None,
@@ -58,7 +59,7 @@ def read_dataset(
     return columns, starts, ends
 
 
-def _select_features(dataset: LeRobotDataset, keys: Iterable[str] | None) -> dict[str, Any]:
+def _select_features(dataset: LeRobotDataset | LongDataset, keys: Iterable[str] | None) -> dict[str, Any]:
     features = dataset.meta.features
     if keys is None:
         keys = [
@@ -86,13 +87,12 @@ def _choose_device(device: str | torch.device | None, nbytes: int) -> torch.devi
         fits = torch.cuda.is_available() and nbytes <= _GPU_SHARE * torch.cuda.mem_get_info()[0]
         device = "cuda" if fits else "cpu"
     device = torch.device(device)
-    if device.type == "cpu" and hasattr(os, "sysconf"):
-        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        if nbytes > total:
-            raise MemoryError(
-                f"The dataset needs {nbytes / 2**30:.1f} GiB in memory, and this machine has {total / 2**30:.1f} GiB. "
-                f"Choose fewer episodes (--dataset.episodes), or use lerobot-train."
-            )
+    free = available_memory()
+    if device.type == "cpu" and nbytes > free:
+        raise MemoryError(
+            f"The dataset needs {nbytes / 2**30:.1f} GiB in memory, and {free / 2**30:.1f} GiB are free. Choose fewer "
+            "episodes (--dataset.episodes), end other programs, or use lerobot-train, which reads from the disk."
+        )
     return device
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_playbyear.inspection.film import at_a_rate_of_aac, tile
-from lerobot_playbyear.inspection.sound_checks import steps
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.structure_checks import fit_microphones
 from lerobot_playbyear.video import amplify, compose, episode_sound, write_film
@@ -46,12 +45,15 @@ def film_preview(source: DatasetSource, path: Path) -> Preview:
     episode = (solved or source.episodes)[0]
     n_frames = min(len(episode), _LONGEST_S * source.fps)
     microphones = _heard_together(source, fit_microphones(source))
-    rows = slice(episode.start, episode.start + n_frames)
-    blocks = [np.clip(steps(source.sound(key)[rows]), -32768, 32767).astype(np.int16) for key in microphones]
+    shown = Episode(episode.index, episode.start, episode.start + n_frames)
+    blocks = [
+        np.clip(source.sound(key, shown)[:], -32768, 32767).astype(np.int16).reshape(n_frames, -1)
+        for key in microphones
+    ]
     stacked = np.stack(blocks, axis=-1) if blocks else np.zeros((n_frames, 0, 0), np.int16)  # (n, S, n_microphones)
-    sound, sample_rate = at_a_rate_of_aac(amplify(episode_sound(stacked)), stacked.shape[1] * source.fps)
-    pictures = list(itertools.islice(_pictures(source, episode), n_frames))
-    write_film(path, compose(pictures, sound, sample_rate), source.fps, sound, sample_rate)
+    heard, sample_rate = at_a_rate_of_aac(amplify(episode_sound(stacked)), stacked.shape[1] * source.fps)
+    pictures, sound = itertools.islice(_pictures(source, shown), n_frames), heard[:]
+    write_film(path, compose(pictures, n_frames, sound, sample_rate), source.fps, sound, sample_rate)
     return Preview(path, episode.index, tuple(microphones), n_frames == len(episode))
 
 

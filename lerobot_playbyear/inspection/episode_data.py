@@ -2,6 +2,7 @@
 
 import base64
 import io
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,8 +14,16 @@ from PIL import Image
 
 from lerobot_playbyear.inspection.control_checks import intervention_spans
 from lerobot_playbyear.inspection.onsets import sudden_sounds
-from lerobot_playbyear.inspection.sound_checks import FULL_SCALE, steps
 from lerobot_playbyear.inspection.source import INTERVENTION, DatasetSource, Episode
+from lerobot_playbyear.inspection.waveform import (
+    FULL_SCALE,
+    PIECE,
+    EpisodeSound,
+    Samples,
+    extremes,
+    mean_and_deviation,
+    pieces,
+)
 
 _WINDOW_S = 0.032
 _SHORTEST_HOP_S = 0.005
@@ -93,9 +102,9 @@ class EpisodeData:
             )
         return curves
 
-    def blocks(self, episode: Episode) -> list[np.ndarray]:
-        """The sound of each microphone, (n, S) in steps of 16-bit PCM."""
-        return [steps(self._source.sound(microphone.key)[episode.rows]) for microphone in self.microphones]
+    def sound(self, episode: Episode) -> list[EpisodeSound]:
+        """What each microphone heard, in steps of 16-bit PCM."""
+        return [self._source.sound(microphone.key, episode) for microphone in self.microphones]
 
     def draw(self, episode: Episode) -> dict[str, Any]:
         """Everything but the film, for JSON."""
@@ -103,7 +112,7 @@ class EpisodeData:
         tagged = source.values(INTERVENTION)[episode.rows].astype(bool) if INTERVENTION in source.numbers else None
         return {
             "microphones": [
-                self._draw_sound(m, b) for m, b in zip(self.microphones, self.blocks(episode), strict=True)
+                self._draw_sound(*pair) for pair in zip(self.microphones, self.sound(episode), strict=True)
             ],
             "curves": [_base64(self._curve(curve["key"], episode)) for curve in self.curves],
             "interventions": None if tagged is None else intervention_spans(tagged),
@@ -113,20 +122,25 @@ class EpisodeData:
         """The level of the first microphone over the episode, 0 to 99 of its loudest, for the list of episodes."""
         if not self.microphones:
             return []
-        blocks = steps(self._source.sound(self.microphones[0].key)[episode.rows]) / FULL_SCALE
-        blocks -= blocks.mean()
-        level = 10 * np.log10(np.square(blocks).mean(axis=1) + _POWER_FLOOR)
+        sound = self._source.sound(self.microphones[0].key, episode)
+        mean = mean_and_deviation(sound)[0]
+        rows = max(PIECE // sound.samples_per_frame, 1) * sound.samples_per_frame
+        power = [
+            np.square((piece - mean).reshape(-1, sound.samples_per_frame) / FULL_SCALE).mean(axis=1)
+            for piece in pieces(sound, size=rows)
+        ]
+        level = 10 * np.log10(np.concatenate(power) + _POWER_FLOOR)
         edges = np.linspace(0, len(level), min(_PREVIEW_COLUMNS, len(level)) + 1).astype(int)
         level = np.maximum.reduceat(level, edges[:-1])
         share = 1 + (level - level.max()) / _PREVIEW_RANGE_DB
         return np.clip(99 * share, 0, 99).astype(int).tolist()
 
     def _measure(self, key: str) -> Microphone:
-        sound = self._source.sound(key)
-        rate = sound.shape[1] * self._source.fps
-        episodes = self._source.episodes[:: max(len(self._source.episodes) // _SAMPLED_EPISODES, 1)]
-        levels = np.concatenate([_levels(steps(sound[e.rows]).reshape(-1), rate)[0] for e in episodes])
-        peak = max(float(np.abs(steps(sound[e.rows])).max()) for e in self._source.episodes) / FULL_SCALE
+        source = self._source
+        rate = source.samples_per_frame(key) * source.fps
+        episodes = source.episodes[:: max(len(source.episodes) // _SAMPLED_EPISODES, 1)]
+        levels = np.concatenate([_levels(source.sound(key, episode), rate)[0] for episode in episodes])
+        peak = max(max(map(abs, extremes(source.sound(key, each)))) for each in source.episodes) / FULL_SCALE
         top = float(np.ceil(levels.max() / 5) * 5)
         bottom = float(np.floor(np.quantile(levels, _DARKEST_SHARE) / 5) * 5)
         return Microphone(
@@ -138,8 +152,7 @@ class EpisodeData:
             top_hz=min(_TOP_FREQUENCY, rate / 2),
         )
 
-    def _draw_sound(self, microphone: Microphone, blocks: np.ndarray) -> dict[str, Any]:
-        samples = blocks.reshape(-1)
+    def _draw_sound(self, microphone: Microphone, samples: Samples) -> dict[str, Any]:
         levels, hop_s = _levels(samples, microphone.sample_rate)  # (columns, bins)
         share = (levels - microphone.bottom_db) / (microphone.top_db - microphone.bottom_db)
         grey = np.clip(np.round(share * (_GREY_LEVELS - 1)), 0, _GREY_LEVELS - 1) * (255 // (_GREY_LEVELS - 1))
@@ -148,7 +161,7 @@ class EpisodeData:
         return {
             "spectrogram": _png(grey.astype(np.uint8).T[::-1]),
             "hop": hop_s,
-            "wave": _base64(_envelope(samples / max(microphone.peak * FULL_SCALE, 1.0))),
+            "wave": _base64(_envelope(samples, max(microphone.peak * FULL_SCALE, 1.0))),
             "onsets": [round(float(time) - frame_s, 4) for time in onsets],
         }
 
@@ -158,7 +171,7 @@ class EpisodeData:
         return values.astype("<f4").reshape(-1)
 
 
-def _levels(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, float]:
+def _levels(samples: Samples, sample_rate: int) -> tuple[np.ndarray, float]:
     """Level in frequency bins from 0 Hz to at most 8 kHz, (columns, bins) [dBFS], and the seconds between columns.
 
     Column j is about the moment (j + 1/2) * hop.
@@ -166,20 +179,31 @@ def _levels(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, float]:
     window = max(round(_WINDOW_S * sample_rate), 16)
     hop = max(round(_SHORTEST_HOP_S * sample_rate), -(-len(samples) // _MAX_COLUMNS), 1)
     n_columns = max(len(samples) // hop, 1)
-    padded = np.pad(samples / FULL_SCALE, window)
-    starts = window + hop // 2 - window // 2 + hop * np.arange(n_columns)
+    samples = samples[:] if len(samples) <= PIECE else samples  # many small reads cost more than one
+    starts = hop // 2 - window // 2 + hop * np.arange(n_columns)
     taper = np.hanning(window)
-    columns = padded[starts[:, None] + np.arange(window)] * taper  # (columns, window)
+    columns = (
+        np.stack([_padded(samples, int(start), window) for start in starts]) / FULL_SCALE * taper
+    )  # (columns, window)
     power = np.square(np.abs(np.fft.rfft(columns, axis=1))) * (4 / taper.sum() ** 2)  # a full-scale sine has 1
     n_bins = min(power.shape[1], int(_TOP_FREQUENCY * window / sample_rate) + 1)
     return 10 * np.log10(power[:, :n_bins] + _POWER_FLOOR), hop / sample_rate
 
 
-def _envelope(samples: np.ndarray) -> np.ndarray:
-    """Lowest and highest sample of each column, (columns * 2,) int8, of samples in [-1, 1]."""
-    edges = np.linspace(0, len(samples), min(_MAX_COLUMNS, len(samples)) + 1).astype(int)[:-1]
-    extremes = np.stack([np.minimum.reduceat(samples, edges), np.maximum.reduceat(samples, edges)], axis=1)
-    return np.clip(np.round(127 * extremes), -127, 127).astype(np.int8).reshape(-1)
+def _padded(samples: Samples, start: int, size: int) -> np.ndarray:
+    """A span of sound, with silence where it reaches over its ends."""
+    stop = start + size
+    inside = samples[max(start, 0) : max(stop, 0)]
+    return np.pad(inside, (max(-start, 0), max(stop - max(len(samples), start), 0))) if len(inside) < size else inside
+
+
+def _envelope(samples: Samples, peak: float) -> np.ndarray:
+    """Lowest and highest sample of each column as shares of `peak`, (columns * 2,) int8."""
+    samples = samples[:] if len(samples) <= PIECE else samples
+    edges = np.linspace(0, len(samples), min(_MAX_COLUMNS, len(samples)) + 1).astype(int).tolist()
+    columns = (samples[start:stop] for start, stop in itertools.pairwise(edges))
+    extreme = np.array([(column.min(), column.max()) for column in columns]) / peak
+    return np.clip(np.round(127 * extreme), -127, 127).astype(np.int8).reshape(-1)
 
 
 def _dimension_names(feature: dict[str, Any], size: int) -> list[str]:

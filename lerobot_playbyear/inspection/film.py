@@ -1,7 +1,6 @@
-"""An episode as a film with sound in memory, in the formats that every browser plays: H.264 and AAC."""
+"""An episode as a film with sound, in the formats that every browser plays: H.264 and AAC."""
 
 import itertools
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -9,9 +8,14 @@ import av
 import numpy as np
 from PIL import Image
 
-from lerobot_playbyear.video import audio_frame, episode_sound, write_film
+from lerobot_playbyear.datasets.audio_files import Channels, Resampled
+from lerobot_playbyear.inspection.waveform import EpisodeSound
+from lerobot_playbyear.video import write_film
 
 _AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
+_SOUND_BIT_RATE = 200_000  # bits per second, of two channels
+_LOWEST_BIT_RATE = 60_000  # of the pictures
+_LIMITED_BIT_RATE = 20_000_000  # of the pictures; a film that may have more is not limited at all
 _NOT_READ = 96  # grey level of a picture that could not be read
 _EMPTY_SIZE = 16  # pixels; the picture of an episode without cameras, which the page hides
 
@@ -47,44 +51,72 @@ def tile(
     return [width for width, _ in sizes], frames()
 
 
-def encode(pictures: Iterator[np.ndarray], fps: int, sound: Sequence[np.ndarray], gain: float) -> bytes:
-    """An mp4 with the sound of the first two microphones, left and right, in time with the pictures.
+class FilmSound:
+    """The sound of a film of an episode, (n, 2 or 1) int16, computed where it is indexed.
+
+    The film shows a picture from when it was taken, so it plays the block of sound after it with it, and silence with
+    the last one.
 
     Args:
-        pictures: n pictures (H, W, 3) uint8, H and W even.
-        fps: Frames per second [Hz].
-        sound: For each microphone its (n, S) blocks in steps of 16-bit PCM; the block of frame t was heard before its
-            picture was taken.
+        sound: Of the microphones; the first two are heard, left and right, or only the first if their rates differ.
         gain: By how much to amplify.
     """
-    blocks = [np.clip(block * gain, -32768, 32767).astype(np.int16) for block in sound[:2]]
-    n_samples = {block.shape[1] for block in blocks}
-    stacked = (
-        np.stack(blocks if len(n_samples) == 1 else blocks[:1], axis=-1) if blocks else np.zeros((1, 0, 0), np.int16)
-    )
-    samples, sample_rate = at_a_rate_of_aac(episode_sound(stacked), stacked.shape[1] * fps)
-    with tempfile.TemporaryDirectory() as folder:
-        # Key frames every second, so that stepping backwards is quick.
-        path = write_film(Path(folder) / "film.mp4", pictures, fps, samples, sample_rate, {"crf": "23", "g": str(fps)})
-        return path.read_bytes()
+
+    def __init__(self, sound: Sequence[EpisodeSound], gain: float) -> None:
+        same_rate = {each.samples_per_frame for each in sound[:2]}
+        self._heard, self._gain = sound[: 2 if len(same_rate) == 1 else 1], np.float32(gain)
+        self.shape = (len(sound[0]), len(self._heard))
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, span: slice) -> np.ndarray:
+        start, stop, _ = span.indices(len(self))
+        film = np.zeros((max(stop - start, 0), len(self._heard)), np.int16)
+        for channel, sound in enumerate(self._heard):
+            later = sound[start + sound.samples_per_frame : stop + sound.samples_per_frame]
+            film[: len(later), channel] = np.clip(later * self._gain, -32768, 32767)
+        return film
 
 
-def at_a_rate_of_aac(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, int]:
-    """Resamples (n, at most 2 channels) int16 to the next higher rate that AAC has, where that is necessary."""
+def encode(
+    path: Path,
+    pictures: Iterator[np.ndarray],
+    n_pictures: int,
+    fps: int,
+    sound: Sequence[EpisodeSound],
+    gain: float,
+    most_bytes: int = 2**28,
+) -> Path:
+    """Writes an mp4 with the sound of the first two microphones, left and right, in time with the pictures.
+
+    Args:
+        path: Of the film.
+        pictures: n pictures (H, W, 3) uint8, H and W even.
+        n_pictures: n.
+        fps: Frames per second [Hz].
+        sound: For each microphone what it heard; the block of frame t was heard before its picture was taken.
+        gain: By how much to amplify.
+        most_bytes: About how large it may become: the film of an episode of hours is coarser, so that a browser can
+            hold it.
+    """
+    rate = sound[0].samples_per_frame * fps if sound else _AAC_RATES[-1]
+    silent: Channels = np.zeros((0, 0), np.int16)
+    samples, sample_rate = at_a_rate_of_aac(FilmSound(sound, gain) if sound else silent, rate)
+    # Key frames every second, so that stepping backwards is quick.
+    options = {"crf": "23", "g": str(fps)}
+    bit_rate = max(round(8 * most_bytes * fps / n_pictures) - _SOUND_BIT_RATE, _LOWEST_BIT_RATE)
+    if bit_rate < _LIMITED_BIT_RATE:
+        options |= {"maxrate": str(bit_rate), "bufsize": str(2 * bit_rate)}
+    return write_film(path, pictures, fps, samples, sample_rate, options)
+
+
+def at_a_rate_of_aac(samples: Channels, sample_rate: int) -> tuple[Channels, int]:
+    """Resamples (n, channels) to the next higher rate that AAC has, where that is necessary."""
     if samples.shape[1] == 0 or sample_rate in _AAC_RATES:
         return samples, sample_rate or _AAC_RATES[-1]
     rate = next((rate for rate in _AAC_RATES if rate > sample_rate), _AAC_RATES[-1])
-    n_channels = samples.shape[1]
-    # FFmpeg's: torchaudio's filter for rates with no common divisor takes gigabytes.
-    resampler = av.AudioResampler(format="s16", layout=("mono", "stereo")[n_channels - 1], rate=rate)
-    parts: list[np.ndarray] = []
-    for first in range(0, len(samples) + sample_rate, sample_rate):
-        part = samples[first : first + sample_rate]
-        frames = resampler.resample(audio_frame(part, sample_rate, first) if len(part) else None)
-        parts.extend(frame.to_ndarray().reshape(-1, n_channels) for frame in frames)
-        if not len(part):
-            break
-    return np.concatenate(parts), rate
+    return Resampled(samples, sample_rate, rate), rate
 
 
 def _fitted(size: int, limit: int) -> int:

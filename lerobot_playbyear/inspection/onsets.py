@@ -15,9 +15,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from lerobot_playbyear.inspection.sound_checks import FULL_SCALE, steps
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.verdict import Verdict
+from lerobot_playbyear.inspection.waveform import FULL_SCALE, PIECE, Samples, mean_and_deviation, pieces
 
 _STEP_S = 0.005
 _RISE_DB = 12.0
@@ -28,7 +28,7 @@ _MIN_ONSETS = 5
 _POWER_FLOOR = 1e-12
 
 
-def sudden_sounds(samples: np.ndarray, sample_rate: float) -> np.ndarray:
+def sudden_sounds(samples: Samples, sample_rate: float) -> np.ndarray:
     """When sudden sounds begin in an episode, (k,) seconds from its first sample.
 
     Args:
@@ -79,8 +79,8 @@ def check_alignment(source: DatasetSource, microphones: Sequence[str]) -> Iterat
 
 def _onset_frames(source: DatasetSource, key: str, episode: Episode) -> np.ndarray:
     """The frames, from the episode's start, at which a sudden sound had been heard."""
-    sound = source.sound(key)[episode.rows]
-    times = sudden_sounds(steps(sound).reshape(-1), sound.shape[1] * source.fps)
+    sound = source.sound(key, episode)
+    times = sudden_sounds(sound, sound.samples_per_frame * source.fps)
     # Row i ends with picture i, so a sound inside row i is seen, at the earliest, in picture i.
     return np.minimum((times * source.fps).astype(int), len(episode) - 1)
 
@@ -124,9 +124,15 @@ def _step(sample_rate: float) -> int:
     return max(round(_STEP_S * sample_rate), 1)
 
 
-def _levels(samples: np.ndarray, sample_rate: float) -> np.ndarray:
+def _levels(samples: Samples, sample_rate: float) -> np.ndarray:
     """Level of every 5 ms [dBFS]."""
     step = _step(sample_rate)
-    samples = samples - samples.mean()
-    blocks = samples[: len(samples) // step * step].reshape(-1, step) / FULL_SCALE
-    return 10 * np.log10(np.square(blocks, dtype=np.float64).mean(axis=1) + _POWER_FLOOR)
+    whole = len(samples) // step * step
+    if not whole:
+        return np.empty(0)
+    mean = np.float32(mean_and_deviation(samples)[0])
+    levels = []
+    for piece in pieces(samples, 0, whole, PIECE // step * step or step):
+        blocks = (piece - mean).reshape(-1, step) / FULL_SCALE
+        levels.append(10 * np.log10(np.square(blocks, dtype=np.float64).mean(axis=1) + _POWER_FLOOR))
+    return np.concatenate(levels)

@@ -6,7 +6,8 @@ import html
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
@@ -23,6 +24,7 @@ from lerobot_playbyear.inspection.verdict import Verdict, worst
 
 _SCRIPTS = ("data.js", "timeline.js", "panels.js", "player.js", "app.js")
 _EPISODES_HERE = "<!-- episodes -->"
+_BYTES_AT_ONCE = 3 * 2**18  # a multiple of 3, so that the parts of a film's base64 join
 
 
 class PageWriter:
@@ -65,9 +67,11 @@ class PageWriter:
         """
         position = len(self._index)
         widths, frames = tile(pictures, len(episode), self._picture_height)
-        film = encode(frames, self._source.fps, self._data.blocks(episode), self._data.gain)
-        self._write("application/json", f"episode-{position}", _json(self._data.draw(episode)))
-        self._write("text/plain", f"film-{position}", base64.b64encode(film).decode())
+        self._write("application/json", f"episode-{position}", [_json(self._data.draw(episode))])
+        with tempfile.TemporaryDirectory() as folder:
+            sound, gain = self._data.sound(episode), self._data.gain
+            film = encode(Path(folder) / "film.mp4", frames, len(episode), self._source.fps, sound, gain)
+            self._write("text/plain", f"film-{position}", _base64(film))
         self._index.append(
             {
                 "index": episode.index,
@@ -92,14 +96,16 @@ class PageWriter:
             "worst": worst(verdicts),
             "verdicts": [{**verdict.to_dict(), "figures": None} for verdict in verdicts],
         }
-        self._write("application/json", "dataset", _json(dataset))
+        self._write("application/json", "dataset", [_json(dataset)])
         self._file.write(self._after)
         self._file.close()
         os.replace(self._partial, self.path)
         return self.path
 
-    def _write(self, kind: str, name: str, text: str) -> None:
-        self._file.write(f'<script type="{kind}" id="{name}">{text}</script>\n')
+    def _write(self, kind: str, name: str, parts: Iterable[str]) -> None:
+        self._file.write(f'<script type="{kind}" id="{name}">')
+        self._file.writelines(parts)
+        self._file.write("</script>\n")
 
 
 def _skeleton(title: str) -> str:
@@ -119,6 +125,13 @@ def _skeleton(title: str) -> str:
 
 def _hash(text: str) -> str:
     return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _base64(path: Path) -> Iterator[str]:
+    """A file's bytes, part by part."""
+    with path.open("rb") as file:
+        while part := file.read(_BYTES_AT_ONCE):
+            yield base64.b64encode(part).decode()
 
 
 def _json(value: Any) -> str:

@@ -11,8 +11,17 @@ import numpy as np
 
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.verdict import Level, Verdict, name_episodes
-
-FULL_SCALE = 32768.0
+from lerobot_playbyear.inspection.waveform import (
+    FULL_SCALE,
+    PIECE,
+    Runs,
+    Samples,
+    extremes,
+    mean_and_deviation,
+    merge,
+    pieces,
+    runs,
+)
 
 _QUIET_DBFS = -80.0  # 16-bit PCM has 3 steps of RMS there: hardly anything was heard
 _CLIPPED = 32766.0  # steps; at or beyond it a sample may have been cut
@@ -64,33 +73,26 @@ def check_sound(source: DatasetSource, microphones: Sequence[str]) -> Iterator[V
         yield from _check_microphone(source, key)
 
 
-def steps(sound: np.ndarray) -> np.ndarray:
-    """Any sound in steps of 16-bit PCM, as float32; NaN and infinite samples, a finding of their own, become 0."""
-    if np.issubdtype(sound.dtype, np.floating):
-        return np.nan_to_num(sound * FULL_SCALE, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
-    return sound.astype(np.float32)
-
-
 def dbfs(rms_steps: float) -> float:
     """Level of an RMS in steps; -120 dBFS for nothing at all."""
     return 20 * math.log10(max(rms_steps / FULL_SCALE, 1e-6))
 
 
-def flat_tops(samples: np.ndarray) -> list[tuple[int, int]]:
+def flat_tops(samples: Samples) -> list[tuple[int, int]]:
     """Spans in which the sound was cut: at full scale, or several equal samples in a row at its own extremes.
 
     Args:
         samples: (n,) in steps.
     """
     spans = []
-    for extreme in (samples.max(initial=0), samples.min(initial=0)):
+    for extreme in extremes(samples):
         if abs(extreme) >= _FLAT_TOP_MIN:
             limit = min(abs(extreme), _CLIPPED)
-            spans += [span for span in _spans(np.sign(extreme) * samples >= limit) if span[1] - span[0] >= _FLAT_TOP]
+            spans += runs((np.sign(extreme) * piece >= limit for piece in pieces(samples)), _FLAT_TOP)
     return sorted(spans)
 
 
-def gaps(samples: np.ndarray, sample_rate: float) -> list[tuple[int, int]]:
+def gaps(samples: Samples, sample_rate: float) -> list[tuple[int, int]]:
     """Spans in which live sound stands still: one exact value, with sound on both sides.
 
     Args:
@@ -99,55 +101,60 @@ def gaps(samples: np.ndarray, sample_rate: float) -> list[tuple[int, int]]:
     """
     shortest, edge = max(round(_GAP_S * sample_rate), 8), max(round(_GAP_EDGE_S * sample_rate), 8)
     found = []
-    for start, stop in _spans(np.diff(samples) == 0):
+    still = (np.diff(samples[first : first + PIECE + 1]) == 0 for first in range(0, len(samples) - 1, PIECE))
+    for start, stop in runs(still, shortest - 1):
         start, stop = start, stop + 1  # of samples, not of differences
         before, after = samples[max(start - edge, 0) : start], samples[stop : stop + edge]
         is_live = min(_rms(before), _rms(after)) >= _LIVE_RMS
-        is_peak = abs(samples[start]) >= _FLAT_TOP_MIN  # cut, not lost
-        if stop - start >= shortest and is_live and not is_peak:
+        is_peak = abs(samples[start : start + 1][0]) >= _FLAT_TOP_MIN  # cut, not lost
+        if is_live and not is_peak:
             found.append((start, stop))
     return found
 
 
-def repeats(samples: np.ndarray, samples_per_frame: int) -> list[tuple[int, int]]:
+def repeats(samples: Samples, samples_per_frame: int) -> list[tuple[int, int]]:
     """Spans that are a sample-exact copy of the block of live sound before them.
 
     Args:
         samples: (n,) in steps.
         samples_per_frame: S, a block size to try besides those of sound drivers.
     """
-    taken = np.zeros(len(samples), bool)
-    for size in sorted({*_BLOCK_SIZES, samples_per_frame}):
-        if size < _BLOCK_SIZES[0] or len(samples) < 2 * size:
-            continue
-        for start, stop in _spans(samples[size:] == samples[:-size]):
-            if stop - start >= size and samples[start + size : stop + size].std() >= _LIVE_RMS:
-                taken[start + size : stop + size] = True
-    return _spans(taken)
+    sizes = sorted({*_BLOCK_SIZES, samples_per_frame})
+    equal = {size: Runs(size) for size in sizes if size >= _BLOCK_SIZES[0] and len(samples) >= 2 * size}
+    for first in range(0, len(samples), PIECE):
+        block = samples[first : first + PIECE + max(equal, default=0)]
+        for size, found in equal.items():
+            n = min(PIECE, len(block) - size)
+            if n > 0:
+                found.add(block[size : size + n] == block[:n])
+    copies = [(start + size, stop + size) for size, found in equal.items() for start, stop in found.finish()]
+    return merge(span for span in copies if mean_and_deviation(samples, *span)[1] >= _LIVE_RMS)
 
 
 def _check_microphone(source: DatasetSource, key: str) -> Iterator[Verdict]:
-    sound = source.sound(key)
-    sample_rate = float(sound.shape[1] * source.fps)
+    samples_per_frame = source.samples_per_frame(key)
+    sample_rate = float(samples_per_frame * source.fps)
     dead, quiet, offset = [], [], []
-    cut, lost, repeated = (_Spans(key, sample_rate, sound.size) for _ in range(3))
+    cut, lost, repeated = (_Spans(key, sample_rate, len(source) * samples_per_frame) for _ in range(3))
     levels, peak, worst_offset = [], 0.0, 0.0
     for episode in source.episodes:
-        samples = steps(sound[episode.rows]).reshape(-1)
-        levels.append(dbfs(_rms(samples - samples.mean())))
-        peak = max(peak, float(np.abs(samples).max()))
-        if np.ptp(samples) == 0:
+        samples = source.sound(key, episode)
+        mean, deviation = mean_and_deviation(samples)
+        levels.append(dbfs(deviation))
+        low, high = extremes(samples)
+        peak = max(peak, high, -low)
+        if not _changes(samples):
             dead.append(episode.index)
             continue
         if levels[-1] < _QUIET_DBFS:
             quiet.append(episode.index)
-        mean = float(samples.mean()) / FULL_SCALE
+        mean /= FULL_SCALE
         worst_offset = max(worst_offset, abs(mean))
         if abs(mean) > _OFFSET:
             offset.append(episode.index)
         cut.add(episode, flat_tops(samples))
         lost.add(episode, gaps(samples, sample_rate))
-        repeated.add(episode, repeats(samples, sound.shape[1]))
+        repeated.add(episode, repeats(samples, samples_per_frame))
 
     figures = {"rms_dbfs": [round(level, 2) for level in levels], "peak_dbfs": dbfs(peak)}
     span = f"{min(levels):.0f} to {max(levels):.0f} dBFS (RMS per episode), peak {dbfs(peak):.0f} dBFS"
@@ -175,9 +182,7 @@ def _rms(samples: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(samples, dtype=np.float64)))) if len(samples) else 0.0
 
 
-def _spans(mask: np.ndarray) -> list[tuple[int, int]]:
-    """First index, and index after the last, of every span of True, from (n,) bool."""
-    if not mask.any():
-        return []
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+def _changes(samples: Samples) -> bool:
+    """Whether not all samples are one and the same value."""
+    first = samples[:1]
+    return any((piece != first).any() for piece in pieces(samples))

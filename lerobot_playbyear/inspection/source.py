@@ -1,4 +1,4 @@
-"""A dataset as the checks and the page read it: whole columns at once, pictures episode by episode.
+"""A dataset as the checks and the page read it: numbers at once, sound and pictures piece by piece.
 
 Unlike training, inspection has to read what is wrong: NaN is a finding here, not an error.
 """
@@ -12,16 +12,20 @@ from typing import Any
 import numpy as np
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.language import LANGUAGE_COLUMNS
-from lerobot.datasets.video_utils import decode_video_frames
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
-from lerobot_playbyear.datasets.columns import check_dataset_files, column_to_numpy, episode_bounds
+from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.confines import ClaimError, OutsideError, file_inside, open_picture
+from lerobot_playbyear.datasets.opening import LongDataset, open_dataset
+from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.inspection.damage import find_damage
+from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound
 
 SUCCESS = "next.success"
 INTERVENTION = "intervention"
+
+_PICTURES_AT_ONCE = 128  # encoded ones that are taken out of the table together
 
 
 class InspectionError(RuntimeError):
@@ -66,13 +70,14 @@ class DatasetSource:
         numbers: The keys of all other numeric features of one dimension, without LeRobot's index columns.
     """
 
-    def __init__(self, dataset: LeRobotDataset, video_backend: str | None = "pyav") -> None:
+    def __init__(self, dataset: LeRobotDataset | LongDataset, video_backend: str | None = "pyav") -> None:
         self.dataset = dataset
         self.fps = int(dataset.fps)
         self.features: dict[str, dict[str, Any]] = dataset.meta.features
         self._video_backend = video_backend
         self._table = dataset.hf_dataset.data
         self._values: dict[str, np.ndarray] = {}
+        self._samples_per_frame: dict[str, int] = {}
         self.cameras = [key for key in dataset.meta.camera_keys if key not in dataset.meta.depth_keys]
         self.microphones = audio_keys(self.features)
         self.numbers = [key for key, feature in self.features.items() if self._is_number(key, feature)]
@@ -95,8 +100,7 @@ class DatasetSource:
             found = "it does not exist" if not folder.exists() else "it has no meta/info.json"
             raise InspectionError(f"There is no LeRobotDataset in '{folder}': {found}. Check --dataset.root.")
         try:
-            check_dataset_files(repo_id, root)
-            dataset = LeRobotDataset(repo_id, root=root, episodes=episodes, video_backend=video_backend)
+            dataset = open_dataset(repo_id, root, episodes, video_backend)
             source = cls(dataset, video_backend)
             n_episodes = len(source.episodes)
         except (OutsideError, ClaimError) as error:
@@ -132,14 +136,40 @@ class DatasetSource:
             self._values[key] = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
         return self._values[key]
 
-    def sound(self, key: str) -> np.ndarray:
-        """A microphone's column, (N, S), as stored.
+    def pieces(self, key: str) -> Iterator[tuple[int, np.ndarray]]:
+        """A numeric column as stored, in parts of bounded size: the first row of each, and its values (n, D).
 
         Raises:
             ValueError: If values are missing, or rows differ in length.
         """
-        values = self.values(key)
-        return values.reshape(len(values), -1)
+        column = self._table.column(key)
+        width = max(column_to_numpy(column.slice(0, 1)).size, 1) if len(column) else 1
+        rows = max(PIECE // width, 1)
+        for first in range(0, len(column), rows):
+            values = column_to_numpy(column.slice(first, rows))
+            values = values.reshape(len(values), -1)
+            if values.shape[1] != width:
+                raise ValueError(f"'{key}': rows hold {width} values, and {values.shape[1]} from row {first} on")
+            yield first, values
+
+    def samples_per_frame(self, key: str) -> int:
+        """How many samples each row of a microphone holds, S.
+
+        Raises:
+            ValueError: If values are missing, or rows differ in length.
+        """
+        if key not in self._samples_per_frame:
+            for _, values in self.pieces(key):
+                self._samples_per_frame[key] = values.shape[1]
+        return self._samples_per_frame[key]
+
+    def sound(self, key: str, episode: Episode) -> EpisodeSound:
+        """What a microphone heard in an episode; it is read where it is indexed.
+
+        Raises:
+            ValueError: If values are missing, or rows differ in length.
+        """
+        return EpisodeSound(self._table.column(key).slice(episode.start, len(episode)), self.samples_per_frame(key))
 
     def task(self, episode: Episode) -> str:
         """The episode's task in words; empty if it has none."""
@@ -166,8 +196,8 @@ class DatasetSource:
             yield from self._video(episode, camera)
             return
         column = self._table.column(camera).slice(episode.start, len(episode))
-        for chunk in column.chunks:
-            for row in chunk.to_pylist():
+        for first in range(0, len(column), _PICTURES_AT_ONCE):
+            for row in column.slice(first, _PICTURES_AT_ONCE).to_pylist():
                 with open_picture(row, Path(self.dataset.root), camera, self.features[camera]) as image:
                     yield np.asarray(image.convert("RGB"))
 
@@ -176,15 +206,7 @@ class DatasetSource:
         path = file_inside(Path(self.dataset.root), meta.get_video_file_path(episode.index, camera))
         offset = meta.episodes[episode.index][f"videos/{camera}/from_timestamp"]
         times = [offset + float(time) for time in self.values("timestamp")[episode.rows]]
-        for first in range(0, len(times), _PICTURES_AT_ONCE):
-            frames = decode_video_frames(
-                path,
-                times[first : first + _PICTURES_AT_ONCE],
-                self.dataset.tolerance_s,
-                self._video_backend,
-                return_uint8=True,
-            )  # (n, C, H, W)
-            yield from frames.permute(0, 2, 3, 1).numpy()
+        yield from video_pictures(path, times, self.dataset.tolerance_s, self._video_backend)
 
     def _is_number(self, key: str, feature: dict[str, Any]) -> bool:
         return (
@@ -194,6 +216,3 @@ class DatasetSource:
             and feature["dtype"] not in ("image", "video", "string")
             and len(feature["shape"]) <= 1
         )
-
-
-_PICTURES_AT_ONCE = 256  # decoded together; bounds the memory for long episodes

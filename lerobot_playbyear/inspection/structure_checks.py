@@ -87,11 +87,10 @@ def check_finite_numbers(source: DatasetSource) -> Iterator[Verdict]:
     """No NaN and no infinite value in any column of floats."""
     n_columns = 0
     for key in [*source.numbers, *source.microphones, "timestamp"]:
-        values = source.values(key)
-        if not np.issubdtype(values.dtype, np.floating):
+        bad = _bad_rows(source, key)
+        if bad is None:
             continue
         n_columns += 1
-        bad = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
         if bad.any():
             episodes = [episode.index for episode in source.episodes if bad[episode.rows].any()]
             message = f"NaN or infinite in {int(bad.sum())} frames ({name_episodes(episodes)})"
@@ -112,7 +111,7 @@ def check_statistics(source: DatasetSource) -> Iterator[Verdict]:
         if key not in stats:
             missing.append(key)
             continue
-        difference = _stats_difference(source.values(key), stats[key])
+        difference = _stats_difference(source, key, stats[key])
         n_compared += 1
         if difference:
             wrong.append(f"{key} ({difference})")
@@ -127,7 +126,7 @@ def check_statistics(source: DatasetSource) -> Iterator[Verdict]:
 
 def _sample_rate(source: DatasetSource, key: str) -> int:
     rate = check_audio_features({key: source.features[key]}, source.fps)[key]
-    held = source.sound(key).shape[1]
+    held = source.samples_per_frame(key)
     if held != rate // source.fps:
         raise ValueError(f"rows hold {held} samples, but {rate} Hz / {source.fps} Hz = {rate // source.fps}")
     return rate
@@ -145,27 +144,63 @@ def _is_whole(source: DatasetSource, episode: Episode) -> bool:
     return episode.index < len(table) and int(table[episode.index]["length"]) == len(episode)
 
 
-def _stats_difference(values: np.ndarray, stats: dict[str, np.ndarray]) -> str | None:
+def _bad_rows(source: DatasetSource, key: str) -> np.ndarray | None:
+    """Which rows of a column hold NaN or infinite values, (N,) bool; None for a column that is not of floats."""
+    bad = np.zeros(len(source), bool)
+    for first, values in source.pieces(key):
+        if not np.issubdtype(values.dtype, np.floating):
+            return None
+        bad[first : first + len(values)] = ~np.isfinite(values).all(axis=1)
+    return bad
+
+
+def _stats_difference(source: DatasetSource, key: str, stats: dict[str, np.ndarray]) -> str | None:
     """What differs, in words.
 
-    Statistics are per element, or one number for all elements of a row, given once or repeated for each.
+    Statistics are per element, or one number for all elements of a row, given once or repeated for each. Those of sound
+    are compared as statistics of all samples: where a sample stands in its row means nothing, and merging datasets
+    averages both kinds.
     """
-    values = values.reshape(len(values), -1).astype(np.float64)  # (N, D)
-    if not np.isfinite(values).all():
+    found = _summarise(source, key)
+    if found is None:
         return None  # a finding of its own
-    for name, compute in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
+    size = found["min"].size
+    stored: dict[str, np.ndarray] = {}
+    for name in ("min", "max", "mean", "std"):
         if name not in stats:
             return f"no {name}"
-        stored: np.ndarray = np.asarray(stats[name], np.float64).reshape(-1)
-        if stored.size > 1 and (stored == stored[0]).all():
-            stored = stored[:1]
-        axis = 0 if stored.size == values.shape[1] > 1 else None
-        if axis is None and stored.size != 1:
-            return f"{name} has {stored.size} values for {values.shape[1]} elements"
-        actual = np.atleast_1d(compute(values, axis=axis))
-        scale = np.atleast_1d(values.max(axis=axis) - values.min(axis=axis))
-        off = np.abs(stored - actual) > _STATS_TOLERANCE * scale + 1e-6 * (1 + np.abs(actual))
+        stored[name] = np.asarray(stats[name], np.float64).reshape(-1)
+        if stored[name].size not in (1, size):
+            return f"{name} has {stored[name].size} values for {size} elements"
+    stored = _of_all_elements(stored) if key in source.microphones else stored
+    for name, value in stored.items():
+        value = value[:1] if (value == value[0]).all() else value
+        compared = found if value.size == size else _of_all_elements(found)
+        actual, scale = compared[name], compared["max"] - compared["min"]
+        off = np.abs(value - actual) > _STATS_TOLERANCE * scale + 1e-6 * (1 + np.abs(actual))
         if off.any():
             element = int(np.flatnonzero(off)[0])
-            return f"{name}[{element}] is {stored[element]:.4g} there, {actual[element]:.4g} in the data"
+            return f"{name}[{element}] is {value[element]:.4g} there, {actual[element]:.4g} in the data"
     return None
+
+
+def _summarise(source: DatasetSource, key: str) -> dict[str, np.ndarray] | None:
+    """Least, largest, mean and standard deviation of each element of a column, (D,); None if a value is not finite."""
+    n, low, high, mean, squares = 0, np.array(np.inf), np.array(-np.inf), np.array(0.0), np.array(0.0)
+    for _, stored in source.pieces(key):
+        values = stored.astype(np.float64)  # (k, D)
+        if not np.isfinite(values).all():
+            return None
+        own, share = values.mean(axis=0), len(values) / (n + len(values))
+        squares = squares + np.square(values - own).sum(axis=0) + np.square(own - mean) * n * share
+        mean = mean + (own - mean) * share
+        low, high, n = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0)), n + len(values)
+    return {"min": low, "max": high, "mean": mean, "std": np.sqrt(squares / max(n, 1))}
+
+
+def _of_all_elements(each: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same of all elements together, (1,)."""
+    mean = each["mean"].mean()
+    variance = (np.square(each["std"]) + np.square(each["mean"] - mean)).mean()
+    together = {"min": each["min"].min(), "max": each["max"].max(), "mean": mean, "std": np.sqrt(variance)}
+    return {name: np.atleast_1d(value) for name, value in together.items()}

@@ -3,11 +3,13 @@
 import contextlib
 import errno
 import glob
+import itertools
 import os
 import shutil
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,14 +25,15 @@ from lerobot.datasets.utils import (
     DatasetInfo,
 )
 
+from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.journal import JOURNAL, LOCK, SCRATCH, STAGING
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, write_tables
+from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES, ParquetDamageError, open_checked, write_tables
 from lerobot_playbyear.datasets.repair.episodes import Row
-from lerobot_playbyear.datasets.repair.frames import Run
+from lerobot_playbyear.datasets.repair.frames import DataFile, Run
 from lerobot_playbyear.datasets.repair.metadata import settle_stats, write_own_info
 from lerobot_playbyear.datasets.repair.replacing import MARKS
-from lerobot_playbyear.datasets.repair.statistics import episode_stats
+from lerobot_playbyear.datasets.repair.statistics import Frames, episode_stats
 from lerobot_playbyear.datasets.repair.tasks import own_tasks
 from lerobot_playbyear.datasets.settling import write_rows
 from lerobot_playbyear.datasets.statistics import write_stats
@@ -152,26 +155,58 @@ def _write_data(
         and all(_stays(kept) for kept in episodes)
         and sum(kept.run.length for kept in episodes) == file.n_rows
     )
-    table = None if is_whole and all("length" in kept.row for kept in episodes) else file.read()
     if is_whole:
         _take_over(root / file.name, target / file.name)
     else:
-        assert table is not None
-        tables = [_renumbered(table.slice(kept.run.start, kept.run.length), kept) for kept in episodes]
-        write_tables(target / file.name, tables, table.schema)
+        tables = (_renumbered(rows, episodes[place], offset) for place, offset, rows in _read(file, episodes))
+        write_tables(target / file.name, tables, file.schema)
     for kept in episodes:
         if "length" in kept.row:
             yield _moved(kept)
-        else:
-            assert table is not None
-            yield _new_row(root, info, tasks, kept, table.slice(kept.run.start, kept.run.length))
+    for kept, frames in _frames(file, [kept for kept in episodes if "length" not in kept.row]):
+        yield _new_row(root, info, tasks, kept, frames)
 
 
-def _renumbered(table: pa.Table, kept: Kept) -> pa.Table:
-    values = {
-        "episode_index": np.full(len(table), kept.number),
-        "index": np.arange(kept.first_index, kept.first_index + len(table)),
-    }
+def _read(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[int, int, pa.Table]]:
+    """The rows of these episodes, in parts: the episode's place in the list, the first row's frame number, and rows.
+
+    Raises:
+        OSError: They cannot be read now, or are others than they were.
+    """
+    before, offset = -1, 0
+    for place, rows in file.read((kept.run.start, kept.run.length) for kept in episodes):
+        offset = 0 if place != before else offset
+        run = episodes[place].run
+        numbers = run.first_frame + offset + np.arange(len(rows))
+        is_same = (column_to_numpy(rows.column("frame_index")) == numbers) & (
+            column_to_numpy(rows.column("episode_index")) == run.episode
+        )
+        if not is_same.all():
+            raise OSError(errno.EIO, f"the rows of episode {run.episode} are others than they were", str(file.name))
+        yield place, offset, rows
+        before, offset = place, offset + len(rows)
+
+
+def _frames(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[Kept, Frames]]:
+    """Each episode with its frames under their new numbers: in memory, or read again and again where there are many."""
+    for place, group in itertools.groupby(_read(file, episodes), key=lambda found: found[0]):
+        kept, n_bytes = episodes[place], 0
+        parts: list[pa.Table] = []
+        for _, offset, rows in group:
+            n_bytes += rows.nbytes
+            if n_bytes <= PIECE_BYTES:
+                parts.append(_renumbered(rows, kept, offset))
+        yield kept, partial(iter, parts) if n_bytes <= PIECE_BYTES else partial(_again, file, kept)
+
+
+def _again(file: DataFile, kept: Kept) -> Iterator[pa.Table]:
+    return (_renumbered(rows, kept, offset) for _, offset, rows in _read(file, [kept]))
+
+
+def _renumbered(table: pa.Table, kept: Kept, offset: int) -> pa.Table:
+    """Some of an episode's rows, the first of which is its frame `offset`, with the numbers that they have from now on."""
+    first = kept.first_index + offset
+    values = {"episode_index": np.full(len(table), kept.number), "index": np.arange(first, first + len(table))}
     for name, value in values.items():
         field = table.schema.field(name)
         table = table.set_column(table.column_names.index(name), field, pa.array(value, field.type))
@@ -193,9 +228,9 @@ def _moved(kept: Kept) -> Row:
     return {**row, **_places(kept)}
 
 
-def _new_row(root: Path, info: DatasetInfo, tasks: pd.DataFrame, kept: Kept, frames: pa.Table) -> Row:
+def _new_row(root: Path, info: DatasetInfo, tasks: pd.DataFrame, kept: Kept, frames: Frames) -> Row:
     names = {int(number): text for text, number in zip(tasks.index, tasks["task_index"], strict=True)}
-    stats = episode_stats(root, info, kept.row, _renumbered(frames, kept))
+    stats = episode_stats(root, info, kept.row, frames, kept.run.length)
     return {
         "episode_index": kept.number,
         "tasks": [names[task] for task in kept.run.tasks],

@@ -3,6 +3,7 @@
 import errno
 import io
 import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,15 @@ from PIL import Image, UnidentifiedImageError
 
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.files import list_files
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing, read_row_groups
+from lerobot_playbyear.datasets.parquet_files import (
+    ParquetDamageError,
+    open_checked,
+    open_parquet,
+    parsing,
+    read_row_groups,
+)
 from lerobot_playbyear.datasets.repair.features import check_columns
-from lerobot_playbyear.datasets.repair.rescue import rescue
+from lerobot_playbyear.datasets.repair.rescue import RescuedFile, rescue
 
 INDEX_COLUMNS = ["episode_index", "frame_index", "index", "task_index", "timestamp"]
 
@@ -29,35 +36,62 @@ class DataFile:
 
     Args:
         name: Relative to the dataset's folder.
-        source: What is read: the file, or a copy in memory that was given a new footer.
+        source: What is read: the file, or what of it can be read with a new footer.
         is_whole: Whether the file can be taken over as it is.
         n_rows: How many rows can be read.
     """
 
     name: Path
-    source: Path | pa.BufferReader
+    source: Path | RescuedFile
     is_whole: bool
     n_rows: int = 0
 
-    def read(self) -> pa.Table:
-        """All rows that can be read, one after the other.
+    def read(self, spans: Iterable[tuple[int, int]]) -> Iterator[tuple[int, pa.Table]]:
+        """Some of the rows that can be read, in parts of bounded size; spans in the file's order are read in one go.
+
+        Args:
+            spans: First row and number of rows of each, counted among those that can be read.
+
+        Returns:
+            The span's place among the spans, and rows of it.
 
         Raises:
             OSError: They cannot be read now, or are others than they were.
         """
-        with _open(self.source) as file:
-            tables = [table for table in read_row_groups(file, path=self.path) if isinstance(table, pa.Table)]
-            table = pa.concat_tables(tables) if tables else file.schema_arrow.empty_table()
-        if len(table) != self.n_rows:
-            raise OSError(
-                errno.EIO, f"{self.n_rows} of its rows could be read before, and now {len(table)}", str(self.name)
-            )
-        return table
+        parts: Iterator[pa.Table] = iter(())
+        part, first = None, 0  # the rows that were read last, and the number of the first of them
+        for place, (start, length) in enumerate(spans):
+            if part is None or start < first:
+                parts, first = self._parts(), 0
+                part = next(parts)
+            at = start
+            while at < start + length:
+                while at >= first + len(part):
+                    first += len(part)
+                    part = next(parts)
+                rows = part.slice(at - first, start + length - at)
+                yield place, rows
+                at += len(rows)
 
     @property
-    def path(self) -> Path | None:
-        """The file; None where it lies in memory."""
-        return self.source if isinstance(self.source, Path) else None
+    def schema(self) -> pa.Schema:
+        """Of its columns."""
+        with _open(self.source) as file:
+            return file.schema_arrow
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.source if isinstance(self.source, Path) else self.source.path
+
+    def _parts(self) -> Iterator[pa.Table]:
+        n_rows = 0
+        with _open(self.source) as file:
+            for table in read_row_groups(file, path=self.path):
+                if isinstance(table, pa.Table):
+                    n_rows += len(table)
+                    yield table
+        raise OSError(errno.EIO, f"{self.n_rows} of its rows could be read before, and now {n_rows}", str(self.name))
 
 
 @dataclass
@@ -66,7 +100,7 @@ class Run:
 
     Args:
         file: Where they are.
-        start: The first row, counted among those of `file.read()`.
+        start: The first row, counted among those that can be read.
         length: How many.
         episode: The episode's number.
         first_frame: The first row's frame number within the episode.
@@ -203,7 +237,7 @@ def _jump(index: np.ndarray) -> str | None:
 
 def _spoilt_pictures(column: pa.ChunkedArray, key: str) -> list[tuple[int, str]]:
     spoilt = []
-    for row, picture in enumerate(column.to_pylist()):
+    for row, picture in enumerate(value.as_py() for value in column):
         try:
             if picture["bytes"] is not None:
                 with Image.open(io.BytesIO(picture["bytes"])) as image:
@@ -218,5 +252,5 @@ def _spoilt_pictures(column: pa.ChunkedArray, key: str) -> list[tuple[int, str]]
 def _open(source: Any) -> pq.ParquetFile:
     if isinstance(source, Path):
         return open_checked(source)
-    with parsing():
-        return pq.ParquetFile(source, page_checksum_verification=True)
+    with parsing(source.path):
+        return open_parquet(source.open())

@@ -7,8 +7,10 @@ columns that the dataset's features demand, the footer is written anew; pyarrow 
 
 import io
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -36,8 +38,83 @@ class _Page:
     n_values: int
 
 
-def rescue(path: Path, schema: pa.Schema) -> pa.BufferReader | None:
-    """A readable copy, in memory, of a parquet file without a valid footer.
+@dataclass(frozen=True)
+class RescuedFile:
+    """A parquet file that can be read with another end.
+
+    Args:
+        path: The file.
+        length: How much of it is taken [bytes].
+        end: What follows these.
+    """
+
+    path: Path
+    length: int
+    end: bytes
+
+    def open(self) -> pa.NativeFile:
+        """For reading."""
+        return pa.PythonFile(_WithEnd(self), mode="r")
+
+
+class _WithEnd(io.RawIOBase):
+    """The bytes of a rescued file."""
+
+    def __init__(self, rescued: RescuedFile) -> None:
+        self._file = rescued.path.open("rb")
+        self._length, self._end = rescued.length, rescued.end
+        self._at = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = offset + {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self.size()}[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def size(self) -> int:
+        return self._length + len(self._end)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        stop = self.size() if size is None or size < 0 else min(self._at + size, self.size())
+        self._file.seek(min(self._at, self._length))
+        data = self._file.read(max(min(stop, self._length) - self._at, 0))
+        data += self._end[max(self._at - self._length, 0) : max(stop - self._length, 0)]
+        self._at += len(data)
+        return data
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+class _FileBytes:
+    """A file's bytes, read where they are sliced. Not mapped: a disk that fails would end the process.
+
+    Args:
+        file: An opened file.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self._size = file, os.fstat(file.fileno()).st_size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def __getitem__(self, span: slice) -> bytes:
+        start, stop, _ = span.indices(self._size)
+        self._file.seek(start)
+        return self._file.read(stop - start)
+
+
+def rescue(path: Path, schema: pa.Schema) -> RescuedFile | None:
+    """A way to read a parquet file without a valid footer.
 
     Args:
         path: The damaged file.
@@ -49,9 +126,8 @@ def rescue(path: Path, schema: pa.Schema) -> pa.BufferReader | None:
     Raises:
         OSError: The file cannot be read now.
     """
-    with naming(path):
-        data = path.read_bytes()
-    pages = _pages(data)
+    with naming(path), path.open("rb") as file:
+        pages = _pages(_FileBytes(file))
     for template in _templates(schema):
         groups = _row_groups(pages, template)
         if groups:
@@ -61,16 +137,17 @@ def rescue(path: Path, schema: pa.Schema) -> pa.BufferReader | None:
                 thrift.LIST,
                 Elements(thrift.STRUCT, [_row_group(template, n_rows, chunks) for n_rows, chunks in groups]),
             )
-            end = groups[-1][1][-1][-1]
+            last = groups[-1][1][-1][-1]
             encoded = thrift.write_struct(footer)
-            whole = data[: end.start + end.stored] + encoded + len(encoded).to_bytes(4, "little") + _MAGIC
+            end = encoded + len(encoded).to_bytes(4, "little") + _MAGIC
+            rescued = RescuedFile(path, last.start + last.stored, end)
             try:
-                with parsing():
-                    pq.ParquetFile(pa.BufferReader(whole))
+                with parsing(path):
+                    pq.ParquetFile(rescued.open())
             except ParquetDamageError as error:
                 logger.debug("%s: the footer that was made for it is not accepted: %s", path, error)
                 continue
-            return pa.BufferReader(whole)
+            return rescued
     return None
 
 
@@ -140,14 +217,13 @@ def _one_row(kind: pa.DataType) -> pa.Array:
     )
 
 
-def _pages(data: bytes) -> list[_Page]:
+def _pages(data: _FileBytes) -> list[_Page]:
     """The pages of a file, from its beginning to the first byte that is none."""
     pages: list[_Page] = []
     at = len(_MAGIC)
-    view = memoryview(data)
     while at < len(data):
         try:
-            header, body = thrift.read_struct(view[at : at + _MAX_HEADER_BYTES])
+            header, body = thrift.read_struct(data[at : at + _MAX_HEADER_BYTES])
             page = _page(header, at, body)
         except (ThriftError, AttributeError, TypeError):
             break

@@ -1,23 +1,34 @@
 """Statistics of an episode that is on disk already, for a row that is made anew; LeRobot makes them while recording."""
 
 import io
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from lerobot.datasets.compute_stats import auto_downsample_height_width, get_feature_stats, sample_indices
+from lerobot.datasets.compute_stats import auto_downsample_height_width, sample_indices
 from lerobot.datasets.utils import DatasetInfo
-from lerobot.datasets.video_utils import decode_video_frames
 from PIL import Image
 
+from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.repair.episodes import Row
-from lerobot_playbyear.datasets.statistics import Stats, numeric_stats
+from lerobot_playbyear.datasets.statistics import Stats, channel_stats, numeric_stats, repeated_stats
+from lerobot_playbyear.datasets.video_pictures import video_pictures
 
 _TOLERANCE = 1e-4  # seconds, LeRobot's own
 
 
-def episode_stats(root: Path, info: DatasetInfo, row: Row, frames: pa.Table) -> Stats:
+Frames = Callable[[], Iterable[pa.Table]]
+"""Gives an episode's frames in parts, from the first whenever it is called."""
+
+_PICTURES_AT_ONCE = 128
+
+
+def episode_stats(root: Path, info: DatasetInfo, row: Row, frames: Frames, length: int) -> Stats:
     """The statistics of one episode, as LeRobot has them: of pictures, from as many as it samples.
 
     Args:
@@ -25,43 +36,60 @@ def episode_stats(root: Path, info: DatasetInfo, row: Row, frames: pa.Table) -> 
         info: What the dataset says about itself.
         row: Where the episode's videos are.
         frames: Its frames.
+        length: How many.
     """
     numbers: dict[str, np.ndarray] = {}
     stats: Stats = {}
     for key, feature in info.features.items():
+        shape = tuple(feature["shape"])
         if _is_depth(feature) or feature["dtype"] in ("string", "language"):
             continue
-        if feature["dtype"] == "image":
-            stats[key] = _picture_stats(_pictures(frames.column(key)))
-        elif feature["dtype"] == "video":
-            stats[key] = _picture_stats(_video_pictures(root, info, key, row, len(frames)))
+        if feature["dtype"] in ("image", "video"):
+            pictures = (
+                partial(_pictures, frames, key, length)
+                if feature["dtype"] == "image"
+                else partial(_video_pictures, root, info, key, row, length)
+            )
+            stats[key] = channel_stats(partial(_downsampled, pictures), len(sample_indices(length)))
+        elif key in audio_keys([key]):
+            stats[key] = repeated_stats(partial(_rows, frames, key), length, math.prod(shape))
         else:
-            shape = tuple(feature["shape"])
-            numbers[key] = column_to_numpy(frames.column(key)).reshape(len(frames), *(() if shape == (1,) else shape))
+            values = np.concatenate(list(_rows(frames, key)))
+            numbers[key] = values.reshape(length, *(() if shape == (1,) else shape))
     return {**numeric_stats(numbers, info.features), **stats}
 
 
-def _pictures(column: pa.ChunkedArray) -> list[np.ndarray]:
-    pictures = []
-    for index in sample_indices(len(column)):
-        with Image.open(io.BytesIO(column[index].as_py()["bytes"])) as image:
-            pictures.append(np.asarray(image.convert("RGB")).transpose(2, 0, 1))
-    return pictures
+def _rows(frames: Frames, key: str) -> Iterator[np.ndarray]:
+    """A numeric column in parts, (n, D)."""
+    for part in frames():
+        yield column_to_numpy(part.column(key)).reshape(len(part), -1)
 
 
-def _video_pictures(root: Path, info: DatasetInfo, key: str, row: Row, length: int) -> list[np.ndarray]:
+def _pictures(frames: Frames, key: str, length: int) -> Iterator[np.ndarray]:
+    """The pictures that LeRobot samples, (H, W, 3) uint8."""
+    wanted, first = set(sample_indices(length)), 0
+    for part in frames():
+        column = part.column(key)
+        for index in range(len(part)):
+            if first + index in wanted:
+                with Image.open(io.BytesIO(column[index].as_py()["bytes"])) as image:
+                    yield np.asarray(image.convert("RGB"))
+        first += len(part)
+
+
+def _video_pictures(root: Path, info: DatasetInfo, key: str, row: Row, length: int) -> Iterator[np.ndarray]:
     path = root / str(info.video_path).format(
         video_key=key, chunk_index=row[f"videos/{key}/chunk_index"], file_index=row[f"videos/{key}/file_index"]
     )
     times = [row[f"videos/{key}/from_timestamp"] + index / info.fps for index in sample_indices(length)]
-    return list(decode_video_frames(path, times, _TOLERANCE, "pyav", return_uint8=True).numpy())
+    return video_pictures(path, times, _TOLERANCE, "pyav")
 
 
-def _picture_stats(pictures: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """Per channel, of pictures (C, H, W) uint8 scaled to [0, 1]."""
-    batch = np.stack([auto_downsample_height_width(picture) for picture in pictures])
-    stats = get_feature_stats(batch, axis=(0, 2, 3), keepdims=True)
-    return {name: value if name == "count" else np.squeeze(value / 255.0, axis=0) for name, value in stats.items()}
+def _downsampled(pictures: Callable[[], Iterable[np.ndarray]]) -> Iterator[np.ndarray]:
+    """As small as LeRobot looks at them, some at a time, (n, C, h, w)."""
+    small = (auto_downsample_height_width(picture.transpose(2, 0, 1)) for picture in pictures())
+    for batch in itertools.batched(small, _PICTURES_AT_ONCE):
+        yield np.stack(batch)
 
 
 def _is_depth(feature: dict) -> bool:
