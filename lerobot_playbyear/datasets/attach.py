@@ -6,7 +6,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +25,14 @@ from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.datasets.opening import LongDataset, open_dataset, scratch_folder
 from lerobot_playbyear.datasets.parquet_files import (
-    PIECE_BYTES,
     ParquetDamageError,
     open_checked,
     read_row_groups,
     write_tables,
 )
 from lerobot_playbyear.datasets.settling import write_rows
-from lerobot_playbyear.datasets.statistics import Stats, add_stats, read_stats, repeated_stats, write_stats
+from lerobot_playbyear.datasets.spooled_sound import EpisodesSound, SpooledFile
+from lerobot_playbyear.datasets.statistics import Stats, add_stats, read_stats, write_stats
 
 _MOST_ERRORS = 10  # that are listed
 
@@ -84,68 +83,6 @@ class AttachAudioConfig:
     pad: bool = False
 
 
-class _Spooled:
-    """The samples of a sound file, (n, channels) int16, decoded to a file of their own.
-
-    Args:
-        path: That file.
-        n_channels: Of the samples in it.
-    """
-
-    def __init__(self, path: Path, n_channels: int) -> None:
-        self._path = path
-        self.shape = (path.stat().st_size // (2 * n_channels), n_channels)
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, span: slice) -> np.ndarray:
-        start, stop, _ = span.indices(len(self))
-        n_channels = self.shape[1]
-        values = np.fromfile(self._path, np.int16, max(stop - start, 0) * n_channels, offset=2 * start * n_channels)
-        return values.reshape(-1, n_channels)
-
-
-@dataclass
-class _Sound:
-    """The sound of all episodes.
-
-    Args:
-        sample_rate: [Hz].
-        keys: The columns.
-        samples_per_frame: S.
-        episodes: For each episode (n_frames * S, columns) int16, read where it is indexed.
-    """
-
-    sample_rate: int
-    keys: list[str]
-    samples_per_frame: int
-    episodes: list[Cut]
-
-    @property
-    def rows_at_once(self) -> int:
-        """How many frames' sound is in memory together."""
-        return max(PIECE_BYTES // (2 * self.samples_per_frame * len(self.keys)), 1)
-
-    def blocks(self, episode: int, start: int, stop: int) -> np.ndarray:
-        """Of some of an episode's frames, (n, S, columns) int16."""
-        size = self.samples_per_frame
-        return self.episodes[episode][start * size : stop * size].reshape(-1, size, len(self.keys))
-
-    def stats(self, episode: int) -> Stats:
-        """An episode's statistics."""
-        n_frames = len(self.episodes[episode]) // self.samples_per_frame
-
-        def pieces(column: int) -> Iterator[np.ndarray]:
-            for start in range(0, n_frames, self.rows_at_once):
-                yield self.blocks(episode, start, min(start + self.rows_at_once, n_frames))[..., column]
-
-        return {
-            key: repeated_stats(partial(pieces, column), n_frames, self.samples_per_frame)
-            for column, key in enumerate(self.keys)
-        }
-
-
 def attach_audio(cfg: AttachAudioConfig) -> Path:
     """Copies a dataset and adds a microphone.
 
@@ -171,7 +108,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
     return target
 
 
-def _write(root: Path, target: Path, sound: _Sound) -> None:
+def _write(root: Path, target: Path, sound: EpisodesSound) -> None:
     """The copy, which is there only when it is complete."""
     unfinished = target.absolute().with_name(f".{target.name}.attaching")
     shutil.rmtree(unfinished, ignore_errors=True)  # of one that was killed
@@ -216,7 +153,7 @@ def _keys(cfg: AttachAudioConfig, dataset: LeRobotDataset | LongDataset) -> list
 
 def _read_sound(
     cfg: AttachAudioConfig, dataset: LeRobotDataset | LongDataset, keys: list[str], scratch: Path
-) -> _Sound:
+) -> EpisodesSound:
     """Decodes all files, so that what is wrong with them is known before anything is written."""
     offsets = _offsets(cfg, dataset.num_episodes)
     lengths = [int(length) for length in dataset.meta.episodes["length"]]
@@ -245,17 +182,17 @@ def _read_sound(
     if errors:
         more = f"\n  ... and {len(errors) - _MOST_ERRORS} more" if len(errors) > _MOST_ERRORS else ""
         raise AttachError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
-    return _Sound(rates[0], keys, rates[0] // dataset.fps, episodes)
+    return EpisodesSound(rates[0], keys, rates[0] // dataset.fps, episodes)
 
 
-def _spool(cfg: AttachAudioConfig, path: Path, n_microphones: int, target: Path) -> tuple[_Spooled, int]:
+def _spool(cfg: AttachAudioConfig, path: Path, n_microphones: int, target: Path) -> tuple[SpooledFile, int]:
     """Decodes the channels of a file that are wanted; the samples, and their rate [Hz]."""
     rate = 0
     with target.open("wb") as file:
         for samples, found in audio_pieces(path):
             rate = found
             file.write(np.ascontiguousarray(_choose_channels(cfg, samples, n_microphones)).tobytes())
-    return _Spooled(target, n_microphones), rate
+    return SpooledFile(target, n_microphones), rate
 
 
 def _format(pattern: str, episode: int) -> str:
@@ -293,7 +230,7 @@ def _choose_channels(cfg: AttachAudioConfig, samples: np.ndarray, n_microphones:
     return samples
 
 
-def _write_copy(root: Path, target: Path, sound: _Sound) -> None:
+def _write_copy(root: Path, target: Path, sound: EpisodesSound) -> None:
     info = DatasetInfo.from_dict(json.loads((root / INFO_PATH).read_text()))
     info.features = _with_microphones(info.features, sound, info.fps)
     schema = get_hf_features_from_features(info.features).arrow_schema
@@ -317,7 +254,7 @@ def _is_scratch(name: Path) -> bool:
     return name.parts[0] in ("images", ".cache", ".git")
 
 
-def _with_microphones(features: dict[str, dict], sound: _Sound, fps: int) -> dict[str, dict[str, Any]]:
+def _with_microphones(features: dict[str, dict], sound: EpisodesSound, fps: int) -> dict[str, dict[str, Any]]:
     own = {key: feature for key, feature in features.items() if key not in DEFAULT_FEATURES}
     return {
         **own,
@@ -326,7 +263,7 @@ def _with_microphones(features: dict[str, dict], sound: _Sound, fps: int) -> dic
     }
 
 
-def _write_data(source: Path, target: Path, schema: pa.Schema, sound: _Sound) -> None:
+def _write_data(source: Path, target: Path, schema: pa.Schema, sound: EpisodesSound) -> None:
     with open_checked(source) as file:
         metadata = file.schema_arrow.metadata or {}
         if b"huggingface" in metadata:
@@ -344,7 +281,7 @@ def _tables(file: Any, source: Path, rows: int) -> Iterator[pa.Table]:
             yield table.slice(start, rows)
 
 
-def _with_columns(table: pa.Table, schema: pa.Schema, sound: _Sound, metadata: dict[bytes, bytes]) -> pa.Table:
+def _with_columns(table: pa.Table, schema: pa.Schema, sound: EpisodesSound, metadata: dict[bytes, bytes]) -> pa.Table:
     episodes = column_to_numpy(table.column("episode_index"))
     frames = column_to_numpy(table.column("frame_index"))
     edges = np.flatnonzero((np.diff(episodes) != 0) | (np.diff(frames) != 1)) + 1
