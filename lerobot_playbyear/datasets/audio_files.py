@@ -15,6 +15,7 @@ from lerobot_playbyear.datasets.audio_feature import samples_per_frame, to_pcm_s
 _GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
 _FLAC_BLOCK = 4096  # samples
 _FILTER_WIDTH, _ROLLOFF = 64, 0.9475937167399596  # of the resampler
+_MOST_PHASES = 4096  # of its filter, which takes the square of them in memory
 
 
 class AudioFileError(ValueError):
@@ -135,6 +136,10 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
     is_pcm = waveform.dtype == np.int16
     floats = torch.from_numpy(waveform.astype(np.float32) / (32768 if is_pcm else 1))
     channels_first = floats.reshape(len(floats), -1).T  # (channels, n)
+    if max(sample_rate, new_sample_rate) > _MOST_PHASES * math.gcd(sample_rate, new_sample_rate):
+        result = _resample_odd_rates(channels_first.numpy(), sample_rate, new_sample_rate).T
+        result = result.reshape(-1, *waveform.shape[1:])
+        return to_pcm_s16(result) if is_pcm else result.astype(waveform.dtype)
     converted = torchaudio.functional.resample(
         channels_first,
         sample_rate,
@@ -146,6 +151,24 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
     )
     result = converted.T.reshape(-1, *waveform.shape[1:]).numpy()
     return to_pcm_s16(result) if is_pcm else result.astype(waveform.dtype)
+
+
+def _resample_odd_rates(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np.ndarray:
+    """(channels, n) float32 by FFmpeg's resampler, for rates with hardly a common divisor: it interpolates its filter."""
+    n_samples = -(-waveform.shape[1] * new_sample_rate // sample_rate)
+    resampled = np.zeros((len(waveform), n_samples), np.float32)
+    for channel, values in enumerate(waveform):
+        resampler = av.AudioResampler(format="flt", layout="mono", rate=new_sample_rate)
+        parts = []
+        for first in range(0, len(values), sample_rate):
+            piece = np.ascontiguousarray(values[None, first : first + sample_rate])
+            frame = av.AudioFrame.from_ndarray(piece, format="flt", layout="mono")
+            frame.sample_rate, frame.pts = sample_rate, first
+            parts += [part.to_ndarray().reshape(-1) for part in resampler.resample(frame)]
+        parts += [part.to_ndarray().reshape(-1) for part in resampler.resample(None)]
+        values = np.concatenate(parts)[:n_samples]
+        resampled[channel, : len(values)] = values
+    return resampled
 
 
 class Resampled:

@@ -161,7 +161,9 @@ def _as_before(parts: Iterator[pa.Table], path: Path | None) -> Iterator[pa.Tabl
         with parsing(path):
             yield from parts
     except ParquetDamageError as error:
-        raise OSError(errno.EIO, f"what could be read before cannot be read now ({error})", path and str(path)) from error
+        raise OSError(
+            errno.EIO, f"what could be read before cannot be read now ({error})", path and str(path)
+        ) from error
 
 
 def _is_large(file: pq.ParquetFile, index: int, columns: list[str] | None) -> bool:
