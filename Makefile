@@ -32,8 +32,8 @@ test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, def
 	./tools/screen.sh
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile
 
-test-slow: install  ## The tests that take minutes
-	$(BIN)/pytest -m slow
+test-slow: install  ## The tests that take minutes, side by side like the others
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -m slow -n $(TEST_JOBS) --dist loadfile
 
 bench: install  ## Measures speed and memory, beside alternatives, in about 10 minutes
 	$(BIN)/python benchmarks/run.py
