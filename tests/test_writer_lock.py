@@ -15,12 +15,12 @@ from lerobot_playbyear.datasets.journal import LOCK, SCRATCH
 from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
 
 
-def hold(root: str, seconds: float, answers) -> None:
-    """Takes the lock again and again, and notes when another one has it as well."""
-    end = time.monotonic() + seconds
+def hold(root: str, n_times: int, answers) -> None:
+    """Takes the lock so many times, and notes when another one has it as well."""
+    end = time.monotonic() + 60.0
     taken = doubled = 0
     marker = Path(root) / "held"
-    while time.monotonic() < end:
+    while taken < n_times and time.monotonic() < end:
         try:
             lock = DatasetLock(Path(root))
         except DatasetLockedError:
@@ -37,6 +37,7 @@ def hold(root: str, seconds: float, answers) -> None:
             time.sleep(0.0005)
             marker.unlink()
         lock.release()
+        time.sleep(0.001)  # let another one have it
     answers.put((taken, doubled))
 
 
@@ -107,14 +108,14 @@ def test_a_writer_that_closes_does_not_let_two_others_in(tmp_path):
 
 def test_two_processes_never_hold_it_at_once(tmp_path, processes):
     answers = processes.Queue()
-    workers = [processes.Process(target=hold, args=(str(tmp_path), 3.0, answers)) for _ in range(4)]
+    workers = [processes.Process(target=hold, args=(str(tmp_path), 10, answers)) for _ in range(4)]
     for worker in workers:
         worker.start()
-    found = [answers.get(timeout=30) for _ in workers]
+    found = [answers.get(timeout=90) for _ in workers]
     for worker in workers:
         worker.join()
     assert not [answer for answer in found if isinstance(answer, BaseException)]
-    assert sum(taken for taken, _ in found) > 20
+    assert [taken for taken, _ in found] == 4 * [10]
     assert sum(doubled for _, doubled in found) == 0
 
 
