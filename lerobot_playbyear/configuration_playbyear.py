@@ -123,8 +123,8 @@ class PlaybyearConfig(PreTrainedConfig):
         for name in ("fps", "n_frame_stack", "n_memory_steps", "n_supervised_steps", "vision_width", "image_size"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
-        if not self.action_range > 0:
-            raise ValueError(f"--policy.action_range must be above 0, got {self.action_range}.")
+        if not 0 < self.action_range < math.inf:
+            raise ValueError(f"--policy.action_range must be above 0 and finite, got {self.action_range}.")
         if self.audio_window_s < self.segment_s or self.hop_s <= 0:
             raise ValueError(
                 f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.processor import PolicyProcessorPipeline, TransitionKey, create_transition
 from torch import Tensor
 
@@ -13,7 +13,7 @@ from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 
 _TOLERANCE = 0.01  # of the range: what is learned a hundredth too small is not worth a word
 _SLACK = 1.1  # tanh gets to its ends only slowly
-_LARGEST = 10.0  # a range that would need more than this has not been demonstrated at all
+_LARGEST = 10.0  # what is normalised and would need more than this has not been demonstrated at all
 
 
 class Reach:
@@ -55,8 +55,10 @@ class Reach:
         names = self._names or [f"action[{i}]" for i in range(actions.shape[1])]
         shares = {name: float(share) for name, share in zip(names, is_out.float().mean(dim=0), strict=True) if share}
         farthest = dict(zip(names, needed.amax(dim=0).tolist(), strict=True))
-        unmoved = [f"'{name}'" for name in shares if farthest[name] > _LARGEST]
-        reachable = [farthest[name] for name in shares if farthest[name] <= _LARGEST]
+        is_normalized = self._policy.normalization_mapping.get("ACTION") != NormalizationMode.IDENTITY
+        largest = _LARGEST if is_normalized else math.inf
+        unmoved = [f"'{name}'" for name in shares if farthest[name] > largest]
+        reachable = [farthest[name] for name in shares if farthest[name] <= largest]
         listed = ", ".join(f"'{name}' in {100 * share:.1f} %" for name, share in shares.items())
         text = (
             f"Some actions of {what} are out of the policy's reach: {listed} of {len(actions)} frames lie beyond the end of "

@@ -43,7 +43,7 @@ class PlannedLR(LambdaLR):
         own = {"n_warmup_steps": self.n_warmup_steps, "n_decay_steps": self.n_decay_steps}
         super().load_state_dict({**state_dict, **own})
         before, after = state_dict["_last_lr"][0], self.base_lrs[0] * self.lr_lambdas[0](self.last_epoch)
-        if after < _NOTICEABLE * before:
+        if after <= _NOTICEABLE * before:
             return
         n_warmup, n_decay = state_dict["n_warmup_steps"], state_dict["n_decay_steps"]
         logging.warning(

@@ -3,6 +3,7 @@
 import itertools
 import json
 import shlex
+import threading
 from pathlib import Path
 
 import av
@@ -13,10 +14,11 @@ from hub_client import HubClient, Result
 from hub_faults import down_after, every_second, everything_fails, nothing_fails, one_in
 from hub_repositories import File, Repository, git_oid
 from hub_server import TOKEN, HubServer
-from huggingface_hub import HfApi, get_session, set_client_factory
+from huggingface_hub import HfApi, ModelCard, get_session, set_client_factory
 from huggingface_hub.utils import _http
 
 from lerobot_playbyear.hub.client import patient_hub
+from lerobot_playbyear.hub.policy_card import with_evaluation
 
 DATASET = "tester/grasp"
 POLICY = "tester/hearing"
@@ -383,3 +385,46 @@ def test_the_patient_client_goes_when_the_work_is_done_or_failed(hub):
         assert _http._GLOBAL_CLIENT_FACTORY is factory
     finally:
         set_client_factory(before)
+
+
+def test_a_thread_that_is_done_leaves_the_others_their_patience(hub):
+    """The first one in and the last one out may be different ones."""
+    api, fails = HfApi(endpoint=hub.url, token=TOKEN), itertools.count()
+    hub.fault = lambda method, path: "unavailable" if next(fails) == 0 else None
+    before, is_in, may_go = _http._GLOBAL_CLIENT_FACTORY, threading.Event(), threading.Event()
+
+    def work():
+        with patient_hub():
+            is_in.set()
+            may_go.wait()
+
+    first = threading.Thread(target=work)
+    first.start()
+    is_in.wait()
+    with patient_hub():
+        session = get_session()
+        may_go.set()
+        first.join()
+        assert get_session() is session
+        assert api.whoami()["name"] == "tester"
+    assert _http._GLOBAL_CLIENT_FACTORY is before
+
+
+# What is known of a policy's success
+
+
+@pytest.mark.parametrize("folder", ["/policy", "/data/policy"])
+def test_a_policy_near_the_root_of_a_disk_gets_its_card(folder):
+    assert with_evaluation(ModelCard("---\nlicense: mit\n---\nA policy."), Path(folder)).text.strip() == "A policy."
+
+
+def test_a_line_of_figures_that_was_cut_off_costs_no_upload(tmp_path):
+    folder = tmp_path / "checkpoints/000010/pretrained_model"
+    state = folder.parent / "training_state/training_step.json"
+    for each in (folder, state.parent):
+        each.mkdir(parents=True)
+    state.write_text('{"step": 10}')
+    lines = ['{"kind": "tr', '{"kind": "eval", "step": 10, "pc_success": 90.0}', '{"kind": "eval", "st']
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
+    card = ModelCard("---\nlicense: mit\n---\n_No evaluation results have been provided for this policy yet._")
+    assert "**90 %**, at step 10" in with_evaluation(card, folder).text

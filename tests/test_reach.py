@@ -144,9 +144,10 @@ def test_a_range_of_one_is_the_papers_tanh():
     assert torch.equal(head(encodings)[:, 0], torch.tanh(head.head(head.lstm(encodings)[0][:, -1])))
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0])
-def test_a_range_must_be_positive(value):
-    with pytest.raises(ValueError, match=rf"--policy.action_range must be above 0, got {value}"):
+@pytest.mark.parametrize("value", [0.0, -1.0, float("inf"), float("nan")])
+def test_a_range_must_be_positive_and_have_an_end(value):
+    """Of an endless one every action would be NaN."""
+    with pytest.raises(ValueError, match=rf"--policy.action_range must be above 0 and finite, got {value}"):
         small_config(action_range=value)
 
 
@@ -174,6 +175,15 @@ def test_what_never_moved_in_the_demonstrations_is_told_apart():
     assert "'action[0]' in 50.0 %, 'action[1]' in 50.0 % of 2 frames" in text
     assert "--policy.action_range=1.7" in text
     assert "'action[1]' hardly moves in the demonstrations" in text
+
+
+def test_actions_that_are_not_normalised_are_not_said_to_stand_still():
+    config = small_config(normalization_mapping={"STATE": "MEAN_STD", "ACTION": "IDENTITY"})
+    reach = Reach(config, processors(config)[0], ["pan", "gripper"])
+    text = reach.warning(torch.tensor([[-50.0, 0.5], [80.0, 0.0]]), "the dataset")  # degrees
+    assert "'pan' in 100.0 % of 2 frames" in text
+    assert "--policy.action_range=88" in text
+    assert "hardly moves" not in text
 
 
 def test_other_policies_reach_everything():

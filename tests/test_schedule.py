@@ -158,6 +158,22 @@ def test_a_run_that_goes_on_as_planned_says_nothing(trained, command, tmp_path, 
     assert not jumps(capfd)
 
 
+def test_a_rate_that_has_fallen_to_nothing_and_stays_there_is_no_jump(caplog):
+    schedule = PlaybyearConfig(scheduler_final_share=0.0).get_scheduler_preset()
+
+    def planned(n_steps):
+        return schedule.build(torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1e-3), n_steps)
+
+    ended = planned(4)
+    for _ in range(4):
+        ended.optimizer.step()
+        ended.step()
+    planned(4).load_state_dict(ended.state_dict())
+    assert "rises" not in caplog.text
+    planned(8).load_state_dict(ended.state_dict())
+    assert "rises from 0 to 0.0005" in caplog.text
+
+
 def test_a_constant_rate_needs_no_plan():
     assert PlaybyearConfig(scheduler_warmup_share=0, scheduler_final_share=1).get_scheduler_preset() is None
     assert PlaybyearConfig().get_scheduler_preset() is not None

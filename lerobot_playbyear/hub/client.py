@@ -5,6 +5,7 @@ that one lost request ends a download of hundreds. What starts, creates or chang
 answer may have been lost after it was done. `pushing` knows which of these can be done again, and how.
 """
 
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,6 +20,7 @@ _PASSING = (500, 502, 503, 504)
 _ASKING = ("GET", "HEAD", "OPTIONS")
 _CARD_CHECK = "/api/validate-yaml"  # a POST that changes nothing
 _PUBLIC_HUB = "huggingface.co"
+_CHANGING = threading.Lock()  # of the library's one client, which threads share
 
 
 class PatientClient(httpx.Client):
@@ -65,27 +67,34 @@ class _PatientFactory:
 
     Args:
         usual: Makes the clients that they use.
+
+    Attributes:
+        n_users: How many are at work with it, of this thread and others.
     """
 
     def __init__(self, usual: _http.CLIENT_FACTORY_T) -> None:
-        self._usual = usual
+        self.usual, self.n_users = usual, 0
 
     def __call__(self) -> httpx.Client:
-        return PatientClient(self._usual())
+        return PatientClient(self.usual())
 
 
 @contextmanager
 def patient_hub() -> Iterator[None]:
     """Lets what talks to the Hub in this process do so with patience, until the work is done or has failed."""
-    before = _http._GLOBAL_CLIENT_FACTORY  # the library has a function to set it, and none to ask for it
-    if isinstance(before, _PatientFactory):
-        yield
-        return
-    set_client_factory(_PatientFactory(before))
+    with _CHANGING:
+        factory = _http._GLOBAL_CLIENT_FACTORY  # the library has a function to set it, and none to ask for it
+        if not isinstance(factory, _PatientFactory):
+            factory = _PatientFactory(factory)
+            set_client_factory(factory)
+        factory.n_users += 1
     try:
         yield
     finally:
-        set_client_factory(before)
+        with _CHANGING:
+            factory.n_users -= 1
+            if factory.n_users == 0:
+                set_client_factory(factory.usual)
 
 
 def _only_asks(request: httpx.Request) -> bool:

@@ -121,13 +121,22 @@ def _section(config: PlaybyearConfig) -> str:
 def _evaluation(checkpoint: Path) -> dict[str, float] | None:
     """The figures of the last evaluation, if it was of this checkpoint."""
     folder = checkpoint.resolve()
-    state, metrics = folder.parent / "training_state" / "training_step.json", folder.parents[2] / METRICS_NAME
+    state, metrics = folder.parent / "training_state" / "training_step.json", folder.parent.parent.parent / METRICS_NAME
     if not (state.is_file() and metrics.is_file()):
         return None
     step = json.loads(state.read_text())["step"]
-    lines = [json.loads(line) for line in metrics.read_text().splitlines() if line.strip()]
+    lines = [_figures(line) for line in metrics.read_text().splitlines()]
     found = [line for line in lines if line.get("kind") == "eval" and line.get("step") == step and "pc_success" in line]
     return found[-1] if found else None
+
+
+def _figures(line: str) -> dict[str, Any]:
+    """What a line says; nothing if a run that was killed, or a full disk, cut it off."""
+    try:
+        figures = json.loads(line)
+    except ValueError:
+        return {}
+    return figures if isinstance(figures, dict) else {}
 
 
 @dataclass(frozen=True)
