@@ -1,5 +1,7 @@
 """The network's blocks: vision encoder, audio encoder, fusion, memory and head (paper, appendix "Architecture Details")."""
 
+from contextlib import AbstractContextManager, nullcontext
+
 import torch
 from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, ResNet
@@ -10,6 +12,7 @@ from lerobot_playbyear.folding import FoldedCopy
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
+_SINGLE_PIXELS = 16  # stacks up to this size are single pixels before the last stage
 
 
 class VisionEncoder(nn.Module):
@@ -37,7 +40,10 @@ class VisionEncoder(nn.Module):
         # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
         stacks = stacks.contiguous(memory_format=torch.channels_last)
         acts = not self.training and not torch.is_grad_enabled() and self.mean.dtype == torch.float32
-        return self._folded.look(self.network, stacks) if acts else self.network(stacks)
+        if acts:
+            return self._folded.look(self.network, stacks)
+        with _precise_if_single_pixels(stacks):
+            return self.network(stacks)
 
     def train(self, mode: bool = True) -> "VisionEncoder":
         """Also forgets what was prepared for acting."""
@@ -50,6 +56,14 @@ class VisionEncoder(nn.Module):
         self._folded.drop()
         if not self.training and self.mean.dtype == torch.float32:
             self._folded.of(self.network)
+
+
+def _precise_if_single_pixels(stacks: Tensor) -> AbstractContextManager:
+    """Without autocast on a CPU: of a single pixel, oneDNN's bfloat16 gradient of a convolution with stride 2 is random, and is
+    written beyond its memory (torch 2.11)."""
+    if stacks.device.type == "cpu" and max(stacks.shape[-2:]) <= _SINGLE_PIXELS:
+        return torch.autocast("cpu", enabled=False)
+    return nullcontext()
 
 
 class _SlimResNet(ResNet):

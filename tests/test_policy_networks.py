@@ -55,6 +55,19 @@ def test_a_quarter_of_the_width_is_a_sixteenth_of_the_weights():
     assert count(encoder) < 11_195_328 / 15
 
 
+@pytest.mark.parametrize(("size", "in_bfloat16"), [(8, False), (16, False), (17, True), (48, True)])
+def test_single_pixels_are_learned_from_in_full_precision(size, in_bfloat16):
+    """On a CPU with bfloat16 the gradient of the last stage would be random, and be written beyond its memory."""
+    encoder = VisionEncoder(3, 4)
+    stacks = torch.rand(2, 9, size, size)
+    reference = encoder(stacks)
+    with torch.autocast("cpu", torch.bfloat16):
+        embeddings = encoder(stacks)
+    assert (embeddings.dtype is torch.bfloat16) == in_bfloat16
+    if not in_bfloat16:
+        torch.testing.assert_close(embeddings, reference)
+
+
 def test_the_audio_encoder_is_four_convolutions_of_kernel_seven_over_time(policy):
     encoder = policy.model.hearing["audio_gripper"]
     shapes = []
