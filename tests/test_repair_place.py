@@ -175,3 +175,25 @@ def test_a_dataset_that_was_moved_in_parts_says_so(root, tmp_path):
     report = repair_dataset(root)
     assert f"data was a link to {tmp_path / 'data'}; it is now a folder" in str(report)
     assert is_whole(root)
+
+
+@pytest.mark.parametrize("part", ["data", "data/chunk-000", "meta/episodes", "meta/episodes/chunk-000"])
+@pytest.mark.parametrize("damaged", ["data/chunk-000/file-000.parquet", "meta/tasks.parquet"])
+def test_nothing_is_written_behind_a_link_to_a_folder(recorded, tmp_path, part, damaged):
+    root = Path(shutil.copytree(recorded, tmp_path / "place" / "dataset"))
+    disk = tmp_path / "disk"
+    shutil.move(root / part, disk)
+    (root / part).symlink_to(disk)
+    (disk / "of somebody else").write_text("no part of the dataset")
+    if damaged.startswith("data"):
+        os.truncate(root / damaged, (root / damaged).stat().st_size - 30)
+    else:
+        (root / damaged).unlink()
+    before = {path: path.read_bytes() for path in disk.rglob("*") if path.is_file()}
+
+    report = repair_dataset(root)
+
+    assert {path: path.read_bytes() for path in disk.rglob("*") if path.is_file()} == before
+    assert f"{part} was a link to {disk}; it is now a folder" in str(report)
+    assert is_whole(root)
+    assert not (root / part / "of somebody else").exists()

@@ -263,13 +263,14 @@ def _take_over_rest(root: Path, target: Path, info: DatasetInfo) -> list[str]:
     Returns:
         What stays behind.
     """
-    notes = []
+    notes: list[str] = []
     for path in sorted(root.iterdir()):
         new = target / path.name
         if path.name in ("data", "meta", SCRATCH.name) and path.is_dir():
             if path.is_symlink():
-                notes.append(f"{path.name} was a link to {path.readlink()}; it is now a folder")
-            leave = _pictures_in_progress(path, info, notes) if path.name == SCRATCH.name else _ours_in(path)
+                notes.append(_unlinked(path, path.name))
+                continue
+            leave = _pictures_in_progress(path, info, notes) if path.name == SCRATCH.name else _ours_in(path, notes)
             shutil.copytree(path, new, symlinks=True, dirs_exist_ok=True, ignore=leave)
         elif path.is_symlink():
             new.symlink_to(path.readlink())
@@ -282,19 +283,36 @@ def _take_over_rest(root: Path, target: Path, info: DatasetInfo) -> list[str]:
     return notes
 
 
-def _ours_in(folder: Path) -> Callable[[str, list[str]], set[str]]:
-    """What is written in another way: the frames in `data`, and the tables in `meta`."""
+def _ours_in(folder: Path, notes: list[str]) -> Callable[[str, list[str]], set[str]]:
+    """What is written in another way: the frames in `data`, and the tables in `meta`.
+
+    So are folders for these that are links: through a copy of the link, the files behind it would be written over.
+    """
 
     def leave(where: str, names: list[str]) -> set[str]:
         place = Path(folder.name) / Path(where).relative_to(folder)
-        paths = [place / name for name in names]
-        return {
-            path.name
-            for path in paths
-            if path.as_posix() in _REMADE or path.match("data/*/*.parquet") or path.match(f"{EPISODES_DIR}/*/*.parquet")
-        }
+        left = set()
+        for path in (place / name for name in names):
+            is_linked_folder = (folder.parent / path).is_symlink() and (folder.parent / path).is_dir()
+            if is_linked_folder and any(path.match(name) for name in ("data/*", EPISODES_DIR, f"{EPISODES_DIR}/*")):
+                notes.append(_unlinked(folder.parent / path, path.as_posix()))
+                left.add(path.name)
+            elif (
+                path.as_posix() in _REMADE
+                or path.match("data/*/*.parquet")
+                or path.match(f"{EPISODES_DIR}/*/*.parquet")
+            ):
+                left.add(path.name)
+        return left
 
     return leave
+
+
+def _unlinked(folder: Path, name: str) -> str:
+    """Says that a folder takes a link's place. It may have led anywhere: what is not the dataset's stays there."""
+    return (
+        f"{name} was a link to {folder.readlink()}; it is now a folder, with the frames or tables of the dataset alone"
+    )
 
 
 def _pictures_in_progress(folder: Path, info: DatasetInfo, notes: list[str]) -> Callable[[str, list[str]], set[str]]:
