@@ -4,7 +4,7 @@ import itertools
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import pyarrow as pa
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import write_info
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import INFO_PATH, DatasetInfo
+from lerobot.datasets.utils import EPISODES_DIR, INFO_PATH, DatasetInfo
 from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 from tqdm import tqdm
 
@@ -22,12 +22,14 @@ from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled, audio_pieces
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.confines import check_links
+from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.datasets.opening import LongDataset, open_dataset, scratch_folder
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
     open_checked,
     read_row_groups,
+    read_table,
     write_tables,
 )
 from lerobot_playbyear.datasets.settling import write_rows
@@ -131,7 +133,11 @@ def _open(place: DatasetPlace) -> LeRobotDataset | LongDataset:
     try:
         dataset = open_dataset(place.repo_id, place.root, video_backend="pyav")
         check_links(Path(dataset.root))  # the copy would hold what they lead to
+        for path in list_files(Path(dataset.root), f"{EPISODES_DIR}/*/*.parquet"):
+            _read_table(path, ["length"])  # LeRobot looks at no checksum
         return dataset
+    except ParquetDamageError as error:
+        raise AttachError(f"{error} Repair it first: playbyear-repair --root={dataset.root}") from error
     except Exception as error:  # also what the Hub's client raises
         raise AttachError(f"The dataset '{place.repo_id}' cannot be opened: {error}") from error
 
@@ -269,7 +275,13 @@ def _write_data(source: Path, target: Path, schema: pa.Schema, sound: EpisodesSo
         if b"huggingface" in metadata:
             metadata = {**metadata, **(schema.metadata or {})}
         first = file.schema_arrow.empty_table()
-        add: Callable[[pa.Table], pa.Table] = lambda table: _with_columns(table, schema, sound, metadata)  # noqa: E731
+
+        def add(table: pa.Table) -> pa.Table:
+            try:
+                return _with_columns(table, schema, sound, metadata)
+            except ValueError as error:
+                raise ParquetDamageError(f"{source} is damaged: {error}.") from error
+
         write_tables(target, map(add, _tables(file, source, sound.rows_at_once)), add(first).schema)
 
 
@@ -285,7 +297,9 @@ def _with_columns(table: pa.Table, schema: pa.Schema, sound: EpisodesSound, meta
     episodes = column_to_numpy(table.column("episode_index"))
     frames = column_to_numpy(table.column("frame_index"))
     edges = np.flatnonzero((np.diff(episodes) != 0) | (np.diff(frames) != 1)) + 1
-    spans = itertools.pairwise([0, *edges.tolist(), len(table)]) if len(table) else ()
+    spans = list(itertools.pairwise([0, *edges.tolist(), len(table)])) if len(table) else []
+    for first, stop in spans:
+        sound.check(int(episodes[first]), int(frames[first]), int(frames[stop - 1]))
     parts = [sound.blocks(int(episodes[a]), int(frames[a]), int(frames[a]) + b - a) for a, b in spans]
     blocks = np.concatenate(parts) if parts else np.zeros((0, sound.samples_per_frame, len(sound.keys)), np.int16)
     for i, key in enumerate(sound.keys):
@@ -296,9 +310,15 @@ def _with_columns(table: pa.Table, schema: pa.Schema, sound: EpisodesSound, meta
     return table.replace_schema_metadata(metadata)
 
 
+def _read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
+    try:
+        return read_table(path, columns)
+    except ParquetDamageError as error:
+        raise ParquetDamageError(f"{path} is damaged: {error}.") from error
+
+
 def _write_rows(source: Path, target: Path, stats: list[Stats]) -> None:
-    with open_checked(source) as file:
-        table = file.read()
+    table = _read_table(source)
     episodes = table.column("episode_index").to_pylist()
     for key in stats[0]:
         for name in stats[0][key]:

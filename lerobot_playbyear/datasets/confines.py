@@ -100,6 +100,11 @@ def check_info(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) 
         )
 
 
+def is_template(text: str) -> bool:
+    """Whether a text is a template of a file's name that can be filled in, with nothing but what LeRobot fills in."""
+    return _TEMPLATE.fullmatch(text) is not None
+
+
 def file_inside(root: Path, name: str | PurePath) -> Path:
     """A file that a dataset names.
 
@@ -112,20 +117,22 @@ def file_inside(root: Path, name: str | PurePath) -> Path:
     return root / name
 
 
-def open_picture(row: Mapping[str, Any], root: Path, key: str, feature: Mapping[str, Any]) -> Image.Image:
+def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: Mapping[str, Any]) -> Image.Image:
     """Opens one picture of an image column; it is not decoded yet.
 
     Args:
-        row: `bytes`, an image file, or None; and then `path`, its name in the dataset's folder.
+        row: `bytes`, an image file, or None; and then `path`, its name in the dataset's folder. None where it is missing.
         root: The dataset's folder.
         key: The camera, for the message.
         feature: Its feature.
 
     Raises:
         OutsideError: `path` leads out of the folder.
-        ValueError: The picture has another size than the feature says.
+        ValueError: The picture is missing, or has another size than the feature says.
         OSError: It is no picture.
     """
+    if row is None:
+        raise ValueError(f"'{key}': a picture is missing. Repair the dataset: playbyear-repair --root={root}")
     data, name = row["bytes"], row["path"]
     if data is None:
         if name is None or not (root / name).resolve().is_relative_to(root.resolve()):
@@ -159,7 +166,7 @@ def _check_templates(root: Path, info: Mapping[str, Any], features: Mapping[str,
         template = info.get(name)
         if not isinstance(template, str):
             continue
-        if not _TEMPLATE.fullmatch(template):
+        if not is_template(template):
             raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
         for key in keys or [""]:
             file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))

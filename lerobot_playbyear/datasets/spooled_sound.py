@@ -55,6 +55,18 @@ class EpisodesSound:
         """How many frames' sound is in memory together."""
         return max(PIECE_BYTES // (2 * self.samples_per_frame * len(self.keys)), 1)
 
+    def check(self, episode: int, first: int, last: int) -> None:
+        """Whether there are such frames.
+
+        Raises:
+            ValueError: There are not.
+        """
+        n_frames = len(self.episodes[episode]) // self.samples_per_frame if 0 <= episode < len(self.episodes) else 0
+        if not 0 <= first <= last < n_frames:
+            raise ValueError(
+                f"it holds frames {first} to {last} of episode {episode}, for which meta/episodes counts {n_frames}"
+            )
+
     def blocks(self, episode: int, start: int, stop: int) -> np.ndarray:
         """Of some of an episode's frames, (n, S, columns) int16."""
         size = self.samples_per_frame

@@ -110,7 +110,8 @@ def _camera(source: DatasetSource, key: str) -> str:
 def _microphone(source: DatasetSource, key: str) -> str:
     feature = source.features[key]
     rate = (feature.get("info") or {}).get("sample_rate")
-    known = f"{int(rate):,} Hz, " if rate else "sample rate unknown, "
+    is_known = isinstance(rate, int | float)
+    known = f"{rate:,} Hz, " if is_known else f"sample rate {text(str(rate)) if rate else 'unknown'}, "
     return f"{code(key)}: {known}{feature['shape'][0]:,} samples a frame, {text(feature['dtype'])}"
 
 

@@ -1,11 +1,13 @@
 """The episodes of a dataset: what the tables in `meta/` say of them, held against the frames that are there."""
 
 import contextlib
+import math
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lerobot.datasets.utils import EPISODES_DIR, DatasetInfo
 
 from lerobot_playbyear.datasets.files import list_files
@@ -16,6 +18,7 @@ Row = dict[str, Any]
 """An episode's row in `meta/episodes`."""
 
 _PARTIAL = "is partial"
+_PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")  # of an episode in a video
 
 
 def read_rows(root: Path, findings: list[str]) -> dict[int, Row]:
@@ -104,7 +107,7 @@ def trusted_rows(rows: dict[int, Row], runs: dict[int, Run], info: DatasetInfo, 
     missing = []
     for episode, run in runs.items():
         if episode not in rows or _PARTIAL in rows[episode]:
-            places = {key: value for key, value in rows.get(episode, {}).items() if key.startswith("videos/")}
+            places = _video_places(rows.get(episode, {}), info)
             if places:
                 trusted[episode] = places
             missing.append(episode)
@@ -146,15 +149,32 @@ def _contradiction(row: Row, run: Run, info: DatasetInfo) -> str | None:
     if not isinstance(row.get("tasks"), list):
         return "its tasks are missing"
     statistics: dict[str, set[str]] = defaultdict(set)
-    for column in row:
+    for column, value in row.items():
         if column.startswith("stats/"):
             statistics[column.rpartition("/")[0]].add(column.rpartition("/")[2])
+            if value is not None and not _are_numbers(value):
+                return f"its statistics '{column.removeprefix('stats/')}' are no numbers"
     if len({frozenset(names) for names in statistics.values()}) > 1:
         return "parts of its statistics are missing"
+    places = _video_places(row, info)
     for key, feature in info.features.items():
-        if feature["dtype"] == "video" and not all(
-            isinstance(row.get(f"videos/{key}/{name}"), int | float)
-            for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
-        ):
+        if feature["dtype"] == "video" and f"videos/{key}/file_index" not in places:
             return f"it does not say where the video of '{key}' is"
     return None
+
+
+def _video_places(row: Row, info: DatasetInfo) -> Row:
+    """Where the row says that the episode's videos are: of each camera everything, or nothing."""
+    places: Row = {}
+    for key in (key for key, feature in info.features.items() if feature["dtype"] == "video"):
+        own = {f"videos/{key}/{name}": row.get(f"videos/{key}/{name}") for name in _PLACE}
+        if all(isinstance(value, int | float) and 0 <= value < math.inf for value in own.values()):
+            places.update({name: int(value) if name.endswith("_index") else value for name, value in own.items()})
+    return places
+
+
+def _are_numbers(value: Any) -> bool:
+    try:
+        return np.array(value).dtype.kind in "fiub"
+    except ValueError:  # lists of different lengths
+        return False

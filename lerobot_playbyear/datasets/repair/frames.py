@@ -88,7 +88,7 @@ class DataFile:
         n_rows = 0
         with _open(self.source) as file:
             for table in read_row_groups(file, path=self.path):
-                if isinstance(table, pa.Table):
+                if not isinstance(table, ParquetDamageError) and not isinstance(_indices(table), ParquetDamageError):
                     n_rows += len(table)
                     yield table
         raise OSError(errno.EIO, f"{self.n_rows} of its rows could be read before, and now {n_rows}", str(self.name))
@@ -193,16 +193,12 @@ def _read_file(
     n_rows = 0
     with _open(file.source) as opened:
         for number, table in enumerate(read_row_groups(opened, columns, file.path)):
-            if isinstance(table, ParquetDamageError):
-                findings.append(f"{file.name}: row group {number} is damaged: {table}")
+            found = table if isinstance(table, ParquetDamageError) else _indices(table)
+            if isinstance(table, ParquetDamageError) or isinstance(found, ParquetDamageError):
+                findings.append(f"{file.name}: row group {number} is damaged: {found}")
                 file.is_whole = False
                 continue
-            try:
-                parts.append({name: column_to_numpy(table.column(name)) for name in INDEX_COLUMNS})
-            except ValueError as error:
-                findings.append(f"{file.name}: row group {number} is damaged: {error}")
-                file.is_whole = False
-                continue
+            parts.append(found)
             for key in pictures:
                 spoilt.update({n_rows + row: what for row, what in _spoilt_pictures(table.column(key), key)})
             n_rows += len(table)
@@ -229,6 +225,14 @@ def _read_file(
         for start, stop in itertools.pairwise(starts)
     ]
     return runs, np.diff(index["timestamp"])[~breaks]
+
+
+def _indices(table: pa.Table) -> dict[str, np.ndarray] | ParquetDamageError:
+    """The index columns; where a number is missing, which rows these are is not known, and nothing of them is used."""
+    try:
+        return {name: column_to_numpy(table.column(name)) for name in INDEX_COLUMNS}
+    except ValueError as error:
+        return ParquetDamageError(str(error))
 
 
 def _jump(index: np.ndarray) -> str | None:

@@ -20,6 +20,7 @@ from lerobot.datasets.utils import (
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
+from lerobot_playbyear.datasets.confines import is_template
 from lerobot_playbyear.datasets.files import is_listed, list_files, naming
 
 _KEPT: dict[str, type] = {"robot_type": str, "splits": dict, "tools": list}  # where the rest is made anew
@@ -186,7 +187,7 @@ def _new_info(
 
 
 def _leads_somewhere(root: Path, template: str | None) -> bool:
-    if not isinstance(template, str):
+    if not isinstance(template, str) or not is_template(template):
         return False
     try:
         return bool(list_files(root, re.sub(r"\{[^{}]*\}", "*", template)))

@@ -31,7 +31,8 @@ def write_own_info(root: Path, target: Path, info: DatasetInfo, kept: Sequence[i
         kept: The numbers that the kept episodes had, in order.
         notes: Gets what is other than it was.
     """
-    info.splits = _moved_splits(info.splits, info.total_episodes, kept, notes)
+    splits = info.splits if isinstance(info.splits, dict) else {}
+    info.splits = _moved_splits(splits, info.total_episodes, kept, notes)
     info.total_episodes = len(kept)
     write_json({**own_info(root), **info.to_dict()}, target / INFO_PATH)
 

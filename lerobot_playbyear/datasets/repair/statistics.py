@@ -1,6 +1,5 @@
 """Statistics of an episode that is on disk already, for a row that is made anew; LeRobot makes them while recording."""
 
-import io
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -11,11 +10,12 @@ import numpy as np
 import pyarrow as pa
 from lerobot.datasets.compute_stats import auto_downsample_height_width, sample_indices
 from lerobot.datasets.utils import DatasetInfo
-from PIL import Image
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.confines import file_inside, open_picture
 from lerobot_playbyear.datasets.repair.episodes import Row
+from lerobot_playbyear.datasets.repair.videos import video_file
 from lerobot_playbyear.datasets.statistics import Stats, channel_stats, numeric_stats, repeated_stats
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 
@@ -32,11 +32,14 @@ def episode_stats(root: Path, info: DatasetInfo, row: Row, frames: Frames, lengt
     """The statistics of one episode, as LeRobot has them: of pictures, from as many as it samples.
 
     Args:
-        root: The dataset's folder, for its videos.
+        root: The dataset's folder, for its videos, and pictures in files.
         info: What the dataset says about itself.
         row: Where the episode's videos are.
         frames: Its frames.
         length: How many.
+
+    Raises:
+        ValueError: A picture or a video lies outside the folder, or a picture has another size than the feature says.
     """
     numbers: dict[str, np.ndarray] = {}
     stats: Stats = {}
@@ -46,7 +49,7 @@ def episode_stats(root: Path, info: DatasetInfo, row: Row, frames: Frames, lengt
             continue
         if feature["dtype"] in ("image", "video"):
             pictures = (
-                partial(_pictures, frames, key, length)
+                partial(_pictures, root, frames, key, feature, length)
                 if feature["dtype"] == "image"
                 else partial(_video_pictures, root, info, key, row, length)
             )
@@ -65,22 +68,20 @@ def _rows(frames: Frames, key: str) -> Iterator[np.ndarray]:
         yield column_to_numpy(part.column(key)).reshape(len(part), -1)
 
 
-def _pictures(frames: Frames, key: str, length: int) -> Iterator[np.ndarray]:
+def _pictures(root: Path, frames: Frames, key: str, feature: dict, length: int) -> Iterator[np.ndarray]:
     """The pictures that LeRobot samples, (H, W, 3) uint8."""
     wanted, first = set(sample_indices(length)), 0
     for part in frames():
         column = part.column(key)
         for index in range(len(part)):
             if first + index in wanted:
-                with Image.open(io.BytesIO(column[index].as_py()["bytes"])) as image:
+                with open_picture(column[index].as_py(), root, key, feature) as image:
                     yield np.asarray(image.convert("RGB"))
         first += len(part)
 
 
 def _video_pictures(root: Path, info: DatasetInfo, key: str, row: Row, length: int) -> Iterator[np.ndarray]:
-    path = root / str(info.video_path).format(
-        video_key=key, chunk_index=row[f"videos/{key}/chunk_index"], file_index=row[f"videos/{key}/file_index"]
-    )
+    path = file_inside(root, video_file(info, key, row))
     times = [row[f"videos/{key}/from_timestamp"] + index / info.fps for index in sample_indices(length)]
     return video_pictures(path, times, _TOLERANCE, "pyav")
 

@@ -76,8 +76,7 @@ class _Camera:
 
     def name(self, row: Row) -> Path:
         """The file in which an episode's row says that its pictures are."""
-        chunk, file = row[f"videos/{self.key}/chunk_index"], row[f"videos/{self.key}/file_index"]
-        return Path(str(self._info.video_path).format(video_key=self.key, chunk_index=int(chunk), file_index=int(file)))
+        return video_file(self._info, self.key, row)
 
     def problem(self, name: Path) -> str | None:
         """What is wrong with a file as a whole."""
@@ -128,6 +127,12 @@ class _Camera:
                 if isinstance(answer, str):
                     self._problems[other] = f"cannot be decoded: {answer}"
         return self._times[name]
+
+
+def video_file(info: DatasetInfo, key: str, row: Row) -> Path:
+    """The file in which an episode's row says that a camera's pictures are, relative to the dataset's folder."""
+    chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
+    return Path(str(info.video_path).format(video_key=key, chunk_index=int(chunk), file_index=int(file)))
 
 
 def _problem(camera: _Camera, row: Row, length: int) -> str | None:
