@@ -1,6 +1,7 @@
 """Datasets that a stranger made: they show no file of this machine, run nothing, and take no memory that they do not fill."""
 
 import ast
+import errno
 import html.parser
 import io
 import json
@@ -253,6 +254,39 @@ def test_links_in_a_circle_and_pipes_hold_no_upload_up(root):
     names = _files(root)
     assert "meta/info.json" in names
     assert not [name for name in names if "loop" in name or "pipe" in name]
+
+
+def test_a_link_to_itself_is_nothing_that_is_uploaded(root):
+    (root / "meta" / "self").symlink_to("self")
+    check_links(root)
+    assert "meta/self" not in _files(root)
+
+
+@pytest.mark.parametrize("part", ["data", "meta/episodes"])
+def test_no_upload_and_no_copy_lacks_the_files_behind_a_link(root, hub, tmp_path, part):
+    shutil.move(root / part, root / "kept")
+    (root / part).symlink_to(root / "kept")
+    with pytest.raises(HubError, match=f"Not pushed.*{part}' is a link to a folder"):
+        push_dataset("me/linked", root)
+    assert not hub.requests
+    output = DatasetPlace("a/c", str(tmp_path / "copy"))
+    with pytest.raises(AttachError, match="is a link to a folder"):
+        attach_audio(AttachAudioConfig(DatasetPlace("a/b", str(root)), output, files="{episode}.wav", microphone="new"))
+
+
+def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, monkeypatch):
+    listed = Path.iterdir
+
+    def fail(folder):
+        if folder.name == "notes":
+            raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+        return listed(folder)
+
+    (root / "notes").mkdir()
+    monkeypatch.setattr(Path, "iterdir", fail)
+    with pytest.raises(HubError, match=r"Not pushed.*Permission denied"):
+        push_dataset("me/noise", root)
+    assert not hub.requests
 
 
 def test_a_snapshot_of_the_hubs_cache_may_be_links_into_the_cache(root, tmp_path):

@@ -4,10 +4,11 @@ import contextlib
 import multiprocessing
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from recording_factory import FEATURES, FPS, REPO_ID
+from recording_factory import FEATURES, FPS, REPO_ID, differences, episode_frames, load
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError
@@ -134,3 +135,42 @@ def test_frames_of_another_tool_stay_where_they_are(tmp_path):
     DatasetLock(tmp_path).release()
     assert (tmp_path / SCRATCH / "camera").is_dir()
     assert not (tmp_path / LOCK).exists()
+
+
+def test_a_lock_of_a_folder_that_was_moved_lets_nobody_into_the_next(tmp_path):
+    root = tmp_path / "set"
+    moved = DatasetLock(root)
+    root.rename(tmp_path / "moved")
+    current = DatasetLock(root)
+    moved.release()
+    with pytest.raises(DatasetLockedError):
+        DatasetLock(root)
+    current.release()
+
+
+def test_a_lock_is_held_and_let_go_by_every_thread(tmp_path):
+    lock = DatasetLock(tmp_path / "set")
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(lambda: lock.is_held).result()
+        pool.submit(lock.release).result()
+    assert not lock.is_held
+    DatasetLock(tmp_path / "set").release()
+
+
+def test_a_writer_whose_folder_was_moved_harms_no_episode_of_the_next(tmp_path):
+    root = tmp_path / "set"
+    frames = episode_frames(0, FEATURES)
+    first = DurableWriter(REPO_ID, root, FPS, FEATURES)
+    first.add_frame(frames[0])
+    root.rename(tmp_path / "moved")
+    with DurableWriter(REPO_ID, root, FPS, FEATURES) as second:
+        for frame in frames[:-1]:
+            second.add_frame(frame)
+        for step in (lambda: first.add_frame(frames[0]), first.save_episode, first.discard_episode):
+            with pytest.raises(DatasetWriteError, match="another program writes to"):
+                step()
+        first.close()
+        second.add_frame(frames[-1])
+        second.save_episode()
+    assert load(root).num_episodes == 1
+    assert not differences(load(root), {0: 0}, FEATURES)

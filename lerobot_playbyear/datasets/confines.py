@@ -8,6 +8,7 @@ import io
 import itertools
 import json
 import math
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePath, PureWindowsPath
@@ -17,8 +18,11 @@ import pyarrow.parquet as pq
 from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH
 from PIL import Image
 
+from lerobot_playbyear.datasets.files import fits
+
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")  # of pictures; others have readers that start programs
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
+_FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
 _MOST_FPS = 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the checks and the repair name
 
@@ -46,13 +50,18 @@ def check_links(root: Path) -> None:
         root: The dataset's folder, also a snapshot in the Hub's cache, whose files are links to the cache's.
 
     Raises:
-        OutsideError: Naming the link.
+        OutsideError: Naming the link; or one to a folder where the dataset's files lie, which would be left out.
     """
     for path in entries_below(root):
         if path.is_symlink() and not _is_at_home(path, root):
             raise OutsideError(
-                f"'{path}' is a link to '{path.resolve()}', outside the dataset's folder. Put the file itself there if it "
+                f"'{path}' is a link to '{_real(path)}', outside the dataset's folder. Put the file itself there if it "
                 "belongs to the dataset, or remove the link."
+            )
+        name = path.relative_to(root)
+        if path.is_symlink() and path.is_dir() and fits(name, *_FOLDERS):
+            raise OutsideError(
+                f"'{path}' is a link to a folder, whose files would be left out. Put the folder itself there."
             )
 
 
@@ -135,7 +144,7 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
         raise ValueError(f"'{key}': a picture is missing. Repair the dataset: playbyear-repair --root={root}")
     data, name = row["bytes"], row["path"]
     if data is None:
-        if name is None or not (root / name).resolve().is_relative_to(root.resolve()):
+        if name is None or not _real(root / name).is_relative_to(root.resolve()):
             raise OutsideError(
                 f"'{key}': a picture is not in the dataset but in the file {name!r}, outside its folder '{root}', and is "
                 "not read. Record it again, or ask who made the dataset for one with its pictures."
@@ -157,7 +166,12 @@ def _is_at_home(path: Path, root: Path) -> bool:
     home = root.resolve()
     if home.parent.name == "snapshots" and home.parent.parent.name.startswith("datasets--"):
         home = home.parent.parent  # the Hub's cache of this dataset: its files lie in blobs/
-    return path.resolve().is_relative_to(home)
+    return _real(path).is_relative_to(home)
+
+
+def _real(path: Path) -> Path:
+    """Where a path leads; `Path.resolve` raises where a link leads to itself."""
+    return Path(os.path.realpath(path))
 
 
 def _check_templates(root: Path, info: Mapping[str, Any], features: Mapping[str, Mapping[str, Any]]) -> None:

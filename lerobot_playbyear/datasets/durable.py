@@ -141,6 +141,7 @@ class DurableWriter:
             ValueError: The frame does not fit the features, or its sound is none.
             DatasetWriteError: The disk does not take it; or the episode before is not saved yet.
         """
+        self._check_place()
         try:
             staging = self._staging
             if staging.is_complete:
@@ -164,6 +165,7 @@ class DurableWriter:
         """
         if self._episode is None or self._episode.length == 0:
             raise DatasetWriteError(f"Episode {self.num_episodes} has no frames: add some before it is saved.")
+        self._check_place()
         episode = self._episode
         try:
             self._save(episode)
@@ -186,6 +188,7 @@ class DurableWriter:
         Raises:
             DatasetWriteError: It is complete on disk already, and only has to be moved to its place.
         """
+        self._check_place()
         if (self.root / JOURNAL).exists():
             raise DatasetWriteError(
                 f"Episode {self.num_episodes} is complete on disk already: call save_episode again.",
@@ -200,10 +203,11 @@ class DurableWriter:
         """Drops an episode in progress and removes what was needed only for writing. Safe to call twice."""
         if self._lock is None or not self._lock.is_held:
             return
-        self._drop_staging()
-        with contextlib.suppress(OSError):  # the next writer tries again
-            finish_journal(self.root)
-            remove_leftovers(self.root)
+        if not self._lock.is_replaced:
+            self._drop_staging()
+            with contextlib.suppress(OSError):  # the next writer tries again
+                finish_journal(self.root)
+                remove_leftovers(self.root)
         self._lock.release()
 
     def __enter__(self) -> "DurableWriter":
@@ -240,6 +244,14 @@ class DurableWriter:
                 raise _another_count(self.root, episode.index, self.num_episodes)
             self._episode = episode
         return self._episode
+
+    def _check_place(self) -> None:
+        """Whether the folder is still the one that was opened: in another's scratch folder frames would be mixed up."""
+        if self._lock is not None and self._lock.is_replaced:
+            raise DatasetWriteError(
+                f"{self.root} was moved away, and another program writes to a dataset of this name now. The episodes that "
+                "were saved before are complete where it was moved to; record there with resume=true."
+            )
 
     def _drop_staging(self) -> None:
         if self._episode is not None:

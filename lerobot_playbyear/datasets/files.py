@@ -9,7 +9,7 @@ import fnmatch
 import glob
 import os
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 
 
 def list_files(root: Path, pattern: str) -> list[Path]:
@@ -26,6 +26,11 @@ def list_files(root: Path, pattern: str) -> list[Path]:
     for part in Path(pattern).parts:
         found = [path / name for path in found for name in _names(path) if fnmatch.fnmatchcase(name, part)]
     return sorted(found)
+
+
+def fits(name: PurePath, *patterns: str) -> bool:
+    """Whether a name, as a whole, matches one of some patterns, part by part."""
+    return any(len(name.parts) == len(PurePath(pattern).parts) and name.match(pattern) for pattern in patterns)
 
 
 def is_listed(root: Path, name: str | Path) -> bool:

@@ -48,6 +48,7 @@ class DatasetLock:
                 break
             if lock is not None:
                 self._lock = lock
+                self._file = os.stat(self._path)
                 return
         raise DatasetLockedError(f"Another process is writing to {root}: wait until it has ended.")
 
@@ -55,6 +56,14 @@ class DatasetLock:
     def is_held(self) -> bool:
         """Whether it was not released yet."""
         return self._lock.is_locked
+
+    @property
+    def is_replaced(self) -> bool:
+        """Whether there is another dataset now, with a lock of its own, where the dataset's folder was."""
+        try:
+            return not os.path.samestat(os.lstat(self._path), self._file)
+        except OSError:
+            return False
 
     def moved_to(self, root: Path) -> None:
         """Says that the dataset's folder, and the lock in it, has another name now."""
@@ -64,9 +73,10 @@ class DatasetLock:
         """Lets go, and leaves nothing behind. Safe to call twice."""
         if not self._lock.is_locked:
             return
-        with contextlib.suppress(OSError):  # Windows removes no open file: there it stays
-            self._path.unlink()
-            self._path.parent.rmdir()
+        if not self.is_replaced:
+            with contextlib.suppress(OSError):  # Windows removes no open file: there it stays
+                self._path.unlink()
+                self._path.parent.rmdir()
         self._lock.release()
 
     def _take(self) -> FileLock | None:
@@ -77,7 +87,7 @@ class DatasetLock:
         """
         before = os.open(self._path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
         try:
-            lock = FileLock(self._path, timeout=0)
+            lock = FileLock(self._path, timeout=0, thread_local=False)
             lock.acquire()
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(before), os.stat(self._path)):

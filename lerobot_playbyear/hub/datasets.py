@@ -61,9 +61,9 @@ def push_dataset(
     try:
         source = DatasetSource.open(repo_id, folder)
         check_links(folder)
-    except (InspectionError, OutsideError) as error:
+        files = _files(folder)
+    except (InspectionError, OutsideError, OSError) as error:
         raise HubError(f"Not pushed. {error}") from error
-    files = _files(folder)
     with TemporaryDirectory() as scratch:
         card = _make_card(source, repo_id, Path(scratch), film, tags, license)
         return push_patiently(

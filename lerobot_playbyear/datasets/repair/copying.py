@@ -26,7 +26,7 @@ from lerobot.datasets.utils import (
 )
 
 from lerobot_playbyear.datasets.columns import column_to_numpy
-from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.files import fits, list_files
 from lerobot_playbyear.datasets.journal import JOURNAL, LOCK, SCRATCH, STAGING
 from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES, ParquetDamageError, open_checked, write_tables
 from lerobot_playbyear.datasets.repair.episodes import Row
@@ -254,7 +254,7 @@ def _places(kept: Kept) -> Row:
     }
 
 
-_REMADE = (INFO_PATH, STATS_PATH, DEFAULT_TASKS_PATH)
+_REMADE = (INFO_PATH, STATS_PATH, DEFAULT_TASKS_PATH, "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet")
 
 
 def _take_over_rest(root: Path, target: Path, info: DatasetInfo) -> list[str]:
@@ -293,15 +293,11 @@ def _ours_in(folder: Path, notes: list[str]) -> Callable[[str, list[str]], set[s
         place = Path(folder.name) / Path(where).relative_to(folder)
         left = set()
         for path in (place / name for name in names):
-            is_linked_folder = (folder.parent / path).is_symlink() and (folder.parent / path).is_dir()
-            if is_linked_folder and any(path.match(name) for name in ("data/*", EPISODES_DIR, f"{EPISODES_DIR}/*")):
-                notes.append(_unlinked(folder.parent / path, path.as_posix()))
+            own = folder.parent / path
+            if own.is_symlink() and own.is_dir() and fits(path, "data/*", EPISODES_DIR, f"{EPISODES_DIR}/*"):
+                notes.append(_unlinked(own, path.as_posix()))
                 left.add(path.name)
-            elif (
-                path.as_posix() in _REMADE
-                or path.match("data/*/*.parquet")
-                or path.match(f"{EPISODES_DIR}/*/*.parquet")
-            ):
+            elif fits(path, *_REMADE):
                 left.add(path.name)
         return left
 
