@@ -16,6 +16,7 @@ from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, Da
 from lerobot_playbyear.datasets.repair import repair_dataset
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.inspection.source import DatasetSource
+from lerobot_playbyear.scripts.repair import main as repair_command
 
 LENGTHS = (6, 5, 7)
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
@@ -196,3 +197,12 @@ def test_a_card_shows_a_sample_rate_that_is_none(root):
     card = describe_dataset(DatasetSource.open("a/b", root), "a/b", None, None)
     assert "abc" in card
     assert "<b>" not in card
+
+
+@pytest.mark.parametrize("text", ["[]", "{}", '{"features": 1}', "{"])
+def test_a_model_for_a_repair_that_is_none_is_told(root, tmp_path, monkeypatch, text):
+    (tmp_path / "like/meta").mkdir(parents=True)
+    (tmp_path / "like/meta/info.json").write_text(text)
+    monkeypatch.setattr("sys.argv", ["playbyear-repair", f"--root={root}", f"--like={tmp_path / 'like'}"])
+    with pytest.raises(SystemExit, match=r"error: --like=.*info\.json"):
+        repair_command()

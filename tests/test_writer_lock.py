@@ -1,6 +1,7 @@
 """At most one process writes to a dataset, whatever the order in which locks are let go and taken."""
 
 import contextlib
+import errno
 import multiprocessing
 import os
 import time
@@ -146,6 +147,23 @@ def test_a_lock_of_a_folder_that_was_moved_lets_nobody_into_the_next(tmp_path):
     with pytest.raises(DatasetLockedError):
         DatasetLock(root)
     current.release()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows locks files in another way")
+@pytest.mark.filterwarnings("ignore:flock not supported")
+def test_a_disk_without_locks_of_the_system_is_locked_by_a_file(tmp_path, monkeypatch):
+    import fcntl
+
+    def fail(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", fail)
+    lock = DatasetLock(tmp_path / "set")
+    with pytest.raises(DatasetLockedError):
+        DatasetLock(tmp_path / "set")
+    lock.release()
+    assert not (tmp_path / "set" / SCRATCH).exists()
+    DatasetLock(tmp_path / "set").release()
 
 
 def test_a_lock_is_held_and_let_go_by_every_thread(tmp_path):

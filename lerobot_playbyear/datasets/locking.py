@@ -4,7 +4,7 @@ import contextlib
 import os
 from pathlib import Path
 
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.journal import LOCK, SCRATCH, check_scratch
@@ -79,16 +79,32 @@ class DatasetLock:
                 self._path.parent.rmdir()
         self._lock.release()
 
-    def _take(self) -> FileLock | None:
+    def _open(self) -> tuple[int, bool]:
+        """The lock's file, and whether it was not there before."""
+        flags = os.O_RDWR | getattr(os, "O_NOFOLLOW", 0)
+        try:
+            return os.open(self._path, flags | os.O_CREAT | os.O_EXCL, 0o644), True
+        except FileExistsError:
+            return os.open(self._path, flags), False
+
+    def _take(self) -> BaseFileLock | None:
         """Locks the file; None where it was another one than is there now.
 
         A file that is open keeps its number, and one that was removed never gets its name back: what has the name
         before and after was locked.
         """
-        before = os.open(self._path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        before, is_new = self._open()
         try:
             lock = FileLock(self._path, timeout=0, thread_local=False)
-            lock.acquire()
+            try:
+                lock.acquire()
+            except Timeout:
+                if not isinstance(lock, SoftFileLock) or not is_new:
+                    raise
+                self._path.unlink()  # the disk has no locks, and there the file itself is one
+                lock.acquire()
+            if isinstance(lock, SoftFileLock):
+                return lock
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(before), os.stat(self._path)):
                     return lock

@@ -39,14 +39,17 @@ def repair(cfg: RepairConfig) -> RepairReport:
     """Checks, and unless it is a dry run repairs. Prints what was found.
 
     Raises:
-        DatasetDamagedError: It cannot be repaired.
+        DatasetDamagedError: It cannot be repaired, or `like` is no dataset.
         OSError: `like` or the dataset cannot be read now, or the repaired copy cannot be written. Nothing was changed.
         MemoryError: There is not enough of it. Nothing was changed.
     """
     known = {}
     if cfg.like is not None:
-        info = DatasetInfo.from_dict(json.loads((cfg.like / INFO_PATH).read_text()))
-        own = {key: feature for key, feature in info.features.items() if key not in DEFAULT_FEATURES}
+        try:
+            info = DatasetInfo.from_dict(json.loads((cfg.like / INFO_PATH).read_text()))
+            own = {key: feature for key, feature in info.features.items() if key not in DEFAULT_FEATURES}
+        except (ValueError, TypeError, AttributeError) as error:
+            raise DatasetDamagedError(f"--like={cfg.like}: its {INFO_PATH} is none of a dataset: {error}") from error
         known = {"fps": info.fps, "features": own}
     report = check_dataset(cfg.root, **known) if cfg.dry_run else repair_dataset(cfg.root, **known)
     print(report)
