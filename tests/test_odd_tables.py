@@ -121,6 +121,15 @@ def test_a_row_whose_statistics_are_no_numbers_is_made_anew(root, values):
     assert "the row of episode 1 was wrong: its statistics" in str(report)
 
 
+def test_statistics_of_one_number_move_with_their_episode(root):
+    table = pq.read_table(root / EPISODES)
+    change(root / EPISODES, "stats/index/min", [row[0] for row in table.column("stats/index/min").to_pylist()])
+    pictures = pq.read_table(root / DATA).column(CAMERA).to_pylist()
+    change(root / DATA, CAMERA, [{"bytes": b"damaged", "path": None}, *pictures[1:]])
+    assert repair_dataset(root).kept == {1: 0, 2: 1}
+    assert pq.read_table(root / EPISODES).column("stats/index/min").to_pylist() == [0, 5]
+
+
 def test_splits_that_are_none_stop_no_repair(root):
     change_info(root, splits=[1])
     (root / "meta/tasks.parquet").unlink()

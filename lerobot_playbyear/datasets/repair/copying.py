@@ -224,7 +224,7 @@ def _moved(kept: Kept) -> Row:
         for name in _SHIFTED:
             column = f"stats/{key}/{name}"
             if shift and row.get(column) is not None:
-                row[column] = [value + shift for value in row[column]]
+                row[column] = (np.array(row[column]) + shift).tolist()
     return {**row, **_places(kept)}
 
 

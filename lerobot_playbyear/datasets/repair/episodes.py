@@ -167,8 +167,9 @@ def _video_places(row: Row, info: DatasetInfo) -> Row:
     """Where the row says that the episode's videos are: of each camera everything, or nothing."""
     places: Row = {}
     for key in (key for key, feature in info.features.items() if feature["dtype"] == "video"):
-        own = {f"videos/{key}/{name}": row.get(f"videos/{key}/{name}") for name in _PLACE}
-        if all(isinstance(value, int | float) and 0 <= value < math.inf for value in own.values()):
+        found = {f"videos/{key}/{name}": row.get(f"videos/{key}/{name}") for name in _PLACE}
+        own = {name: value for name, value in found.items() if isinstance(value, int | float) and 0 <= value < math.inf}
+        if own.keys() == found.keys():
             places.update({name: int(value) if name.endswith("_index") else value for name, value in own.items()})
     return places
 
