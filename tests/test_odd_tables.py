@@ -1,6 +1,7 @@
 """Tables and metadata that are damaged in a part, or that a stranger wrote: the episodes behind them are kept."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -113,12 +114,12 @@ def test_a_template_that_cannot_be_filled_in_is_replaced(videos, path, field):
     assert json.loads((videos / "meta/info.json").read_text())[path] == template
 
 
-@pytest.mark.parametrize("values", [[[1.0] * 4, [None] * 4, [1.0] * 4], ["x", "y", "z"]])
+@pytest.mark.parametrize("values", [[[1.0] * 4, [None] * 4, [1.0] * 4], [[1.0] * 4, None, [1.0] * 4], ["x", "y", "z"]])
 def test_a_row_whose_statistics_are_no_numbers_is_made_anew(root, values):
     change(root / EPISODES, "stats/action/mean", values)
     report = repair_dataset(root)
     assert len(report.kept) == len(LENGTHS)
-    assert "the row of episode 1 was wrong: its statistics" in str(report)
+    assert re.search("the row of episode 1 was wrong: (parts of )?its statistics", str(report))
 
 
 def test_statistics_of_one_number_move_with_their_episode(root):

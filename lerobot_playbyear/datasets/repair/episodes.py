@@ -150,9 +150,9 @@ def _contradiction(row: Row, run: Run, info: DatasetInfo) -> str | None:
         return "its tasks are missing"
     statistics: dict[str, set[str]] = defaultdict(set)
     for column, value in row.items():
-        if column.startswith("stats/"):
+        if column.startswith("stats/") and value is not None:
             statistics[column.rpartition("/")[0]].add(column.rpartition("/")[2])
-            if value is not None and not _are_numbers(value):
+            if not _are_numbers(value):
                 return f"its statistics '{column.removeprefix('stats/')}' are no numbers"
     if len({frozenset(names) for names in statistics.values()}) > 1:
         return "parts of its statistics are missing"
