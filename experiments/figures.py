@@ -74,7 +74,8 @@ def noise(output: Path) -> None:
         figure, axes = plt.subplots(figsize=(6, 3.6))
         for study, by_level in curves.items():
             label, colour = NOISES[study]
-            band(axes, by_level, label, colour)
+            most = max(map(len, by_level.values()))  # a level that fewer policies were tried at would be another curve
+            band(axes, {level: tried for level, tried in by_level.items() if len(tried) == most}, label, colour)
         blind_line(axes, task)
         axes.set_xscale("log", base=2)
         levels = sorted({level for by_level in curves.values() for level in by_level})
