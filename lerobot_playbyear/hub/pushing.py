@@ -14,13 +14,7 @@ from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 from lerobot_playbyear.hub.client import patient_hub
 
 _WAITS_S = (1, 2, 5)
-_PASSING = (
-    408,
-    409,
-    412,
-    425,
-    429,
-)  # besides all from 500; 412: there is a newer commit than the one that this one follows
+_PASSING = (408, 409, 412, 425, 429)  # besides all from 500; 412: a newer commit came before this one
 
 logger = logging.getLogger(__name__)
 
