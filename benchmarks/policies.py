@@ -4,8 +4,8 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 CAMERA, MICROPHONE, STATE = "observation.images.front", "observation.audio.gripper", "observation.state"
 SAMPLES, PIXELS = 800, 84  # of a frame: 16 kHz at 20 Hz, and the simulation's pictures

@@ -89,8 +89,8 @@ def main() -> None:
         return
     started = machine()
     helper = Helper(sys.executable, __file__, "--reference")
-    from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-    from lerobot_playbyear.memory import keep_freed_memory
+    from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+    from lerobot_playbyear.training.heap import keep_freed_memory
 
     keep_freed_memory()  # as playbyear-train does
     config = PlaybyearConfig(device="cpu")

@@ -24,9 +24,9 @@ from scenes import dataset_features, frames
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
 from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 WANTED_TIMES, WANTED_MEMORY = 100, 1.2
 _BATCH = 32  # windows

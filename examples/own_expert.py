@@ -18,7 +18,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 
 from lerobot_playbyear.dagger import Expert, ExpertConfig
-from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.scripts import dagger, train
 
 

@@ -30,8 +30,8 @@ from experiments.protocol import DONOR_SEEDS, EVALUATION_SEEDS, N_DEMONSTRATIONS
 from experiments.sound_probe import REACTION_STEPS, Donor, SoundProbe, Trial, make_donors
 from experiments.training import Job
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.acting import load_for_rollout
-from lerobot_playbyear.recording import env_spec
+from lerobot_playbyear.episodes.acting import load_for_rollout
+from lerobot_playbyear.recording.record import env_spec
 
 TASK = "OccludedGrasp-v0"
 MODES = ("false", "control", "muted")

@@ -19,8 +19,8 @@ from lerobot.policies.factory import make_pre_post_processors
 from experiments.protocol import RESULTS, RUN_LENGTHS, TASKS, TRAINING_SEEDS, Result, dataset_root, record
 from experiments.training import Job, train_and_evaluate
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.training import PolicyWindows
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.training.parts import PolicyWindows
 
 STUDY = "run_length"
 N_WINDOWS = 64  # per update

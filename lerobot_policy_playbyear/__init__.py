@@ -4,10 +4,10 @@ Import `lerobot_playbyear` in programs of your own.
 """
 
 from lerobot_playbyear import __version__
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.environment_sound import Pcm16ToFloatProcessorStep
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.processor_playbyear import make_playbyear_pre_post_processors
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.processor_playbyear import make_playbyear_pre_post_processors
 
 __all__ = [
     "Pcm16ToFloatProcessorStep",

@@ -14,7 +14,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
-from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.scripts import dagger as dagger_script
 from lerobot_playbyear.scripts import train as train_script
 

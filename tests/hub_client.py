@@ -28,7 +28,7 @@ COMMANDS = {
     "hub-clients": "hub_clients",
 }
 _IMPORTED_LATER = (
-    "lerobot_playbyear.teleoperation.demonstrations",
+    "lerobot_playbyear.recording.demonstrations",
     "lerobot_env_playbyear",
 )
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from test_policy_contract import make_config
 
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 

@@ -23,16 +23,16 @@ from lerobot_playbyear.datasets import EpisodeStore, audio_feature, opening, par
 from lerobot_playbyear.datasets.attach import attach_audio
 from lerobot_playbyear.datasets.audio_files import Resampled
 from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.opening import LongDataset, open_dataset
 from lerobot_playbyear.datasets.repair import check_dataset, copying, repair_dataset
 from lerobot_playbyear.datasets.video_pictures import video_pictures
+from lerobot_playbyear.film.video import episode_sound
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
 from lerobot_playbyear.inspection.film import FilmSound, encode
 from lerobot_playbyear.inspection.onsets import sudden_sounds
 from lerobot_playbyear.inspection.sound_checks import flat_tops, gaps, repeats
 from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound
-from lerobot_playbyear.memory import available_memory
-from lerobot_playbyear.video import episode_sound
 
 FPS, RATE = 30, 48000
 BLOCK = RATE // FPS

@@ -15,12 +15,12 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.dagger import DaggerError, Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.collector import PolicyActor, collect
 from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.recording import env_spec
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.recording.record import env_spec
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -8,10 +8,10 @@ import torch
 from dataset_factory import make_dataset
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.dagger.batches import BalancedBatches, intervention_run_weights
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.training import PolicyWindows
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.training.parts import PolicyWindows
 
 N_DEMONSTRATIONS = 1000
 """Actions of the demonstrations are below it, those of the attempts above: a window tells where it is from."""

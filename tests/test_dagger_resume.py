@@ -27,7 +27,7 @@ from safetensors.torch import load_file
 from lerobot_playbyear.dagger import DaggerError
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.training import TrainingParts
+from lerobot_playbyear.training.parts import TrainingParts
 
 RUN = (*QUICK, "--episodes=3", "--warmup_episodes=2")
 EVALUATED = ("--eval_every=2", "--eval.n_episodes=1")

@@ -14,7 +14,7 @@ from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
 from lerobot_env_playbyear import PcmToFloatProcessorStep, PlaybyearEnvConfig
-from lerobot_playbyear.recording import RecordConfig
+from lerobot_playbyear.recording.record import RecordConfig
 
 
 def vector_env(config: PlaybyearEnvConfig, n_envs: int = 1, use_async_envs: bool = False):

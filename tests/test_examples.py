@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from dataset_factory import make_dataset
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

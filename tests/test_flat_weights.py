@@ -19,7 +19,7 @@ from test_policy_contract import make_config, make_policy
 from test_policy_training import batch_of
 from torch import nn
 
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts.train import train
 
 TINY = (

@@ -18,7 +18,7 @@ from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts.train import train
 
 AVAILABLE = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}

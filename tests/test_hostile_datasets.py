@@ -387,8 +387,8 @@ def test_the_card_of_a_policy_shows_names_as_they_are(root, hub):
 def _policy(camera: str):
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-    from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+    from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+    from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
     config = PlaybyearConfig(
         input_features={

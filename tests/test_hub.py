@@ -14,11 +14,11 @@ from hub_client import HubClient, Result
 from hub_faults import down_after, every_second, everything_fails, nothing_fails, one_in
 from hub_repositories import File, Repository, git_oid
 from hub_server import TOKEN, HubServer
-from huggingface_hub import HfApi, ModelCard, get_session, set_client_factory
+from huggingface_hub import HfApi, get_session, set_client_factory
 from huggingface_hub.utils import _http
 
 from lerobot_playbyear.hub.client import patient_hub
-from lerobot_playbyear.hub.policy_card import with_evaluation
+from lerobot_playbyear.hub.training_run import evaluation_of
 
 DATASET = "tester/grasp"
 POLICY = "tester/hearing"
@@ -415,7 +415,7 @@ def test_a_thread_that_is_done_leaves_the_others_their_patience(hub):
 
 @pytest.mark.parametrize("folder", ["/policy", "/data/policy"])
 def test_a_policy_near_the_root_of_a_disk_gets_its_card(folder):
-    assert with_evaluation(ModelCard("---\nlicense: mit\n---\nA policy."), Path(folder)).text.strip() == "A policy."
+    assert evaluation_of(Path(folder)) is None
 
 
 def test_a_line_of_figures_that_was_cut_off_costs_no_upload(tmp_path):
@@ -426,5 +426,6 @@ def test_a_line_of_figures_that_was_cut_off_costs_no_upload(tmp_path):
     state.write_text('{"step": 10}')
     lines = ['{"kind": "tr', '{"kind": "eval", "step": 10, "pc_success": 90.0}', '{"kind": "eval", "st']
     (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
-    card = ModelCard("---\nlicense: mit\n---\n_No evaluation results have been provided for this policy yet._")
-    assert "**90 %**, at step 10" in with_evaluation(card, folder).text
+    figures = evaluation_of(folder)
+    assert figures is not None
+    assert (figures["pc_success"], figures["step"]) == (90.0, 10)

@@ -17,7 +17,7 @@ from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets.audio_feature import audio_feature
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
 from lerobot_playbyear.inspection.page_writer import PageWriter
-from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect
 
 pytestmark = pytest.mark.skipif(

@@ -17,8 +17,8 @@ from test_policy_contract import make_config, make_episode, run_ending_at
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from lerobot_playbyear.augmentation import Augmentation, sample
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.augmentation import Augmentation, sample
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 ZEROS, BILINEAR = 0, 0  # how aten counts paddings and interpolations
 

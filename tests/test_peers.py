@@ -19,7 +19,7 @@ from lerobot.scripts import lerobot_edit_dataset
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys, episode_waveform
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
-from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 
 LENGTHS = (12, 17, 9, 14)
 

@@ -11,8 +11,8 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.factory import make_policy, make_pre_post_processors
 from test_policy_contract import make_config
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 MICROPHONE = "observation.audio.gripper"
 SMALL = {"image_size": 32, "vision_width": 4, "hidden_size": 32, "device": "cpu", "push_to_hub": False}

@@ -6,10 +6,10 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import nn
 from torchvision.models import resnet18
 
-from lerobot_playbyear.augmentation import Augmentation, resize
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.networks import VisionEncoder
+from lerobot_playbyear.policy.augmentation import Augmentation, resize
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.networks import VisionEncoder
 
 STRENGTHS = {"crop": 4.0, "brightness": 0.05, "hue": 0.05, "degrees": 5.0, "translate": 0.05, "scale": 0.05}
 

@@ -8,8 +8,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from test_policy_contract import make_config, make_episode, make_policy, run_ending_at
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 MICROPHONE = "observation.audio.gripper"
 

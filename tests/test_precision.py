@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 from test_policy_contract import make_config
 from torch import nn
 
-from lerobot_playbyear.precision import training_dtype
+from lerobot_playbyear.policy.precision import training_dtype
 from lerobot_playbyear.scripts.train import train
-from lerobot_playbyear.training import make_accelerator
+from lerobot_playbyear.training.parts import make_accelerator
 
 TINY = (
     "--policy.type=playbyear",

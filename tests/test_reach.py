@@ -13,11 +13,11 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.dagger import DaggerError
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.reach import Reach
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts.train import train
+from lerobot_playbyear.training.reach import Reach
 
 FEATURES = dataset_features(image_size=16)
 FEATURES["action"]["names"] = ["pan", "lift", "elbow", "gripper"]

@@ -15,7 +15,7 @@ from recording_factory import FEATURES, FPS, REPO_ID, differences, episode_frame
 from lerobot_playbyear.datasets import settling
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, repair_dataset
-from lerobot_playbyear.recording import RecordConfig, RecordDatasetConfig, RecordError, record
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, RecordError, record
 
 N_EPISODES = 4
 

@@ -9,10 +9,10 @@ from dataset_factory import dataset_features, make_dataset
 from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.presets import apply_preset
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.scripts.train import train
-from lerobot_playbyear.train_config import PlaybyearTrainConfig
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.presets import apply_preset
 
 TINY = ("--policy.device=cpu", "--policy.push_to_hub=false", "--policy.audio_window_s=0.9", "--num_workers=0")
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from torchaudio.functional import resample
 
-from lerobot_playbyear.networks import AudioEncoder
-from lerobot_playbyear.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, to_float_wave
+from lerobot_playbyear.policy.networks import AudioEncoder
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, to_float_wave
 
 SEGMENT_S, HOP_S, N_BINS, WINDOW_S = 0.040, 0.035, 160, 2.0
 

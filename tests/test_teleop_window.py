@@ -18,10 +18,10 @@ from virtual_screen import MISSING, VirtualScreen, wait_for
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Verdict
 from lerobot_playbyear.dagger.collector import PolicyActor, collect
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.recording import RecordDatasetConfig, env_spec
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
+from lerobot_playbyear.recording.record import RecordDatasetConfig, env_spec
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
-from lerobot_playbyear.teleoperation.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
 from lerobot_playbyear.teleoperation.expert import PersonLeftError
 from lerobot_playbyear.teleoperation.panel import FRAME
 from lerobot_playbyear.teleoperation.status import Control

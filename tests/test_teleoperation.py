@@ -21,11 +21,11 @@ from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
 from lerobot_playbyear.dagger.collector import collect
 from lerobot_playbyear.dagger.config import DatasetSource
-from lerobot_playbyear.recording import RecordDatasetConfig, RecordError, env_spec
+from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
+from lerobot_playbyear.recording.record import RecordDatasetConfig, RecordError, env_spec
 from lerobot_playbyear.teleoperation.actions import CLOSE, DELTAS, OPEN, STAY, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
 from lerobot_playbyear.teleoperation.controls import Controls
-from lerobot_playbyear.teleoperation.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
 from lerobot_playbyear.teleoperation.expert import Desk, PersonLeftError, TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig, WindowKeys
 from lerobot_playbyear.teleoperation.levels import FLOOR_DB, as_float, level_db

@@ -15,12 +15,12 @@ from safetensors.torch import load_file
 from torch.utils.data import default_collate
 
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.presets import PRESETS, apply_preset
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts import train as train_script
 from lerobot_playbyear.scripts.train import TrainError, frame_weights, train
-from lerobot_playbyear.train_config import PlaybyearTrainConfig, SamplingConfig
-from lerobot_playbyear.training import PolicyWindows
+from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
+from lerobot_playbyear.training.parts import PolicyWindows
+from lerobot_playbyear.training.presets import PRESETS, apply_preset
 
 FPS = 20
 TINY = (

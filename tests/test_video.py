@@ -9,9 +9,9 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.rollouts import RolloutError
+from lerobot_playbyear.episodes.rollouts import RolloutError
+from lerobot_playbyear.film.video import amplify, compose, episode_sound, spectrogram_strip, write_film
 from lerobot_playbyear.scripts.video import VideoConfig, film
-from lerobot_playbyear.video import amplify, compose, episode_sound, spectrogram_strip, write_film
 
 FPS, SAMPLE_RATE = 20, 16000
 BLOCK = SAMPLE_RATE // FPS

@@ -1,8 +1,8 @@
 """HG-DAgger: an expert corrects a policy while it works, and the policy learns from the corrections."""
 
 from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
-from lerobot_playbyear.dagger.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig, Verdict
 from lerobot_playbyear.dagger.run import run_dagger
+from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig, Verdict
 
 __all__ = [
     "DaggerConfig",

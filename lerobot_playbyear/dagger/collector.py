@@ -14,8 +14,8 @@ from lerobot.policies import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 
-from lerobot_playbyear.dagger.expert import Expert, Verdict
-from lerobot_playbyear.rollouts import Episode, Observation
+from lerobot_playbyear.episodes.expert import Expert, Verdict
+from lerobot_playbyear.episodes.rollouts import Episode, Observation
 
 
 @dataclass

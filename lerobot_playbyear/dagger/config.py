@@ -13,8 +13,8 @@ from lerobot.configs.default import DatasetConfig, EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
-from lerobot_playbyear.dagger.expert import ExpertConfig, ScriptedExpertConfig
-from lerobot_playbyear.train_config import PlaybyearTrainConfig, StoreConfig
+from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig
+from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 
 CONFIG_NAME = "dagger_config.json"
 """File in the output folder with the options of the run."""

@@ -12,8 +12,8 @@ from lerobot_playbyear.dagger.collector import Attempt
 from lerobot_playbyear.dagger.config import DaggerError, DatasetSource
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.recording import INTERVENTION, SEED, episode_frames
-from lerobot_playbyear.saving import save_or_ask
+from lerobot_playbyear.recording.record import INTERVENTION, SEED, episode_frames
+from lerobot_playbyear.recording.saving import save_or_ask
 
 
 class Corrections:

@@ -18,7 +18,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError
-from lerobot_playbyear.tracking import METRICS_NAME
+from lerobot_playbyear.hub.training_run import METRICS_NAME
 
 STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""

@@ -16,14 +16,14 @@ from lerobot_playbyear.dagger.batches import BalancedBatches
 from lerobot_playbyear.dagger.collector import Attempt, PolicyActor, Seconds, collect
 from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
 from lerobot_playbyear.dagger.corrections import Corrections
-from lerobot_playbyear.dagger.expert import Expert, Verdict
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.reach import Reach
-from lerobot_playbyear.tracking import make_tracker
-from lerobot_playbyear.train_config import PlaybyearTrainConfig
-from lerobot_playbyear.training import TrainingParts
+from lerobot_playbyear.episodes.expert import Expert, Verdict
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.metrics import make_tracker
+from lerobot_playbyear.training.parts import TrainingParts
+from lerobot_playbyear.training.reach import Reach
 
 _ATTEMPT, _UPDATES = 0, 1  # what random numbers are for
 _LOSS_BATCHES = 10**9  # numbers from here on are of batches that are only looked at

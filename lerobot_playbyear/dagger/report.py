@@ -10,7 +10,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_playbyear.dagger.collector import Attempt
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
-from lerobot_playbyear.train_config import PlaybyearTrainConfig
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 
 class Report:

@@ -22,14 +22,14 @@ from lerobot_playbyear.dagger.loop import Loop
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.episodes.rollouts import RolloutError, env_facts
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
-from lerobot_playbyear.reach import Reach, action_names
-from lerobot_playbyear.recording import dataset_features, env_spec, next_seed
-from lerobot_playbyear.rollouts import RolloutError, env_facts
-from lerobot_playbyear.tracking import METRICS_NAME
-from lerobot_playbyear.train_config import PlaybyearTrainConfig
-from lerobot_playbyear.training import PolicyWindows, dataset_names, make_training_parts
+from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.recording.record import dataset_features, env_spec, next_seed
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.parts import PolicyWindows, dataset_names, make_training_parts
+from lerobot_playbyear.training.reach import Reach, action_names
 
 
 def run_dagger(cfg: DaggerConfig) -> Path:

@@ -5,7 +5,7 @@ import shlex
 
 import numpy as np
 
-from lerobot_playbyear.hub.markdown import code, text
+from lerobot_playbyear.datasets.markdown import code, text
 from lerobot_playbyear.hub.preview import Preview
 from lerobot_playbyear.inspection.source import INTERVENTION, SUCCESS, DatasetSource
 

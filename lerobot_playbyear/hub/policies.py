@@ -5,20 +5,19 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from huggingface_hub import ModelCard
-from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
 from lerobot.configs import PreTrainedConfig
-from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import get_policy_class
-from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME
 
+from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.hub.datasets import CARD, FILM
-from lerobot_playbyear.hub.markdown import word
-from lerobot_playbyear.hub.policy_card import with_evaluation, with_film, write_card
 from lerobot_playbyear.hub.pushing import HubError, push_patiently
 from lerobot_playbyear.hub.repository import HubRepository
-from lerobot_playbyear.train_config import PlaybyearTrainConfig
+from lerobot_playbyear.hub.training_run import evaluation_of, find_checkpoint, training_options
+from lerobot_playbyear.policy.card import write_card
 
+_NO_RESULTS = "_No evaluation results have been provided for this policy yet._"  # LeRobot's template
 _FILES = ("*.safetensors", "*.json", "*.yaml")  # as LeRobot uploads them
 
 
@@ -65,7 +64,8 @@ def push_policy(
             card = _make_card(policy, folder)
             if film is not None:
                 files[FILM] = film
-                with_film(card, f"{repository.api.endpoint}/{repository.repo_id}/resolve/main/{FILM}")
+                url = f"{repository.api.endpoint}/{repository.repo_id}/resolve/main/{FILM}"
+                card.text = f'\n<video controls width="480" src="{url}"></video>\n{card.text}'
             files[CARD] = Path(scratch) / CARD
             card.save(files[CARD])
             repository.commit(files, "Upload policy")
@@ -93,24 +93,8 @@ def push_checkpoint(folder: Path, repo_id: str, private: bool | None = None) -> 
     repository.set_tag(folder.name, repository.commit(files, f"checkpoint {folder.name}"))
 
 
-def find_checkpoint(path: Path) -> Path:
-    """The folder `pretrained_model` in or at `path`.
-
-    Raises:
-        HubError: There is none.
-    """
-    for inside in ("", PRETRAINED_MODEL_DIR, f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}"):
-        folder = path / inside
-        if all((folder / name).is_file() for name in (CONFIG_NAME, SAFETENSORS_SINGLE_FILE)):
-            return folder
-    raise HubError(
-        f"policy.path={path}: there is no checkpoint with {CONFIG_NAME} and {SAFETENSORS_SINGLE_FILE}. Give the folder "
-        f"`{PRETRAINED_MODEL_DIR}` of one, or the output folder of a training."
-    )
-
-
 def _make_card(policy: Any, folder: Path) -> ModelCard:
-    config, training = policy.config, _training(folder)
+    config, training = policy.config, training_options(folder)
     dataset = training.dataset if training is not None else None
     meta = None
     if dataset is not None:
@@ -127,8 +111,8 @@ def _make_card(policy: Any, folder: Path) -> ModelCard:
         cfg=training,
         dataset_meta=meta,
     )
-    return with_evaluation(card, folder)
-
-
-def _training(folder: Path) -> TrainPipelineConfig | None:
-    return PlaybyearTrainConfig.from_pretrained(folder) if (folder / TRAIN_CONFIG_NAME).is_file() else None
+    figures = evaluation_of(folder)
+    if figures is not None:
+        result = f"Success in simulation: **{figures['pc_success']:.0f} %**, at step {figures['step']} of its training."
+        card.text = card.text.replace(_NO_RESULTS, result)
+    return card

@@ -8,8 +8,8 @@ import numpy as np
 from PIL import Image
 
 from lerobot_playbyear.datasets.audio_files import Channels, Resampled
+from lerobot_playbyear.film.video import write_film
 from lerobot_playbyear.inspection.waveform import EpisodeSound
-from lerobot_playbyear.video import write_film
 
 _AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 _SOUND_BIT_RATE = 200_000  # bits per second, of two channels

@@ -16,8 +16,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_playbyear.dagger import DaggerConfig, DaggerError, run_dagger
 from lerobot_playbyear.dagger.config import with_saved_options
 from lerobot_playbyear.hub.client import patient_hub
-from lerobot_playbyear.memory import keep_freed_memory
 from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
+from lerobot_playbyear.training.heap import keep_freed_memory
 
 
 @parser.wrap()

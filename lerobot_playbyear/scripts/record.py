@@ -14,8 +14,8 @@ def main() -> None:
     from lerobot.configs import parser
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_playbyear.recording import RecordError
-    from lerobot_playbyear.teleoperation.demonstrations import DemonstrationConfig, record_demonstrations
+    from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, record_demonstrations
+    from lerobot_playbyear.recording.record import RecordError
 
     @parser.wrap()
     def run(cfg: DemonstrationConfig) -> None:

@@ -40,12 +40,13 @@ from lerobot_playbyear.datasets import (
 from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
-from lerobot_playbyear.memory import keep_freed_memory
-from lerobot_playbyear.presets import apply_preset
-from lerobot_playbyear.reach import Reach, action_names
-from lerobot_playbyear.tracking import METRICS_NAME, make_tracker
-from lerobot_playbyear.train_config import PlaybyearTrainConfig, SamplingConfig
-from lerobot_playbyear.training import PolicyWindows, TrainingParts, make_training_parts
+from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
+from lerobot_playbyear.training.heap import keep_freed_memory
+from lerobot_playbyear.training.metrics import make_tracker
+from lerobot_playbyear.training.parts import PolicyWindows, TrainingParts, make_training_parts
+from lerobot_playbyear.training.presets import apply_preset
+from lerobot_playbyear.training.reach import Reach, action_names
 
 
 class TrainError(ValueError):

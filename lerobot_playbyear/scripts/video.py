@@ -15,11 +15,11 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig, close_envs, make_env
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_playbyear.acting import load_for_rollout
+from lerobot_playbyear.episodes.acting import load_for_rollout
+from lerobot_playbyear.episodes.rollouts import RolloutError
+from lerobot_playbyear.film.takes import policy_takes, script_takes, write_take
 from lerobot_playbyear.hub.client import patient_hub
-from lerobot_playbyear.recording import env_spec
-from lerobot_playbyear.rollouts import RolloutError
-from lerobot_playbyear.takes import policy_takes, script_takes, write_take
+from lerobot_playbyear.recording.record import env_spec
 
 
 @dataclass

@@ -6,7 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_playbyear.dagger.expert import ExpertError
+from lerobot_playbyear.episodes.expert import ExpertError
 
 DELTAS = ("delta_x", "delta_y", "delta_z")
 GRIPPER = "gripper"

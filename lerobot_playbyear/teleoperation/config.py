@@ -15,7 +15,7 @@ from lerobot.teleoperators import (
 )
 from lerobot.teleoperators.gamepad import GamepadTeleop
 
-from lerobot_playbyear.dagger.expert import Expert, ExpertConfig, ExpertError
+from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.expert import Desk, TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig

@@ -7,8 +7,8 @@ import gymnasium as gym
 import numpy as np
 from lerobot.teleoperators import Teleoperator
 
-from lerobot_playbyear.dagger.expert import Expert, Verdict
-from lerobot_playbyear.rollouts import Observation
+from lerobot_playbyear.episodes.expert import Expert, Verdict
+from lerobot_playbyear.episodes.rollouts import Observation
 from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.controls import Controls, Wish
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks

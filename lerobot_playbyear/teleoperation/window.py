@@ -12,7 +12,7 @@ import threading
 
 import numpy as np
 
-from lerobot_playbyear.dagger.expert import ExpertError
+from lerobot_playbyear.episodes.expert import ExpertError
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 from lerobot_playbyear.teleoperation.status import Status
 from lerobot_playbyear.teleoperation.wire import receive, send

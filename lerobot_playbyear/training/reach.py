@@ -9,7 +9,7 @@ from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.processor import PolicyProcessorPipeline, TransitionKey, create_transition
 from torch import Tensor
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 _TOLERANCE = 0.01  # of the range: what is learned a hundredth too small is not worth a word
 _SLACK = 1.1  # tanh gets to its ends only slowly

@@ -13,7 +13,7 @@ import draccus
 import gymnasium as gym
 import numpy as np
 
-from lerobot_playbyear.rollouts import Observation
+from lerobot_playbyear.episodes.rollouts import Observation
 
 
 class ExpertError(ValueError):

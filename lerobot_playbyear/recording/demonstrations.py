@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_playbyear.dagger.collector import collect
-from lerobot_playbyear.dagger.expert import ExpertConfig, ScriptedExpertConfig, Verdict
-from lerobot_playbyear.recording import RecordConfig, RecordError, env_spec, record
-from lerobot_playbyear.rollouts import EnvFacts, Episode, Observation, env_facts
+from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig, Verdict
+from lerobot_playbyear.episodes.rollouts import EnvFacts, Episode, Observation, env_facts
+from lerobot_playbyear.recording.record import RecordConfig, RecordError, env_spec, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
 

@@ -10,7 +10,7 @@ from lerobot.processor import (
     make_policy_processor_pipelines,
 )
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 
 def make_playbyear_pre_post_processors(

@@ -8,7 +8,7 @@ import torchaudio
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_playbyear.distributed import mean_over_processes
+from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 
 _POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
 _NOISE_TILT = (0.0, 1.2)  # exponent of 1 / frequency: from white to a little steeper than pink

@@ -29,10 +29,10 @@ from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_root
+from lerobot_playbyear.episodes.rollouts import EnvFacts, EnvSpec, Episode, Observation, RolloutError, RolloutPool
 from lerobot_playbyear.hub.datasets import push_dataset
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
-from lerobot_playbyear.rollouts import EnvFacts, EnvSpec, Episode, Observation, RolloutError, RolloutPool
-from lerobot_playbyear.saving import save_or_ask
+from lerobot_playbyear.recording.saving import save_or_ask
 
 INTERVENTION = "intervention"
 SEED = "seed"

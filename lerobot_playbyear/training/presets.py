@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 from lerobot.configs import parser
 
-from lerobot_playbyear.precision import computes_bfloat16
+from lerobot_playbyear.policy.precision import computes_bfloat16
 
 
 @dataclass(frozen=True)

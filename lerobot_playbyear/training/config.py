@@ -63,7 +63,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
     that lerobot-train can resume what playbyear-train began, and the other way round.
 
     Attributes:
-        preset: A named set of defaults, see `lerobot_playbyear.presets`.
+        preset: A named set of defaults, see `lerobot_playbyear.training.presets`.
         sampling: Which moments are learned from more often.
         store: Where the dataset is kept.
     """

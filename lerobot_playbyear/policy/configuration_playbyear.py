@@ -11,8 +11,8 @@ from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
-from lerobot_playbyear.precision import DTYPES, training_dtype
-from lerobot_playbyear.schedule import PlaybyearSchedulerConfig
+from lerobot_playbyear.policy.precision import DTYPES, training_dtype
+from lerobot_playbyear.policy.schedule import PlaybyearSchedulerConfig
 
 AUDIO_PREFIX = "observation.audio."
 

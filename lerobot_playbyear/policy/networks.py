@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 from torchvision.models.resnet import BasicBlock, ResNet
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.distributed import SharedBatchNorm2d
-from lerobot_playbyear.folding import FoldedCopy
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.packed_encoder import FoldedCopy
+from lerobot_playbyear.policy.shared_statistics import SharedBatchNorm2d
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7

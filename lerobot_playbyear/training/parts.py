@@ -27,12 +27,12 @@ from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.logging_utils import MetricsTracker
 from torch import Tensor
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
 from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
-from lerobot_playbyear.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.train_config import PlaybyearTrainConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 _DTYPES = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}
 

@@ -11,10 +11,10 @@ import torch
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.constants import OBS_IMAGE, OBS_STR
 
-from lerobot_playbyear.acting import RolloutParts
 from lerobot_playbyear.datasets.audio_feature import audio_keys
-from lerobot_playbyear.rollouts import roll_out
-from lerobot_playbyear.video import amplify, compose, episode_sound, inset, write_film
+from lerobot_playbyear.episodes.acting import RolloutParts
+from lerobot_playbyear.episodes.rollouts import roll_out
+from lerobot_playbyear.film.video import amplify, compose, episode_sound, inset, write_film
 
 _AUDIO = "audio."
 

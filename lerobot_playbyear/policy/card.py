@@ -1,23 +1,18 @@
 """What the card of a policy says beside LeRobot's template: what it hears, and how to try it."""
 
-import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.hub.markdown import code, plain, repository_name, word
-from lerobot_playbyear.tracking import METRICS_NAME
+from lerobot_playbyear.datasets.markdown import code, plain, repository_name, word
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 _BEFORE = "## Model Details"
-_NO_RESULTS = "_No evaluation results have been provided for this policy yet._"
-
 _PLAIN_NAME = re.compile(r"[\w ./-]+")
 
 
@@ -62,26 +57,6 @@ def with_hearing(card: ModelCard, config: PlaybyearConfig) -> ModelCard:
     return card
 
 
-def with_film(card: ModelCard, url: str) -> ModelCard:
-    """Shows a film at the card's head."""
-    card.text = f'\n<video controls width="480" src="{url}"></video>\n{card.text}'
-    return card
-
-
-def with_evaluation(card: ModelCard, checkpoint: Path) -> ModelCard:
-    """Writes into the card how often the policy succeeded, where its run evaluated this very checkpoint.
-
-    Args:
-        card: It is changed.
-        checkpoint: A folder `<run>/checkpoints/<step>/pretrained_model`.
-    """
-    figures = _evaluation(checkpoint)
-    if figures is not None:
-        result = f"Success in simulation: **{figures['pc_success']:.0f} %**, at step {figures['step']} of its training."
-        card.text = card.text.replace(_NO_RESULTS, result)
-    return card
-
-
 def _section(config: PlaybyearConfig) -> str:
     features = config.input_features or {}
     if config.use_audio:
@@ -116,27 +91,6 @@ def _section(config: PlaybyearConfig) -> str:
             f"```bash\nlerobot-eval --policy.path={name} --env.type=playbyear --env.task=OccludedGrasp-v0\n```",
         ]
     )
-
-
-def _evaluation(checkpoint: Path) -> dict[str, float] | None:
-    """The figures of the last evaluation, if it was of this checkpoint."""
-    folder = checkpoint.resolve()
-    state, metrics = folder.parent / "training_state" / "training_step.json", folder.parent.parent.parent / METRICS_NAME
-    if not (state.is_file() and metrics.is_file()):
-        return None
-    step = json.loads(state.read_text())["step"]
-    lines = [_figures(line) for line in metrics.read_text().splitlines()]
-    found = [line for line in lines if line.get("kind") == "eval" and line.get("step") == step and "pc_success" in line]
-    return found[-1] if found else None
-
-
-def _figures(line: str) -> dict[str, Any]:
-    """What a line says; nothing if a run that was killed, or a full disk, cut it off."""
-    try:
-        figures = json.loads(line)
-    except ValueError:
-        return {}
-    return figures if isinstance(figures, dict) else {}
 
 
 @dataclass(frozen=True)

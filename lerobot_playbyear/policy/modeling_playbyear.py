@@ -12,14 +12,19 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_playbyear.augmentation import Augmentation, resize
-from lerobot_playbyear.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.distributed import mean_over_processes
-from lerobot_playbyear.hub.policy_card import with_hearing, write_card
-from lerobot_playbyear.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
-from lerobot_playbyear.recent import RecentFrames
-from lerobot_playbyear.runs import before_episode, newest
-from lerobot_playbyear.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, segment_and_hop, to_float_wave
+from lerobot_playbyear.policy.augmentation import Augmentation, resize
+from lerobot_playbyear.policy.card import with_hearing, write_card
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.history import RecentFrames, before_episode, newest
+from lerobot_playbyear.policy.networks import AudioEncoder, Fusion, MemoryHead, VisionEncoder
+from lerobot_playbyear.policy.shared_statistics import mean_over_processes
+from lerobot_playbyear.policy.spectrogram import (
+    LogSpectrogram,
+    SharedStretches,
+    mix_in_noise,
+    segment_and_hop,
+    to_float_wave,
+)
 
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
 

@@ -5,9 +5,6 @@ from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 
 from lerobot_playbyear.datasets import EpisodeStore
 
-METRICS_NAME = "metrics.jsonl"
-"""File in the output folder with one JSON object per line."""
-
 
 def make_tracker(batch_size: int, store: EpisodeStore, step: int = 0) -> MetricsTracker:
     """The averages that LeRobot's `update_policy` writes to.

@@ -1,0 +1,1 @@
+"""Episodes: whoever acts in an environment, and what happens then."""

@@ -1,0 +1,1 @@
+"""The policy `playbyear`: configuration, network, processors, and what its card says."""

@@ -1,0 +1,1 @@
+"""Recording demonstrations, of a script or of a person."""

@@ -1,0 +1,1 @@
+"""Training with the dataset in memory."""
