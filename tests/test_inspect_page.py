@@ -150,8 +150,7 @@ def test_it_plays_to_the_end_and_from_the_start_again(page):
     assert frame(page) == LENGTHS[0] - 1
     page.press(" ")
     page.wait("!document.getElementById('video').paused && document.getElementById('video').currentTime < 1")
-    page.evaluate("document.getElementById('video').playbackRate = 8")
-    page.wait("document.getElementById('video').ended")
+    page.wait("document.getElementById('video').ended", timeout_s=60)  # three seconds, and longer on a busy machine
     assert frame(page) == LENGTHS[0] - 1
     assert page.evaluate("document.getElementById('play').className") == ""
 
@@ -206,6 +205,18 @@ def test_a_click_in_the_timeline_seeks(page):
     )
     page.click(left + width / 2, top + 20)
     assert frame(page) == pytest.approx(LENGTHS[0] / 2, abs=3)
+
+
+def test_a_click_in_the_timeline_goes_on_playing_what_was_started_anew(page):
+    page.press("End")
+    page.press(" ")
+    page.wait("!document.getElementById('video').paused && document.getElementById('video').currentTime < 1")
+    left, top, width = page.evaluate(
+        "(({left, top, width}) => [left, top, width])(document.querySelector('.panel canvas').getBoundingClientRect())"
+    )
+    page.click(left + width / 2, top + 20)
+    page.wait("!document.getElementById('video').paused && document.getElementById('video').currentTime > 1")
+
 
 
 def test_other_keys_do_what_the_help_says(page):

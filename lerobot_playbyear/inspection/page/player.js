@@ -25,8 +25,8 @@ class Player {
     if (play) this.play();
   }
   play() {
-    this.wantsToPlay = true;
     if (this.frame >= this.episode.frames - 1) this.show(0);
+    this.wantsToPlay = true;
     this.video.play().catch(() => this.onTime(this.frame / fps));
   }
   toggle() {
