@@ -18,8 +18,8 @@ import torch
 from torch import nn
 
 from experiments.protocol import RESULTS
-from gym_playbyear.base import NO_SENSOR_NOISE, SensorNoise
 from gym_playbyear.experts import ExpertConfig, GraspExpert
+from gym_playbyear.proprioception import NO_SENSOR_NOISE, SensorNoise
 
 TASK = "OccludedGrasp-v0"
 _ASIDE = -0.15  # x of a cube that is not in the way [m]

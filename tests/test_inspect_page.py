@@ -218,7 +218,6 @@ def test_a_click_in_the_timeline_goes_on_playing_what_was_started_anew(page):
     page.wait("!document.getElementById('video').paused && document.getElementById('video').currentTime > 1")
 
 
-
 def test_other_keys_do_what_the_help_says(page):
     page.press("?")
     page.wait("document.getElementById('keys').open")

@@ -1,7 +1,6 @@
 """What all tasks share: the arm on its table, one control step, observations, sound, rendering."""
 
 import time
-from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -11,26 +10,13 @@ from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from mujoco import rollout
 
-from gym_playbyear.arena import (
-    CUBE_HALF_SIZE,
-    TABLE_TOP,
-    contact_pairs,
-    contact_sensor_xml,
-    cube_xml,
-    pair_forces,
-    table_xml,
-)
-from gym_playbyear.arm import (
-    ARM_DEFAULT_XML,
-    N_JOINTS,
-    PHYSICS_TIMESTEP,
-    ArmConfig,
-    CartesianController,
-    arm_actuator_xml,
-    arm_body_xml,
-)
+from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, contact_pairs, pair_forces
+from gym_playbyear.arm import N_JOINTS, PHYSICS_TIMESTEP, CartesianController
 from gym_playbyear.materials import CUBE_MATERIALS
+from gym_playbyear.privileged import PrivilegedState
+from gym_playbyear.proprioception import Proprioception
 from gym_playbyear.rendering import SceneRenderer, Window
+from gym_playbyear.scene import model_xml
 from gym_playbyear.sound import ContactPair, ContactSound
 
 ACTION_SCALE = 0.05  # m of displacement per unit of action and step (the authors' code)
@@ -41,49 +27,7 @@ _CARRIED_HEIGHT = TABLE_TOP + CUBE_HALF_SIZE + 0.015  # m: the cube's centre is 
 _LIFTED_SILENCE_HEIGHT = 0.84  # m: above it the paper's force proxy is silent (the authors' code)
 
 
-@dataclass(frozen=True)
-class SensorNoise:
-    """Standard deviation and quantum of what the arm measures of itself, as on a real one. Zero switches noise off.
-
-    position: end effector [m]; finger: finger positions [m]; finger_velocity: [m/s]; quantum_*: rounding step. A hand whose
-    encoder has 8 bits counts in steps of half a millimetre.
-    differentiated: finger velocities are differences of the measured positions over a step, as from a hand that reports
-    its width alone; otherwise they are the fingers' own at the moment, in which every touch rings.
-    """
-
-    position: float = 0.0003
-    finger: float = 0.00002
-    finger_velocity: float = 0.002
-    quantum_position: float = 0.0001
-    quantum_finger: float = 0.0005
-    quantum_velocity: float = 0.001
-    differentiated: bool = True
-
-
-NO_SENSOR_NOISE = SensorNoise(0, 0, 0, 0, 0, 0, differentiated=False)
-
-
-@dataclass(frozen=True)
-class Variant:
-    """The numbers of a task that decide whether it can be solved without hearing.
-
-    cube_y, cube_x: ranges of the hidden cube's position [m]; cube_yaw: largest yaw, either way [rad];
-    cube_density [kg/m3]; cube_friction: sliding friction; max_shove: how far the cube may be shoved along the table before
-    the attempt has failed [m]; horizon: steps of an episode; arm, sensors: their numbers.
-    """
-
-    cube_x: tuple[float, float]
-    cube_y: tuple[float, float]
-    cube_yaw: float
-    cube_density: float
-    cube_friction: float
-    horizon: int
-    max_shove: float = np.inf
-    arm: ArmConfig = field(default_factory=ArmConfig)
-    sensors: SensorNoise = field(default_factory=SensorNoise)
-
-
-class PlayByEarEnv(gym.Env):
+class PlayByEarEnv(PrivilegedState, gym.Env):
     """Base of the tasks. A task gives its fixed bodies, places what moves, and says when it is solved.
 
     A copy (`copy.deepcopy`, `pickle`), of the environment alone or together with an expert or a gate, goes on as the original
@@ -131,7 +75,9 @@ class PlayByEarEnv(gym.Env):
         self._sample_rate = sample_rate
 
         self.pairs = contact_pairs(self._scene_bodies)
-        self.model = mujoco.MjModel.from_xml_string(self._model_xml())
+        self.model = mujoco.MjModel.from_xml_string(
+            model_xml(self.variant, self._scene_xml(), self.pairs, max(render_size, image_size))
+        )
         self.data = mujoco.MjData(self.model)
         self._controller = CartesianController(self.variant.arm, CONTROL_HZ)
         self._sound: ContactSound | None = None
@@ -158,7 +104,7 @@ class PlayByEarEnv(gym.Env):
         self._expert_rng: np.random.Generator | None = None  # None before the first episode
         self._peak_forces = np.zeros(len(self.pairs))
         self._n_steps = 0
-        self._measured_fingers = np.zeros(2)
+        self._sensors = Proprioception(self.variant.sensors, CONTROL_HZ)
 
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         observation: dict[str, spaces.Space] = {
@@ -219,6 +165,7 @@ class PlayByEarEnv(gym.Env):
         self._expert_rng = np.random.default_rng(self.np_random.integers(2**63))
         if self._sound is not None:
             self._sound.reset(np.random.default_rng(self.np_random.integers(2**63)))
+        self._sensors.reset()
         self._n_steps = 0
         mujoco.mj_forward(self.model, self.data)
         hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)
@@ -280,44 +227,6 @@ class PlayByEarEnv(gym.Env):
         if self._expert_rng is None:
             raise ResetNeeded(f"{call}() was called before the first episode: call reset() first.")
 
-    # Privileged state, for experts, tests and probes
-
-    @property
-    def expert_rng(self) -> np.random.Generator:
-        """What the episode's experts draw from.
-
-        Raises:
-            ResetNeeded: There is no episode yet.
-        """
-        if self._expert_rng is None:
-            raise ResetNeeded("An expert was made before the first episode: call reset() first.")
-        return self._expert_rng
-
-    @property
-    def eef_position(self) -> np.ndarray:
-        """(3,) the point between the fingertips [m, world frame], without sensor noise."""
-        return self.data.site_xpos[self._tcp].copy()
-
-    @property
-    def gripper_obeys(self) -> bool:
-        """Whether a change of the gripper's command takes effect in the next step; for 2 s after the last one it does not."""
-        return self._controller.gripper_obeys
-
-    @property
-    def cube_position(self) -> np.ndarray:
-        """(3,) the cube's centre [m, world frame]."""
-        return self.data.xpos[self._cube].copy()
-
-    @property
-    def finger_positions(self) -> np.ndarray:
-        """(2,) [m], without sensor noise."""
-        return self.data.qpos[N_JOINTS : N_JOINTS + 2].copy()
-
-    @property
-    def contact_forces(self) -> dict[str, float]:
-        """Largest net force of each pair of bodies in the last control step [N], e.g. `gripper-cube`."""
-        return {f"{a}-{b}": float(force) for (a, b), force in zip(self.pairs, self._peak_forces, strict=True)}
-
     def cube_pixels(self) -> int:
         """How many pixels of the policy's camera show the cube (segmentation rendering)."""
         self._check_is_running("cube_pixels")
@@ -351,7 +260,7 @@ class PlayByEarEnv(gym.Env):
     def _observe(self, sensors: np.ndarray) -> dict[str, Any]:
         observation: dict[str, Any] = {
             "pixels": {"front": self._front_camera().render(self.data, "front")},
-            "agent_pos": self._proprioception(),
+            "agent_pos": self._sensors.measure(self._true_proprioception(), self.np_random),
         }
         if self._sound is not None:
             first_qvel = 1 + self.model.nq
@@ -364,20 +273,9 @@ class PlayByEarEnv(gym.Env):
             observation["contact_force"] = force.astype(np.float32)
         return observation
 
-    def _proprioception(self) -> np.ndarray:
-        noise = self.variant.sensors
+    def _true_proprioception(self) -> np.ndarray:
         fingers = slice(N_JOINTS, N_JOINTS + 2)
-        values = np.concatenate([self.eef_position - self._base, self.data.qpos[fingers], self.data.qvel[fingers]])
-        scale = np.repeat([noise.position, noise.finger, noise.finger_velocity], (3, 2, 2))
-        values += scale * self.np_random.standard_normal(7)
-        quantum = np.repeat([noise.quantum_position, noise.quantum_finger, noise.quantum_velocity], (3, 2, 2))
-        coarse = quantum > 0
-        values[coarse] = np.round(values[coarse] / quantum[coarse]) * quantum[coarse]
-        if noise.differentiated:
-            before = values[3:5] if self._n_steps == 0 else self._measured_fingers
-            self._measured_fingers = values[3:5].copy()
-            values[5:] = (values[3:5] - before) * CONTROL_HZ
-        return values.astype(np.float32)
+        return np.concatenate([self.eef_position - self._base, self.data.qpos[fingers], self.data.qvel[fingers]])
 
     def _front_camera(self) -> SceneRenderer:
         if self._camera is None:
@@ -391,26 +289,6 @@ class PlayByEarEnv(gym.Env):
 
     def _place_body(self, name: str, position: np.ndarray) -> None:
         self.model.body(name).pos[:] = position
-
-    def _model_xml(self) -> str:
-        size = max(self._render_size, self._image_size)
-        return f"""
-<mujoco model="playbyear">
-  <compiler angle="radian" autolimits="true"/>
-  <option timestep="{PHYSICS_TIMESTEP}" integrator="implicitfast" cone="elliptic" impratio="10"/>
-  <visual>
-    <global offwidth="{size}" offheight="{size}"/><quality offsamples="0" numslices="10" numstacks="5"/>
-    <headlight ambient="0.45 0.45 0.45" diffuse="0.45 0.45 0.45" specular="0 0 0"/>
-    <map znear="0.02" zfar="20"/>
-  </visual>
-  <statistic extent="1.5" center="0 0 0.9"/>
-  <default>{ARM_DEFAULT_XML}</default>
-  <asset><texture type="skybox" builtin="gradient" rgb1="0.85 0.88 0.92" rgb2="0.45 0.5 0.56" width="32" height="192"/></asset>
-  <worldbody>{arm_body_xml(self.variant.arm)}{table_xml()}{self._scene_xml()}
-    {cube_xml(self.variant.cube_density, self.variant.cube_friction)}
-  </worldbody>
-  {arm_actuator_xml(self.variant.arm)}{contact_sensor_xml(self.pairs)}
-</mujoco>"""
 
 
 def _check_option(name: str, value, allowed: tuple) -> None:

@@ -7,10 +7,12 @@ import numpy as np
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.base import NO_SENSOR_NOISE, PlayByEarEnv, Variant
+from gym_playbyear.base import PlayByEarEnv
 from gym_playbyear.blind import blind_grasps
 from gym_playbyear.experts import CORRECTING_EXPERT, GraspExpert
 from gym_playbyear.gates import InterventionGate
+from gym_playbyear.proprioception import NO_SENSOR_NOISE
+from gym_playbyear.variant import Variant
 
 WALL_HALF_SIZE = (0.02, 0.40, 0.30)  # m
 WALL_CENTRE = (0.20, 0.0, 0.775)  # m: its top is 0.275 m above the table

@@ -7,10 +7,12 @@ import numpy as np
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml, tray_xml
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.base import NO_SENSOR_NOISE, PlayByEarEnv, Variant
+from gym_playbyear.base import PlayByEarEnv
 from gym_playbyear.blind import blind_pick_places
 from gym_playbyear.experts import CORRECTING_EXPERT, PickPlaceExpert
 from gym_playbyear.gates import InterventionGate
+from gym_playbyear.proprioception import NO_SENSOR_NOISE
+from gym_playbyear.variant import Variant
 
 WALL_HALF_SIZE = (0.02, 0.20, 0.18)  # m
 WALL_CENTRE = (0.10, 0.20, 0.80)  # m
