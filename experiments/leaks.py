@@ -20,6 +20,8 @@ from torch import nn
 from experiments.protocol import RESULTS
 from gym_playbyear.experts import ExpertConfig, GraspExpert
 from gym_playbyear.proprioception import NO_SENSOR_NOISE, SensorNoise
+from lerobot_playbyear.episodes.episode import Observation
+from lerobot_playbyear.episodes.play import play
 
 TASK = "OccludedGrasp-v0"
 _ASIDE = -0.15  # x of a cube that is not in the way [m]
@@ -31,6 +33,18 @@ _SENSORS = {
     "noise of 0.2 mm, velocities from widths": SensorNoise(finger=0.0002, quantum_finger=0.0001),
     "widths in steps of 0.5 mm, velocities from them": SensorNoise(),
 }
+
+
+class Numb:
+    """Sweeps as the expert does, and feels no touch. Remembers in which steps it was sweeping."""
+
+    def reset(self, env: gym.Env) -> None:
+        self._script = GraspExpert(env.unwrapped, ExpertConfig(contact_force=np.inf))
+        self.sweeping: list[bool] = []
+
+    def act(self, observation: Observation) -> np.ndarray:
+        self.sweeping.append(self._script.phase == "sweep")
+        return self._script.act()
 
 
 def twin_sweeps(sensors: SensorNoise, seeds: range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -59,18 +73,12 @@ def twin_sweeps(sensors: SensorNoise, seeds: range) -> tuple[np.ndarray, np.ndar
 
 def _sweep(env: gym.Env, seed: int, cube: tuple[float, float] | None) -> tuple[list[np.ndarray], list[int]]:
     """The observed states of a numb sweep, and in which of them the cube is touched."""
-    observation, _ = env.reset(seed=seed, options={} if cube is None else {"cube_position": cube})
-    task = env.unwrapped
-    numb = GraspExpert(task, ExpertConfig(contact_force=np.inf))
-    states, contacts, ended = [observation["agent_pos"]], [], False
-    while not ended:
-        sweeping = numb.phase == "sweep"
-        observation, _, terminated, truncated, _ = env.step(numb.act())
-        states.append(observation["agent_pos"])
-        if sweeping and task.contact_forces["gripper-cube"] > 0:
-            contacts.append(len(states) - 1)
-        ended = terminated or truncated
-    return states, contacts
+    numb = Numb()
+    options = {} if cube is None else {"cube_position": cube}
+    episode = play(env, numb, seed, options=options, watch=lambda: env.unwrapped.contact_forces["gripper-cube"] > 0)
+    steps = enumerate(zip(numb.sweeping, episode.watched[1:], strict=True), start=1)
+    contacts = [step for step, (sweeping, touched) in steps if sweeping and touched]
+    return [observation["agent_pos"] for observation in episode.observations], contacts
 
 
 def area_under_curve(scores: np.ndarray, positive: np.ndarray) -> float:

@@ -14,15 +14,10 @@ figures do not depend on whether the episode would have succeeded.
 
 import argparse
 import json
-from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
-import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.envs.utils import freeze_after_episode_end
-from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from experiments.ablations import STUDY
@@ -30,36 +25,25 @@ from experiments.protocol import DONOR_SEEDS, EVALUATION_SEEDS, N_DEMONSTRATIONS
 from experiments.sound_probe import REACTION_STEPS, Donor, SoundProbe, Trial, make_donors
 from experiments.training import Job
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.episodes.acting import load_for_rollout
-from lerobot_playbyear.recording.record import env_spec
+from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 
 TASK = "OccludedGrasp-v0"
 MODES = ("false", "control", "muted")
-_BATCH = 25
 
 
-def listen(policy_path: Path, mode: str, seeds: range, donors: list[Donor]) -> list[Trial]:
+def listen(policy_path: Path, mode: str, env: gym.Env, seeds: range, donors: list[Donor]) -> list[Trial]:
     """What a policy does when its sound is swapped, one trial per seed."""
-    env_cfg = PlaybyearEnvConfig(task=TASK)
     policy_cfg = PreTrainedConfig.from_pretrained(policy_path)
     policy_cfg.pretrained_path = policy_path
-    parts = load_for_rollout(policy_cfg, env_cfg)
-    spec = env_spec(env_cfg)
-    make = partial(_make_probe, spec.id, spec.kwargs, mode, donors)
-    envs = SyncVectorEnv([freeze_after_episode_end(make)] * _BATCH, autoreset_mode=AutoresetMode.SAME_STEP)
-    trials: list[Trial] = []
-    try:
-        for start in range(seeds.start, seeds.stop, _BATCH):
-            with torch.no_grad():
-                rollout(envs, *parts.in_order(), seeds=list(range(start, start + _BATCH)))
-            trials += [env.get_wrapper_attr("trial") for env in envs.envs]
-    finally:
-        envs.close()
+    actor = load_policy_actor(policy_cfg, PlaybyearEnvConfig(task=TASK))
+    probe = SoundProbe(env, mode, donors)
+    trials = []
+    for seed in seeds:
+        play(probe, actor, seed)
+        trials.append(probe.trial)
     return trials
-
-
-def _make_probe(env_id: str, kwargs: dict, mode: str, donors: list[Donor]) -> gym.Env:
-    return SoundProbe(gym.make(env_id, disable_env_checker=True, **kwargs), mode, donors)
 
 
 def summary(trials: list[Trial]) -> dict[str, float | int | None]:
@@ -86,18 +70,18 @@ def main() -> None:
 
     env = env_spec(PlaybyearEnvConfig(task=TASK)).make()
     donors = make_donors(env, DONOR_SEEDS)
-    env.close()
     episodes = range(options.first_seed, options.first_seed + options.n_episodes)
     policies = {"policy": options.policy} if options.policy else {}
     for seed in () if options.policy else options.seeds:
         policies[f"seed{seed}"] = Job(STUDY, TASK, "full", seed, N_DEMONSTRATIONS, STEPS[TASK]).checkpoint
     for name, path in policies.items():
-        report = {mode: summary(listen(path, mode, episodes, donors)) for mode in MODES}
+        report = {mode: summary(listen(path, mode, env, episodes, donors)) for mode in MODES}
         print(name, json.dumps(report), flush=True)
         if not options.policy:
             output = RESULTS / "listening" / f"{TASK}-{name}.json"
             output.parent.mkdir(parents=True, exist_ok=True)
             output.write_text(json.dumps({"first_seed": episodes.start, **report}, indent=1) + "\n")
+    env.close()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ import numpy as np
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP
 from gym_playbyear.arm import FINGER_THICKNESS
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.script import Script
 
 AUDIO_KEY = "audio.gripper"
 REACTION_STEPS = 10
@@ -151,14 +153,9 @@ def make_donors(env: gym.Env, seeds: range) -> list[Donor]:
     donors = []
     task: Any = env.unwrapped
     for seed in seeds:
-        observation, _ = env.reset(seed=seed)
-        expert, blocks, touched_at, ended = task.scripted_expert(), [observation[AUDIO_KEY]], None, False
-        while not ended and (touched_at is None or len(blocks) < touched_at + _CONTACT_BLOCKS):
-            observation, _, terminated, truncated, _ = env.step(expert.act())
-            blocks.append(observation[AUDIO_KEY])
-            if touched_at is None and task.contact_forces["gripper-cube"] > 0:
-                touched_at = len(blocks) - 1
-            ended = terminated or truncated
+        episode = play(env, Script(), seed, watch=lambda: task.contact_forces["gripper-cube"] > 0)
+        blocks = [observation[AUDIO_KEY] for observation in episode.observations]
+        touched_at = next((step for step, touched in enumerate(episode.watched) if touched), None)
         if touched_at is not None and touched_at > _QUIET_BLOCKS and len(blocks) >= touched_at + _CONTACT_BLOCKS:
             contact = np.stack(blocks[touched_at : touched_at + _CONTACT_BLOCKS])
             donors.append(Donor(contact, np.stack(blocks[touched_at - _QUIET_BLOCKS : touched_at])))

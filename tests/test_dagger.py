@@ -16,11 +16,13 @@ from safetensors.torch import load_file
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerError, Expert, ExpertConfig, Verdict
-from lerobot_playbyear.dagger.collector import PolicyActor, collect
 from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
+from lerobot_playbyear.dagger.loop import outcome_of
+from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.recording.record import env_spec
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -75,7 +77,7 @@ def scene(expert=None):
 
 def test_a_policy_acts_as_in_lerobots_rollout():
     env, actor, expert = scene()
-    attempt = collect(env, actor, expert, seed=5)
+    episode = play(env, actor, seed=5, expert=expert)
     env_cfg = PlaybyearEnvConfig(image_size=16)
     policy = PlaybyearPolicy.from_pretrained(base_folder() / "policy").eval()
     own = make_pre_post_processors(policy.config, str(base_folder() / "policy"))
@@ -84,15 +86,14 @@ def test_a_policy_acts_as_in_lerobots_rollout():
     vec.close()
     env.close()
     expected = result["action"][0].clamp(-1, 1)
-    np.testing.assert_allclose(attempt.episode.actions, expected, atol=1e-6)
-    assert not attempt.episode.interventions.any()
+    np.testing.assert_array_equal(episode.actions, expected)
+    assert not episode.interventions.any()
 
 
 def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted():
     expert = Scripted(steps=range(4, 9))
     env, actor, _ = scene()
-    attempt = collect(env, actor, expert, seed=5)
-    episode = attempt.episode
+    episode = play(env, actor, seed=5, expert=expert)
     assert np.flatnonzero(episode.interventions).tolist() == list(range(4, 9))
     for step, action in expert.actions.items():
         np.testing.assert_array_equal(episode.actions[step], action)
@@ -108,23 +109,23 @@ def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted():
 def test_the_policy_remembers_the_steps_in_which_the_expert_acted():
     """Its action after a correction is that of a policy that saw the corrected steps."""
     env, actor, _ = scene()
-    episode = collect(env, actor, Scripted(steps=range(4, 9)), seed=5).episode
-    actor.reset()
-    seen = [actor.act(observation, episode.task) for observation in episode.observations[:-1]]
+    episode = play(env, actor, seed=5, expert=Scripted(steps=range(4, 9)))
+    actor.reset(env)
+    seen = [actor.act(observation) for observation in episode.observations[:-1]]
     env.close()
     np.testing.assert_allclose(np.clip(seen[9], -1, 1), episode.actions[9], atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("verdict", "is_kept"), [(Verdict.SUCCESS, True), (Verdict.FAILURE, False), (Verdict.DISCARD, False)]
+    ("verdict", "outcome"), [(Verdict.SUCCESS, "kept"), (Verdict.FAILURE, "failed"), (Verdict.DISCARD, "discarded")]
 )
-def test_an_expert_can_end_an_attempt(verdict, is_kept):
+def test_an_expert_can_end_an_attempt(verdict, outcome):
     env, actor, _ = scene()
-    attempt = collect(env, actor, Scripted(steps=(2,), verdicts={6: verdict}), seed=5)
+    episode = play(env, actor, seed=5, expert=Scripted(steps=(2,), verdicts={6: verdict}))
     env.close()
-    assert len(attempt.episode) == 7
-    assert attempt.episode.success is (verdict is Verdict.SUCCESS)
-    assert attempt.is_kept is is_kept
+    assert len(episode) == 7
+    assert episode.success is (verdict is Verdict.SUCCESS)
+    assert outcome_of(episode) == outcome
 
 
 # A run

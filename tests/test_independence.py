@@ -56,4 +56,4 @@ for package in (lerobot_playbyear, lerobot_policy_playbyear):
 
 def test_what_a_rollout_worker_imports_needs_neither_lerobot_nor_torch():
     """Otherwise each worker takes half a minute to start on a slow machine."""
-    _run_without({"torch", "lerobot"}, "import lerobot_playbyear.episodes.rollouts, lerobot_playbyear.scripts.record")
+    _run_without({"torch", "lerobot"}, "import lerobot_playbyear.episodes.pool, lerobot_playbyear.scripts.record")

@@ -16,8 +16,9 @@ from lerobot.envs import EnvConfig
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.episodes.rollouts import RolloutError, RolloutPool
-from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, RecordError, env_spec, record
+from lerobot_playbyear.episodes.environment import RolloutError, env_spec
+from lerobot_playbyear.episodes.pool import RolloutPool
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, RecordError, record
 
 
 def config(root: Path, num_episodes: int = 2, **options) -> RecordConfig:

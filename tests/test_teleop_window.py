@@ -17,10 +17,12 @@ from virtual_screen import MISSING, VirtualScreen, wait_for
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Verdict
-from lerobot_playbyear.dagger.collector import PolicyActor, collect
+from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
-from lerobot_playbyear.recording.record import RecordDatasetConfig, env_spec
+from lerobot_playbyear.recording.record import RecordDatasetConfig
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 from lerobot_playbyear.teleoperation.expert import PersonLeftError
 from lerobot_playbyear.teleoperation.panel import FRAME
@@ -110,12 +112,12 @@ class Remembering(PolicyActor):
 
     wanted: list  # of actions (action dim,)
 
-    def reset(self):
-        super().reset()
+    def reset(self, env):
+        super().reset(env)
         self.wanted = []
 
-    def act(self, observation, task):
-        self.wanted.append(super().act(observation, task))
+    def act(self, observation):
+        self.wanted.append(super().act(observation))
         return self.wanted[-1]
 
 
@@ -132,7 +134,7 @@ def test_an_override_is_recorded_on_exactly_the_held_frames_and_the_arm_moves_as
     env.expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
     try:
         screen.focus(screen.window(_TITLE))
-        episode = collect(env, actor, env.expert, seed=5).episode
+        episode = play(env, actor, seed=5, expert=env.expert)
         axes = env.unwrapped.data.cam("people").xmat.reshape(3, 3)
     finally:
         env.expert.close()
@@ -268,7 +270,7 @@ def test_escape_ends_the_session(screen):
     screen.press("s", "Escape")  # before an attempt has begun
     wait_for(lambda: "escape" in expert._desk.window.keys._pressed_since)
     with pytest.raises(PersonLeftError):
-        collect(env, Nobody(env), expert, seed=1)
+        play(env, Nobody(), seed=1, expert=expert)
     expert.close()
     env.close()
 
@@ -291,7 +293,7 @@ def test_verdicts_reach_the_loop(screen):
     env = Person(env_spec(env_config(episode_length=2000)).make(), screen, {"r": (4, 6)})
     env.expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
     screen.focus(screen.window(_TITLE))
-    attempt = collect(env, Nobody(env), env.expert, seed=1)
+    episode = play(env, Nobody(), seed=1, expert=env.expert)
     env.expert.close()
     env.close()
-    assert (attempt.verdict, len(attempt.episode)) == (Verdict.DISCARD, 5)
+    assert (episode.verdict, len(episode)) == (Verdict.DISCARD, 5)

@@ -19,10 +19,12 @@ from lerobot.teleoperators.keyboard import (
 from gym_playbyear.arm import ArmConfig, CartesianController
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
-from lerobot_playbyear.dagger.collector import collect
 from lerobot_playbyear.dagger.config import DatasetSource
+from lerobot_playbyear.dagger.loop import outcome_of
+from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.play import play as play_episode
 from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
-from lerobot_playbyear.recording.record import RecordDatasetConfig, RecordError, env_spec
+from lerobot_playbyear.recording.record import RecordDatasetConfig, RecordError
 from lerobot_playbyear.teleoperation.actions import CLOSE, DELTAS, OPEN, STAY, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
 from lerobot_playbyear.teleoperation.controls import Controls
@@ -385,7 +387,7 @@ def play(script, teleop=None, begins_paused=False, demonstrates=False, horizon=3
     desk = Desk(window, teleop, mapping, Gripper(40), Pace(20, clock, clock.sleep), None, [])
     expert = TeleopExpert(desk, begins_paused, demonstrates)
     try:
-        return collect(env, Nobody(env), expert, seed=3), window
+        return play_episode(env, Nobody(), seed=3, expert=expert), window
     finally:
         expert.close()
         if own:
@@ -399,10 +401,10 @@ def make_env(horizon):
 
 def test_the_person_acts_on_exactly_the_steps_in_which_the_key_is_held():
     attempt, window = play({5: holding("space", "right"), 12: letting_go("space"), 15: letting_go("right")})
-    flags = attempt.episode.interventions
+    flags = attempt.interventions
     assert np.flatnonzero(flags).tolist() == list(range(5, 12))
-    np.testing.assert_allclose(attempt.episode.actions[flags], np.tile([0.3, 0, 0, -1], (7, 1)), atol=1e-6)
-    assert not attempt.episode.actions[~flags].any()
+    np.testing.assert_allclose(attempt.actions[flags], np.tile([0.3, 0, 0, -1], (7, 1)), atol=1e-6)
+    assert not attempt.actions[~flags].any()
     controls = [status.control for status, picture in window.shown if picture is not None]
     assert controls[6:13] == [Control.PERSON] * 7  # each step shows who acted in the one before
     assert controls[13:] == [Control.POLICY] * (len(controls) - 13)
@@ -411,9 +413,9 @@ def test_the_person_acts_on_exactly_the_steps_in_which_the_key_is_held():
 def test_a_teleoperators_intervention_takes_over_with_its_own_action():
     events = [()] * 4 + [(TeleopEvents.IS_INTERVENTION,)] * 3 + [()]
     attempt, _ = play({}, scripted([(0, 1, 0, CLOSE)], events))
-    flags = attempt.episode.interventions
+    flags = attempt.interventions
     assert np.flatnonzero(flags).tolist() == [3, 4, 5]  # one reading was made before the first step
-    np.testing.assert_allclose(attempt.episode.actions[flags], np.tile([0, 0.3, 0, 1], (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(attempt.actions[flags], np.tile([0, 0.3, 0, 1], (3, 1)), atol=1e-6)
 
 
 def test_a_pause_stops_the_simulation_and_nothing_else():
@@ -421,36 +423,36 @@ def test_a_pause_stops_the_simulation_and_nothing_else():
     without, _ = play(held)
     paused, window = play({**held, 8: tapping("p"), "paused": tapping("p")})
     assert window.n_pauses == 3
-    np.testing.assert_array_equal(paused.episode.actions, without.episode.actions)
-    last = [attempt.episode.observations[-1]["agent_pos"] for attempt in (paused, without)]
+    np.testing.assert_array_equal(paused.actions, without.actions)
+    last = [attempt.observations[-1]["agent_pos"] for attempt in (paused, without)]
     np.testing.assert_array_equal(*last)
 
 
 def test_an_attempt_can_wait_for_the_person():
     attempt, window = play({"paused": tapping("p")}, begins_paused=True)
-    assert len(attempt.episode) == 30
+    assert len(attempt) == 30
     assert [status.note for status, _ in window.shown if status.control is Control.PAUSED] == ["Press P to begin"] * 3
 
 
 @pytest.mark.parametrize(
-    ("name", "verdict", "is_kept"),
-    [("s", Verdict.SUCCESS, True), ("q", Verdict.FAILURE, False), ("r", Verdict.DISCARD, False)],
+    ("name", "verdict", "outcome"),
+    [("s", Verdict.SUCCESS, "kept"), ("q", Verdict.FAILURE, "failed"), ("r", Verdict.DISCARD, "discarded")],
 )
-def test_an_attempt_ends_when_the_person_says_so(name, verdict, is_kept):
+def test_an_attempt_ends_when_the_person_says_so(name, verdict, outcome):
     attempt, _ = play({5: holding("space", "up"), 9: tapping(name)})
-    assert (attempt.verdict, attempt.is_kept, len(attempt.episode)) == (verdict, is_kept, 10)
-    assert attempt.episode.success == (verdict is Verdict.SUCCESS)
+    assert (attempt.verdict, outcome_of(attempt), len(attempt)) == (verdict, outcome, 10)
+    assert attempt.success == (verdict is Verdict.SUCCESS)
 
 
 def test_an_attempt_can_be_ended_in_a_pause():
     attempt, _ = play({4: tapping("p"), "paused": tapping("r")})
-    assert (attempt.verdict, len(attempt.episode)) == (Verdict.DISCARD, 5)
+    assert (attempt.verdict, len(attempt)) == (Verdict.DISCARD, 5)
 
 
 def test_the_gripper_key_closes_and_opens_it_with_the_cool_down_between():
     presses = {3: tapping("g"), 20: tapping("g"), 50: tapping("g"), 60: tapping("g")}
     attempt, window = play({0: holding("space"), **presses}, horizon=80)
-    commands = attempt.episode.actions[:, 3]
+    commands = attempt.actions[:, 3]
     assert (np.flatnonzero(np.diff(commands)) + 1).tolist() == [3, 50]
     assert commands[:3].tolist() == [-1] * 3
     shown = {status.step: status for status, picture in window.shown if picture is not None}
@@ -460,19 +462,19 @@ def test_the_gripper_key_closes_and_opens_it_with_the_cool_down_between():
 
 def test_the_gripper_key_does_nothing_while_the_policy_acts():
     attempt, _ = play({3: tapping("g"), 6: holding("space")})
-    assert attempt.episode.actions[6:, 3].tolist() == [-1] * 24
+    assert attempt.actions[6:, 3].tolist() == [-1] * 24
 
 
 def test_a_teleoperator_says_close_stay_and_open():
     grips = [(0, 0, 0, grip) for grip in [STAY] * 3 + [CLOSE] + [STAY] * 50 + [OPEN] + [STAY]]
     attempt, _ = play({}, scripted(grips), demonstrates=True, horizon=70)
-    assert (np.flatnonzero(np.diff(attempt.episode.actions[:, 3])) + 1).tolist() == [2, 53]
+    assert (np.flatnonzero(np.diff(attempt.actions[:, 3])) + 1).tolist() == [2, 53]
 
 
 def test_a_demonstration_is_the_persons_from_start_to_end():
     attempt, _ = play({4: holding("e"), 6: letting_go("e")}, demonstrates=True)
-    assert attempt.episode.interventions.all()
-    assert np.flatnonzero(attempt.episode.actions[:, 2]).tolist() == [4, 5]
+    assert attempt.interventions.all()
+    assert np.flatnonzero(attempt.actions[:, 2]).tolist() == [4, 5]
 
 
 def test_what_was_pressed_before_an_attempt_is_not_meant_for_it():
@@ -484,11 +486,11 @@ def test_what_was_pressed_before_an_attempt_is_not_meant_for_it():
     mapping = ActionMapping(teleop.action_features, env.action_space, "x,y,z", 0.3)
     expert = TeleopExpert(Desk(window, teleop, mapping, Gripper(40), Pace(20, clock, clock.sleep), None, []), False)
     press(window.keys, "s", "g", "p", "right", "space")
-    attempt = collect(env, Nobody(env), expert, seed=3)
-    assert (attempt.verdict, len(attempt.episode), attempt.intervention_share) == (None, 8, 0)
+    attempt = play_episode(env, Nobody(), seed=3, expert=expert)
+    assert (attempt.verdict, len(attempt), attempt.intervention_share) == (None, 8, 0)
     press(window.keys, "escape")
     with pytest.raises(PersonLeftError):
-        collect(env, Nobody(env), expert, seed=3)
+        play_episode(env, Nobody(), seed=3, expert=expert)
     env.close()
 
 

@@ -1,15 +1,21 @@
 """Films: pictures and sound in time with each other, in a file that players take."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+import torch
+from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.envs.utils import env_to_policy_features
-from lerobot.policies import make_policy, make_policy_config, make_pre_post_processors
+from lerobot.policies import ACTConfig, make_policy, make_policy_config, make_pre_post_processors
+from lerobot.scripts.lerobot_eval import rollout
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.episodes.rollouts import RolloutError
+from lerobot_playbyear.episodes.environment import RolloutError, env_spec
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.film.video import amplify, compose, episode_sound, spectrogram_strip, write_film
 from lerobot_playbyear.scripts.video import VideoConfig, film
 
@@ -93,8 +99,8 @@ def test_a_blind_baseline_can_be_filmed_and_an_unknown_one_is_named(tmp_path):
         film(VideoConfig(env, output=tmp_path / "film.mp4", baseline="deaf"))
 
 
-def test_any_lerobot_policy_can_be_filmed(tmp_path):
-    env = small_env(episode_length=5)
+def save_act(env: PlaybyearEnvConfig, folder: Path, **options) -> ACTConfig:
+    """A small policy of LeRobot's own, untrained."""
     features = env_to_policy_features(env)
     config = make_policy_config(
         "act",
@@ -106,15 +112,42 @@ def test_any_lerobot_policy_can_be_filmed(tmp_path):
         dim_feedforward=32,
         input_features={key: features[key] for key in ("observation.state", "observation.images.front")},
         output_features={"action": features["action"]},
+        **options,
     )
-    make_policy(config, env_cfg=env).save_pretrained(tmp_path)
+    make_policy(config, env_cfg=env).save_pretrained(folder)
     for processor in make_pre_post_processors(config, dataset_stats={}):
-        processor.save_pretrained(tmp_path)
-    config.pretrained_path = tmp_path
-    path = film(VideoConfig(env, policy=config, output=tmp_path / "policy.mp4"))
+        processor.save_pretrained(folder)
+    config.pretrained_path = folder
+    return config
+
+
+def test_any_lerobot_policy_can_be_filmed(tmp_path):
+    env = small_env(episode_length=5)
+    path = film(VideoConfig(env, policy=save_act(env, tmp_path), output=tmp_path / "policy.mp4", attempts=2))
     pictures, sound = decode(path)
     assert len(pictures) == 6
     assert sound.any()
+
+
+@pytest.mark.parametrize("use_amp", [False, True])
+def test_a_loaded_policy_acts_bit_for_bit_as_in_lerobot_eval(tmp_path, use_amp):
+    env_cfg = small_env(episode_length=4)
+    policy_cfg = save_act(env_cfg, tmp_path, use_amp=use_amp, n_action_steps=1)
+    env = env_spec(env_cfg).make()
+    episode = play(env, load_policy_actor(policy_cfg, env_cfg), seed=5)
+    env.close()
+
+    policy = make_policy(policy_cfg, env_cfg=env_cfg).eval()
+    processors = (
+        *make_env_pre_post_processors(env_cfg, policy_cfg),
+        *make_pre_post_processors(policy_cfg, str(tmp_path)),
+    )
+    vec = make_env(env_cfg)["playbyear"][0]
+    with torch.no_grad(), torch.autocast("cpu") if use_amp else nullcontext():
+        result = rollout(vec, policy, *processors, seeds=[5])
+    vec.close()
+    np.testing.assert_array_equal(episode.actions, result["action"][0].float().clamp(-1, 1))
+    assert episode.actions.any()
 
 
 def test_an_interrupted_film_leaves_no_file(tmp_path):

@@ -2,7 +2,8 @@
 
 from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
 from lerobot_playbyear.dagger.run import run_dagger
-from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig, Verdict
+from lerobot_playbyear.episodes.episode import Verdict
+from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig
 
 __all__ = [
     "DaggerConfig",

@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
-from lerobot_playbyear.recording.record import INTERVENTION
+from lerobot_playbyear.episodes.frames import INTERVENTION
 from lerobot_playbyear.training.parts import PolicyWindows
 
 _IS_PAD = f"{ACTION}_is_pad"

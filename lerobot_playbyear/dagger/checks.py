@@ -12,7 +12,7 @@ from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.dagger.config import DaggerError
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.recording.record import INTERVENTION
+from lerobot_playbyear.episodes.frames import INTERVENTION
 from lerobot_playbyear.training.parts import PolicyWindows, TrainingParts, check_dataset_suits, dataset_names
 
 Features = Mapping[str, Mapping[str, Any]]

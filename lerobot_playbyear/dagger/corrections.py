@@ -8,12 +8,12 @@ import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
 from lerobot_playbyear.dagger.checks import check_corrections
-from lerobot_playbyear.dagger.collector import Attempt
 from lerobot_playbyear.dagger.config import DaggerError, DatasetSource
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.recording.record import INTERVENTION, SEED, episode_frames
-from lerobot_playbyear.recording.saving import save_or_ask
+from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.episodes.frames import INTERVENTION, SEED
+from lerobot_playbyear.episodes.saving import save_episode
 
 
 class Corrections:
@@ -88,17 +88,14 @@ class Corrections:
         """Attempts in the dataset."""
         return self._writer.num_episodes if self._writer is not None else self.meta.total_episodes
 
-    def append(self, attempt: Attempt) -> None:
+    def append(self, episode: Episode) -> None:
         """Write an attempt to disk, then take it into memory.
 
         Raises:
             DatasetWriteError: It could not be written; the dataset is as it was before.
         """
         assert self._writer is not None
-        frames = episode_frames(attempt.episode, self._writer.features)
-        for frame in frames:
-            self._writer.add_frame(frame)
-        save_or_ask(self._writer)
+        frames = save_episode(episode, self._writer)
         if self.store is None:
             self._read()
         else:

@@ -13,13 +13,15 @@ from lerobot.common.train_utils import get_step_identifier
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.dagger.batches import BalancedBatches
-from lerobot_playbyear.dagger.collector import Attempt, PolicyActor, Seconds, collect
 from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.episodes.expert import Expert, Verdict
+from lerobot_playbyear.episodes.episode import Episode, Verdict
+from lerobot_playbyear.episodes.expert import Expert
+from lerobot_playbyear.episodes.play import Seconds, play
+from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.metrics import make_tracker
 from lerobot_playbyear.training.parts import TrainingParts
@@ -115,17 +117,18 @@ class Loop:
         while len(outcomes) < self._cfg.max_attempts:
             self._report.doing("acting")
             spent = Seconds()
-            attempt = self._attempt(spent)
-            if attempt.is_kept:
+            episode = self._attempt(spent)
+            outcomes.append(outcome_of(episode))
+            if outcomes[-1] == "kept":
                 with spent.of("episode_saving"):
-                    self._corrections.append(attempt)
+                    self._corrections.append(episode)
                     assert self._corrections.store is not None
                     self._batches.set_interventions(self._corrections.store)
-            outcomes.append(self._note(attempt, spent))
+            self._note(episode, outcomes[-1], spent)
             seconds.add(spent)
-            if attempt.is_kept:
+            if outcomes[-1] == "kept":
                 self._report.advance()
-                by_expert = torch.from_numpy(attempt.episode.actions[attempt.episode.interventions])
+                by_expert = torch.from_numpy(episode.actions[episode.interventions])
                 self._reach.warn(by_expert, f"the corrections of attempt {self._state.attempts}")
                 return True
         if outcomes.count("failed") > len(outcomes) / 2:
@@ -138,29 +141,22 @@ class Loop:
         )
         return False
 
-    def _attempt(self, spent: Seconds) -> Attempt:
+    def _attempt(self, spent: Seconds) -> Episode:
         assert self._scene is not None
         while self._state.next_seed in self._cfg.eval_seeds:
             self._state.next_seed += 1
         set_seed(self._random_seed(_ATTEMPT, self._state.next_seed))
         env, actor, expert = self._scene
-        return collect(env, actor, expert, self._state.next_seed, spent)
+        return play(env, actor, self._state.next_seed, expert=expert, seconds=spent)
 
-    def _note(self, attempt: Attempt, spent: Seconds) -> str:
-        """Counts an attempt. Returns what became of it."""
+    def _note(self, episode: Episode, outcome: str, spent: Seconds) -> None:
+        """Counts an attempt."""
         state = self._state
-        if attempt.is_kept:
-            outcome = "kept"
-        elif attempt.verdict is Verdict.DISCARD:
-            outcome = "discarded"
-        else:
-            outcome = "unneeded" if attempt.episode.success else "failed"
         state.attempts += 1
         setattr(state, outcome, getattr(state, outcome) + 1)
-        state.next_seed = attempt.episode.seed + 1
-        self._report.attempt(attempt, outcome, spent.spent)
+        state.next_seed = episode.seed + 1
+        self._report.attempt(episode, outcome, spent.spent)
         self._folder.commit(state)
-        return outcome
 
     # Learning
 
@@ -229,6 +225,15 @@ class Loop:
 
     def _random_seed(self, purpose: int, number: int) -> int:
         return int(np.random.SeedSequence([self._cfg.seed, purpose, number]).generate_state(1)[0])
+
+
+def outcome_of(episode: Episode) -> str:
+    """What becomes of an attempt: `kept` (learned from), `unneeded`, `failed` or `discarded`, as `RunState` counts them."""
+    if episode.verdict is Verdict.DISCARD:
+        return "discarded"
+    if not episode.success:
+        return "failed"
+    return "kept" if episode.intervention_share > 0 else "unneeded"
 
 
 def _is_due(round_number: int, every: int) -> bool:

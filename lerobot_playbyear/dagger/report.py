@@ -8,8 +8,8 @@ from lerobot.utils.utils import inside_slurm
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from lerobot_playbyear.dagger.collector import Attempt
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
+from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 
@@ -61,16 +61,16 @@ class Report:
         """The bar goes on."""
         self._bar.update(n)
 
-    def attempt(self, attempt: Attempt, outcome: str, seconds: dict[str, float]) -> None:
+    def attempt(self, episode: Episode, outcome: str, seconds: dict[str, float]) -> None:
         """An attempt has ended."""
         self.write(
             "attempt",
             {
-                "seed": attempt.episode.seed,
+                "seed": episode.seed,
                 "outcome": outcome,
-                "success": attempt.episode.success,
-                "n_frames": len(attempt.episode),
-                "intervention_share": round(attempt.intervention_share, 4),
+                "success": episode.success,
+                "n_frames": len(episode),
+                "intervention_share": round(episode.intervention_share, 4),
                 **{f"{name}_s": round(value, 4) for name, value in seconds.items()},
             },
         )

@@ -14,7 +14,6 @@ from lerobot.utils.utils import init_logging, inside_slurm
 
 from lerobot_playbyear.dagger.batches import BalancedBatches, frames_by_expert
 from lerobot_playbyear.dagger.checks import check_action_range, check_actions_can_be_masked, check_alike, check_dataset
-from lerobot_playbyear.dagger.collector import PolicyActor
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError, differences
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
@@ -22,11 +21,12 @@ from lerobot_playbyear.dagger.loop import Loop
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.errors import DatasetWriteError
-from lerobot_playbyear.episodes.rollouts import RolloutError, env_facts
+from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
+from lerobot_playbyear.episodes.frames import dataset_features, next_seed
+from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
 from lerobot_playbyear.hub.training_run import METRICS_NAME
-from lerobot_playbyear.recording.record import dataset_features, env_spec, next_seed
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.parts import PolicyWindows, dataset_names, make_training_parts
 from lerobot_playbyear.training.reach import Reach, action_names

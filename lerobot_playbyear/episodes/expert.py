@@ -6,29 +6,17 @@ under a name for `--expert.type` (`examples/own_expert.py`).
 
 import abc
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import draccus
 import gymnasium as gym
 import numpy as np
 
-from lerobot_playbyear.episodes.rollouts import Observation
+from lerobot_playbyear.episodes.episode import Observation, Verdict
 
 
 class ExpertError(ValueError):
     """The environment and the expert do not go together; the message says what is missing."""
-
-
-class Verdict(Enum):
-    """How an expert ends an attempt before the environment does.
-
-    SUCCESS, FAILURE: It counts as solved, or as not. DISCARD: It counts for nothing; the next one begins.
-    """
-
-    SUCCESS = "success"
-    FAILURE = "failure"
-    DISCARD = "discard"
 
 
 class Expert(abc.ABC):

@@ -8,10 +8,11 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from lerobot_playbyear.dagger.collector import collect
-from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig, Verdict
-from lerobot_playbyear.episodes.rollouts import EnvFacts, Episode, Observation, env_facts
-from lerobot_playbyear.recording.record import RecordConfig, RecordError, env_spec, record
+from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
+from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
+from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.recording.record import RecordConfig, RecordError, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
 
@@ -52,9 +53,9 @@ class PersonRollouts:
     def episodes(self, seeds: Iterable[int]) -> Iterator[Episode]:
         """One episode per seed; those that the person throws away are done again."""
         for seed in seeds:
-            while (attempt := collect(self._env, Nobody(self._env), self._expert, seed)).verdict is Verdict.DISCARD:
+            while (episode := play(self._env, Nobody(), seed, expert=self._expert)).verdict is Verdict.DISCARD:
                 pass
-            yield attempt.episode
+            yield episode
 
     def close(self) -> None:
         self._expert.close()
@@ -68,16 +69,13 @@ class PersonRollouts:
 
 
 class Nobody:
-    """Stands where the policy stands while a person is corrected by nobody."""
+    """Stands where the policy stands while a person demonstrates: an actor that never moves."""
 
-    def __init__(self, env: gym.Env) -> None:
+    def reset(self, env: gym.Env) -> None:
         assert env.action_space.shape is not None
         self._action = np.zeros(env.action_space.shape, np.float32)
 
-    def reset(self) -> None:
-        """Nothing to forget."""
-
-    def act(self, observation: Observation, task: str) -> np.ndarray:
+    def act(self, observation: Observation) -> np.ndarray:
         return self._action
 
 

@@ -5,39 +5,24 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
-import gymnasium as gym
-import numpy as np
-import pyarrow.parquet as pq
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import (
-    ACTION,
-    DONE,
-    HF_LEROBOT_HOME,
-    OBS_ENV_STATE,
-    OBS_IMAGE,
-    OBS_IMAGES,
-    OBS_STATE,
-    OBS_STR,
-    REWARD,
-    SUCCESS,
-)
+from lerobot.utils.constants import HF_LEROBOT_HOME
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_root
-from lerobot_playbyear.episodes.rollouts import EnvFacts, EnvSpec, Episode, Observation, RolloutError, RolloutPool
+from lerobot_playbyear.episodes.environment import EnvFacts, RolloutError, env_spec
+from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.episodes.frames import dataset_features, next_seed
+from lerobot_playbyear.episodes.pool import RolloutPool
+from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.hub.datasets import push_dataset
 from lerobot_playbyear.hub.pushing import HubError, warn_without_login
-from lerobot_playbyear.recording.saving import save_or_ask
 
-INTERVENTION = "intervention"
-SEED = "seed"
 _MIN_ATTEMPTS_PER_SUCCESS = 20  # attempts in a row without one success after which recording gives up
-_STATE_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 
 
 class RecordError(RuntimeError):
@@ -80,7 +65,7 @@ class RecordConfig:
         dataset: What is written, and where.
         seed: The first attempt's seed; each further attempt takes the next one.
         resume: Append to a dataset that is there already, up to `num_episodes`, with the seeds after its largest.
-        num_workers: Processes that roll out. 0: none but this one. None: as many as there are processor cores, at
+        num_workers: Processes that play. 0: none but this one. None: as many as there are processor cores, at
             most 8. The dataset does not depend on it.
     """
 
@@ -96,7 +81,7 @@ class RecordConfig:
 
 
 class Rollouts(Protocol):
-    """Where episodes come from: a pool of processes that roll a script out, or a person."""
+    """Where episodes come from: a pool of processes in which a script plays, or a person."""
 
     def facts(self) -> EnvFacts:
         """What the environment looks like."""
@@ -156,73 +141,6 @@ def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = Non
     return root
 
 
-def env_spec(env: EnvConfig) -> EnvSpec:
-    """How Gymnasium makes the environment that a LeRobot configuration describes."""
-    return EnvSpec(f"{env.package_name}:{env.gym_id}", dict(env.gym_kwargs))
-
-
-def dataset_features(facts: EnvFacts, video: bool = False) -> dict[str, dict[str, Any]]:
-    """The features of a dataset of expert episodes, as the raw observation space gives them.
-
-    Args:
-        facts: What the environment looks like.
-        video: Whether pictures become video.
-
-    Raises:
-        ValueError: An observation has no place in a LeRobotDataset.
-    """
-    features: dict[str, dict[str, Any]] = {}
-    for key, space in _observation_boxes(facts.observation_space).items():
-        if key.startswith((OBS_IMAGES, OBS_IMAGE)):
-            names = ["height", "width", "channel"]
-            features[key] = {"dtype": "video" if video else "image", "shape": space.shape, "names": names}
-        elif key.startswith(AUDIO_PREFIX):
-            features[key] = audio_feature(sample_rate=space.shape[0] * facts.fps, fps=facts.fps)
-        else:
-            features[key] = {"dtype": "float32", "shape": space.shape, "names": None}
-    features[ACTION] = {"dtype": "float32", "shape": facts.action_space.shape, "names": None}
-    for key, dtype in ((INTERVENTION, "bool"), (REWARD, "float32"), (SUCCESS, "bool"), (DONE, "bool"), (SEED, "int64")):
-        features[key] = {"dtype": dtype, "shape": (1,), "names": None}
-    return features
-
-
-def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
-    """The T frames of an episode: frame t holds what was observed, the action taken then, and what came of it.
-
-    Args:
-        episode: An episode of an expert, or of a policy that an expert corrected.
-        features: From `dataset_features`.
-    """
-    by_expert = np.ones(len(episode), bool) if episode.interventions is None else episode.interventions
-    frames = []
-    for t in range(len(episode)):
-        frame: dict[str, Any] = dict(_flat_observation(episode.observations[t]))
-        for key, value in frame.items():
-            if features[key]["dtype"] == "float32":
-                frame[key] = np.asarray(value, np.float32)
-        frame[ACTION] = episode.actions[t]
-        frame[INTERVENTION] = by_expert[t : t + 1]
-        frame[REWARD] = episode.rewards[t : t + 1]
-        frame[SUCCESS] = episode.successes[t : t + 1]
-        frame[DONE] = np.array([t == len(episode) - 1])
-        frame[SEED] = np.array([episode.seed], np.int64)
-        frame["task"] = episode.task
-        frames.append(frame)
-    return frames
-
-
-def next_seed(root: Path, seed: int) -> int:
-    """The seed after the largest in the dataset, so that no attempt is made twice.
-
-    Args:
-        root: The dataset's folder.
-        seed: What to begin with when that is larger, or when the dataset holds no seeds.
-    """
-    files = sorted(root.glob("data/*/*.parquet"))
-    used = [pq.read_table(path, columns=[SEED])[SEED].to_numpy().max() for path in files]
-    return max([seed, *(int(value) + 1 for value in used)])
-
-
 def _record_episodes(cfg: RecordConfig, pool: Rollouts, writer: DurableWriter) -> None:
     wanted = cfg.dataset.num_episodes
     first_seed = next_seed(writer.root, cfg.seed)
@@ -234,9 +152,7 @@ def _record_episodes(cfg: RecordConfig, pool: Rollouts, writer: DurableWriter) -
             attempts += 1
             failures_in_a_row = 0 if episode.success else failures_in_a_row + 1
             if episode.success:
-                for frame in episode_frames(episode, writer.features):
-                    writer.add_frame(frame)
-                save_or_ask(writer)
+                save_episode(episode, writer)
                 successes += 1
                 progress.update()
             progress.set_postfix_str(f"success rate {successes / attempts:.0%} of {attempts} attempts")
@@ -268,31 +184,6 @@ def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:
         )
     if facts.fps != env.fps:
         raise RecordError(f"--env.fps={env.fps}, but the environment runs at {facts.fps} steps per second: give that.")
-
-
-def _observation_boxes(space: gym.spaces.Dict) -> dict[str, gym.spaces.Box]:
-    boxes = _flat_observation(dict(space.spaces))
-    for key, box in boxes.items():
-        if not isinstance(box, gym.spaces.Box) or (key.startswith(AUDIO_PREFIX) and box.dtype != np.int16):
-            raise ValueError(f"The observation {key!r} cannot be recorded: its space is {box}.")
-        if key.startswith(AUDIO_PREFIX) and len(box.shape) != 1:
-            raise ValueError(
-                f"The observation {key!r} has shape {box.shape}; wanted (S,): every microphone is its own key."
-            )
-    return boxes
-
-
-def _flat_observation(observation: Observation) -> dict[str, Any]:
-    """Names a raw observation's entries, or those of its space, as LeRobot's `preprocess_observation` does."""
-    flat: dict[str, Any] = {}
-    for key, value in observation.items():
-        if key != "pixels":
-            flat[_STATE_KEYS.get(key, f"{OBS_STR}.{key}")] = value
-        elif isinstance(value, dict | gym.spaces.Dict):
-            flat.update({f"{OBS_IMAGES}.{camera}": picture for camera, picture in value.items()})
-        else:
-            flat[OBS_IMAGE] = value
-    return flat
 
 
 def _push(dataset: RecordDatasetConfig) -> None:

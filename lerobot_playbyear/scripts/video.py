@@ -6,20 +6,22 @@
 
 import logging
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 from lerobot.configs import PreTrainedConfig, parser
-from lerobot.envs import EnvConfig, close_envs, make_env
+from lerobot.envs import EnvConfig, make_env
+from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_playbyear.episodes.acting import load_for_rollout
-from lerobot_playbyear.episodes.rollouts import RolloutError
-from lerobot_playbyear.film.takes import policy_takes, script_takes, write_take
+from lerobot_playbyear.episodes.environment import RolloutError, env_spec
+from lerobot_playbyear.episodes.play import Actor
+from lerobot_playbyear.episodes.policy_actor import load_policy_actor
+from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.film.takes import takes, write_take
 from lerobot_playbyear.hub.client import patient_hub
-from lerobot_playbyear.recording.record import env_spec
 
 
 @dataclass
@@ -69,24 +71,25 @@ def film(cfg: VideoConfig) -> Path:
     if cfg.attempts < 1:
         raise ValueError(f"attempts={cfg.attempts}: give at least 1.")
     seeds = range(cfg.seed, cfg.seed + cfg.attempts)
-    close: Callable[[], None]
-    if cfg.policy is not None:
-        envs = make_env(cfg.env, n_envs=1)
-        vec = next(iter(next(iter(envs.values())).values()))
-        play, close = policy_takes(vec, load_for_rollout(cfg.policy, cfg.env), seeds), partial(close_envs, envs)
-    else:
-        env = env_spec(cfg.env).make()
-        play, close = script_takes(env, seeds, cfg.baseline), env.close
+    env = env_spec(cfg.env).make() if cfg.policy is None else _env_of_lerobot(cfg.env)
     try:
-        for take in play:
+        actor: Actor = Script(cfg.baseline) if cfg.policy is None else load_policy_actor(cfg.policy, cfg.env)
+        for take in takes(env, actor, seeds):
             if take.success:
                 break
     finally:
-        close()
+        env.close()
     write_take(take, cfg.output, cfg.env.fps)
     outcome = "success" if take.success else "failure"
     print(f"Film: {cfg.output} (seed {take.seed}, {len(take.pictures) - 1} steps, {outcome})")
     return cfg.output
+
+
+def _env_of_lerobot(env_cfg: EnvConfig) -> gym.Env:
+    """The first environment that LeRobot makes for a configuration, also where Gymnasium knows none of that name."""
+    vec: Any = next(iter(next(iter(make_env(env_cfg).values())).values()))
+    env = vec.envs[0]
+    return env.env if isinstance(env, FreezeAfterEpisodeEnd) else env  # that one ends with its first episode
 
 
 @parser.wrap()

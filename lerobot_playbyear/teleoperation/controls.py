@@ -7,7 +7,7 @@ from typing import Any
 from lerobot.teleoperators import Teleoperator, TeleopEvents
 from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleop, KeyboardTeleop
 
-from lerobot_playbyear.episodes.expert import Verdict
+from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.teleoperation.actions import DELTAS, GRIPPER, STAY
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 

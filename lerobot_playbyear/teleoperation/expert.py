@@ -7,8 +7,9 @@ import gymnasium as gym
 import numpy as np
 from lerobot.teleoperators import Teleoperator
 
-from lerobot_playbyear.episodes.expert import Expert, Verdict
-from lerobot_playbyear.episodes.rollouts import Observation
+from lerobot_playbyear.episodes.environment import task_description
+from lerobot_playbyear.episodes.episode import Observation, Verdict
+from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.controls import Controls, Wish
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
@@ -76,7 +77,7 @@ class TeleopExpert(Expert):
         self._env = env
         status = self._status
         status.attempt, status.step = status.attempt + 1, -1
-        status.n_steps, status.task = int(env.get_wrapper_attr("_max_episode_steps")), _task(env)
+        status.n_steps, status.task = int(env.get_wrapper_attr("_max_episode_steps")), task_description(env)
         status.levels_db = {}
         status.note = _NOTES[self._verdict] if self._verdict else ""
         self._verdict, self._last_command, self._is_paused = None, None, self._begins_paused
@@ -166,7 +167,3 @@ class TeleopExpert(Expert):
         if desk.speaker is not None:
             status.sound = desk.speaker.problem
         desk.window.show(status, picture)
-
-
-def _task(env: gym.Env) -> str:
-    return str(env.get_wrapper_attr("task_description")) if env.has_wrapper_attr("task_description") else ""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_playbyear.episodes.rollouts import Observation
+from lerobot_playbyear.episodes.episode import Observation
 
 FLOOR_DB = -80.0
 _AUDIO = "audio."  # how raw observations name microphones

@@ -1,9 +1,28 @@
 """Saving an episode that a person may have made by hand: a full disk is a reason to ask, not to lose it."""
 
 import sys
+from typing import Any
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.episodes.frames import episode_frames
+
+
+def save_episode(episode: Episode, writer: DurableWriter) -> list[dict[str, Any]]:
+    """Appends an episode to a dataset.
+
+    Returns:
+        Its frames, as the dataset holds them.
+
+    Raises:
+        DatasetWriteError: As `save_or_ask`; the dataset is as it was before.
+    """
+    frames = episode_frames(episode, writer.features)
+    for frame in frames:
+        writer.add_frame(frame)
+    save_or_ask(writer)
+    return frames
 
 
 def save_or_ask(writer: DurableWriter) -> int:

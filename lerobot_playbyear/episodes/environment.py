@@ -1,0 +1,80 @@
+"""How an environment is made, and what there is to know about it before its first episode."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+
+if TYPE_CHECKING:  # a process that plays scripts imports nothing of LeRobot
+    from lerobot.envs import EnvConfig
+
+
+class RolloutError(RuntimeError):
+    """No episode can be played in the environment; the message says why."""
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """How to make an environment: what `gymnasium.make` is given.
+
+    Args:
+        id: Its id, with the package that registers it: `package:namespace/Name-v0`.
+        kwargs: Its arguments.
+    """
+
+    id: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+    def make(self) -> gym.Env:
+        """Makes the environment and resets it once, so that whatever is missing shows now.
+
+        Raises:
+            RolloutError: It cannot be made: not installed, a wrong argument, no OpenGL library.
+        """
+        try:
+            env = gym.make(self.id, disable_env_checker=True, **self.kwargs)
+            env.reset(seed=0)
+        except Exception as error:
+            raise RolloutError(f"{self.id} does not start: {error}") from error
+        return env
+
+
+def env_spec(env: "EnvConfig") -> EnvSpec:
+    """How Gymnasium makes the environment that a LeRobot configuration describes."""
+    return EnvSpec(f"{env.package_name}:{env.gym_id}", dict(env.gym_kwargs))
+
+
+@dataclass(frozen=True)
+class EnvFacts:
+    """What a dataset needs to know about an environment before its first episode."""
+
+    observation_space: gym.spaces.Dict
+    action_space: gym.spaces.Box
+    fps: int
+    has_expert: bool
+
+
+def env_facts(env: gym.Env) -> EnvFacts:
+    """Reads off an environment what a dataset of it looks like.
+
+    Raises:
+        RolloutError: Its observation or action space is not of the kind that LeRobot's datasets hold.
+    """
+    if not isinstance(env.observation_space, gym.spaces.Dict):
+        raise RolloutError(f"The observation space must be a Dict, but it is {env.observation_space}.")
+    if not isinstance(env.action_space, gym.spaces.Box):
+        raise RolloutError(f"The action space must be a Box, but it is {env.action_space}.")
+    return EnvFacts(
+        observation_space=env.observation_space,
+        action_space=env.action_space,
+        fps=int(env.metadata.get("render_fps", 0)),
+        has_expert=callable(getattr(env.unwrapped, "scripted_expert", None)),
+    )
+
+
+def task_description(env: gym.Env) -> str:
+    """What is to be done, in words, as LeRobot asks an environment; empty if it does not say."""
+    for name in ("task_description", "task"):
+        if env.has_wrapper_attr(name):
+            return str(env.get_wrapper_attr(name))
+    return ""

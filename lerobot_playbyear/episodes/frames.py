@@ -1,0 +1,114 @@
+"""What a dataset holds of an episode: its features, and its frames."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pyarrow.parquet as pq
+from lerobot.utils.constants import (
+    ACTION,
+    DONE,
+    OBS_ENV_STATE,
+    OBS_IMAGE,
+    OBS_IMAGES,
+    OBS_STATE,
+    OBS_STR,
+    REWARD,
+    SUCCESS,
+)
+
+from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
+from lerobot_playbyear.episodes.environment import EnvFacts
+from lerobot_playbyear.episodes.episode import Episode, Observation
+
+INTERVENTION = "intervention"
+SEED = "seed"
+_STATE_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+
+
+def dataset_features(facts: EnvFacts, video: bool = False) -> dict[str, dict[str, Any]]:
+    """The features of a dataset of expert episodes, as the raw observation space gives them.
+
+    Args:
+        facts: What the environment looks like.
+        video: Whether pictures become video.
+
+    Raises:
+        ValueError: An observation has no place in a LeRobotDataset.
+    """
+    features: dict[str, dict[str, Any]] = {}
+    for key, space in _observation_boxes(facts.observation_space).items():
+        if key.startswith((OBS_IMAGES, OBS_IMAGE)):
+            names = ["height", "width", "channel"]
+            features[key] = {"dtype": "video" if video else "image", "shape": space.shape, "names": names}
+        elif key.startswith(AUDIO_PREFIX):
+            features[key] = audio_feature(sample_rate=space.shape[0] * facts.fps, fps=facts.fps)
+        else:
+            features[key] = {"dtype": "float32", "shape": space.shape, "names": None}
+    features[ACTION] = {"dtype": "float32", "shape": facts.action_space.shape, "names": None}
+    for key, dtype in ((INTERVENTION, "bool"), (REWARD, "float32"), (SUCCESS, "bool"), (DONE, "bool"), (SEED, "int64")):
+        features[key] = {"dtype": dtype, "shape": (1,), "names": None}
+    return features
+
+
+def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
+    """The T frames of an episode: frame t holds what was observed, the action taken then, and what came of it.
+
+    Args:
+        episode: An episode of an expert, or of a policy that an expert corrected.
+        features: From `dataset_features`.
+    """
+    by_expert = np.ones(len(episode), bool) if episode.interventions is None else episode.interventions
+    frames = []
+    for t in range(len(episode)):
+        frame: dict[str, Any] = dict(_flat_observation(episode.observations[t]))
+        for key, value in frame.items():
+            if features[key]["dtype"] == "float32":
+                frame[key] = np.asarray(value, np.float32)
+        frame[ACTION] = episode.actions[t]
+        frame[INTERVENTION] = by_expert[t : t + 1]
+        frame[REWARD] = episode.rewards[t : t + 1]
+        frame[SUCCESS] = episode.successes[t : t + 1]
+        frame[DONE] = np.array([t == len(episode) - 1])
+        frame[SEED] = np.array([episode.seed], np.int64)
+        frame["task"] = episode.task
+        frames.append(frame)
+    return frames
+
+
+def next_seed(root: Path, seed: int) -> int:
+    """The seed after the largest in the dataset, so that no attempt is made twice.
+
+    Args:
+        root: The dataset's folder.
+        seed: What to begin with when that is larger, or when the dataset holds no seeds.
+    """
+    files = sorted(root.glob("data/*/*.parquet"))
+    used = [pq.read_table(path, columns=[SEED])[SEED].to_numpy().max() for path in files]
+    return max([seed, *(int(value) + 1 for value in used)])
+
+
+def _observation_boxes(space: gym.spaces.Dict) -> dict[str, gym.spaces.Box]:
+    boxes = _flat_observation(dict(space.spaces))
+    for key, box in boxes.items():
+        if not isinstance(box, gym.spaces.Box) or (key.startswith(AUDIO_PREFIX) and box.dtype != np.int16):
+            raise ValueError(f"The observation {key!r} cannot be recorded: its space is {box}.")
+        if key.startswith(AUDIO_PREFIX) and len(box.shape) != 1:
+            raise ValueError(
+                f"The observation {key!r} has shape {box.shape}; wanted (S,): every microphone is its own key."
+            )
+    return boxes
+
+
+def _flat_observation(observation: Observation) -> dict[str, Any]:
+    """Names a raw observation's entries, or those of its space, as LeRobot's `preprocess_observation` does."""
+    flat: dict[str, Any] = {}
+    for key, value in observation.items():
+        if key != "pixels":
+            flat[_STATE_KEYS.get(key, f"{OBS_STR}.{key}")] = value
+        elif isinstance(value, dict | gym.spaces.Dict):
+            flat.update({f"{OBS_IMAGES}.{camera}": picture for camera, picture in value.items()})
+        else:
+            flat[OBS_IMAGE] = value
+    return flat

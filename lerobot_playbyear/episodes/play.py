@@ -1,0 +1,119 @@
+"""The loop that plays an episode, whoever acts: a script, a policy, a person, or a policy with an expert beside it.
+
+This module imports neither LeRobot nor torch, so that a process that plays scripts starts in seconds.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_playbyear.episodes.environment import task_description
+from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.episodes.expert import Expert
+
+
+class Actor(Protocol):
+    """Whoever chooses the actions of an episode, unless an expert does."""
+
+    def reset(self, env: gym.Env) -> None:
+        """A new episode has begun; the environment is reset."""
+
+    def act(self, observation: Observation) -> np.ndarray:
+        """The next action (action dim,), as the environment takes it. Asked in every step, also if an expert acts."""
+        ...
+
+
+@dataclass
+class Seconds:
+    """Where time went, by name [s]."""
+
+    spent: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def of(self, name: str) -> Iterator[None]:
+        """Counts what happens inside."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.spent[name] = self.spent.get(name, 0.0) + time.perf_counter() - start
+
+    def add(self, other: "Seconds") -> None:
+        """Counts what another clock has counted."""
+        for name, value in other.spent.items():
+            self.spent[name] = self.spent.get(name, 0.0) + value
+
+
+def play(
+    env: gym.Env,
+    actor: Actor,
+    seed: int,
+    *,
+    expert: "Expert | None" = None,
+    options: dict[str, Any] | None = None,
+    watch: Callable[[], Any] | None = None,
+    seconds: Seconds | None = None,
+) -> Episode:
+    """Plays one episode until the environment or the expert ends it, or its steps are used up.
+
+    In every step the actor is asked first; an expert who sits beside it then takes over or lets it act. So a policy's
+    memory is that of the whole episode. Actions are clipped to the action space.
+
+    Args:
+        env: The environment; `info["is_success"]` is there after every step, and `_max_episode_steps`, if it has that,
+            limits their number.
+        actor: Who acts.
+        seed, options: For `env.reset`.
+        expert: Who may take over.
+        watch: Called after the reset and after every step; what it returns is kept, such as `env.render` pictures.
+        seconds: Counts `simulation` (environment and expert) and `inference` (actor).
+    """
+    seconds = seconds or Seconds()
+    with seconds.of("simulation"):
+        observation, _ = env.reset(seed=seed, options=options)
+        if expert is not None:
+            expert.reset(env)
+    with seconds.of("inference"):
+        actor.reset(env)
+    space = env.action_space
+    assert isinstance(space, gym.spaces.Box)
+    limit = env.get_wrapper_attr("_max_episode_steps") if env.has_wrapper_attr("_max_episode_steps") else np.inf
+    observations, actions, rewards, successes, interventions = [observation], [], [], [], []
+    watched = [watch()] if watch else []
+    verdict, ended = None, False
+    while not ended:
+        with seconds.of("inference"):
+            action = actor.act(observation)
+        with seconds.of("simulation"):
+            by_expert = expert is not None and bool(expert.wants_control(observation, action))
+            if expert is not None and by_expert:
+                action = expert.act()
+            action = np.asarray(action, np.float32).clip(space.low, space.high)
+            observation, reward, terminated, truncated, info = env.step(action)
+            verdict = expert.verdict() if expert is not None else None
+        observations.append(observation)
+        actions.append(action)
+        rewards.append(float(reward))
+        successes.append(verdict is Verdict.SUCCESS or (verdict is None and bool(info["is_success"])))
+        interventions.append(by_expert)
+        if watch:
+            watched.append(watch())
+        ended = terminated or truncated or verdict is not None or len(actions) >= limit
+    return Episode(
+        seed=seed,
+        task=task_description(env),
+        observations=observations,
+        actions=np.stack(actions),
+        rewards=np.asarray(rewards, np.float32),
+        successes=np.asarray(successes, bool),
+        interventions=None if expert is None else np.asarray(interventions, bool),
+        verdict=verdict,
+        watched=watched,
+    )

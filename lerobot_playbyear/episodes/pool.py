@@ -1,0 +1,145 @@
+"""Episodes of an environment's scripted expert, played in this process or in several, with the same result.
+
+This module imports neither LeRobot nor torch, so that a worker process starts in seconds.
+"""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import connection
+from typing import Any
+
+import gymnasium as gym
+
+from lerobot_playbyear.episodes.environment import EnvFacts, EnvSpec, RolloutError, env_facts
+from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.script import Script
+
+
+class RolloutPool:
+    """Makes environments and lets their expert play, in this process or in worker processes.
+
+    Episodes come in the order of their seeds and do not depend on the number of workers.
+
+    Args:
+        spec: The environment.
+        num_workers: Processes; 0 plays in this one. Workers start afresh, so a script that uses this class needs
+            an `if __name__ == "__main__":` guard.
+    """
+
+    def __init__(self, spec: EnvSpec, num_workers: int = 0):
+        if num_workers < 0:
+            raise ValueError(f"num_workers={num_workers}: give 0 for none, or how many processes.")
+        self._spec, self._num_workers = spec, num_workers
+        self._env: gym.Env | None = None
+        self._executor: ProcessPoolExecutor | None = None
+        if num_workers:
+            context = multiprocessing.get_context("spawn")
+            self._lifeline, self._workers_end = context.Pipe()  # workers exit when our end is closed, or dies with us
+            self._executor = ProcessPoolExecutor(
+                num_workers,
+                mp_context=context,
+                initializer=_start_worker,
+                initargs=(spec, self._workers_end),
+            )
+
+    def facts(self) -> EnvFacts:
+        """What the environment looks like.
+
+        Raises:
+            RolloutError: It cannot be made, or is not of the kind that datasets hold.
+        """
+        return self._result(self._executor.submit(_facts_in_worker)) if self._executor else env_facts(self._own_env())
+
+    def episodes(self, seeds: Iterable[int]) -> Iterator[Episode]:
+        """Expert episodes, one per seed and in their order; works ahead of the caller by two per worker.
+
+        Raises:
+            RolloutError: A worker died, or the environment has no expert.
+        """
+        if self._executor is None:
+            for seed in seeds:
+                yield play(self._own_env(), Script(), seed)
+            return
+        upcoming = iter(seeds)
+        pending: deque[Future] = deque()
+        while True:
+            while len(pending) < 2 * self._num_workers:
+                try:
+                    pending.append(self._executor.submit(_play_in_worker, next(upcoming)))
+                except StopIteration:
+                    break
+            if not pending:
+                return
+            yield self._result(pending.popleft())
+
+    def close(self) -> None:
+        """Ends the workers, without waiting for what they are doing."""
+        if self._executor is not None:
+            self._executor.shutdown(wait=False, cancel_futures=True)
+            self._lifeline.close()
+            self._executor.shutdown(wait=True)
+            self._workers_end.close()
+            self._executor = None
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def __enter__(self) -> "RolloutPool":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _own_env(self) -> gym.Env:
+        if self._env is None:
+            self._env = self._spec.make()
+        return self._env
+
+    @staticmethod
+    def _result(future: Future) -> Any:
+        try:
+            return future.result()
+        except BrokenProcessPool as error:
+            raise RolloutError(
+                "A rollout worker died (out of memory, or killed). Try fewer: num_workers=1, or 0 for none."
+            ) from error
+
+
+# What follows runs in a worker; the environment there is the worker's own and lives as long as it does.
+_worker_spec: EnvSpec | None = None
+_worker_env: gym.Env | None = None
+
+
+def _start_worker(spec: EnvSpec, lifeline: connection.Connection) -> None:
+    global _worker_spec
+    _worker_spec = spec
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends the workers
+    threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
+
+
+def _exit_with_parent(lifeline: connection.Connection) -> None:
+    connection.wait([lifeline])
+    os._exit(0)
+
+
+def _env_of_worker() -> gym.Env:
+    global _worker_env
+    if _worker_env is None:
+        assert _worker_spec is not None
+        _worker_env = _worker_spec.make()
+    return _worker_env
+
+
+def _facts_in_worker() -> EnvFacts:
+    return env_facts(_env_of_worker())
+
+
+def _play_in_worker(seed: int) -> Episode:
+    return play(_env_of_worker(), Script(), seed)

@@ -1,0 +1,109 @@
+"""How the package is laid out: who imports whom, where modules lie, how long they are, and which one steps environments."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+_ROOT = Path(__file__).parents[1] / "lerobot_playbyear"
+
+# Each package, and what it may import besides itself and `compat`. A package names only those above it: no circles.
+_ARROWS = """
+datasets
+policy          datasets
+episodes        datasets
+film            datasets episodes
+inspection      datasets film
+hub             datasets policy film inspection
+training        datasets policy hub
+teleoperation   episodes
+recording       datasets episodes hub teleoperation
+dagger          datasets episodes hub training
+scripts         datasets policy episodes film inspection hub training teleoperation recording dagger
+"""
+_ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}
+_AT_THE_TOP = {"__init__.py", "compat.py"}
+
+_MOST_LINES, _FEWEST_LINES = 300, 25
+_STILL_TOO_LONG = {
+    "datasets/attach.py",
+    "datasets/repair/copying.py",
+    "datasets/repair/rescue.py",
+    "policy/configuration_playbyear.py",
+    "policy/modeling_playbyear.py",
+}
+_SHORT = {
+    "datasets/errors.py": "the error that all of the package raise; whoever catches it needs none of the rest",
+}
+
+_LOOP = "episodes/play.py"
+
+
+def modules() -> dict[str, str]:
+    """The text of every module, by its path in the package."""
+    return {path.relative_to(_ROOT).as_posix(): path.read_text() for path in sorted(_ROOT.rglob("*.py"))}
+
+
+def imported(text: str) -> Iterator[str]:
+    """The parts of `lerobot_playbyear` that a module imports, wherever in it the import stands."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports name the whole path"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        parts = [name.split(".") for name in names]
+        yield from (path[1] for path in parts if path[0] == _ROOT.name and len(path) > 1)
+
+
+def forbidden(path: str, text: str) -> list[str]:
+    """What a module imports against the arrows."""
+    package = path.split("/")[0] if "/" in path else ""
+    allowed = {package, "compat", *_ALLOWED.get(package, [])} if package else set()
+    return [f"{path} imports {other}" for other in sorted(set(imported(text))) if other not in allowed]
+
+
+def test_no_package_imports_one_that_stands_below_it():
+    packages = list(_ALLOWED)
+    for index, package in enumerate(packages):
+        assert set(_ALLOWED[package]) <= set(packages[:index]), f"{package}: the table itself goes in circles"
+    wrong = [line for path, text in modules().items() for line in forbidden(path, text)]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    ("path", "text"),
+    [
+        ("dagger/run.py", "from lerobot_playbyear.recording.record import record"),
+        ("recording/record.py", "import lerobot_playbyear.dagger.loop"),
+        ("policy/card.py", "def card():\n    from lerobot_playbyear import hub"),
+        ("compat.py", "from lerobot_playbyear.datasets import EpisodeStore"),
+    ],
+)
+def test_an_import_against_the_arrows_is_found(path, text):
+    assert len(forbidden(path, text)) == 1
+
+
+def test_every_module_lies_in_a_package_of_the_table():
+    places = {path.split("/")[0] if "/" in path else path for path in modules()}
+    assert places - _AT_THE_TOP <= set(_ALLOWED)
+
+
+def test_no_module_is_too_long_to_be_read_nor_too_short_to_be_one():
+    lengths = {path: len(text.splitlines()) for path, text in modules().items()}
+    long = {path: n for path, n in lengths.items() if n > _MOST_LINES and path not in _STILL_TOO_LONG}
+    short = {path: n for path, n in lengths.items() if n < _FEWEST_LINES and not path.endswith("__init__.py")}
+    assert not long
+    assert not set(short) - set(_SHORT), short
+
+
+def test_one_loop_steps_environments():
+    def steps(text: str) -> bool:
+        """Whether something is stepped with an argument; optimizers and metrics take none."""
+        calls = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call) and node.args)
+        return any(isinstance(call.func, ast.Attribute) and call.func.attr == "step" for call in calls)
+
+    assert [path for path, text in modules().items() if steps(text)] == [_LOOP]
