@@ -19,8 +19,9 @@ from experiments.sound_probe import SoundProbe, make_donors
 from experiments.training import Job
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
-from lerobot_playbyear.film.takes import takes, write_take
+from lerobot_playbyear.film.episode_film import write_episode_film
 
 TASK = "OccludedGrasp-v0"
 
@@ -31,10 +32,12 @@ def film(condition: str, env: gym.Env, wanted: Callable[[bool], bool], path: Pat
     checkpoint = Job(STUDY, TASK, condition, TRAINING_SEEDS[0], N_DEMONSTRATIONS, STEPS[TASK]).checkpoint
     policy_cfg = PreTrainedConfig.from_pretrained(checkpoint)
     policy_cfg.pretrained_path = checkpoint
-    for take in takes(env, load_policy_actor(policy_cfg, env_cfg), EVALUATION_SEEDS):
-        if wanted(take.success):
-            write_take(take, path, env_cfg.fps)
-            print(f"{path}: seed {take.seed}, {'success' if take.success else 'failure'}")
+    actor = load_policy_actor(policy_cfg, env_cfg)
+    for seed in EVALUATION_SEEDS:
+        episode = play(env, actor, seed, watch=env.render)
+        if wanted(episode.success):
+            write_episode_film(episode, path, env_cfg.fps)
+            print(f"{path}: seed {seed}, {'success' if episode.success else 'failure'}")
             return
     raise RuntimeError(f"No episode for {path.name} in {len(EVALUATION_SEEDS)} seeds.")
 

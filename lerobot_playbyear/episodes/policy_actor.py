@@ -68,13 +68,13 @@ def load_policy_actor(policy_cfg: PreTrainedConfig, env_cfg: EnvConfig) -> Polic
     """
     policy = make_policy(cfg=policy_cfg, env_cfg=env_cfg)
     device = torch.device(str(policy.config.device))
-    processors = make_pre_post_processors(
+    preprocessor, postprocessor = make_pre_post_processors(
         policy_cfg=policy_cfg,
         pretrained_path=str(policy_cfg.pretrained_path),
         preprocessor_overrides={"device_processor": {"device": str(device)}},
     )
     autocast = partial(torch.autocast, device_type=device.type) if policy_cfg.use_amp else nullcontext
-    return PolicyActor(policy, env_cfg, *processors, autocast=autocast)
+    return PolicyActor(policy, env_cfg, preprocessor, postprocessor, autocast)
 
 
 def _as_batch(observation: Observation) -> Observation:

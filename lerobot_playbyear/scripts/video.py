@@ -17,10 +17,10 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_playbyear.episodes.environment import RolloutError, env_spec
-from lerobot_playbyear.episodes.play import Actor
+from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.episodes.script import Script
-from lerobot_playbyear.film.takes import takes, write_take
+from lerobot_playbyear.film.episode_film import write_episode_film
 from lerobot_playbyear.hub.client import patient_hub
 
 
@@ -70,18 +70,18 @@ def film(cfg: VideoConfig) -> Path:
     """
     if cfg.attempts < 1:
         raise ValueError(f"attempts={cfg.attempts}: give at least 1.")
-    seeds = range(cfg.seed, cfg.seed + cfg.attempts)
     env = env_spec(cfg.env).make() if cfg.policy is None else _env_of_lerobot(cfg.env)
     try:
         actor: Actor = Script(cfg.baseline) if cfg.policy is None else load_policy_actor(cfg.policy, cfg.env)
-        for take in takes(env, actor, seeds):
-            if take.success:
+        for seed in range(cfg.seed, cfg.seed + cfg.attempts):
+            episode = play(env, actor, seed, watch=env.render)
+            if episode.success:
                 break
     finally:
         env.close()
-    write_take(take, cfg.output, cfg.env.fps)
-    outcome = "success" if take.success else "failure"
-    print(f"Film: {cfg.output} (seed {take.seed}, {len(take.pictures) - 1} steps, {outcome})")
+    write_episode_film(episode, cfg.output, cfg.env.fps)
+    outcome = "success" if episode.success else "failure"
+    print(f"Film: {cfg.output} (seed {episode.seed}, {len(episode)} steps, {outcome})")
     return cfg.output
 
 

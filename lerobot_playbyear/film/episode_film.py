@@ -1,0 +1,38 @@
+"""The film of an episode that was played with `watch=env.render`."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_playbyear.episodes.episode import Episode, Observation
+from lerobot_playbyear.film.video import amplify, compose, episode_sound, inset, write_film
+
+_AUDIO = "audio."  # how raw observations name microphones
+
+
+def write_episode_film(episode: Episode, path: Path, fps: int) -> None:
+    """Writes a film with the policy's camera in a corner, the spectrogram below, and the sound as loud as it can be.
+
+    Args:
+        episode: Has watched T + 1 pictures (H, W, 3) uint8; its sound is int16.
+        path: Of the film, an mp4.
+        fps: Steps per second.
+    """
+    blocks = np.stack([_sound(observation) for observation in episode.observations])  # (T + 1, S, n_microphones)
+    sample_rate = blocks.shape[1] * fps or 16000
+    sound = amplify(episode_sound(blocks))
+    views = [_first_camera(observation) for observation in episode.observations]
+    pictures = (p if v is None else inset(p, v) for p, v in zip(episode.watched, views, strict=True))
+    write_film(path, compose(pictures, len(views), sound, sample_rate), fps, sound, sample_rate)
+
+
+def _first_camera(observation: Observation) -> np.ndarray | None:
+    pixels: Any = observation.get("pixels")
+    return next(iter(pixels.values()), None) if isinstance(pixels, dict) else pixels
+
+
+def _sound(observation: Observation) -> np.ndarray:
+    """(S, n_microphones) int16; without one (0, 0)."""
+    blocks = [block for key, block in observation.items() if key.startswith(_AUDIO)]
+    return np.stack(blocks, axis=-1) if blocks else np.zeros((0, 0), np.int16)
