@@ -8,14 +8,14 @@ import torch
 from test_policy_contract import make_episode, make_policy, run_ending_at, step_through
 
 from lerobot_playbyear.policy.networks import VisionEncoder
-from lerobot_playbyear.policy.packed_encoder import PackedResNet
+from lerobot_playbyear.policy.packed_encoder import FoldedVisionEncoder, PackedResNet
 
 
 @pytest.fixture
-def encoder() -> VisionEncoder:
+def encoder() -> FoldedVisionEncoder:
     """An encoder whose statistics and norms are not those of a new one."""
     torch.manual_seed(0)
-    encoder = VisionEncoder(3, 8)
+    encoder = FoldedVisionEncoder(VisionEncoder(3, 8))
     for _ in range(3):
         encoder(torch.rand(8, 9, 32, 32))
     for module in encoder.modules():
@@ -25,7 +25,7 @@ def encoder() -> VisionEncoder:
     return encoder.eval()
 
 
-def both(encoder: VisionEncoder) -> tuple[torch.Tensor, torch.Tensor]:
+def both(encoder: FoldedVisionEncoder) -> tuple[torch.Tensor, torch.Tensor]:
     """What the encoder computes as it acts, and as it learns, in eval mode."""
     images = torch.rand(2, 9, 40, 40, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
@@ -33,7 +33,7 @@ def both(encoder: VisionEncoder) -> tuple[torch.Tensor, torch.Tensor]:
     return acting, encoder(images).detach()
 
 
-def assert_same(encoder: VisionEncoder) -> None:
+def assert_same(encoder: FoldedVisionEncoder) -> None:
     acting, learning = both(encoder)
     torch.testing.assert_close(acting, learning, rtol=1e-4, atol=max(1e-4, 1e-5 * float(learning.abs().max())))
 
@@ -126,7 +126,7 @@ def test_acting_in_inference_mode_and_under_autocast():
 @pytest.mark.parametrize(("width", "size"), [(8, 33), (16, 84), (64, 96)])
 def test_packed_convolutions_compute_the_same_for_one_picture_and_many(width, size):
     torch.manual_seed(width)
-    encoder = VisionEncoder(3, width).eval()
+    encoder = FoldedVisionEncoder(VisionEncoder(3, width)).eval()
     pictures = torch.rand(5, 9, size, size)
     assert PackedResNet.suits(pictures)
     plain = encoder(pictures).detach()
@@ -141,7 +141,7 @@ def test_packed_convolutions_compute_the_same_for_one_picture_and_many(width, si
 
 
 def test_what_acts_can_be_copied_and_pickled():
-    encoder = VisionEncoder(3, 8).eval()
+    encoder = FoldedVisionEncoder(VisionEncoder(3, 8)).eval()
     pictures = torch.rand(1, 9, 64, 64)
     with torch.no_grad():
         acting = encoder(pictures)

@@ -10,6 +10,7 @@ from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
+from lerobot_playbyear.policy.packed_encoder import FoldedVisionEncoder
 
 STRENGTHS = {"crop": 4.0, "brightness": 0.05, "hue": 0.05, "degrees": 5.0, "translate": 0.05, "scale": 0.05}
 
@@ -58,7 +59,7 @@ def test_a_quarter_of_the_width_is_a_sixteenth_of_the_weights():
 @pytest.mark.parametrize(("size", "in_bfloat16"), [(8, False), (16, False), (17, True), (48, True)])
 def test_single_pixels_are_learned_from_in_full_precision(size, in_bfloat16):
     """On a CPU with bfloat16 the gradient of the last stage would be random, and be written beyond its memory."""
-    encoder = VisionEncoder(3, 4)
+    encoder = FoldedVisionEncoder(VisionEncoder(3, 4))
     stacks = torch.rand(2, 9, size, size)
     reference = encoder(stacks)
     with torch.autocast("cpu", torch.bfloat16):

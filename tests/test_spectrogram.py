@@ -119,7 +119,9 @@ def test_windows_that_share_segments_are_encoded_as_each_alone(sample_rate, fps,
     begun = torch.arange(wave.shape[1]).expand(2, -1) >= torch.tensor([[0], [length]])
     shared = SharedStretches(n_windows, step, length, spectrogram.hop)
 
-    together = shared.windows(encoder(spectrogram(shared.stretches(wave), shared.stretches(begun))), encoder.length)
+    together = shared.windows(
+        encoder(spectrogram(shared.stretches(wave), shared.stretches(begun))), encoder.window_columns
+    )
 
     alone = [part[:, 11:].unfold(1, length, step).flatten(0, 1) for part in (wave, begun)]
     torch.testing.assert_close(together, encoder(spectrogram(*alone)), rtol=1e-5, atol=1e-5)

@@ -11,10 +11,18 @@ from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
+from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.policy.feature_checks import check_features, sample_rate_of
 from lerobot_playbyear.policy.precision import DTYPES, training_dtype
 from lerobot_playbyear.policy.schedule import PlaybyearSchedulerConfig
 
-AUDIO_PREFIX = "observation.audio."
+
+def segment_and_hop(sample_rate: int, segment_s: float, hop_s: float) -> tuple[int, int]:
+    """Samples of a spectrogram's segment and of a step.
+
+    The step is rounded down, so that a window holds as many segments at every sample rate.
+    """
+    return round(segment_s * sample_rate), math.floor(hop_s * sample_rate + 1e-6)
 
 
 @PreTrainedConfig.register_subclass("playbyear")
@@ -36,8 +44,11 @@ class PlaybyearConfig(PreTrainedConfig):
         segment_s, hop_s: Length and step of the spectrogram's segments [s].
         n_frequency_bins: Lowest bins of the spectrogram that are kept; a bin is 1 / segment_s wide.
         image_size: Pixels, height and width, that the vision encoder sees. 84 trains about five times faster than 224.
+        audio_steps: Names in LeRobot's ProcessorStepRegistry: steps that sound passes through before the network, in training
+            as in a rollout. A trained policy keeps those it was trained with (`extension.MicrophoneStep`).
 
     Architecture:
+        vision_encoder, audio_encoder: Names of registered encoders (`extension.register_vision_encoder`, `_audio_encoder`).
         vision_width: Channels of the ResNet-18's first stage; 64 is ResNet-18, and its embedding has 8 times as many.
         audio_channels: Channels of the audio encoder's convolutions, all with kernel 7.
         hidden_size: Of the two hidden layers in the fusion and in the head.
@@ -82,6 +93,7 @@ class PlaybyearConfig(PreTrainedConfig):
     hop_s: float = 0.035
     n_frequency_bins: int = 160
     image_size: int = 224
+    audio_steps: tuple[str, ...] = ()
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -92,6 +104,8 @@ class PlaybyearConfig(PreTrainedConfig):
     )
 
     # Architecture
+    vision_encoder: str = "resnet18"
+    audio_encoder: str = "spectrogram_cnn"
     vision_width: int = 64
     audio_channels: tuple[int, ...] = (64, 32, 16, 8)
     hidden_size: int = 1024
@@ -217,6 +231,13 @@ class PlaybyearConfig(PreTrainedConfig):
         assert self.sample_rate is not None
         return round(self.audio_window_s * self.sample_rate)
 
+    @property
+    def n_segments(self) -> int:
+        """Columns of the spectrogram of one encoding's sound."""
+        assert self.sample_rate is not None
+        segment, hop = segment_and_hop(self.sample_rate, self.segment_s, self.hop_s)
+        return (self.window_samples - segment) // hop + 1
+
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
         """Takes the sample rate from the dataset's features; LeRobot calls it before it builds the policy.
 
@@ -224,27 +245,7 @@ class PlaybyearConfig(PreTrainedConfig):
             ValueError: There is no sound, or a microphone's rate or frame length is missing or differs from the
                 configuration.
         """
-        if self.use_audio and not any(key.startswith(AUDIO_PREFIX) for key in features):
-            raise ValueError(
-                f"No '{AUDIO_PREFIX}<microphone>' among the dataset's features {sorted(features)}: record with sound, "
-                "or set --policy.use_audio=false to train a deaf policy."
-            )
-        for key, feature in features.items():
-            if not key.startswith(AUDIO_PREFIX) or not self.use_audio:
-                continue
-            seen = (feature.get("info") or {}).get("sample_rate", self.sample_rate)
-            if seen is None:
-                raise ValueError(
-                    f"{key} has no info.sample_rate in the dataset: give it with --policy.sample_rate, or write it into "
-                    "the dataset's meta/info.json."
-                )
-            if self.sample_rate is not None and int(seen) != self.sample_rate:
-                raise ValueError(
-                    f"{key} was recorded at {seen} Hz, but the policy is configured for {self.sample_rate} Hz: set "
-                    f"--policy.sample_rate={seen}, or train a new policy for this dataset."
-                )
-            self.sample_rate = int(seen)
-            self._check_samples(key, int(feature["shape"][0]))
+        self.sample_rate = sample_rate_of(features, self)
 
     def validate_features(self) -> None:
         """Checks that the features are ones that the policy can use.
@@ -252,38 +253,7 @@ class PlaybyearConfig(PreTrainedConfig):
         Raises:
             ValueError: Names what is missing or does not fit, and what to do.
         """
-        keys = sorted(self.input_features or {})
-        if self.action_feature is None:
-            raise ValueError("The dataset has no 'action': a policy cannot be trained without.")
-        if self.use_vision and not self.camera_keys:
-            raise ValueError(
-                f"No camera among the observations {keys}: set --policy.use_vision=false to train without."
-            )
-        if not self.use_audio:
-            return
-        if not self.audio_keys:
-            raise ValueError(
-                f"No '{AUDIO_PREFIX}<microphone>' among the observations {keys}: record with sound, or set "
-                "--policy.use_audio=false to train a deaf policy."
-            )
-        if self.sample_rate is None:
-            raise ValueError(f"The sample rate of {self.audio_keys} is not known: set --policy.sample_rate.")
-        for key in self.audio_keys:
-            self._check_samples(key, int((self.input_features or {})[key].shape[0]))
-
-    def _check_samples(self, key: str, samples: int) -> None:
-        assert self.sample_rate is not None
-        if self.sample_rate % self.fps:
-            raise ValueError(
-                f"sample_rate {self.sample_rate} / fps {self.fps} is not an integer: {key} cannot hold whole frames. Set "
-                "--policy.fps to the dataset's."
-            )
-        if samples * self.fps != self.sample_rate:
-            raise ValueError(
-                f"{key} has {samples} samples per frame, which at {self.sample_rate} Hz means "
-                f"{self.sample_rate / samples:g} frames per second, but the policy is configured for fps={self.fps}: set "
-                f"--policy.fps={self.sample_rate / samples:g}."
-            )
+        check_features(self)
 
     # Training presets
 

@@ -1,18 +1,145 @@
-"""The network's blocks: vision encoder, audio encoder, fusion, memory and head (paper, appendix "Architecture Details")."""
+"""The network, from top to bottom: how a frame is encoded, and its blocks (paper, appendix "Architecture Details").
 
-from contextlib import AbstractContextManager, nullcontext
+In comments: B items, n frames of each, K windows of H frames, D numbers in a joint encoding, W channels of the first stage.
+"""
+
+import math
 
 import torch
+from lerobot.utils.constants import OBS_PREFIX
 from torch import Tensor, nn
-from torchvision.models.resnet import BasicBlock, ResNet
+from torch.nn import functional
+from torchvision.models.resnet import BasicBlock, ResNet, conv1x1
 
+from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.packed_encoder import FoldedCopy
-from lerobot_playbyear.policy.shared_statistics import SharedBatchNorm2d
+from lerobot_playbyear.policy.extension import (
+    make_audio_encoder,
+    make_vision_encoder,
+    register_audio_encoder,
+    register_vision_encoder,
+)
+from lerobot_playbyear.policy.history import before_episode, newest
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, to_float_wave
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
-_SINGLE_PIXELS = 16  # stacks up to this size are single pixels before the last stage
+_ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
+
+
+class PlaybyearNetwork(nn.Module):
+    """Vision, hearing, fusion, memory and head, from batches of runs of frames."""
+
+    def __init__(self, config: PlaybyearConfig):
+        super().__init__()
+        self.config = config
+        assert config.action_feature is not None
+        self.augment = Augmentation(
+            config.augmentation_crop,
+            config.augmentation_brightness,
+            config.augmentation_hue,
+            config.augmentation_degrees,
+            config.augmentation_translate,
+            config.augmentation_scale,
+        )
+        n_fused = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
+        if config.use_vision:
+            self.vision = nn.ModuleDict({_module_name(key): make_vision_encoder(config) for key in config.camera_keys})
+            n_fused += sum(encoder.embedding_size for encoder in self.vision.values())  # type: ignore[misc]
+        if config.use_audio:
+            self.spectrogram = nn.ModuleDict({_module_name(key): _log_spectrogram(config) for key in config.audio_keys})
+            self.hearing = nn.ModuleDict({_module_name(key): make_audio_encoder(config) for key in config.audio_keys})
+            n_fused += sum(encoder.embedding_size for encoder in self.hearing.values())  # type: ignore[misc]
+        self.fusion = Fusion(n_fused, config)
+        self.memory_head = MemoryHead(config, config.action_feature.shape[0])
+
+    def encode_run(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
+        """Joint encodings of the last `n_frames` frames of every item, each encoded once: (B, n_frames, D).
+
+        Where the episode had not begun, the first frame's encoding repeats.
+        """
+        encodings = self._encode(batch, n_frames).unflatten(0, (-1, n_frames))  # (B, n, D)
+        is_pad = before_episode(batch, self._padded_key(), n_frames)  # (B, n)
+        if is_pad is None:
+            return encodings
+        before = is_pad.sum(dim=1).clamp(max=n_frames - 1)  # (B,)
+        index = torch.maximum(torch.arange(n_frames, device=encodings.device), before.unsqueeze(1))  # (B, n)
+        return encodings.gather(1, index.unsqueeze(-1).expand(-1, -1, encodings.shape[-1]))  # (B, n, D)
+
+    def encode_frame(self, run: dict[str, Tensor]) -> Tensor:
+        """Joint encoding of the newest frame: (B, D)."""
+        return self._encode(run, 1)
+
+    def _encode(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
+        """The joint encoding of every frame by itself, (B * n, D)."""
+        config = self.config
+        seen = [self._see(batch, key, n_frames) for key in config.camera_keys if config.use_vision]
+        heard = [self._hear(batch, key, n_frames) for key in config.audio_keys if config.use_audio]
+        felt = [self._feel(batch, key, n_frames) for key in config.low_dimensional_keys]
+        return self.fusion([*seen, *heard, *felt])
+
+    def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        """One camera's embeddings, (B * n, embedding size)."""
+        n_stacked = self.config.frame_stack
+        images = self.prepare_images(
+            newest(batch, key, n_frames + n_stacked - 1)
+        )  # (B, n + n_stacked - 1, 3, size, size)
+        stacks = torch.cat(
+            [images[:, i : i + n_frames] for i in range(n_stacked)], dim=2
+        )  # (B, n, 3 n_stacked, size, size)
+        return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
+
+    def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        """One microphone's embeddings, (B * n, embedding size)."""
+        config = self.config
+        n_heard = n_frames + config.audio_frames - 1
+        sound = newest(batch, key, n_heard, config.feature_shape(key))  # (B, n_heard, S)
+        wave = to_float_wave(sound.flatten(1), key)  # (B, n_heard * S)
+        if self.training and config.audio_noise_db is not None:
+            assert config.sample_rate is not None
+            wave = mix_in_noise(wave, config.audio_noise_db, config.sample_rate)
+        begun = torch.ones_like(wave, dtype=torch.bool)  # (B, n_heard * S)
+        is_pad = before_episode(batch, key, n_heard)  # (B, n_heard)
+        if is_pad is not None:
+            begun = ~is_pad.repeat_interleave(sound.shape[2], dim=1)
+        spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
+        assert isinstance(spectrogram, LogSpectrogram)
+        # Neighbouring windows overlap: their segments are computed once.
+        shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
+        levels = spectrogram(shared.stretches(wave), shared.stretches(begun))  # (B * n_stretches, bins, columns)
+        n_columns = getattr(encoder, "window_columns", None)
+        if isinstance(n_columns, int):  # convolutional along time: embeddings overlap, too
+            embeddings = shared.windows(encoder(levels), n_columns)  # (B * n, channels, n_columns)
+        else:
+            embeddings = encoder(shared.windows(levels, config.n_segments))
+        return self._normalize(embeddings.flatten(1))
+
+    def _feel(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        """One low-dimensional observation, (B * n, its numbers)."""
+        values = newest(batch, key, n_frames, self.config.feature_shape(key))  # (B, n, ...)
+        values = values.flatten(0, 1).flatten(1).float()  # (B * n, its numbers)
+        if self.training and self.config.low_dimensional_noise > 0:
+            values = values + self.config.low_dimensional_noise * torch.randn_like(values)
+        return self.config.low_dimensional_gain * values
+
+    def prepare_images(self, images: Tensor) -> Tensor:
+        """(B, T, 3, H, W) bytes or in [0, 1] -> (B, T, 3, size, size) in [0, 1], in training augmented."""
+        size = self.config.image_size
+        with torch.autocast(images.device.type, enabled=False):  # colours keep their 8 bits
+            images = images.float() / 255 if images.dtype == torch.uint8 else images
+            return self.augment(images, size) if self.training else resize(images, size)
+
+    def _normalize(self, embeddings: Tensor) -> Tensor:
+        """(N, E) -> (N, E), of the same size whatever the sense."""
+        if not self.config.normalize_encodings:
+            return embeddings
+        return _ENCODING_SIZE * functional.layer_norm(embeddings, embeddings.shape[1:])
+
+    def _padded_key(self) -> str:
+        """An observation that every batch has."""
+        config = self.config
+        keys = [*config.low_dimensional_keys, *(config.camera_keys if config.use_vision else []), *config.audio_keys]
+        return keys[0]
 
 
 class VisionEncoder(nn.Module):
@@ -29,59 +156,44 @@ class VisionEncoder(nn.Module):
     def __init__(self, n_stacked: int, width: int):
         super().__init__()
         self.embedding_size = 8 * width
-        self.network = _SlimResNet(3 * n_stacked, width)
+        self.network = SlimResNet(3 * n_stacked, width)
         self.register_buffer("mean", torch.tensor(_IMAGE_MEAN).repeat(n_stacked)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(_IMAGE_STD).repeat(n_stacked)[:, None, None], persistent=False)
-        self._folded = FoldedCopy()  # for acting; no part of a checkpoint
 
     def forward(self, stacks: Tensor) -> Tensor:
         """(N, 3 * n_stacked, size, size) in [0, 1] -> (N, embedding_size)."""
+        return self.network(self.normalize(stacks))
+
+    def normalize(self, stacks: Tensor) -> Tensor:
+        """(N, 3 * n_stacked, size, size) in [0, 1] -> the same shape, as networks for images want it."""
         stacks = (stacks - self.mean) / self.std
         # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
-        stacks = stacks.contiguous(memory_format=torch.channels_last)
-        acts = not self.training and not torch.is_grad_enabled() and self.mean.dtype == torch.float32
-        if acts:
-            return self._folded.look(self.network, stacks)
-        with _precise_if_single_pixels(stacks):
-            return self.network(stacks)
-
-    def train(self, mode: bool = True) -> "VisionEncoder":
-        """Also forgets what was prepared for acting."""
-        if mode:
-            self._folded.drop()
-        return super().train(mode)
-
-    def refresh(self) -> None:
-        """Prepares for acting anew: even a change of weights that passed torch's own count of changes by is seen."""
-        self._folded.drop()
-        if not self.training and self.mean.dtype == torch.float32:
-            self._folded.of(self.network)
+        return stacks.contiguous(memory_format=torch.channels_last)
 
 
-def _precise_if_single_pixels(stacks: Tensor) -> AbstractContextManager:
-    """Without autocast on a CPU: of a single pixel, oneDNN's bfloat16 gradient of a convolution with stride 2 is random, and is
-    written beyond its memory (torch 2.11)."""
-    if stacks.device.type == "cpu" and max(stacks.shape[-2:]) <= _SINGLE_PIXELS:
-        return torch.autocast("cpu", enabled=False)
-    return nullcontext()
-
-
-class _SlimResNet(ResNet):
+class SlimResNet(ResNet):
     """torchvision's ResNet-18 with another number of input channels and another width, without the classifier."""
 
     def __init__(self, in_channels: int, width: int):
-        super().__init__(BasicBlock, [2, 2, 2, 2], norm_layer=SharedBatchNorm2d)
-        self.inplanes = width
+        super().__init__(
+            BasicBlock, [2, 2, 2, 2]
+        )  # what follows takes the place of its layers; forward is torchvision's
         self.conv1 = nn.Conv2d(in_channels, width, kernel_size=7, stride=2, padding=3, bias=False)
-        self.bn1 = SharedBatchNorm2d(width)
-        self.layer1 = self._make_layer(BasicBlock, width, 2)
-        self.layer2 = self._make_layer(BasicBlock, 2 * width, 2, stride=2)
-        self.layer3 = self._make_layer(BasicBlock, 4 * width, 2, stride=2)
-        self.layer4 = self._make_layer(BasicBlock, 8 * width, 2, stride=2)
+        self.bn1 = nn.BatchNorm2d(width)  # (N, W, size / 2, size / 2); then ReLU, and pooling by 2
+        self.layer1 = _stage(width, width)  # (N, W, size / 4, size / 4)
+        self.layer2 = _stage(width, 2 * width, stride=2)  # (N, 2 W, size / 8, size / 8)
+        self.layer3 = _stage(2 * width, 4 * width, stride=2)  # (N, 4 W, size / 16, size / 16)
+        self.layer4 = _stage(4 * width, 8 * width, stride=2)  # (N, 8 W, size / 32, size / 32); then the mean, (N, 8 W)
         self.fc = nn.Identity()
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+
+
+def _stage(n_in: int, n_out: int, stride: int = 1) -> nn.Sequential:
+    """Two residual blocks: (N, n_in, h, w) -> (N, n_out, h / stride, w / stride)."""
+    shortcut = nn.Sequential(conv1x1(n_in, n_out, stride), nn.BatchNorm2d(n_out)) if n_in != n_out else None
+    return nn.Sequential(BasicBlock(n_in, n_out, stride, shortcut), BasicBlock(n_out, n_out))
 
 
 class AudioEncoder(nn.Module):
@@ -91,12 +203,15 @@ class AudioEncoder(nn.Module):
         n_bins: Frequency bins.
         n_segments: Columns of the spectrogram.
         channels: Output channels of each convolution.
+
+    Attributes:
+        window_columns: Columns that are left of a window's segments.
     """
 
     def __init__(self, n_bins: int, n_segments: int, channels: tuple[int, ...]):
         super().__init__()
-        length = n_segments - len(channels) * (_AUDIO_KERNEL - 1)
-        if length < 1:
+        self.window_columns = n_segments - len(channels) * (_AUDIO_KERNEL - 1)
+        if self.window_columns < 1:
             raise ValueError(
                 f"audio_window_s holds {n_segments} segments, too few for {len(channels)} convolutions of kernel "
                 f"{_AUDIO_KERNEL}: at least {1 + len(channels) * (_AUDIO_KERNEL - 1)} are needed."
@@ -105,20 +220,14 @@ class AudioEncoder(nn.Module):
         for n_in, n_out in zip((n_bins, *channels), channels, strict=False):
             layers += [nn.Conv1d(n_in, n_out, _AUDIO_KERNEL), nn.ReLU()]
         self.layers = nn.Sequential(*layers)
-        self.length, self.embedding_size = length, channels[-1] * length
+        self.embedding_size = channels[-1] * self.window_columns
 
     def forward(self, spectrogram: Tensor) -> Tensor:
-        """(N, n_bins, n_segments + extra) -> (N, channels[-1], length + extra), embeddings before they are flattened.
+        """(N, n_bins, n_segments + extra) -> (N, channels[-1], window_columns + extra), embeddings before they are flattened.
 
         Extra segments belong to later windows of the same sound; their embeddings are slices of the result.
         """
         return self.layers(spectrogram)
-
-
-def _mlp(n_in: int, hidden: int, n_out: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, n_out)
-    )
 
 
 class Fusion(nn.Module):
@@ -146,14 +255,41 @@ class MemoryHead(nn.Module):
         """The action after every full window.
 
         Args:
-            encodings: (B, R, D) consecutive frames' joint encodings.
+            encodings: (B, n, D) consecutive frames' joint encodings.
 
         Returns:
-            (B, R - H + 1, n_actions), in [-1, 1] times the action range.
+            (B, K, n_actions) with K = n - H + 1, in [-1, 1] times the action range.
         """
         windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
         n_items, n_windows = windows.shape[:2]
         outputs, _ = self.lstm(windows.flatten(0, 1))  # (B * K, H, D)
-        actions = self.head(outputs[:, -1]).float()  # whatever autocast computed in
+        actions = self.head(outputs[:, -1]).float()  # (B * K, n_actions), whatever autocast computed in
         actions = self.action_range * torch.tanh(actions / self.action_range)
-        return actions.unflatten(0, (n_items, n_windows))
+        return actions.unflatten(0, (n_items, n_windows))  # (B, K, n_actions)
+
+
+def _mlp(n_in: int, hidden: int, n_out: int) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, n_out)
+    )
+
+
+@register_vision_encoder("resnet18")
+def _vision_encoder(config: PlaybyearConfig) -> VisionEncoder:
+    return VisionEncoder(config.frame_stack, config.vision_width)
+
+
+@register_audio_encoder("spectrogram_cnn")
+def _audio_encoder(config: PlaybyearConfig) -> AudioEncoder:
+    return AudioEncoder(config.n_frequency_bins, config.n_segments, tuple(config.audio_channels))
+
+
+def _log_spectrogram(config: PlaybyearConfig) -> LogSpectrogram:
+    assert config.sample_rate is not None
+    return LogSpectrogram(
+        config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins, config.spectrogram_momentum
+    )
+
+
+def _module_name(key: str) -> str:
+    return key.removeprefix(OBS_PREFIX).replace(".", "_")

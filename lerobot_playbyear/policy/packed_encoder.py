@@ -1,6 +1,10 @@
-"""Batch norm folded into the convolutions before it: the network as it acts, not as it learns."""
+"""The vision encoder as it acts: batch norm folded into the convolutions before it, and these packed for the CPU.
+
+Attached from outside, after the network was made: the same function, the same names in a checkpoint.
+"""
 
 import copy
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -8,8 +12,71 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 from torchvision.models.resnet import BasicBlock, ResNet
 
+from lerobot_playbyear.policy.networks import VisionEncoder
+
 _PAIRS = (("conv1", "bn1"), ("conv2", "bn2"))  # torchvision's names in a ResNet and in its blocks
 _SMALLEST = 32  # pixels: their last maps are 1x1, whose order in memory oneDNN cannot tell
+_SINGLE_PIXELS = 16  # stacks up to this size are single pixels before the last stage
+
+
+def act_by_folded_copies(network: nn.Module) -> None:
+    """Lets every `VisionEncoder` in a network act by a copy of itself; the names in its `state_dict` stay."""
+    for parent in list(network.modules()):
+        for name, encoder in parent.named_children():
+            if type(encoder) is VisionEncoder:
+                parent.register_module(name, FoldedVisionEncoder(encoder))
+
+
+def prepare_to_act(network: nn.Module) -> None:
+    """Makes the copies anew: even a change of weights that passed torch's own count of changes by is seen."""
+    for module in network.modules():
+        if isinstance(module, FoldedVisionEncoder):
+            module.refresh()
+
+
+class FoldedVisionEncoder(VisionEncoder):
+    """A vision encoder that learns as what it is, and acts by a folded and packed copy of itself.
+
+    Args:
+        plain: The encoder whose parts it takes over.
+    """
+
+    def __init__(self, plain: VisionEncoder) -> None:
+        nn.Module.__init__(self)
+        self.embedding_size, self.network = plain.embedding_size, plain.network
+        self.register_buffer("mean", plain.mean, persistent=False)
+        self.register_buffer("std", plain.std, persistent=False)
+        self._folded = FoldedCopy()  # no part of a checkpoint
+
+    def forward(self, stacks: Tensor) -> Tensor:
+        """(N, 3 * n_stacked, size, size) in [0, 1] -> (N, embedding_size)."""
+        if self._can_act() and not torch.is_grad_enabled():
+            return self._folded.look(self.network, self.normalize(stacks))
+        with _precise_if_single_pixels(stacks):
+            return super().forward(stacks)
+
+    def train(self, mode: bool = True) -> "FoldedVisionEncoder":
+        """Also forgets what was prepared for acting."""
+        if mode:
+            self._folded.drop()
+        return super().train(mode)
+
+    def refresh(self) -> None:
+        """Prepares for acting anew."""
+        self._folded.drop()
+        if self._can_act():
+            self._folded.of(self.network)
+
+    def _can_act(self) -> bool:
+        return not self.training and self.mean.dtype == torch.float32
+
+
+def _precise_if_single_pixels(stacks: Tensor) -> AbstractContextManager:
+    """Without autocast on a CPU: of a single pixel, oneDNN's bfloat16 gradient of a convolution with stride 2 is random, and is
+    written beyond its memory (torch 2.11)."""
+    if stacks.device.type == "cpu" and max(stacks.shape[-2:]) <= _SINGLE_PIXELS:
+        return torch.autocast("cpu", enabled=False)
+    return nullcontext()
 
 
 def fold_batch_norm(network: ResNet) -> ResNet:

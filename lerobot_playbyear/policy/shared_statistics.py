@@ -18,6 +18,18 @@ def mean_over_processes(values: Tensor) -> Tensor:
     return all_reduce(values) / n_processes()
 
 
+def share_batch_norm(network: nn.Module) -> None:
+    """Makes every `nn.BatchNorm2d` in a network one of all processes; the names in its `state_dict` stay."""
+    for parent in list(network.modules()):
+        for name, norm in parent.named_children():
+            if type(norm) is nn.BatchNorm2d:
+                shared = SharedBatchNorm2d(
+                    norm.num_features, norm.eps, norm.momentum, norm.affine, norm.track_running_stats
+                )
+                shared.load_state_dict(norm.state_dict())
+                parent.register_module(name, shared)
+
+
 class SharedBatchNorm2d(nn.BatchNorm2d):
     """Batch norm whose statistics in training are those of all processes' batches; parameters and names are torch's.
 

@@ -8,6 +8,7 @@ import torchaudio
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_playbyear.policy.configuration_playbyear import segment_and_hop
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 
 _POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
@@ -36,14 +37,6 @@ def to_float_wave(wave: Tensor, key: str) -> Tensor:
             "Pcm16ToFloatProcessorStep (docs/dataset.md)."
         )
     return wave.float()
-
-
-def segment_and_hop(sample_rate: int, segment_s: float, hop_s: float) -> tuple[int, int]:
-    """Samples of a segment and of a step.
-
-    The step is rounded down, so that a window holds as many segments at every sample rate.
-    """
-    return round(segment_s * sample_rate), math.floor(hop_s * sample_rate + 1e-6)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,126 @@
+"""What other packages add to the policy by name, without a fork: encoders, and steps between microphone and network.
+
+A distribution whose name begins with `lerobot_policy_` and whose module has that very name is imported by every LeRobot command
+and by ours; what it registers can then be named on the command line. `examples/extension` is one.
+"""
+
+from collections.abc import Callable
+
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import ObservationProcessorStep
+from torch import Tensor, nn
+
+from lerobot_playbyear.policy.configuration_playbyear import AUDIO_PREFIX, PlaybyearConfig
+from lerobot_playbyear.policy.spectrogram import to_float_wave
+
+EncoderFactory = Callable[[PlaybyearConfig], nn.Module]
+
+_VISION_ENCODERS: dict[str, EncoderFactory] = {}
+_AUDIO_ENCODERS: dict[str, EncoderFactory] = {}
+
+
+def register_vision_encoder(name: str) -> Callable[[EncoderFactory], EncoderFactory]:
+    """Decorates what makes a vision encoder, for `--policy.vision_encoder=<name>`; one is made for every camera.
+
+    It gets the policy's configuration and returns a module with
+
+    - `embedding_size`, an int, E;
+    - `forward`: (N, 3 * config.frame_stack, config.image_size, config.image_size) in [0, 1] -> (N, E), for any N.
+
+    Raises:
+        ValueError: The name is taken.
+    """
+    return _register(_VISION_ENCODERS, name)
+
+
+def register_audio_encoder(name: str) -> Callable[[EncoderFactory], EncoderFactory]:
+    """Decorates what makes an audio encoder, for `--policy.audio_encoder=<name>`; one is made for every microphone.
+
+    It gets the policy's configuration and returns a module with
+
+    - `embedding_size`, an int, E;
+    - `forward`: (N, config.n_frequency_bins, config.n_segments) -> (N, E), for any N: log power, about 0 +- 1 in every bin, and
+      0 where the episode had not begun.
+
+    In training neighbouring windows share segments. An encoder that is convolutional along time, without padding, may share its
+    work too, and says so by an attribute `window_columns`: it then gets (N, n_frequency_bins, n_segments + extra) and returns
+    (N, C, window_columns + extra), where every window's embedding is a slice of `window_columns` columns, so that E is C *
+    window_columns.
+
+    Raises:
+        ValueError: The name is taken.
+    """
+    return _register(_AUDIO_ENCODERS, name)
+
+
+def make_vision_encoder(config: PlaybyearConfig) -> nn.Module:
+    """One camera's encoder, the one that the configuration names.
+
+    Raises:
+        ValueError: There is none of this name, or it does not say how large its embedding is.
+    """
+    return _make(_VISION_ENCODERS, "vision_encoder", config)
+
+
+def make_audio_encoder(config: PlaybyearConfig) -> nn.Module:
+    """One microphone's encoder, the one that the configuration names.
+
+    Raises:
+        ValueError: There is none of this name, or it does not say how large its embedding is.
+    """
+    return _make(_AUDIO_ENCODERS, "audio_encoder", config)
+
+
+class MicrophoneStep(ObservationProcessorStep):
+    """A step between the microphones and the network, for `--policy.audio_steps=[<name>]`.
+
+    Subclass it, implement `sound`, and decorate the class with LeRobot's `ProcessorStepRegistry.register(name=...)`. It is made
+    without arguments. In training it gets runs of frames in any order, and while the policy acts one frame at a time: it must
+    remember nothing, and treat every frame by itself, or the policy hears something else than it learned from.
+    """
+
+    def sound(self, wave: Tensor) -> Tensor:
+        """(..., S) in [-1, 1] -> the same shape: (B, T, S) in training, (B, S) in a rollout."""
+        raise NotImplementedError
+
+    def observation(self, observation: dict) -> dict:
+        """Every `observation.audio.<microphone>`, integers as PCM at full scale, and nothing else."""
+        heard = {
+            key: self.sound(to_float_wave(value, key))
+            for key, value in observation.items()
+            if key.startswith(AUDIO_PREFIX) and not key.endswith("_is_pad")
+        }
+        return {**observation, **heard}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+def _register(factories: dict[str, EncoderFactory], name: str) -> Callable[[EncoderFactory], EncoderFactory]:
+    def add(factory: EncoderFactory) -> EncoderFactory:
+        if name in factories:
+            raise ValueError(
+                f"An encoder '{name}' is registered already, by {factories[name].__module__}: take another name."
+            )
+        factories[name] = factory
+        return factory
+
+    return add
+
+
+def _make(factories: dict[str, EncoderFactory], option: str, config: PlaybyearConfig) -> nn.Module:
+    name = getattr(config, option)
+    if name not in factories:
+        raise ValueError(
+            f"--policy.{option}={name}: there is no such encoder; there are: {', '.join(sorted(factories))}. Install the "
+            "package that registers it: a distribution that LeRobot imports by itself has a name that begins with "
+            "lerobot_policy_ (docs/training.md)."
+        )
+    encoder = factories[name](config)
+    if not isinstance(getattr(encoder, "embedding_size", None), int):
+        raise ValueError(
+            f"--policy.{option}={name}: {type(encoder).__name__} has no `embedding_size`: give it one, an int."
+        )
+    return encoder
