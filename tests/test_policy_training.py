@@ -202,7 +202,5 @@ def test_broken_sound_stops_training_with_its_key():
 
 
 def test_lerobots_metadata_of_another_frame_rate_is_refused():
-    config = make_config()
-    config._runtime_dataset_meta = SimpleNamespace(fps=30)
     with pytest.raises(ValueError, match=r"--policy\.fps=30"):
-        PlaybyearPolicy(config)
+        PlaybyearPolicy(make_config(), dataset_meta=SimpleNamespace(fps=30))

@@ -9,9 +9,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from lerobot.common.train_utils import get_step_identifier
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_playbyear.compat import get_step_identifier
 from lerobot_playbyear.dagger.batches import BalancedBatches
 from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
 from lerobot_playbyear.dagger.corrections import Corrections

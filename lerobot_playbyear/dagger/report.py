@@ -3,11 +3,11 @@
 import logging
 from typing import Any
 
-from lerobot.common.wandb_utils import WandBLogger
 from lerobot.utils.utils import inside_slurm
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from lerobot_playbyear.compat import WandBLogger
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.training.config import PlaybyearTrainConfig

@@ -18,6 +18,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot.utils.utils import SuppressProgressBars
 from torch import Tensor
 
+from lerobot_playbyear.compat import forget_unsaved_rows, set_streaming_encoder, streaming_encoder
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.episode_checks import check_pictures, check_videos
 from lerobot_playbyear.datasets.films import Film, FinishedFilms, finish_films, link
@@ -127,20 +128,20 @@ class Staging:
         """Closes what is open, so that LeRobot writes nothing more; for an episode that is given up."""
         with contextlib.suppress(Exception):
             self.dataset.clear_episode_buffer()
-        self.dataset.meta._metadata_buffer.clear()  # or LeRobot writes the row of an episode that is not there
+        forget_unsaved_rows(self.dataset.meta)  # or LeRobot writes the row of an episode that is not there
         with contextlib.suppress(Exception):
             self.dataset.finalize()
 
     def _put_frames_aside(self) -> None:
-        is_streaming = self._writer._streaming_encoder is not None
+        is_streaming = streaming_encoder(self._writer) is not None
         check_pictures(self.dataset, is_streaming)
         shutil.rmtree(self._pictures / SCRATCH, ignore_errors=True)  # of a try that was interrupted
         if (self.folder / SCRATCH).is_dir():
             shutil.copytree(self.folder / SCRATCH, self._pictures / SCRATCH, copy_function=link)
         if is_streaming:
             if not self._films:
-                self._films = finish_films(self._writer._streaming_encoder, self._pictures / "films", self.length)
-            self._writer._streaming_encoder = FinishedFilms(self._films, self.folder)
+                self._films = finish_films(streaming_encoder(self._writer), self._pictures / "films", self.length)
+            set_streaming_encoder(self._writer, FinishedFilms(self._films, self.folder))
         self._frames = dict(self._writer.episode_buffer)
 
     def _begin_again(self) -> None:
@@ -151,7 +152,7 @@ class Staging:
         if (self._pictures / SCRATCH).is_dir():
             shutil.copytree(self._pictures / SCRATCH, self.folder / SCRATCH, copy_function=link)
         if self._films:
-            self._writer._streaming_encoder = FinishedFilms(self._films, self.folder)
+            set_streaming_encoder(self._writer, FinishedFilms(self._films, self.folder))
         assert self._frames is not None
         self._writer.episode_buffer = dict(self._frames)
 

@@ -7,13 +7,14 @@ answer may have been lost after it was done. `pushing` knows which of these can 
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import httpx
 from huggingface_hub import constants, set_client_factory
-from huggingface_hub.utils import _http
+
+from lerobot_playbyear.compat import hub_client_factory
 
 _WAITS_S = (0.5, 1.0, 2.0)
 _PASSING = (500, 502, 503, 504)
@@ -72,7 +73,7 @@ class _PatientFactory:
         n_users: How many are at work with it, of this thread and others.
     """
 
-    def __init__(self, usual: _http.CLIENT_FACTORY_T) -> None:
+    def __init__(self, usual: Callable[[], httpx.Client]) -> None:
         self.usual, self.n_users = usual, 0
 
     def __call__(self) -> httpx.Client:
@@ -83,7 +84,7 @@ class _PatientFactory:
 def patient_hub() -> Iterator[None]:
     """Lets what talks to the Hub in this process do so with patience, until the work is done or has failed."""
     with _CHANGING:
-        factory = _http._GLOBAL_CLIENT_FACTORY  # the library has a function to set it, and none to ask for it
+        factory = hub_client_factory()
         if not isinstance(factory, _PatientFactory):
             factory = _PatientFactory(factory)
             set_client_factory(factory)

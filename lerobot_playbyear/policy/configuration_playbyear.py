@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import draccus
-from draccus.parsers.encoding import encode_choice
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
+from lerobot_playbyear.compat import encode_choice
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.policy.feature_checks import check_features, sample_rate_of
 from lerobot_playbyear.policy.precision import DTYPES, training_dtype

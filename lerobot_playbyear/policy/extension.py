@@ -19,7 +19,7 @@ _VISION_ENCODERS: dict[str, EncoderFactory] = {}
 _AUDIO_ENCODERS: dict[str, EncoderFactory] = {}
 
 
-def register_vision_encoder(name: str) -> Callable[[EncoderFactory], EncoderFactory]:
+def register_vision_encoder[Factory: EncoderFactory](name: str) -> Callable[[Factory], Factory]:
     """Decorates what makes a vision encoder, for `--policy.vision_encoder=<name>`; one is made for every camera.
 
     It gets the policy's configuration and returns a module with
@@ -33,7 +33,7 @@ def register_vision_encoder(name: str) -> Callable[[EncoderFactory], EncoderFact
     return _register(_VISION_ENCODERS, name)
 
 
-def register_audio_encoder(name: str) -> Callable[[EncoderFactory], EncoderFactory]:
+def register_audio_encoder[Factory: EncoderFactory](name: str) -> Callable[[Factory], Factory]:
     """Decorates what makes an audio encoder, for `--policy.audio_encoder=<name>`; one is made for every microphone.
 
     It gets the policy's configuration and returns a module with
@@ -98,8 +98,8 @@ class MicrophoneStep(ObservationProcessorStep):
         return features
 
 
-def _register(factories: dict[str, EncoderFactory], name: str) -> Callable[[EncoderFactory], EncoderFactory]:
-    def add(factory: EncoderFactory) -> EncoderFactory:
+def _register[Factory: EncoderFactory](factories: dict[str, EncoderFactory], name: str) -> Callable[[Factory], Factory]:
+    def add(factory: Factory) -> Factory:
         if name in factories:
             raise ValueError(
                 f"An encoder '{name}' is registered already, by {factories[name].__module__}: take another name."

@@ -67,16 +67,15 @@ def check_features(config: "PlaybyearConfig") -> None:
         _check_samples(key, int(features[key].shape[0]), config.sample_rate, config.fps)
 
 
-def check_fps(config: "PlaybyearConfig") -> None:
-    """Checks the frame rate against that of the dataset which LeRobot builds the policy for, where it says which.
+def check_fps(fps: int, config: "PlaybyearConfig") -> None:
+    """Checks a dataset's frame rate.
 
     Raises:
-        ValueError: They differ.
+        ValueError: It is not the configured one.
     """
-    meta = getattr(config, "_runtime_dataset_meta", None)
-    if meta is not None and meta.fps != config.fps:
+    if fps != config.fps:
         raise ValueError(
-            f"The dataset has fps={meta.fps}, but the policy is configured for fps={config.fps}: set --policy.fps={meta.fps}, "
+            f"The dataset has fps={fps}, but the policy is configured for fps={config.fps}: set --policy.fps={fps}, "
             "or train a new policy for this dataset."
         )
 

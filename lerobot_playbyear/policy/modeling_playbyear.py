@@ -31,14 +31,15 @@ class PlaybyearPolicy(PreTrainedPolicy):
     config_class = PlaybyearConfig
     name = "playbyear"
 
-    def __init__(self, config: PlaybyearConfig, dataset_stats: dict[str, Any] | None = None, **kwargs: Any):
+    def __init__(self, config: PlaybyearConfig, dataset_meta: Any = None, **kwargs: Any):
         if not isinstance(config, PlaybyearConfig):
             raise ValueError(
                 f"This is a checkpoint of the policy type '{config.type}', wanted '{self.name}': give the folder "
                 "`pretrained_model` of a playbyear policy."
             )
         super().__init__(config)
-        check_fps(config)
+        if dataset_meta is not None:
+            check_fps(dataset_meta.fps, config)
         config.validate_features()
         self.config: PlaybyearConfig = config
         self.model = PlaybyearNetwork(config)

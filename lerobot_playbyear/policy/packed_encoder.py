@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 from torchvision.models.resnet import BasicBlock, ResNet
 
+from lerobot_playbyear.compat import n_changes
 from lerobot_playbyear.policy.networks import VisionEncoder
 
 _PAIRS = (("conv1", "bn1"), ("conv2", "bn2"))  # torchvision's names in a ResNet and in its blocks
@@ -111,6 +112,14 @@ class PackedResNet:
     """
 
     def __init__(self, folded: ResNet) -> None:
+        from lerobot_playbyear.compat import (  # not in every build of torch
+            convolution_pointwise,
+            convolution_pointwise_binary,
+            reorder_convolution_weight,
+        )
+
+        self._pack, self._convolution = reorder_convolution_weight, convolution_pointwise
+        self._convolution_and_sum = convolution_pointwise_binary
         self._network = folded
         self._weights: dict[nn.Module, Tensor] = {}
 
@@ -139,12 +148,11 @@ class PackedResNet:
         geometry = list(module.padding), list(module.stride), list(module.dilation), module.groups
         if module not in self._weights:
             with torch.inference_mode(False), torch.no_grad():
-                pack = torch.ops.mkldnn._reorder_convolution_weight
-                self._weights[module] = pack(module.weight.detach(), *geometry, list(maps.shape))
+                self._weights[module] = self._pack(module.weight.detach(), *geometry, list(maps.shape))
         packed = self._weights[module], module.bias, *geometry
         if plus is None:
-            return torch.ops.mkldnn._convolution_pointwise(maps, *packed, then, [], "")
-        return torch.ops.mkldnn._convolution_pointwise.binary(maps, plus, *packed, "add", 1.0, then, [], "")
+            return self._convolution(maps, *packed, then, [], "")
+        return self._convolution_and_sum(maps, plus, *packed, "add", 1.0, then, [], "")
 
 
 class FoldedCopy:
@@ -185,4 +193,4 @@ class FoldedCopy:
 def _fingerprint(network: nn.Module) -> tuple[tuple[int, int], ...]:
     """Where every weight lies and how often it was changed: other after every update, loading and move to a device."""
     tensors = (*network.parameters(), *network.buffers())
-    return tuple((t.data_ptr(), -1 if t.is_inference() else t._version) for t in tensors)
+    return tuple((tensor.data_ptr(), n_changes(tensor)) for tensor in tensors)

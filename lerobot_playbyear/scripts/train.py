@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lerobot.common.wandb_utils import WandBLogger
 from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset, make_train_eval_datasets
 from lerobot.utils.constants import ACTION
@@ -29,6 +28,7 @@ from torch import Tensor
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from lerobot_playbyear.compat import WandBLogger
 from lerobot_playbyear.datasets import (
     EpisodeStore,
     RunSampler,

@@ -15,6 +15,7 @@ from lerobot.teleoperators import (
 )
 from lerobot.teleoperators.gamepad import GamepadTeleop
 
+from lerobot_playbyear.compat import has_gamepad
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.expert import Desk, TeleopExpert
@@ -138,7 +139,7 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoper
         ) from error
     except Exception as error:  # whatever a device may say
         raise ExpertError(f"{option} cannot be connected: {error}") from error
-    has_pad = not isinstance(teleop, GamepadTeleop) or getattr(teleop.gamepad, "running", True)
+    has_pad = not isinstance(teleop, GamepadTeleop) or has_gamepad(teleop)
     if not teleop.is_connected or not has_pad:
         teleop.disconnect() if teleop.is_connected else None
         hint = {

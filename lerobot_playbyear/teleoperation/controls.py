@@ -7,6 +7,7 @@ from typing import Any
 from lerobot.teleoperators import Teleoperator, TeleopEvents
 from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleop, KeyboardTeleop
 
+from lerobot_playbyear.compat import held_keys
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.teleoperation.actions import DELTAS, GRIPPER, STAY
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
@@ -87,7 +88,8 @@ def _events_of(teleop: Teleoperator) -> dict[TeleopEvents, bool]:
         return dict(teleop.get_teleop_events())
     # LeRobot's keyboard forgets held keys when it is asked for events, until the screen repeats them half a second later.
     # Released ones stay forgotten: it would let them cancel the opposite direction.
-    held = {key: True for key, is_pressed in teleop.current_pressed.items() if is_pressed}
+    keys = held_keys(teleop)
+    held = {key: True for key, is_pressed in keys.items() if is_pressed}
     events = dict(teleop.get_teleop_events())
-    teleop.current_pressed.update(held)
+    keys.update(held)
     return events

@@ -8,25 +8,25 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
-from lerobot.common.train_utils import (
-    get_step_checkpoint_dir,
-    get_step_identifier,
-    load_training_state,
-    save_checkpoint,
-    update_last_checkpoint,
-)
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.scripts.lerobot_eval import eval_policy_all
-from lerobot.scripts.lerobot_train import update_policy
 from lerobot.utils.constants import ACTION, OBS_STR
 from lerobot.utils.logging_utils import MetricsTracker
 from torch import Tensor
 
+from lerobot_playbyear.compat import (
+    eval_policy_all,
+    get_step_checkpoint_dir,
+    get_step_identifier,
+    load_training_state,
+    save_checkpoint,
+    update_last_checkpoint,
+    update_policy,
+)
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
 from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
