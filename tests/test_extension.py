@@ -1,0 +1,177 @@
+"""Another package adds an encoder, a step for microphones and an expert by name: the example, installed as any other."""
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import draccus
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from dataset_factory import MICROPHONE, make_dataset
+from lerobot.configs import PreTrainedConfig
+from lerobot.scripts import lerobot_eval, lerobot_train
+from lerobot.utils.import_utils import register_third_party_plugins
+from test_policy_contract import make_config, make_episode, make_policy, run_ending_at, step_through
+from torch import nn
+
+from lerobot_playbyear.dagger import ExpertConfig
+from lerobot_playbyear.policy.extension import register_audio_encoder, register_vision_encoder
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.processor_playbyear import make_playbyear_pre_post_processors
+from lerobot_playbyear.scripts import train
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "extension"
+THEIRS = {"audio_encoder": "spectrogram_gru", "audio_steps": ("remove_offset",)}
+BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory):
+    """Builds the example's wheel and unpacks it where Python finds distributions, as an installer does."""
+    folder = tmp_path_factory.mktemp("extension")
+    shutil.copytree(EXAMPLE, folder / "source")
+    subprocess.run([sys.executable, "-c", BUILD, str(folder)], cwd=folder / "source", check=True, capture_output=True)
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as wheel:
+        wheel.extractall(folder / "site")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder / "site")
+        register_third_party_plugins()
+        yield
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("data") / "noise"
+    make_dataset(root, (12, 17), image_size=16)
+    return root
+
+
+def call(command, *arguments: str | Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
+        command.main()
+
+
+@pytest.mark.parametrize("command", [train, lerobot_train], ids=["playbyear-train", "lerobot-train"])
+def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, dataset, tmp_path):
+    call(
+        command,
+        "--policy.type=playbyear",
+        "--policy.audio_encoder=spectrogram_gru",
+        "--policy.audio_steps=[remove_offset]",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--policy.image_size=16",
+        "--policy.vision_width=4",
+        "--policy.audio_window_s=0.9",
+        "--policy.n_memory_steps=2",
+        "--policy.hidden_size=32",
+        "--dataset.repo_id=tests/noise",
+        f"--dataset.root={dataset}",
+        "--num_workers=0",
+        "--batch_size=2",
+        "--steps=2",
+        "--seed=3",
+        f"--output_dir={tmp_path / 'train'}",
+    )
+    checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
+    saved = json.loads((checkpoint / "config.json").read_text())
+    assert (saved["audio_encoder"], saved["vision_encoder"]) == ("spectrogram_gru", "resnet18")
+    steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
+    assert [step["registry_name"] for step in steps][-2:] == ["remove_offset", "normalizer_processor"]
+    call(
+        lerobot_eval,
+        f"--policy.path={checkpoint}",
+        "--env.type=playbyear",
+        "--env.task=OccludedGrasp-v0",
+        "--env.image_size=16",
+        "--env.episode_length=5",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
+
+
+@torch.no_grad()
+def test_an_encoder_that_cannot_share_hears_the_same_in_training_and_in_a_rollout():
+    policy = make_policy(audio_encoder="spectrogram_gru")
+    episode = make_episode(seed=1, config=policy.config)
+    stepped = step_through(policy, [episode])
+    whole = policy.predict_run(run_ending_at(episode, 54, policy.config, 55), 55)
+    torch.testing.assert_close(stepped, whole, atol=1e-5, rtol=0)
+
+
+def test_a_step_gets_runs_in_training_and_frames_in_a_rollout_and_nothing_but_sound():
+    preprocess, _ = make_playbyear_pre_post_processors(make_config(**THEIRS))
+    sound = torch.randint(900, 1100, (2, 5, 800), dtype=torch.int16)
+    others = {f"{MICROPHONE}_is_pad": torch.ones(2, 5, dtype=torch.bool), "observation.state": torch.ones(2, 5, 7)}
+    run = preprocess({MICROPHONE: sound, **others})
+    assert run[MICROPHONE].mean(dim=-1).abs().max() < 1e-6
+    assert all(torch.equal(run[key], value) for key, value in others.items())
+    frame = preprocess({MICROPHONE: sound[:, 3] / 32768})
+    torch.testing.assert_close(frame[MICROPHONE], run[MICROPHONE][:, 3])
+
+
+def test_their_expert_takes_over_when_it_is_loud():
+    expert_config = draccus.decode(ExpertConfig, {"type": "startled", "loud": 0.2, "steps": 2})
+    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0")
+    observation, _ = env.reset(seed=0)
+    expert = expert_config.make(env)
+    expert.reset(env)
+    loud = {**observation, "audio.gripper": np.full(800, -9000, np.int16)}
+    wants = [expert.wants_control(heard, np.zeros(4)) for heard in (observation, loud, observation, observation)]
+    assert wants == [False, True, True, False]
+    assert env.action_space.contains(expert.act())
+
+
+def test_a_vision_encoder_of_another_package_learns_and_acts():
+    @register_vision_encoder("test_colours")
+    class Colours(nn.Module):
+        embedding_size = 9
+
+        def __init__(self, config):
+            super().__init__()
+            self.weight = nn.Parameter(torch.ones(3 * config.frame_stack, 1, 1))
+
+        def forward(self, stacks):
+            return (self.weight * stacks).mean(dim=(2, 3))
+
+    policy = make_policy(vision_encoder="test_colours")
+    assert [name for name, _ in policy.named_parameters() if "vision" in name] == ["model.vision.images_front.weight"]
+    episode = make_episode(1, policy.config, 3)
+    assert step_through(policy, [episode]).shape == (1, 3, 4)
+    with pytest.raises(ValueError, match="'test_colours' is registered already, by test_extension"):
+        register_vision_encoder("test_colours")(Colours)
+
+
+@pytest.mark.parametrize("option", ["vision_encoder", "audio_encoder"])
+def test_an_unknown_encoder_is_one_error_with_the_known_ones(option):
+    known = {"vision_encoder": "resnet18", "audio_encoder": "spectrogram_cnn, spectrogram_gru"}[option]
+    with pytest.raises(ValueError, match=rf"--policy\.{option}=nobody: .*there are: {known}.*lerobot_policy_"):
+        PlaybyearPolicy(make_config(**{option: "nobody"}))
+
+
+def test_an_unknown_step_and_an_encoder_without_a_size_are_refused():
+    with pytest.raises(ValueError, match=r"--policy\.audio_steps names 'nobody'.*lerobot_policy_"):
+        make_playbyear_pre_post_processors(make_config(audio_steps=("nobody",)))
+    register_audio_encoder("test_sizeless")(lambda config: nn.Flatten())
+    with pytest.raises(ValueError, match=r"test_sizeless: Flatten has no `embedding_size`"):
+        PlaybyearPolicy(make_config(audio_encoder="test_sizeless"))
+
+
+def test_a_checkpoint_from_before_encoders_had_names_loads(tmp_path):
+    policy = make_policy()
+    policy.save_pretrained(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    for key in ("vision_encoder", "audio_encoder", "audio_steps"):
+        del config[key]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    old = PlaybyearPolicy.from_pretrained(tmp_path, config=PreTrainedConfig.from_pretrained(tmp_path))
+    episode = make_episode(1, policy.config, 3)
+    assert torch.equal(step_through(old, [episode]), step_through(policy, [episode]))
