@@ -53,7 +53,7 @@ class Borrowed:
         try:
             found = attrgetter(name)(import_module(module))
         except (ImportError, AttributeError) as error:
-            raise CompatError(self._complaint(f"there is no {self.where}")) from error
+            raise CompatError(self._complaint(f"there is no {self.where} ({error})")) from error
         if self.says and self.says not in inspect.getsource(found):
             raise CompatError(self._complaint(f"{self.where} does nothing with `{self.says}`"))
         return found
@@ -66,111 +66,88 @@ class Borrowed:
         )
 
 
-_LEROBOT, _TORCH, _HUB = "lerobot 0.6.1", "torch 2.11.0", "huggingface_hub 1.33.0"
+def _lerobot(where: str, breaks: str, says: str = "") -> Borrowed:
+    return Borrowed(f"lerobot.{where}", "lerobot 0.6.1", breaks, says)
+
+
+def _torch(where: str, breaks: str) -> Borrowed:
+    return Borrowed(f"torch:{where}", "torch 2.11.0", breaks)
+
+
 _TRAINS = "playbyear-train and playbyear-dagger cannot"
+_PAD = "a gamepad that is not plugged in is not noticed"
 
 BORROWED = {
     # Functions of LeRobot's commands
-    "update_policy": Borrowed("lerobot.scripts.lerobot_train:update_policy", _LEROBOT, f"{_TRAINS} learn"),
-    "eval_policy_all": Borrowed("lerobot.scripts.lerobot_eval:eval_policy_all", _LEROBOT, f"{_TRAINS} evaluate"),
-    "rollout": Borrowed("lerobot.scripts.lerobot_eval:rollout", _LEROBOT, "playbyear-video cannot film a policy"),
-    "get_step_checkpoint_dir": Borrowed(
-        "lerobot.common.train_utils:get_step_checkpoint_dir", _LEROBOT, f"{_TRAINS} name checkpoints as LeRobot does"
-    ),
-    "get_step_identifier": Borrowed(
-        "lerobot.common.train_utils:get_step_identifier",
-        _LEROBOT,
-        f"{_TRAINS} name checkpoints and videos as LeRobot does",
-    ),
-    "load_training_state": Borrowed("lerobot.common.train_utils:load_training_state", _LEROBOT, f"{_TRAINS} resume"),
-    "save_checkpoint": Borrowed("lerobot.common.train_utils:save_checkpoint", _LEROBOT, f"{_TRAINS} save"),
-    "update_last_checkpoint": Borrowed(
-        "lerobot.common.train_utils:update_last_checkpoint", _LEROBOT, f"{_TRAINS} say which checkpoint is the last"
-    ),
-    "WandBLogger": Borrowed("lerobot.common.wandb_utils:WandBLogger", _LEROBOT, f"{_TRAINS} report to W&B"),
-    # Methods that we give LeRobot, and that it has to call
-    "_save_pretrained": Borrowed(
-        "lerobot.policies.pretrained:PreTrainedPolicy.save_pretrained",
-        _LEROBOT,
-        "policies on a GPU cannot be saved (their LSTM's weights are views of one buffer)",
+    "update_policy": _lerobot("scripts.lerobot_train:update_policy", f"{_TRAINS} learn"),
+    "eval_policy_all": _lerobot("scripts.lerobot_eval:eval_policy_all", f"{_TRAINS} evaluate"),
+    "rollout": _lerobot("scripts.lerobot_eval:rollout", "playbyear-video cannot film a policy"),
+    "get_step_checkpoint_dir": _lerobot("common.train_utils:get_step_checkpoint_dir", f"{_TRAINS} name a checkpoint"),
+    "get_step_identifier": _lerobot("common.train_utils:get_step_identifier", f"{_TRAINS} name a film"),
+    "load_training_state": _lerobot("common.train_utils:load_training_state", f"{_TRAINS} resume"),
+    "save_checkpoint": _lerobot("common.train_utils:save_checkpoint", f"{_TRAINS} save"),
+    "update_last_checkpoint": _lerobot("common.train_utils:update_last_checkpoint", f"{_TRAINS} save"),
+    "WandBLogger": _lerobot("common.wandb_utils:WandBLogger", f"{_TRAINS} report to W&B"),
+    # Methods and arguments of ours that LeRobot has to call and to give
+    "_save_pretrained": _lerobot(
+        "policies.pretrained:PreTrainedPolicy.save_pretrained",
+        "policies on a GPU cannot be saved: their LSTM's weights are views of one buffer",
         says="self._save_pretrained(",
     ),
-    "_load_as_safetensor": Borrowed(
-        "lerobot.policies.pretrained:PreTrainedPolicy.from_pretrained",
-        _LEROBOT,
+    "_load_as_safetensor": _lerobot(
+        "policies.pretrained:PreTrainedPolicy.from_pretrained",
         "weights that a checkpoint lacks stay at random without a word",
         says="cls._load_as_safetensor(",
     ),
-    "generate_model_card": Borrowed(
-        "lerobot.policies.pretrained:PreTrainedPolicy.push_model_to_hub",
-        _LEROBOT,
+    "generate_model_card": _lerobot(
+        "policies.pretrained:PreTrainedPolicy.push_model_to_hub",
         "a policy's card does not say what it hears",
         says="self.generate_model_card(",
     ),
-    "set_dataset_feature_metadata": Borrowed(
-        "lerobot.policies.factory:make_policy",
-        _LEROBOT,
+    "set_dataset_feature_metadata": _lerobot(
+        "policies.factory:make_policy",
         "the policy does not take its sample rate from the dataset",
         says="set_dataset_feature_metadata(ds_meta.features)",
     ),
-    "dataset_meta": Borrowed(
-        "lerobot.policies.factory:make_policy",
-        _LEROBOT,
+    "dataset_meta": _lerobot(
+        "policies.factory:make_policy",
         "lerobot-train takes a dataset of another frame rate without a word",
         says='kwargs["dataset_meta"] = ds_meta',
     ),
-    "__get_path_fields__": Borrowed(
-        "lerobot.configs.parser:wrap",
-        _LEROBOT,
+    "__get_path_fields__": _lerobot(
+        "configs.parser:wrap",
         "playbyear-dagger and playbyear-video do not take --policy.path",
         says="argtype.__get_path_fields__()",
     ),
     # Attributes of LeRobot's objects
-    "_metadata_buffer": Borrowed(
-        "lerobot.datasets.dataset_metadata:LeRobotDatasetMetadata",
-        _LEROBOT,
+    "_metadata_buffer": _lerobot(
+        "datasets.dataset_metadata:LeRobotDatasetMetadata",
         "an episode that could not be saved leaves a row in the dataset",
         says="self._metadata_buffer.clear()",
     ),
-    "_streaming_encoder": Borrowed(
-        "lerobot.datasets.dataset_writer:DatasetWriter",
-        _LEROBOT,
+    "_streaming_encoder": _lerobot(
+        "datasets.dataset_writer:DatasetWriter",
         "an episode that was filmed while it came in is lost when its saving fails",
         says="self._streaming_encoder.finish_episode()",
     ),
-    "current_pressed": Borrowed(
-        "lerobot.teleoperators.keyboard:KeyboardTeleop",
-        _LEROBOT,
-        "held keys of keyboard_ee are forgotten at every step",
-        says="self.current_pressed[",
+    "current_pressed": _lerobot(
+        "teleoperators.keyboard:KeyboardTeleop", "held keys are forgotten at every step", says="self.current_pressed["
     ),
-    "gamepad": Borrowed(
-        "lerobot.teleoperators.gamepad:GamepadTeleop",
-        _LEROBOT,
-        "a gamepad that is not plugged in is not noticed",
-        says="self.gamepad = ",
-    ),
-    "running": Borrowed(
-        "lerobot.teleoperators.gamepad.gamepad_utils:GamepadController",
-        _LEROBOT,
-        "a gamepad that is not plugged in is not noticed",
-        says="self.running = False",
-    ),
+    "gamepad": _lerobot("teleoperators.gamepad:GamepadTeleop", _PAD, says="self.gamepad = "),
+    "running": _lerobot("teleoperators.gamepad.gamepad_utils:GamepadController", _PAD, says="self.running = False"),
     # torch
-    "reorder_convolution_weight": Borrowed(
-        "torch:ops.mkldnn._reorder_convolution_weight", _TORCH, "no policy acts on a CPU"
-    ),
-    "convolution_pointwise": Borrowed("torch:ops.mkldnn._convolution_pointwise", _TORCH, "no policy acts on a CPU"),
-    "convolution_pointwise_binary": Borrowed(
-        "torch:ops.mkldnn._convolution_pointwise.binary", _TORCH, "no policy acts on a CPU"
-    ),
-    "_version": Borrowed("torch:Tensor._version", _TORCH, "a policy goes on acting by weights from before an update"),
+    "reorder_convolution_weight": _torch("ops.mkldnn._reorder_convolution_weight", "no policy acts on a CPU"),
+    "convolution_pointwise": _torch("ops.mkldnn._convolution_pointwise", "no policy acts on a CPU"),
+    "convolution_pointwise_binary": _torch("ops.mkldnn._convolution_pointwise.binary", "no policy acts on a CPU"),
+    "_version": _torch("Tensor._version", "a policy goes on acting by weights from before an update"),
     # Others
     "encode_choice": Borrowed(
-        "draccus.parsers.encoding:encode_choice", "draccus 0.11.6", "configurations cannot be saved"
+        "draccus.parsers.encoding:encode_choice", "draccus 0.11.6", "a policy's configuration cannot be saved"
     ),
     "_GLOBAL_CLIENT_FACTORY": Borrowed(
-        "huggingface_hub.utils._http:_GLOBAL_CLIENT_FACTORY", _HUB, "one lost request ends a download of hundreds"
+        "huggingface_hub.utils._http:_GLOBAL_CLIENT_FACTORY",
+        "huggingface_hub 1.33.0",
+        "one lost request ends a download of hundreds",
     ),
 }
 

@@ -27,6 +27,8 @@ def register_vision_encoder[Factory: EncoderFactory](name: str) -> Callable[[Fac
     - `embedding_size`, an int, E;
     - `forward`: (N, 3 * config.frame_stack, config.image_size, config.image_size) in [0, 1] -> (N, E), for any N.
 
+    Where several processes train, every `nn.BatchNorm2d` in it takes the statistics of all their batches.
+
     Raises:
         ValueError: The name is taken.
     """
