@@ -141,6 +141,9 @@ BORROWED = {
     "convolution_pointwise_binary": _torch("ops.mkldnn._convolution_pointwise.binary", "no policy acts on a CPU"),
     "_version": _torch("Tensor._version", "a policy goes on acting by weights from before an update"),
     # Others
+    "BasicBlock": Borrowed(
+        "torchvision.models.resnet:BasicBlock", "torchvision 0.26.0", "the vision encoder cannot be built"
+    ),
     "encode_choice": Borrowed(
         "draccus.parsers.encoding:encode_choice", "draccus 0.11.6", "a policy's configuration cannot be saved"
     ),

@@ -9,8 +9,9 @@ import torch
 from lerobot.utils.constants import OBS_PREFIX
 from torch import Tensor, nn
 from torch.nn import functional
-from torchvision.models.resnet import BasicBlock, ResNet, conv1x1
+from torchvision.models import ResNet
 
+from lerobot_playbyear.compat import BasicBlock
 from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import (
@@ -192,7 +193,9 @@ class SlimResNet(ResNet):
 
 def _stage(n_in: int, n_out: int, stride: int = 1) -> nn.Sequential:
     """Two residual blocks: (N, n_in, h, w) -> (N, n_out, h / stride, w / stride)."""
-    shortcut = nn.Sequential(conv1x1(n_in, n_out, stride), nn.BatchNorm2d(n_out)) if n_in != n_out else None
+    shortcut = None
+    if n_in != n_out:
+        shortcut = nn.Sequential(nn.Conv2d(n_in, n_out, 1, stride, bias=False), nn.BatchNorm2d(n_out))
     return nn.Sequential(BasicBlock(n_in, n_out, stride, shortcut), BasicBlock(n_out, n_out))
 
 

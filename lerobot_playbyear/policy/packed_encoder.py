@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
-from torchvision.models.resnet import BasicBlock, ResNet
+from torchvision.models import ResNet
 
-from lerobot_playbyear.compat import n_changes
+from lerobot_playbyear.compat import BasicBlock, n_changes
 from lerobot_playbyear.policy.networks import VisionEncoder
 
 _PAIRS = (("conv1", "bn1"), ("conv2", "bn2"))  # torchvision's names in a ResNet and in its blocks
