@@ -81,7 +81,6 @@ BORROWED = {
     # Functions of LeRobot's commands
     "update_policy": _lerobot("scripts.lerobot_train:update_policy", f"{_TRAINS} learn"),
     "eval_policy_all": _lerobot("scripts.lerobot_eval:eval_policy_all", f"{_TRAINS} evaluate"),
-    "rollout": _lerobot("scripts.lerobot_eval:rollout", "playbyear-video cannot film a policy"),
     "get_step_checkpoint_dir": _lerobot("common.train_utils:get_step_checkpoint_dir", f"{_TRAINS} name a checkpoint"),
     "get_step_identifier": _lerobot("common.train_utils:get_step_identifier", f"{_TRAINS} name a film"),
     "load_training_state": _lerobot("common.train_utils:load_training_state", f"{_TRAINS} resume"),

@@ -30,8 +30,6 @@ _STILL_TOO_LONG = {
     "datasets/attach.py",
     "datasets/repair/copying.py",
     "datasets/repair/rescue.py",
-    "policy/configuration_playbyear.py",
-    "policy/modeling_playbyear.py",
 }
 _SHORT = {
     "datasets/errors.py": "the error that all of the package raise; whoever catches it needs none of the rest",
