@@ -15,7 +15,7 @@ from pathlib import Path
 
 from common import machine, markdown, parser_for, rows_of
 
-SCRIPTS = ("training", "acting", "windows", "recording", "environment")
+SCRIPTS = ("startup", "training", "acting", "windows", "recording", "environment")
 SECTIONS = (*SCRIPTS, "scaling")  # the last is measured by hand
 
 

@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
+from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict, run_dagger
+from lerobot_playbyear.dagger.config import with_saved_options
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
-from lerobot_playbyear.scripts import dagger as dagger_script
-from lerobot_playbyear.scripts import train as train_script
+from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
+from lerobot_playbyear.training.loop import train
 
 ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v0", "--env.image_size=16")
 QUICK = ("--expert.type=test_quick", "--env.episode_length=12")
@@ -77,7 +79,7 @@ def base_folder() -> Path:
     run = ("--steps=2", "--batch_size=2", f"--output_dir={folder / 'train'}")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train", *_TINY_POLICY, *data, *run])
-        train_script.train()
+        parser.wrap()(train)()
     (folder / "policy").symlink_to(folder / "train/checkpoints/last/pretrained_model")
     return folder
 
@@ -107,8 +109,8 @@ def dagger(folder: Path, *options: str, **kwargs: Any) -> Path:
 def command(*args: str) -> Path:
     """Run the command with these arguments in this process, as `main` does, but without turning errors into exits."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["playbyear-dagger", *dagger_script.with_saved_options(list(args))])
-        return dagger_script.dagger()
+        patch.setattr(sys, "argv", ["playbyear-dagger", *with_saved_options(list(args))])
+        return parser.wrap()(run_dagger)()
 
 
 def metrics(folder: Path, kind: str | None = None) -> list[dict[str, Any]]:

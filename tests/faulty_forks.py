@@ -52,9 +52,9 @@ def repair(root: str) -> dict[str, Any]:
 def inspect(root: str) -> dict[str, Any]:
     from recording_factory import REPO_ID
 
+    from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig
+    from lerobot_playbyear.inspection.inspecting import inspect as inspect_dataset
     from lerobot_playbyear.inspection.source import DatasetSource
-    from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig
-    from lerobot_playbyear.scripts.inspect import inspect as inspect_dataset
 
     inspect_dataset(InspectConfig(dataset=InspectDatasetConfig(repo_id=REPO_ID, root=root)))
     return {"episodes": len(DatasetSource.open(REPO_ID, root).episodes)}
@@ -140,7 +140,8 @@ def answer_in_child(control: Control, order: dict[str, Any]) -> str:
 def main() -> None:
 
     import lerobot_playbyear.datasets.durable
-    import lerobot_playbyear.scripts.inspect  # noqa: F401
+    import lerobot_playbyear.inspection.checking
+    import lerobot_playbyear.inspection.picture_checks  # noqa: F401
 
     control = Control(os.environ["FAULT_CONTROL"])
     print(json.dumps({"ready": True}), flush=True)

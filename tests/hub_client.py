@@ -28,7 +28,12 @@ COMMANDS = {
     "hub-clients": "hub_clients",
 }
 _IMPORTED_LATER = (
+    "lerobot_playbyear.dagger.run",
+    "lerobot_playbyear.hub.policies",
+    "lerobot_playbyear.hub.uploads",
+    "lerobot_playbyear.inspection.page_writer",
     "lerobot_playbyear.recording.demonstrations",
+    "lerobot_playbyear.training.loop",
     "lerobot_env_playbyear",
 )
 

@@ -123,3 +123,20 @@ def test_every_command_reads_an_episode_as_the_memory_benchmark_makes_it(tmp_pat
     assert [result.command for result in results] == list(COMMANDS)
     assert [result.failure for result in results] == [""] * len(COMMANDS)
     assert json.loads((tmp_path / "bench.json").read_text())["memory"].keys() == COMMANDS.keys()
+
+
+def test_a_command_is_timed_up_to_the_first_of_its_files(tmp_path):
+    """That none of them ends otherwise, the benchmark checks itself."""
+    from startup import make_inputs, rows, works
+
+    make_inputs(tmp_path)
+    timed = works(tmp_path)
+    for name in (
+        "playbyear-inspect, to its first work",
+        "playbyear-inspect --help",
+        "playbyear-push with a misspelt option",
+    ):
+        timed[name]()
+    table = rows(dict.fromkeys(timed, 3.0))
+    assert len(table) == len(timed) - 1
+    assert {row.what for row in table if row.holds} == {row.what for row in table if "first work" in row.what}

@@ -10,6 +10,7 @@ import pytest
 import torch
 from dagger_factory import QUICK, command, dagger
 from dataset_factory import make_dataset
+from lerobot.configs import parser
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -20,7 +21,9 @@ from test_policy_training import batch_of
 from torch import nn
 
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.scripts.train import train
+from lerobot_playbyear.training import loop
+
+train = parser.wrap()(loop.train)
 
 TINY = (
     "--policy.type=playbyear",

@@ -12,6 +12,7 @@ import torch
 from accelerate.state import AcceleratorState
 from dagger_factory import QUICK, base_folder, command, dagger
 from dataset_factory import make_dataset
+from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_train
@@ -19,7 +20,9 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.scripts.train import train
+from lerobot_playbyear.training import loop
+
+train = parser.wrap()(loop.train)
 
 AVAILABLE = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
 DEVICES = [

@@ -34,8 +34,8 @@ from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.hub.datasets import _files, push_dataset
 from lerobot_playbyear.hub.pushing import HubError
 from lerobot_playbyear.inspection.film import at_a_rate_of_aac
+from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
-from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect
 
 SECRET = (250, 5, 120)  # a colour that no other picture has
 EVIL = (
@@ -449,7 +449,7 @@ from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
 from lerobot_playbyear.inspection.source import InspectionError
-from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect
+from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 
 def attempt(name, work):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

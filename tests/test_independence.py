@@ -16,7 +16,7 @@ sys.meta_path.insert(0, Blocker())
 """
 
 
-def _run_without(blocked: set[str], code: str) -> str:
+def run_without(blocked: set[str], code: str) -> str:
     script = _BLOCKER.format(blocked=blocked) + code
     result = subprocess.run(
         [sys.executable, "-c", script],
@@ -29,7 +29,7 @@ def _run_without(blocked: set[str], code: str) -> str:
     return result.stdout
 
 
-def test_the_tasks_run_without_torch_and_lerobot():
+def test_the_tasksrun_without_torch_and_lerobot():
     code = """
 import gymnasium
 env = gymnasium.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0")
@@ -38,7 +38,7 @@ observation, *_ = env.step(env.unwrapped.scripted_expert().act())
 print(sorted(observation))
 """
     blocked = {"torch", "torchaudio", "torchvision", "lerobot", "lerobot_playbyear", "lerobot_env_playbyear"}
-    assert _run_without(blocked, code).strip() == "['agent_pos', 'audio.gripper', 'pixels']"
+    assert run_without(blocked, code).strip() == "['agent_pos', 'audio.gripper', 'pixels']"
 
 
 def test_every_module_of_the_policy_imports_without_mujoco_and_the_tasks():
@@ -50,10 +50,10 @@ for package in (lerobot_playbyear, lerobot_policy_playbyear):
         importlib.import_module(module.name)
         print(module.name)
 """
-    imported = _run_without({"mujoco", "gym_playbyear", "lerobot_env_playbyear"}, code).split()
+    imported = run_without({"mujoco", "gym_playbyear", "lerobot_env_playbyear"}, code).split()
     assert {"lerobot_playbyear.recording.record", "lerobot_playbyear.scripts.record"} <= set(imported)
 
 
 def test_what_a_rollout_worker_imports_needs_neither_lerobot_nor_torch():
     """Otherwise each worker takes half a minute to start on a slow machine."""
-    _run_without({"torch", "lerobot"}, "import lerobot_playbyear.episodes.pool, lerobot_playbyear.scripts.record")
+    run_without({"torch", "lerobot"}, "import lerobot_playbyear.episodes.pool, lerobot_playbyear.scripts.record")

@@ -16,9 +16,10 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_playbyear.datasets.audio_feature import audio_feature
 from lerobot_playbyear.inspection import InspectionError, Verdict
+from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.onsets import sudden_sounds
 from lerobot_playbyear.inspection.sound_checks import flat_tops, gaps, repeats
-from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect, main
+from lerobot_playbyear.scripts.inspect import main
 
 FPS, SAMPLE_RATE, SIZE = 20, 16000, 32
 BLOCK = SAMPLE_RATE // FPS

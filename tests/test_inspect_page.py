@@ -16,9 +16,9 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets.audio_feature import audio_feature
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
+from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.page_writer import PageWriter
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
-from lerobot_playbyear.scripts.inspect import InspectConfig, InspectDatasetConfig, inspect
 
 pytestmark = pytest.mark.skipif(
     find_chromium() is None, reason="needs Chromium (Debian, Ubuntu: apt-get install chromium)"

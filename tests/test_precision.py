@@ -7,6 +7,7 @@ import pytest
 import torch
 from accelerate.state import AcceleratorState
 from dataset_factory import make_dataset
+from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -15,8 +16,10 @@ from test_policy_contract import make_config
 from torch import nn
 
 from lerobot_playbyear.policy.precision import training_dtype
-from lerobot_playbyear.scripts.train import train
+from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.parts import make_accelerator
+
+train = parser.wrap()(loop.train)
 
 TINY = (
     "--policy.type=playbyear",

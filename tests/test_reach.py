@@ -8,6 +8,7 @@ import pytest
 import torch
 from dagger_factory import ENV, QUICK, SMALL, command
 from dataset_factory import TASK, dataset_features, random_frame
+from lerobot.configs import parser
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
@@ -16,8 +17,10 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_playbyear.dagger import DaggerError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.scripts.train import train
+from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.reach import Reach
+
+train = parser.wrap()(loop.train)
 
 FEATURES = dataset_features(image_size=16)
 FEATURES["action"]["names"] = ["pan", "lift", "elbow", "gripper"]

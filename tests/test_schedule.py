@@ -6,13 +6,16 @@ import sys
 import pytest
 import torch
 from dataset_factory import dataset_features, make_dataset
+from lerobot.configs import parser
 from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.scripts.train import train
+from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.presets import apply_preset
+
+train = parser.wrap()(loop.train)
 
 TINY = ("--policy.device=cpu", "--policy.push_to_hub=false", "--policy.audio_window_s=0.9", "--num_workers=0")
 

@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
+from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
@@ -17,10 +18,13 @@ from torch.utils.data import default_collate
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts import train as train_script
-from lerobot_playbyear.scripts.train import TrainError, frame_weights, train
+from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
+from lerobot_playbyear.training.loop import TrainError, frame_weights
 from lerobot_playbyear.training.parts import PolicyWindows
 from lerobot_playbyear.training.presets import PRESETS, apply_preset
+
+train = parser.wrap()(loop.train)
 
 FPS = 20
 TINY = (

@@ -16,8 +16,8 @@ from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import RolloutError, env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
+from lerobot_playbyear.film.filming import VideoConfig, film
 from lerobot_playbyear.film.video import amplify, compose, episode_sound, spectrogram_strip, write_film
-from lerobot_playbyear.scripts.video import VideoConfig, film
 
 FPS, SAMPLE_RATE = 20, 16000
 BLOCK = SAMPLE_RATE // FPS

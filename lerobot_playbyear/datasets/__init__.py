@@ -1,5 +1,7 @@
 """Datasets with sound: their contract, an in-memory store of episodes, and what to draw from it."""
 
+from typing import TYPE_CHECKING
+
 from lerobot_playbyear.datasets.audio_feature import (
     AUDIO_PREFIX,
     audio_feature,
@@ -10,9 +12,12 @@ from lerobot_playbyear.datasets.audio_feature import (
 )
 from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.columns import check_dataset_files
-from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.datasets.microphone import MicrophoneBuffer, SoundCardBuffer
-from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
+from lerobot_playbyear.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.datasets.episode_store import EpisodeStore
+    from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 
 __all__ = [
     "AUDIO_PREFIX",
@@ -34,3 +39,9 @@ __all__ = [
     "write_audio",
     "write_wav",
 ]
+
+_WITH_TORCH = {
+    "episode_store": ("EpisodeStore",),
+    "samplers": ("RunSampler", "loud_frames", "run_weights", "start_frames"),
+}
+__getattr__ = lazy_names(__name__, _WITH_TORCH)

@@ -9,12 +9,14 @@ a plain LeRobotDataset v3.0.
 import wave
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from lerobot.datasets import LeRobotDataset
 
 from lerobot_playbyear.datasets.columns import column_to_numpy
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
 
 AUDIO_PREFIX = "observation.audio."
 """What the key of every microphone starts with."""
@@ -131,7 +133,7 @@ def _check_one(key: str, feature: Mapping[str, Any], fps: int) -> int:
     return int(sample_rate)
 
 
-def episode_waveform(dataset: LeRobotDataset, episode: int, key: str) -> tuple[np.ndarray, int]:
+def episode_waveform(dataset: "LeRobotDataset", episode: int, key: str) -> tuple[np.ndarray, int]:
     """The sound of a whole episode as one microphone heard it.
 
     Args:

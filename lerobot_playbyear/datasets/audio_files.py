@@ -7,8 +7,6 @@ from typing import Any, Protocol
 
 import av
 import numpy as np
-import torch
-import torchaudio
 
 from lerobot_playbyear.datasets.audio_feature import samples_per_frame, to_pcm_s16, write_wav
 
@@ -133,6 +131,9 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
     """
     if sample_rate == new_sample_rate:
         return waveform
+    import torch
+    import torchaudio
+
     is_pcm = waveform.dtype == np.int16
     floats = torch.from_numpy(waveform.astype(np.float32) / (32768 if is_pcm else 1))
     channels_first = floats.reshape(len(floats), -1).T  # (channels, n)

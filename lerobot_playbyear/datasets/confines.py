@@ -15,10 +15,10 @@ from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import pyarrow.parquet as pq
-from lerobot.datasets.utils import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH
 from PIL import Image
 
 from lerobot_playbyear.datasets.files import fits
+from lerobot_playbyear.datasets.names import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")  # of pictures; others have readers that start programs
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")

@@ -8,7 +8,8 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from torch import Tensor
 
-from lerobot_playbyear.datasets.opening import LongDataset, open_dataset
+from lerobot_playbyear.datasets.long_dataset import LongDataset
+from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.reading import INDEX_KEYS, read_dataset
 
 _GROWTH = 1.5

@@ -11,9 +11,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_feature import check_audio_features
-from lerobot_playbyear.datasets.columns import episode_bounds, read_images, read_values, read_videos
+from lerobot_playbyear.datasets.columns import episode_bounds
 from lerobot_playbyear.datasets.free_memory import available_memory
-from lerobot_playbyear.datasets.opening import LongDataset
+from lerobot_playbyear.datasets.long_dataset import LongDataset
+from lerobot_playbyear.datasets.tensors import read_images, read_values, read_videos
 
 INDEX_KEYS = ("index", "episode_index", "frame_index", "task_index", "timestamp")
 """The columns that every LeRobotDataset has."""

@@ -6,11 +6,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from huggingface_hub import HfApi
-from lerobot.datasets.dataset_metadata import CODEBASE_VERSION
-from lerobot.datasets.utils import create_lerobot_dataset_card
-from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from lerobot_playbyear.datasets.confines import OutsideError, check_links, entries_below
+from lerobot_playbyear.datasets.names import HF_LEROBOT_HOME
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview
 from lerobot_playbyear.hub.pushing import HubError, push_patiently
@@ -77,6 +75,8 @@ def _make_card(
     source: DatasetSource, repo_id: str, scratch: Path, film: Path | None, tags: list[str] | None, license: str
 ) -> dict[str, Path]:
     """The files that go up beside the dataset, by their names there."""
+    from lerobot.datasets.utils import create_lerobot_dataset_card
+
     preview = None
     if film is None:
         try:
@@ -99,6 +99,8 @@ def _make_card(
 
 
 def _push(repo_id: str, files: dict[str, Path], card: dict[str, Path], private: bool | None) -> str:
+    from lerobot.datasets import CODEBASE_VERSION
+
     repository = HubRepository(repo_id, "dataset", private)
     # LeRobot reads every file in data/: one that is no longer there must go.
     repository.commit(files, "Upload dataset", is_stale=lambda name: name.startswith(_CONTENT))

@@ -7,20 +7,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from lerobot.datasets import LeRobotDataset
-from lerobot.datasets.language import LANGUAGE_COLUMNS
-from lerobot.utils.constants import DEFAULT_FEATURES, HF_LEROBOT_HOME
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.confines import ClaimError, OutsideError, file_inside, open_picture
-from lerobot_playbyear.datasets.opening import LongDataset, open_dataset
-from lerobot_playbyear.datasets.video_pictures import video_pictures
-from lerobot_playbyear.inspection.damage import find_damage
+from lerobot_playbyear.datasets.names import HF_LEROBOT_HOME, INFO_PATH
+from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
+
+    from lerobot_playbyear.datasets.long_dataset import LongDataset
 
 SUCCESS = "next.success"
 INTERVENTION = "intervention"
@@ -70,7 +71,7 @@ class DatasetSource:
         numbers: The keys of all other numeric features of one dimension, without LeRobot's index columns.
     """
 
-    def __init__(self, dataset: LeRobotDataset | LongDataset, video_backend: str | None = "pyav") -> None:
+    def __init__(self, dataset: "LeRobotDataset | LongDataset", video_backend: str | None = "pyav") -> None:
         self.dataset = dataset
         self.fps = int(dataset.fps)
         self.features: dict[str, dict[str, Any]] = dataset.meta.features
@@ -96,8 +97,8 @@ class DatasetSource:
             InspectionError: If there is none, or LeRobot cannot read it.
         """
         folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
-        if root is not None and not (folder / "meta" / "info.json").is_file():
-            found = "it does not exist" if not folder.exists() else "it has no meta/info.json"
+        if root is not None and not (folder / INFO_PATH).is_file():
+            found = "it does not exist" if not folder.exists() else f"it has no {INFO_PATH}"
             raise InspectionError(f"There is no LeRobotDataset in '{folder}': {found}. Check --dataset.root.")
         try:
             dataset = open_dataset(repo_id, root, episodes, video_backend)
@@ -107,6 +108,8 @@ class DatasetSource:
             raise InspectionError(str(error)) from error
         except Exception as error:  # whatever LeRobot, Arrow or the network may raise
             where = f"in '{folder}'" if root is not None else f"'{repo_id}' (neither in '{folder}' nor from the Hub)"
+            from lerobot_playbyear.inspection.damage import find_damage
+
             reason = find_damage(folder) or " ".join(str(error.__cause__ or error).split()) or type(error).__name__
             raise InspectionError(f"The dataset {where} cannot be opened: {reason}") from error
         if n_episodes == 0:
@@ -202,6 +205,8 @@ class DatasetSource:
                     yield np.asarray(image.convert("RGB"))
 
     def _video(self, episode: Episode, camera: str) -> Iterator[np.ndarray]:
+        from lerobot_playbyear.datasets.video_pictures import video_pictures
+
         meta = self.dataset.meta
         path = file_inside(Path(self.dataset.root), meta.get_video_file_path(episode.index, camera))
         offset = meta.episodes[episode.index][f"videos/{camera}/from_timestamp"]
@@ -209,6 +214,9 @@ class DatasetSource:
         yield from video_pictures(path, times, self.dataset.tolerance_s, self._video_backend)
 
     def _is_number(self, key: str, feature: dict[str, Any]) -> bool:
+        from lerobot.datasets.language import LANGUAGE_COLUMNS
+        from lerobot.utils.constants import DEFAULT_FEATURES
+
         return (
             key not in DEFAULT_FEATURES
             and key not in self.microphones

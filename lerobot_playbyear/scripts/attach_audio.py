@@ -1,33 +1,39 @@
-"""Adds sound to a LeRobotDataset from files that were recorded beside it, as a copy.
+"""playbyear-attach-audio: a copy of a LeRobotDataset with sound from files recorded beside it.
 
-    playbyear-attach-audio --dataset.repo_id=user/grasp --dataset.root=outputs/grasp \
-        --output.repo_id=user/grasp_with_sound --output.root=outputs/grasp_with_sound \
+Every video is copied as it is; everything is checked before anything is written. What the columns
+mean is in docs/dataset.md.
+
+    playbyear-attach-audio --dataset.repo_id=me/grasp --dataset.root=outputs/grasp \\
+        --output.repo_id=me/grasp_with_sound --output.root=outputs/grasp_with_sound \\
         --files='sound/{episode:06d}.wav' --microphone=gripper --offset=0.25
 
-Every video is copied as it is; what is checked before anything is written, and what the columns mean, is in
-docs/dataset.md.
+  --dataset.repo_id=...        name of the dataset, user/name; it is not changed; needed
+  --dataset.root=null          its folder; else LeRobot's cache, or the Hub
+  --output.repo_id=...         the copy's name; needed
+  --output.root=null           its folder, which must not be there yet; else in LeRobot's cache
+  --files=...                  each episode's sound (WAV, FLAC, film), {episode} its number; needed
+  --microphone=microphone      its name; for files of several channels, one for each: left,right
+  --channel=null               take only this channel of the files, counted from 0
+  --offset=0.0                 where in its file each episode's first frame was taken [s]
+  --offsets=null               a JSON file with a list of offsets [s], one per episode, in addition
+  --sample_rate=null           resample to this rate [Hz]; else the files' own
+  --pad=false                  fill what a file lacks with silence; otherwise that is an error
 """
 
 import sys
 
-from lerobot.configs import parser
-from lerobot.utils.import_utils import register_third_party_plugins
-
-from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, attach_audio
-from lerobot_playbyear.hub.client import patient_hub
-
-
-@parser.wrap()
-def _run(cfg: AttachAudioConfig) -> None:
-    attach_audio(cfg)
+from lerobot_playbyear.scripts.command import answer_at_once, read_options
 
 
 def main() -> None:
     """The command."""
-    register_third_party_plugins()
+    answer_at_once("playbyear-attach-audio", __doc__)
+    from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, attach_audio
+    from lerobot_playbyear.hub.client import patient_hub
+
     try:
         with patient_hub():
-            _run()
+            attach_audio(read_options(AttachAudioConfig))
     except AttachError as error:
         sys.exit(f"error: {error}")
     except OSError as error:

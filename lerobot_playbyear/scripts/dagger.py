@@ -1,39 +1,66 @@
-"""playbyear-dagger: an expert corrects a policy while it works, and the policy learns from it (HG-DAgger).
+"""playbyear-dagger: an expert corrects a policy while it works, and the policy learns from it.
 
-    playbyear-dagger --policy.path=outputs/train/checkpoints/last/pretrained_model \
-        --demos.repo_id=me/demos --demos.root=outputs/demos \
-        --interventions.repo_id=me/corrections --interventions.root=outputs/corrections \
+HG-DAgger: the policy acts, the expert takes over where it goes wrong, and after every attempt the
+policy is trained on demonstrations and corrections.
+
+    playbyear-dagger --policy.path=outputs/train/checkpoints/last/pretrained_model \\
+        --demos.repo_id=me/demos --demos.root=outputs/demos \\
+        --interventions.repo_id=me/corrections --interventions.root=outputs/corrections \\
         --env.type=playbyear --env.task=OccludedGrasp-v0 --episodes=25 --output_dir=outputs/dagger
     playbyear-dagger --resume=true --output_dir=outputs/dagger
+
+What goes in
+  --policy.path=...            the policy to improve, a checkpoint's folder or a name on the Hub
+  --demos.repo_id=...          the demonstrations it was trained on; half of each batch; needed
+  --demos.root=null            their folder; else LeRobot's cache
+  --env.type=...               where it acts, like playbyear
+  --expert.type=...            who corrects: scripted (the environment's own, default), teleop
+  --expert.teleop.type=...     what a person moves the arm with: keyboard_window, gamepad, ...
+
+Attempts
+  --interventions.repo_id=...  the dataset of attempts with corrections, made or appended to; needed
+  --interventions.root=null    its folder
+  --episodes=25                attempts that it shall hold in the end; 0: none, see --updates
+  --max_attempts=50            attempts in a row without a correction, after which the run ends
+  --episode_seed=10000         of the first attempt; the others take the next ones
+
+Training
+  --updates_per_episode=100    updates after each attempt that is kept
+  --warmup_episodes=5          attempts before the first update
+  --updates=0                  with --episodes=0: updates on the corrections that are there
+  --batch_size=24              runs of windows per update, half of them demonstrations
+  --learning_rate=null         the largest of each round; else the policy's own
+  --seed=1000                  of training, and of the first evaluation episode
+
+What comes out
+  --output_dir=outputs/dagger  folder of checkpoints, figures and options
+  --eval_every=5               rounds between two evaluations; 0: none
+  --eval.n_episodes=50         episodes of an evaluation
+  --eval_videos=0              of these, how many are filmed
+  --save_every=0               rounds between two checkpoints that stay; 0: last and evaluated ones
+  --wandb.enable=false         report to Weights & Biases
+  --resume=false               go on with the run in --output_dir; options not given again stay
+
+--help=all lists all of LeRobot's options.
 """
 
 import sys
-from pathlib import Path
 
-from lerobot.configs import parser
-from lerobot.utils.import_utils import register_third_party_plugins
-
-from lerobot_playbyear.dagger import DaggerConfig, DaggerError, run_dagger
-from lerobot_playbyear.dagger.config import with_saved_options
-from lerobot_playbyear.hub.client import patient_hub
-from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
+from lerobot_playbyear.scripts.command import answer_at_once, run_with_lerobot
 from lerobot_playbyear.training.heap import keep_freed_memory
-
-
-@parser.wrap()
-def dagger(cfg: DaggerConfig) -> Path:
-    """Run HG-DAgger with options from the command line."""
-    return run_dagger(cfg)
 
 
 def main() -> None:
     """The command."""
+    answer_at_once("playbyear-dagger", __doc__)
     keep_freed_memory()
-    register_third_party_plugins()
+    from lerobot_playbyear.dagger.config import DaggerError, with_saved_options
+    from lerobot_playbyear.dagger.run import run_dagger
+    from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
+
     sys.argv[1:] = with_saved_options(sys.argv[1:])
     try:
-        with patient_hub():
-            dagger()
+        run_with_lerobot(run_dagger)
     except DaggerError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -1,110 +1,34 @@
-"""Uploads a dataset or a policy to the Hub, with its card.
-
-    playbyear-push --dataset.repo_id=me/occluded --dataset.root=outputs/occluded
-    playbyear-push --policy.path=outputs/train --policy.repo_id=me/occluded_policy
+"""playbyear-push: uploads a dataset or a policy to the Hub, with its card.
 
 An upload that was interrupted goes on with the same command.
+
+    playbyear-push --dataset.repo_id=me/demos --dataset.root=outputs/demos
+    playbyear-push --policy.path=outputs/train --policy.repo_id=me/policy
+
+  --dataset.repo_id=null       the dataset's name on the Hub, user/name
+  --dataset.root=null          its folder; else LeRobot's cache
+  --policy.path=null           a checkpoint's folder, or the output folder of a training
+  --policy.repo_id=null        the policy's name on the Hub, user/name
+  --private=null               whether a new repository is private; else the account's default
+  --tags=null                  for the card, like [franka,glass], besides its own
+  --license=null               as the Hub names licences; else the policy's own, or apache-2.0
+  --preview=null               an mp4 for the card; else one is made of a dataset
 """
 
 import logging
 import sys
-from dataclasses import dataclass, field
-from pathlib import Path
 
-from lerobot.configs import parser
-from lerobot.utils.import_utils import register_third_party_plugins
-
-from lerobot_playbyear.hub.datasets import push_dataset
-from lerobot_playbyear.hub.policies import push_policy
-from lerobot_playbyear.hub.pushing import HubError
-
-
-@dataclass
-class PushDatasetConfig:
-    """The dataset.
-
-    Args:
-        repo_id: Its name on the Hub, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
-    """
-
-    repo_id: str | None = None
-    root: str | None = None
-
-
-@dataclass
-class PushPolicyConfig:
-    """The policy.
-
-    Args:
-        path: The folder of a checkpoint, or the output folder of a training, whose last checkpoint is taken.
-        repo_id: Its name on the Hub, `user/name`.
-    """
-
-    path: str | None = None
-    repo_id: str | None = None
-
-
-@dataclass
-class PushConfig:
-    """Options of `playbyear-push`. One of `dataset` and `policy` has to be given.
-
-    Args:
-        dataset: The dataset to upload.
-        policy: The policy to upload.
-        private: Whether a repository that is created is private. None: as the account's default says.
-        tags: For the card, besides those that it gets by itself.
-        license: As the Hub names licences. None: the policy's own, or else apache-2.0.
-        preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
-    """
-
-    dataset: PushDatasetConfig = field(default_factory=PushDatasetConfig)
-    policy: PushPolicyConfig = field(default_factory=PushPolicyConfig)
-    private: bool | None = None
-    tags: list[str] | None = None
-    license: str | None = None
-    preview: Path | None = None
-
-
-def push(cfg: PushConfig) -> str:
-    """Uploads what the options name.
-
-    Returns:
-        Its address on the Hub.
-
-    Raises:
-        HubError: An option is missing, there is nothing to upload, or it could not be uploaded.
-    """
-    dataset, policy = cfg.dataset, cfg.policy
-    if (dataset.repo_id is None) == (policy.repo_id is None):
-        raise HubError("Give either --dataset.repo_id (and --dataset.root), or --policy.path and --policy.repo_id.")
-    if dataset.repo_id is not None:
-        license = cfg.license or "apache-2.0"
-        url = push_dataset(
-            dataset.repo_id, dataset.root, private=cfg.private, tags=cfg.tags, license=license, film=cfg.preview
-        )
-        print(f"Dataset: {url}\nLoad it anywhere: playbyear-inspect --dataset.repo_id={dataset.repo_id}")
-        return url
-    if policy.path is None or policy.repo_id is None:
-        raise HubError("--policy.repo_id needs --policy.path, the folder of a checkpoint.")
-    url = push_policy(
-        policy.path, policy.repo_id, private=cfg.private, tags=cfg.tags, license=cfg.license, film=cfg.preview
-    )
-    print(f"Policy: {url}\nTry it anywhere: lerobot-eval --policy.path={policy.repo_id} --env.type=...")
-    return url
-
-
-@parser.wrap()
-def _run(cfg: PushConfig) -> str:
-    return push(cfg)
+from lerobot_playbyear.scripts.command import answer_at_once, read_options
 
 
 def main() -> None:
     """The command."""
+    answer_at_once("playbyear-push", __doc__)
     logging.basicConfig(level=logging.WARNING)
-    register_third_party_plugins()
+    from lerobot_playbyear.hub.uploads import HubError, PushConfig, push
+
     try:
-        _run()
+        push(read_options(PushConfig))
     except HubError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

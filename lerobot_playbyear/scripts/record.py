@@ -1,29 +1,41 @@
-"""Records a scripted expert, or a person (`--expert.type=teleop`), into a LeRobotDataset with sound.
+"""playbyear-record: a script or a person demonstrates a task; a LeRobotDataset with sound.
 
-    playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v0 \
-        --dataset.repo_id=user/grasp --dataset.root=outputs/grasp --dataset.num_episodes=50 --seed=0
+Only successful episodes are kept. Each is safe on the disk as soon as it is saved.
 
-LeRobot is imported inside `main`: the processes that roll out import this module and nothing of LeRobot, and so
-start in 2 seconds instead of 30.
+    playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v0 --seed=0 \\
+        --dataset.repo_id=me/demos --dataset.root=outputs/demos --dataset.num_episodes=50
+    playbyear-record ... --expert.type=teleop          # a person, in a window
+
+  --env.type=...               the environment, like playbyear; needed
+  --env.task=...               its task: OccludedGrasp-v0 or OccludedPickPlace-v0
+  --expert.type=...            who demonstrates: scripted (the environment's own, default), teleop
+  --expert.teleop.type=...     what a person moves the arm with: keyboard_window, gamepad, ...
+  --dataset.repo_id=...        the dataset's name, user/name; needed
+  --dataset.root=null          its folder; else LeRobot's cache
+  --dataset.num_episodes=50    how many episodes it shall have
+  --dataset.video=false        pictures as video; otherwise each is stored without loss
+  --dataset.push_to_hub=false  upload it when it is complete
+  --seed=0                     of the first attempt; the others take the next ones
+  --num_workers=null           processes that roll out, 0: this one; else one per core, at most 8
+  --resume=false               append to a dataset that is there, up to --dataset.num_episodes
+
+--help=all lists all of LeRobot's options.
 """
 
 import sys
 
+from lerobot_playbyear.scripts.command import answer_at_once, run_with_lerobot
+
 
 def main() -> None:
-    from lerobot.configs import parser
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, record_demonstrations
+    """The command."""
+    answer_at_once("playbyear-record", __doc__)
+    # Here, because the processes that roll out import this module, and start in 2 seconds without LeRobot.
+    from lerobot_playbyear.recording.demonstrations import record_demonstrations
     from lerobot_playbyear.recording.record import RecordError
 
-    @parser.wrap()
-    def run(cfg: DemonstrationConfig) -> None:
-        record_demonstrations(cfg)
-
-    register_third_party_plugins()
     try:
-        run()
+        run_with_lerobot(record_demonstrations)
     except RecordError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

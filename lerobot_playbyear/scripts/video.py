@@ -1,108 +1,34 @@
-"""Films an episode with its sound: a policy's, or without one the scripted expert's.
+"""playbyear-video: films an episode with its sound, a policy's or the scripted expert's.
 
-    playbyear-video --policy.path=outputs/train/checkpoints/last/pretrained_model \
-        --env.type=playbyear --env.task=OccludedGrasp-v0 --seed=1000 --output=outputs/rollout.mp4
+    playbyear-video --policy.path=outputs/train/checkpoints/last/pretrained_model \\
+        --env.type=playbyear --env.task=OccludedGrasp-v0 --output=outputs/rollout.mp4
+
+  --env.type=...               the environment, like playbyear; needed
+  --env.task=...               its task: OccludedGrasp-v0 or OccludedPickPlace-v0
+  --policy.path=...            who acts, a checkpoint's folder or a name on the Hub; else a script
+  --baseline=null              without a policy, the environment's blind baseline of this name acts
+  --output=outputs/rollout.mp4  the film
+  --seed=1000                  of the first episode
+  --attempts=1                 episodes, at most, until one succeeds; the last one is filmed
+
+--help=all lists all of LeRobot's options.
 """
 
 import logging
 import sys
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
-from lerobot.configs import PreTrainedConfig, parser
-from lerobot.envs import EnvConfig, make_env
-from lerobot.envs.utils import FreezeAfterEpisodeEnd
-from lerobot.utils.import_utils import register_third_party_plugins
-
-from lerobot_playbyear.episodes.environment import RolloutError, env_spec
-from lerobot_playbyear.episodes.play import Actor, play
-from lerobot_playbyear.episodes.policy_actor import load_policy_actor
-from lerobot_playbyear.episodes.script import Script
-from lerobot_playbyear.film.episode_film import write_episode_film
-from lerobot_playbyear.hub.client import patient_hub
-
-
-@dataclass
-class VideoConfig:
-    """Options of `playbyear-video`.
-
-    Args:
-        env: The environment; its `render()` gives the pictures.
-        policy: `--policy.path=`, a checkpoint's folder or its name on the Hub. Without it a script acts.
-        output: The film, an mp4.
-        seed: Of the first episode.
-        attempts: How many episodes, with the seeds after it, may be played until one succeeds; the last one played
-            is filmed.
-        baseline: Without a policy, the name of the environment's blind baseline that acts in the expert's stead.
-    """
-
-    env: EnvConfig
-    policy: PreTrainedConfig | None = None
-    output: Path = field(default=Path("outputs/rollout.mp4"))
-    seed: int = 1000
-    attempts: int = 1
-    baseline: str | None = None
-
-    def __post_init__(self) -> None:
-        path = parser.get_path_arg("policy")
-        if path:
-            overrides = parser.get_cli_overrides("policy") or []
-            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-            self.policy.pretrained_path = Path(path)
-
-    @classmethod
-    def __get_path_fields__(cls) -> list[str]:
-        """The fields that a checkpoint can fill: `--policy.path`."""
-        return ["policy"]
-
-
-def film(cfg: VideoConfig) -> Path:
-    """Plays episodes until one succeeds or the attempts are used up, and writes the last one's film.
-
-    Returns:
-        The film's path.
-
-    Raises:
-        ValueError: An option is out of range.
-        RolloutError: No policy is given and the environment has no script.
-    """
-    if cfg.attempts < 1:
-        raise ValueError(f"attempts={cfg.attempts}: give at least 1.")
-    env = env_spec(cfg.env).make() if cfg.policy is None else _env_of_lerobot(cfg.env)
-    try:
-        actor: Actor = Script(cfg.baseline) if cfg.policy is None else load_policy_actor(cfg.policy, cfg.env)
-        for seed in range(cfg.seed, cfg.seed + cfg.attempts):
-            episode = play(env, actor, seed, watch=env.render)
-            if episode.success:
-                break
-    finally:
-        env.close()
-    write_episode_film(episode, cfg.output, cfg.env.fps)
-    outcome = "success" if episode.success else "failure"
-    print(f"Film: {cfg.output} (seed {episode.seed}, {len(episode)} steps, {outcome})")
-    return cfg.output
-
-
-def _env_of_lerobot(env_cfg: EnvConfig) -> gym.Env:
-    """The first environment that LeRobot makes for a configuration, also where Gymnasium knows none of that name."""
-    vec: Any = next(iter(next(iter(make_env(env_cfg).values())).values()))
-    env = vec.envs[0]
-    return env.env if isinstance(env, FreezeAfterEpisodeEnd) else env  # that one ends with its first episode
-
-
-@parser.wrap()
-def _run(cfg: VideoConfig) -> None:
-    film(cfg)
+from lerobot_playbyear.scripts.command import answer_at_once, run_with_lerobot
 
 
 def main() -> None:
+    """The command."""
+    answer_at_once("playbyear-video", __doc__)
     logging.basicConfig(level=logging.WARNING)
-    register_third_party_plugins()
+    from lerobot_playbyear.episodes.environment import RolloutError
+    from lerobot_playbyear.film.filming import film
+
     try:
-        with patient_hub():
-            _run()
+        run_with_lerobot(film)
     except (RolloutError, ValueError, OSError) as error:
         sys.exit(f"error: {error}")
 

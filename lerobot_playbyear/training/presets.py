@@ -7,9 +7,7 @@ bfloat16 the preset `cpu` switches `policy.use_amp` on.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from lerobot.configs import parser
-
-from lerobot_playbyear.policy.precision import computes_bfloat16
+from lerobot_playbyear.arguments import given_options
 
 
 @dataclass(frozen=True)
@@ -85,28 +83,30 @@ def apply_preset(args: Sequence[str]) -> list[str]:
     Raises:
         ValueError: If there is no such preset, or the policy is of another type.
     """
-    args = list(args)
-    name = parser.parse_arg("preset", args)
-    if name is None or (parser.parse_arg("resume", args) or "").lower() in ("true", "1", "yes"):
-        return args
+    given, _ = given_options(args)
+    name = given.get("preset")
+    if name is None or (given.get("resume") or "").lower() in ("true", "1", "yes"):
+        return list(args)
     if name not in PRESETS:
         known = "; ".join(f"{key} ({preset.purpose})" for key, preset in PRESETS.items())
         raise ValueError(f"--preset={name} is not known. The presets are: {known}.")
     preset = PRESETS[name]
-    policy_type = parser.get_type_arg("policy", args)
+    policy_type = given.get("policy.type")
     if policy_type not in (None, preset.network["policy.type"]):
         raise ValueError(
             f"--preset={name} is for --policy.type={preset.network['policy.type']}, not for {policy_type}: "
             "leave one of the two out."
         )
-    from_checkpoint = parser.parse_arg("policy.path", args) is not None
+    from_checkpoint = given.get("policy.path") is not None
     options = preset.training if from_checkpoint else {**preset.network, **preset.training}
-    if name == "cpu" and computes_bfloat16():
+    if name == "cpu" and _computes_bfloat16():
         options = {**options, "policy.use_amp": "true"}
-    if _is_given("policy.repo_id", args):  # whoever names a place on the Hub wants it used
+    if "policy.repo_id" in given:  # whoever names a place on the Hub wants it used
         options = {key: value for key, value in options.items() if key != "policy.push_to_hub"}
-    return [f"--{key}={value}" for key, value in options.items() if not _is_given(key, args)] + args
+    return [*(f"--{key}={value}" for key, value in options.items() if key not in given), *args]
 
 
-def _is_given(option: str, args: Sequence[str]) -> bool:
-    return any(arg == f"--{option}" or arg.startswith(f"--{option}=") for arg in args)
+def _computes_bfloat16() -> bool:
+    from lerobot_playbyear.policy.precision import computes_bfloat16  # imports torch
+
+    return computes_bfloat16()

@@ -1,0 +1,94 @@
+"""The files of sound that a dataset gets: decoded once, and checked against its episodes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets import LeRobotDataset
+from tqdm import tqdm
+
+from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError
+from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled, audio_pieces
+from lerobot_playbyear.datasets.long_dataset import LongDataset
+from lerobot_playbyear.datasets.spooled_sound import EpisodesSound, SpooledFile
+
+_MOST_ERRORS = 10  # that are listed
+
+
+def read_sound(
+    cfg: AttachAudioConfig, dataset: LeRobotDataset | LongDataset, keys: list[str], scratch: Path
+) -> EpisodesSound:
+    """Decodes all files, so that what is wrong with them is known before anything is written."""
+    offsets = _offsets(cfg, dataset.num_episodes)
+    lengths = [int(length) for length in dataset.meta.episodes["length"]]
+    errors: list[str] = []
+    rates: dict[int, int] = {}
+    episodes: list[Cut] = []
+    for episode, length in enumerate(tqdm(lengths, desc="Reading sound", unit="episode")):
+        path = Path(_format(cfg.files, episode))
+        try:
+            samples, rate = _spool(cfg, path, len(keys), scratch / str(episode))
+            rates[episode] = cfg.sample_rate or rate
+            if rates[episode] % dataset.fps:
+                raise AudioFileError(
+                    f"it has {rate} samples per second, which is no multiple of {dataset.fps} frames per second. "
+                    f"Resample it, for example with --sample_rate={max(1, round(rate / dataset.fps)) * dataset.fps}."
+                )
+            resampled = Resampled(samples, rate, rates[episode])
+            episodes.append(Cut(resampled, rates[episode], dataset.fps, length, offsets[episode], cfg.pad))
+        except (AudioFileError, ValueError) as error:
+            errors.append(f"episode {episode}, {path}: {error}")
+    if len(set(rates.values())) > 1:
+        each = ", ".join(
+            f"{rate} Hz (episode {list(rates.values()).index(rate)})" for rate in sorted(set(rates.values()))
+        )
+        errors.append(f"the files have different sample rates, {each}. Give --sample_rate to resample them.")
+    if errors:
+        more = f"\n  ... and {len(errors) - _MOST_ERRORS} more" if len(errors) > _MOST_ERRORS else ""
+        raise AttachError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
+    return EpisodesSound(rates[0], keys, rates[0] // dataset.fps, episodes)
+
+
+def _spool(cfg: AttachAudioConfig, path: Path, n_microphones: int, target: Path) -> tuple[SpooledFile, int]:
+    """Decodes the channels of a file that are wanted; the samples, and their rate [Hz]."""
+    rate = 0
+    with target.open("wb") as file:
+        for samples, found in audio_pieces(path):
+            rate = found
+            file.write(np.ascontiguousarray(_choose_channels(cfg, samples, n_microphones)).tobytes())
+    return SpooledFile(target, n_microphones), rate
+
+
+def _format(pattern: str, episode: int) -> str:
+    try:
+        return pattern.format(episode=episode)
+    except (KeyError, IndexError, ValueError) as error:
+        raise AttachError(
+            f"--files={pattern} cannot be filled in: {error}. Only {{episode}} may stand in it."
+        ) from error
+
+
+def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
+    if cfg.offsets is None:
+        return [cfg.offset] * n_episodes
+    try:
+        values = [float(value) for value in json.loads(cfg.offsets.read_text())]
+    except (OSError, ValueError, TypeError) as error:
+        raise AttachError(f"--offsets={cfg.offsets} is no list of numbers in JSON: {error}") from error
+    if len(values) != n_episodes:
+        raise AttachError(f"--offsets={cfg.offsets} has {len(values)} values; the dataset has {n_episodes} episodes.")
+    return [cfg.offset + value for value in values]
+
+
+def _choose_channels(cfg: AttachAudioConfig, samples: np.ndarray, n_microphones: int) -> np.ndarray:
+    n_channels = samples.shape[1]
+    if cfg.channel is not None:
+        if not 0 <= cfg.channel < n_channels:
+            raise AudioFileError(f"it has {n_channels} channels; there is no --channel={cfg.channel}.")
+        return samples[:, [cfg.channel]]
+    if n_channels != n_microphones:
+        raise AudioFileError(
+            f"it has {n_channels} channels, and --microphone names {n_microphones}. Choose one with --channel=0, or "
+            "name a microphone for each, separated by commas."
+        )
+    return samples

@@ -1,0 +1,65 @@
+"""A dataset with long episodes, opened for reading whole columns."""
+
+import tempfile
+from pathlib import Path
+
+import datasets
+import pyarrow as pa
+from datasets.arrow_writer import ArrowWriter
+from datasets.table import table_cast
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.parquet_files import open_parquet, row_group_parts
+
+
+class LongDataset:
+    """A local dataset with long episodes: of LeRobotDataset what reading whole columns needs.
+
+    Args:
+        repo_id: Its name.
+        root: Its folder.
+        episodes: Only these; None: all.
+
+    Attributes:
+        repo_id, root, meta, fps, num_episodes, features, tolerance_s, hf_dataset: As LeRobotDataset's.
+    """
+
+    def __init__(self, repo_id: str, root: Path, episodes: list[int] | None = None) -> None:
+        self.repo_id, self.root = repo_id, root
+        self.meta = LeRobotDatasetMetadata(repo_id, root)
+        self.fps, self.features = self.meta.fps, self.meta.features
+        self.num_episodes = self.meta.total_episodes if episodes is None else len(episodes)
+        self.tolerance_s = 1e-4  # LeRobot's own
+        self._folder = scratch_folder()  # until this object is gone
+        self.hf_dataset = self._map(Path(self._folder.name) / "data.arrow", episodes)
+
+    def __len__(self) -> int:
+        """The frames of the episodes."""
+        return len(self.hf_dataset)
+
+    def _map(self, path: Path, episodes: list[int] | None) -> datasets.Dataset:
+        features = get_hf_features_from_features(self.meta.features)
+        with ArrowWriter(features=features, path=str(path)) as writer:
+            for name in sorted((self.root / "data").glob("*/*.parquet")):
+                with open_parquet(name) as file:
+                    for group in range(file.num_row_groups):
+                        for table in row_group_parts(file, group):
+                            wanted = table if episodes is None else _of(table, episodes)
+                            if len(wanted):
+                                writer.write_table(table_cast(wanted, features.arrow_schema))
+            writer.finalize()
+        return datasets.Dataset.from_file(str(path))
+
+
+def scratch_folder() -> tempfile.TemporaryDirectory[str]:
+    """A folder for files of gigabytes, where LeRobot has its own: what `tempfile` chooses by itself may be memory."""
+    cache = Path(datasets.config.HF_DATASETS_CACHE)
+    cache.mkdir(parents=True, exist_ok=True)
+    return tempfile.TemporaryDirectory(dir=cache, prefix="playbyear-")
+
+
+def _of(table: pa.Table, episodes: list[int]) -> pa.Table:
+    found = column_to_numpy(table.column("episode_index"))
+    return table.filter(pa.array([number in episodes for number in found.tolist()]))

@@ -1,0 +1,84 @@
+"""`playbyear-video`: an episode of a policy or of a script, as a film with its sound."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs import EnvConfig, make_env
+from lerobot.envs.utils import FreezeAfterEpisodeEnd
+
+from lerobot_playbyear.episodes.environment import RolloutError, env_spec
+from lerobot_playbyear.episodes.play import Actor, play
+from lerobot_playbyear.episodes.policy_actor import load_policy_actor
+from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.film.episode_film import write_episode_film
+
+
+@dataclass
+class VideoConfig:
+    """Options of `playbyear-video`.
+
+    Args:
+        env: The environment; its `render()` gives the pictures.
+        policy: `--policy.path=`, a checkpoint's folder or its name on the Hub. Without it a script acts.
+        output: The film, an mp4.
+        seed: Of the first episode.
+        attempts: How many episodes, with the seeds after it, may be played until one succeeds; the last one played
+            is filmed.
+        baseline: Without a policy, the name of the environment's blind baseline that acts in the expert's stead.
+    """
+
+    env: EnvConfig
+    policy: PreTrainedConfig | None = None
+    output: Path = field(default=Path("outputs/rollout.mp4"))
+    seed: int = 1000
+    attempts: int = 1
+    baseline: str | None = None
+
+    def __post_init__(self) -> None:
+        path = parser.get_path_arg("policy")
+        if path:
+            overrides = parser.get_cli_overrides("policy") or []
+            self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+            self.policy.pretrained_path = Path(path)
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """The fields that a checkpoint can fill: `--policy.path`."""
+        return ["policy"]
+
+
+def film(cfg: VideoConfig) -> Path:
+    """Plays episodes until one succeeds or the attempts are used up, and writes the last one's film.
+
+    Returns:
+        The film's path.
+
+    Raises:
+        ValueError: An option is out of range.
+        RolloutError: No policy is given and the environment has no script.
+    """
+    if cfg.attempts < 1:
+        raise ValueError(f"attempts={cfg.attempts}: give at least 1.")
+    env = env_spec(cfg.env).make() if cfg.policy is None else _env_of_lerobot(cfg.env)
+    try:
+        actor: Actor = Script(cfg.baseline) if cfg.policy is None else load_policy_actor(cfg.policy, cfg.env)
+        for seed in range(cfg.seed, cfg.seed + cfg.attempts):
+            episode = play(env, actor, seed, watch=env.render)
+            if episode.success:
+                break
+    finally:
+        env.close()
+    write_episode_film(episode, cfg.output, cfg.env.fps)
+    outcome = "success" if episode.success else "failure"
+    print(f"Film: {cfg.output} (seed {episode.seed}, {len(episode)} steps, {outcome})")
+    return cfg.output
+
+
+def _env_of_lerobot(env_cfg: EnvConfig) -> gym.Env:
+    """The first environment that LeRobot makes for a configuration, also where Gymnasium knows none of that name."""
+    vec: Any = next(iter(next(iter(make_env(env_cfg).values())).values()))
+    env = vec.envs[0]
+    return env.env if isinstance(env, FreezeAfterEpisodeEnd) else env  # that one ends with its first episode

@@ -1,0 +1,118 @@
+"""What every command does before its work: answer at once what needs no imports, then read its options."""
+
+import difflib
+import json
+import re
+import sys
+from collections.abc import Callable, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from lerobot_playbyear.arguments import given_options
+
+OPTIONS_FILE = Path(__file__).with_name("options.json")
+"""The names of all options of each command; `python tools/list_options.py` writes it."""
+
+_NOTHING = ("", "~", "null", "none")
+_WORDS_OF_KIND = {
+    "bool": ("true", "false", "yes", "no", "on", "off"),
+    "int": ("true", "false"),
+    "float": ("true", "false", "inf", ".inf", "nan", ".nan", "infinity"),
+}
+_WANTED = {"bool": "true or false", "int": "a whole number", "float": "a number"}
+
+
+def answer_at_once(command: str, short_help: str | None) -> None:
+    """Prints the help, or what is certainly wrong with the command line, and ends the process; otherwise does nothing.
+
+    `--help=all` becomes `--help`, which the full parser answers.
+
+    Args:
+        command: Its name.
+        short_help: What `--help` prints.
+    """
+    args = sys.argv[1:]
+    if "--help=all" in args:
+        sys.argv[1:] = [*(argument for argument in args if argument != "--help=all"), "--help"]
+        return
+    if "--help" in args or "-h" in args:
+        print((short_help or "").strip())
+        sys.exit(0)
+    listed = json.loads(OPTIONS_FILE.read_text())
+    if metadata.version("lerobot") != listed["lerobot"]:
+        return  # another version may have other options
+    wrong = find_mistake(args, listed[command], listed["policies"])
+    if wrong is not None:
+        print(f"error: {wrong}\n`{command} --help` shows the options that matter.", file=sys.stderr)
+        sys.exit(2)
+
+
+def find_mistake(args: list[str], listed: Mapping[str, Any], policies: Mapping[str, Any]) -> str | None:
+    """What the full parser would certainly refuse; None where nothing is certain.
+
+    Args:
+        args: The command line.
+        listed: The command's `options` with their kinds, its `required` ones, and the groups that are `open`: what they hold
+            depends on a type, which plugins may add.
+        policies: The options of the policies that are known here, by their type.
+    """
+    given, strays = given_options(args)
+    if strays:
+        return f"'{strays[0]}' is no option: options begin with --."
+    known: dict[str, str] = dict(listed["options"])
+    opened = list(listed["open"])
+    policy_type = given.get("policy.type") or ("playbyear" if given.get("preset") else "")
+    if "policy" in opened and policy_type in policies and not given.keys() & {"policy.path", "config_path"}:
+        opened.remove("policy")
+        known.update({f"policy.{name}": kind for name, kind in policies[policy_type].items()})
+        known.update({f"policy.{name}": "" for name in ("type", "path")})
+    for name, value in given.items():
+        is_open = name.partition(".")[0] in opened or name.endswith("discover_packages_path")
+        if name not in known and not is_open:
+            near = difflib.get_close_matches(name, known, 1)
+            return f"--{name} is no option{f'; did you mean --{near[0]}?' if near else '.'}"
+        if name in known and value is None:
+            return f"--{name} needs a value, --{name}=..."
+        if name in known and not _may_be(known[name], value or ""):
+            return f"--{name}={value}: wanted {_WANTED[known[name]]}."
+    if given.keys() & {"config_path", "resume"}:
+        return None
+    missing = [name for name in listed["required"] if name not in given and name.partition(".")[0] not in given]
+    return f"--{missing[0]} is needed." if missing else None
+
+
+def _may_be(kind: str, value: str) -> bool:
+    word = value.strip().lower()
+    if kind not in _WANTED or word in _NOTHING or word.startswith("include"):
+        return True
+    return word.lstrip("+-") in _WORDS_OF_KIND[kind] or (kind != "bool" and re.search(r"\d", word) is not None)
+
+
+def read_options[Options](config_class: type[Options]) -> Options:
+    """The options of a command that can do without LeRobot's parser."""
+    import draccus
+    from draccus.utils import DecodingError
+
+    try:
+        return draccus.parse(config_class)
+    except DecodingError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+def run_with_lerobot[Result](work: Callable[..., Result]) -> Result:
+    """Does the work of a command with the options that LeRobot's parser reads, once LeRobot knows all plugins.
+
+    Args:
+        work: Takes an instance of the configuration that its first argument is annotated with.
+    """
+    from lerobot.configs import parser
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    from lerobot_playbyear.hub.client import patient_hub
+
+    register_third_party_plugins()
+    with patient_hub():
+        result: Result = parser.wrap()(work)()
+    return result

@@ -1,0 +1,174 @@
+"""`playbyear-train`: lerobot-train with the dataset in memory.
+
+Takes lerobot-train's options, keeps its output folder and its checkpoints (each resumes the other's), and trains
+through LeRobot's own `update_policy`. What is added: the dataset is read once, runs of windows are cut out of memory,
+and some moments can be drawn more often than others.
+"""
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from lerobot.datasets import LeRobotDataset, make_train_eval_datasets
+from lerobot.utils.constants import ACTION
+from lerobot.utils.random_utils import set_seed
+from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
+from torch import Tensor
+
+from lerobot_playbyear.datasets.columns import check_dataset_files
+from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
+from lerobot_playbyear.hub.policies import push_policy
+from lerobot_playbyear.hub.pushing import HubError, warn_without_login
+from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
+from lerobot_playbyear.training.parts import PolicyWindows, TrainingParts, make_training_parts
+from lerobot_playbyear.training.reach import Reach, action_names
+from lerobot_playbyear.training.report import Report, print_results
+
+
+class TrainError(ValueError):
+    """What a person asked for cannot be trained; the message says why, and what to do."""
+
+
+def train(cfg: PlaybyearTrainConfig) -> Path:
+    """Train a policy.
+
+    Args:
+        cfg: The options of the run.
+
+    Returns:
+        The output folder.
+
+    Raises:
+        TrainError: If an option, the dataset and the policy do not go together, before any work is done; or, after it, if
+            the Hub does not take the policy.
+    """
+    init_logging()
+    with _errors_of_input():
+        cfg.validate()
+        check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
+        if cfg.policy is not None and cfg.policy.push_to_hub:
+            warn_without_login()
+        if cfg.seed is not None:
+            set_seed(cfg.seed)
+        _configure_backends(cfg)
+        dataset, held_out = make_train_eval_datasets(cfg)
+        parts = make_training_parts(cfg, dataset.meta)
+        windows = PolicyWindows(parts.policy.config, dataset.meta, cfg.rename_map)
+        store = _read(dataset, windows, cfg)
+        validation_store = None if held_out is None or cfg.eval_steps <= 0 else _read(held_out, windows, cfg)
+
+    reach = Reach(parts.policy.config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
+    reach.warn(store.column(ACTION), f"the dataset '{cfg.dataset.repo_id}'")
+    weights = run_weights(store, windows.n_windows, frame_weights(store, cfg.sampling))
+    sampler = RunSampler(weights, cfg.seed or 0)
+    sampler.load_state_dict({**sampler.state_dict(), "n_batches": parts.step})
+    _log_start(cfg, parts, store)
+    with Report(cfg, store, parts) as report:
+        _loop(cfg, parts, windows, store, sampler, validation_store, report)
+    print_results(cfg, report.last_success)
+    if cfg.policy is not None and cfg.policy.push_to_hub:
+        _push(cfg, parts)
+    return Path(str(cfg.output_dir))
+
+
+def frame_weights(store: EpisodeStore, sampling: SamplingConfig) -> Tensor:
+    """How much each frame of a store matters, (N,): the weights of all the moments it belongs to, multiplied."""
+    weights = torch.ones(len(store))
+    if sampling.start_weight != 1:
+        weights[start_frames(store, round(sampling.start_s * store.fps))] *= sampling.start_weight
+    if sampling.loud_weight != 1:
+        loud = loud_frames(store, sampling.loud_db, max(1, round(sampling.loud_s * store.fps)))
+        weights[loud] *= sampling.loud_weight
+        logging.info(f"{int(loud.sum())} of {len(store)} frames follow a sudden sound")
+    return weights
+
+
+def validation_loss(parts: TrainingParts, windows: PolicyWindows, store: EpisodeStore, batch_size: int) -> float:
+    """The mean loss over held-out episodes; every frame counts once, but for those that do not fill a run."""
+    ends = [
+        torch.arange(end - 1, start - 1, -windows.n_windows)
+        for start, end in zip(store.starts, store.ends, strict=True)
+    ]
+    batches = torch.cat(ends).split(batch_size)
+    losses = [parts.loss(windows.batch(store, last)) * len(last) for last in batches]
+    return sum(losses) / sum(len(last) for last in batches)
+
+
+def _loop(
+    cfg: PlaybyearTrainConfig,
+    parts: TrainingParts,
+    windows: PolicyWindows,
+    store: EpisodeStore,
+    sampler: RunSampler,
+    validation_store: EpisodeStore | None,
+    report: Report,
+) -> None:
+    grad_clip_norm = cfg.optimizer.grad_clip_norm if cfg.optimizer is not None else 0.0
+    while parts.step < cfg.steps:
+        start = time.perf_counter()
+        batch = windows.batch(store, sampler.draw(cfg.batch_size))
+        report.metrics.dataloading_s = time.perf_counter() - start
+        parts.update(batch, report.metrics, grad_clip_norm)
+        report.updated()
+        is_last = parts.step == cfg.steps
+        if _is_due(parts.step, cfg.log_freq):
+            report.write_training()
+        if validation_store is not None and (_is_due(parts.step, cfg.eval_steps) or is_last):
+            report.write("validation", {"loss": validation_loss(parts, windows, validation_store, cfg.batch_size)})
+        if cfg.save_checkpoint and (_is_due(parts.step, cfg.save_freq) or is_last):
+            report.saved(parts.save(cfg))
+        if cfg.env is not None and cfg.env_eval_freq > 0 and (_is_due(parts.step, cfg.env_eval_freq) or is_last):
+            report.write_evaluation(parts.evaluate(cfg))
+
+
+def _read(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTrainConfig) -> EpisodeStore:
+    start = time.perf_counter()
+    backend = cfg.dataset.video_backend
+    store = EpisodeStore.from_dataset(dataset, windows.keys, cfg.store.device, backend, progress=not inside_slurm())
+    logging.info(
+        f"{len(store)} frames of {store.n_episodes} episodes in memory ({store.nbytes / 2**20:.0f} MiB on "
+        f"{store.device}) after {time.perf_counter() - start:.1f} s"
+    )
+    return store
+
+
+@contextmanager
+def _errors_of_input() -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, FileExistsError, FileNotFoundError, MemoryError) as error:
+        raise TrainError(str(error)) from error
+
+
+def _configure_backends(cfg: PlaybyearTrainConfig) -> None:
+    torch.backends.cudnn.deterministic = cfg.cudnn_deterministic
+    torch.backends.cudnn.benchmark = not cfg.cudnn_deterministic
+    torch.backends.cuda.matmul.allow_tf32 = True
+
+
+def _is_due(step: int, frequency: int) -> bool:
+    return frequency > 0 and step % frequency == 0
+
+
+def _log_start(cfg: PlaybyearTrainConfig, parts: TrainingParts, store: EpisodeStore) -> None:
+    n_parameters = sum(p.numel() for p in parts.policy.parameters() if p.requires_grad)
+    logging.info(
+        f"{format_big_number(n_parameters)} parameters on {parts.accelerator.device}, steps {parts.step} to {cfg.steps} "
+        f"of {cfg.batch_size} runs, output in {cfg.output_dir}"
+    )
+
+
+def _push(cfg: PlaybyearTrainConfig, parts: TrainingParts) -> None:
+    """Uploads the last checkpoint, which is on disk and stays there."""
+    assert cfg.policy is not None
+    assert cfg.policy.repo_id is not None
+    folder = (Path(str(cfg.output_dir)) / "checkpoints" / "last") if cfg.save_checkpoint else parts.save(cfg)
+    try:
+        url = push_policy(folder / "pretrained_model", cfg.policy.repo_id, private=cfg.policy.private)
+    except HubError as error:
+        raise TrainError(str(error)) from error
+    print(f"On the Hub: {url}")

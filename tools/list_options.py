@@ -1,0 +1,98 @@
+"""Writes the names of all options of our commands, by which they refuse what is misspelt before LeRobot is imported.
+
+    python tools/list_options.py
+
+Needed when an option of ours, or LeRobot's version, changes; a test says when.
+"""
+
+import dataclasses
+import json
+import typing
+from importlib import metadata
+from typing import Any
+
+from draccus.argparsing import ArgumentParser
+from draccus.utils import is_choice_type
+
+from lerobot_playbyear.dagger.config import DaggerConfig
+from lerobot_playbyear.datasets.attach import AttachAudioConfig
+from lerobot_playbyear.datasets.repair.command import RepairConfig
+from lerobot_playbyear.film.filming import VideoConfig
+from lerobot_playbyear.hub.uploads import PushConfig
+from lerobot_playbyear.inspection.inspecting import InspectConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.recording.demonstrations import DemonstrationConfig
+from lerobot_playbyear.scripts.command import OPTIONS_FILE
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
+
+CONFIGS: dict[str, type] = {
+    "playbyear-attach-audio": AttachAudioConfig,
+    "playbyear-dagger": DaggerConfig,
+    "playbyear-inspect": InspectConfig,
+    "playbyear-push": PushConfig,
+    "playbyear-record": DemonstrationConfig,
+    "playbyear-repair": RepairConfig,
+    "playbyear-train": PlaybyearTrainConfig,
+    "playbyear-video": VideoConfig,
+}
+
+
+def list_options() -> dict[str, Any]:
+    """What the file holds: per command its options, and LeRobot's version, which has a say in them."""
+    listed: dict[str, Any] = {name: _options_of(config) for name, config in CONFIGS.items()}
+    return {
+        "lerobot": metadata.version("lerobot"),
+        "policies": {"playbyear": _options_of(PlaybyearConfig)["options"]},
+        **listed,
+    }
+
+
+def _options_of(config: type) -> dict[str, Any]:
+    opened = sorted(_choices(config))
+    groups = {"config_path", *(field.name for field in dataclasses.fields(config))} - set(opened)
+    options = {
+        option.removeprefix("--"): _kind(action.type)
+        for action in ArgumentParser(config).parser._actions
+        for option in action.option_strings
+        if option.removeprefix("--").partition(".")[0] in groups
+    }
+    return {"options": dict(sorted(options.items())), "open": opened, "required": _required(config)}
+
+
+def _choices(config: type) -> list[str]:
+    """The fields whose options depend on a type."""
+    hints = typing.get_type_hints(config)
+    return [
+        field.name
+        for field in dataclasses.fields(config)
+        if any(_is_choice(part) for part in (hints[field.name], *typing.get_args(hints[field.name])))
+    ]
+
+
+def _required(config: type, prefix: str = "") -> list[str]:
+    hints, required = typing.get_type_hints(config), []
+    for field in dataclasses.fields(config):
+        if field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING:
+            continue
+        name, kind = prefix + field.name, hints[field.name]
+        nested = _required(kind, f"{name}.") if dataclasses.is_dataclass(kind) and isinstance(kind, type) else []
+        required += [f"{name}.type"] if _is_choice(kind) else nested or [name]
+    return required
+
+
+def _is_choice(kind: Any) -> bool:
+    return isinstance(kind, type) and is_choice_type(kind)
+
+
+def _kind(of: Any) -> str:
+    kinds = [part for part in typing.get_args(of) or (of,) if part is not type(None)]
+    return kinds[0].__name__ if len(kinds) == 1 and kinds[0] in (bool, int, float) else ""
+
+
+def as_text(listed: dict[str, Any]) -> str:
+    """The file's content, a command per line."""
+    return "{\n" + ",\n".join(f"{json.dumps(name)}: {json.dumps(value)}" for name, value in listed.items()) + "\n}\n"
+
+
+if __name__ == "__main__":
+    OPTIONS_FILE.write_text(as_text(list_options()))
