@@ -270,7 +270,7 @@ def test_a_truncated_dataset_and_an_existing_output_are_refused(command, tmp_pat
 
 def test_the_command_says_in_one_line_what_is_wrong(command):
     with pytest.raises(SystemExit, match=r"^error: --preset=gpu is not known. The presets are: cpu .*; paper "):
-        command(train_script.main, "--preset=gpu")
+        command(train_script.main, "--preset=gpu", "--dataset.repo_id=tests/noise")
 
 
 def test_moments_that_matter_weigh_more():
