@@ -24,7 +24,8 @@ from lerobot_playbyear.datasets.attach import attach_audio
 from lerobot_playbyear.datasets.audio_files import Resampled
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.free_memory import available_memory
-from lerobot_playbyear.datasets.opening import LongDataset, open_dataset
+from lerobot_playbyear.datasets.long_dataset import LongDataset
+from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.repair import check_dataset, copying, repair_dataset
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import episode_sound
@@ -158,7 +159,7 @@ def test_reading_a_long_video_holds_its_tensor_and_little_else(tmp_path):
         "timestamp": (np.arange(n_frames) / FPS).astype(np.float32),
     }
     dataset.reader.hf_dataset = type(dataset.hf_dataset)(pa.table(columns))
-    from lerobot_playbyear.datasets.columns import read_videos
+    from lerobot_playbyear.datasets.tensors import read_videos
 
     kept: list[torch.Tensor] = []
     grown = peak_of_process(lambda: kept.append(read_videos(dataset, CAMERA, "pyav")))
