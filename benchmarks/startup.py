@@ -39,7 +39,12 @@ def first_work_of(folder: Path) -> dict[str, list[str]]:
     return {
         "inspect": data,
         "repair": [f"--root={folder / 'dataset'}"],
-        "attach_audio": [*data, "--output.repo_id=a/c", f"--output.root={folder / 'copy'}", "--files={episode}.wav"],
+        "attach_audio": [
+            *data,
+            "--output.repo_id=a/c",
+            f"--output.root={folder / 'copy'}",
+            "--files=sound/{episode}.wav",
+        ],
         "push": data,
         "train": [*data, "--preset=cpu", f"--output_dir={folder / 'train'}"],
         "record": [*env, "--dataset.repo_id=a/b", f"--dataset.root={folder / 'recording'}"],

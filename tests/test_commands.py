@@ -210,7 +210,7 @@ def test_names_of_files_are_lerobots():
     from lerobot.datasets import utils
     from lerobot.utils import constants
 
-    from lerobot_playbyear.datasets import names
+    from lerobot_playbyear.datasets import files
 
-    ours = {name: value for name, value in vars(names).items() if name.isupper() and name not in ("HF_HOME",)}
+    ours = {name: value for name, value in vars(files).items() if name.isupper() and name != "HF_HOME"}
     assert ours == {name: getattr(constants if "HOME" in name else utils, name) for name in ours}

@@ -13,7 +13,7 @@ from lerobot_playbyear.datasets.audio_feature import (
 from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.microphone import MicrophoneBuffer, SoundCardBuffer
-from lerobot_playbyear.lazy import lazy_names
+from lerobot_playbyear.startup import lazy_names
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.episode_store import EpisodeStore

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING
 
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.confines import check_links
-from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.journal import flush
-from lerobot_playbyear.datasets.names import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
 

@@ -7,8 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.confines import check_info
-from lerobot_playbyear.datasets.files import list_files
-from lerobot_playbyear.datasets.names import HF_LEROBOT_HOME, INFO_PATH
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked
 
 

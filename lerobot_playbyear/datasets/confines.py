@@ -17,8 +17,7 @@ from typing import Any
 import pyarrow.parquet as pq
 from PIL import Image
 
-from lerobot_playbyear.datasets.files import fits
-from lerobot_playbyear.datasets.names import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH
+from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH, fits
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")  # of pictures; others have readers that start programs
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")

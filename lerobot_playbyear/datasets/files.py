@@ -2,6 +2,8 @@
 
 What a damaged dataset lacks is dropped. So a file counts as missing only where its folder can be listed and does not
 name it; a folder that cannot be listed is an error, never an empty one.
+
+The names are LeRobot's, spelled here as well because its own modules with them take seconds to import; a test compares them.
 """
 
 import contextlib
@@ -10,6 +12,16 @@ import glob
 import os
 from collections.abc import Iterator
 from pathlib import Path, PurePath
+
+from huggingface_hub.constants import HF_HOME
+
+HF_LEROBOT_HOME = Path(os.getenv("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser()
+"""LeRobot's own cache, where datasets without a root are."""
+
+INFO_PATH = "meta/info.json"
+EPISODES_DIR = "meta/episodes"
+DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
 
 def list_files(root: Path, pattern: str) -> list[Path]:

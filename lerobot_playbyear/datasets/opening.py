@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.columns import check_dataset_files
-from lerobot_playbyear.datasets.names import HF_LEROBOT_HOME, INFO_PATH
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

@@ -14,7 +14,7 @@ import numpy as np
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.confines import ClaimError, OutsideError, file_inside, open_picture
-from lerobot_playbyear.datasets.names import HF_LEROBOT_HOME, INFO_PATH
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound
 

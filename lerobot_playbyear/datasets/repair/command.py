@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear.datasets.names import INFO_PATH
+from lerobot_playbyear.datasets.files import INFO_PATH
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.repair.repairing import RepairReport
