@@ -9,7 +9,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig, make_env
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
-from lerobot_playbyear.episodes.environment import RolloutError, env_spec
+from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.episodes.script import Script
