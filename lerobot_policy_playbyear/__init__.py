@@ -6,10 +6,9 @@ processors by their modules' names. Import `lerobot_playbyear` in programs of yo
 
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear import __version__
+from lerobot_playbyear import __version__, lazy_names
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
-from lerobot_playbyear.startup import lazy_names
 
 if TYPE_CHECKING:
     from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy

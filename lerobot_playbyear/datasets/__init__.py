@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from lerobot_playbyear import lazy_names
 from lerobot_playbyear.datasets.audio_feature import (
     AUDIO_PREFIX,
     audio_feature,
@@ -13,7 +14,6 @@ from lerobot_playbyear.datasets.audio_feature import (
 from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.microphone import MicrophoneBuffer, SoundCardBuffer
-from lerobot_playbyear.startup import lazy_names
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.episode_store import EpisodeStore

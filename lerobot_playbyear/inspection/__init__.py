@@ -2,9 +2,9 @@
 
 from typing import TYPE_CHECKING
 
+from lerobot_playbyear import lazy_names
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 from lerobot_playbyear.inspection.verdict import Verdict, worst
-from lerobot_playbyear.startup import lazy_names
 
 if TYPE_CHECKING:
     from lerobot_playbyear.inspection.checking import check_numbers

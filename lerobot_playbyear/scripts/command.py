@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from lerobot_playbyear.startup import given_options
+from lerobot_playbyear.training.command_line import given_options
 
 OPTIONS_FILE = Path(__file__).with_name("options.json")
 """The names of all options of each command; `python tools/list_options.py` writes it."""

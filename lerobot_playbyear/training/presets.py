@@ -7,7 +7,7 @@ bfloat16 the preset `cpu` switches `policy.use_amp` on.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from lerobot_playbyear.startup import given_options
+from lerobot_playbyear.training.command_line import given_options
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear.startup import lazy_names
+from lerobot_playbyear import lazy_names
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.repair.info import DatasetDamagedError
