@@ -14,6 +14,7 @@ from recording_factory import FEATURES, FPS, REPO_ID, differences, episode_frame
 
 from lerobot_playbyear.datasets import settling
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
+from lerobot_playbyear.datasets.existing import has_dataset
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, repair_dataset
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, RecordError, record
 
@@ -159,6 +160,32 @@ def test_a_file_that_may_not_be_read_costs_no_episode(root):
         os.seteuid(0)
         path.chmod(0o644)
     assert everything(root.parent) == before
+
+
+@pytest.mark.parametrize("what", ["parent", "data"])
+def test_a_folder_that_cannot_be_listed_is_not_empty(tmp_path, what):
+    """Only the names in it tell that it holds a dataset: its metadata are lost."""
+    if os.geteuid() != 0:
+        pytest.skip("takes root, which becomes somebody else")
+    root = tmp_path / "dataset"
+    (root / "data/chunk-000").mkdir(parents=True)
+    (root / "data/chunk-000/file-000.parquet").touch()
+    assert has_dataset(root)
+    for path in [root, *root.parents]:
+        if str(path).startswith(str(root.parents[2])):
+            path.chmod(0o777)
+    (root.parent if what == "parent" else root / "data").chmod(0)
+    os.seteuid(65534)
+    try:
+        with pytest.raises(PermissionError):
+            has_dataset(root)
+        with pytest.raises(DatasetWriteError, match="Permission denied"):
+            writer(root)
+    finally:
+        os.seteuid(0)
+        root.parent.chmod(0o755)
+        (root / "data").chmod(0o755)
+    assert [path.name for path in root.iterdir()] == ["data"]
 
 
 def test_the_recording_command_says_what_to_do_and_touches_nothing(tmp_path):

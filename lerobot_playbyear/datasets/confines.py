@@ -85,7 +85,7 @@ def check_info(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) 
     features = info.get("features") if isinstance(info, dict) else None
     if not isinstance(features, dict) or not all(isinstance(feature, dict) for feature in features.values()):
         return
-    _check_templates(root, info, features)
+    check_templates(root, info)
     fps = info.get("fps")
     if isinstance(fps, int | float) and fps > _MOST_FPS:
         raise ClaimError(f"{root / INFO_PATH}: fps is {fps:,}; wanted at most {_MOST_FPS:,}. Correct it.")
@@ -106,6 +106,27 @@ def check_info(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) 
             f"{root / INFO_PATH}: total_episodes is {total:,}, but meta/episodes has {n_episodes:,}. "
             f"Repair it: playbyear-repair --root={root}"
         )
+
+
+def check_templates(root: Path, info: Mapping[str, Any]) -> None:
+    """Refuses templates of file names that lead out of a dataset, as LeRobot fills them in.
+
+    Args:
+        root: The dataset's folder.
+        info: What `meta/info.json` holds, with its features.
+
+    Raises:
+        OutsideError: Naming the template.
+    """
+    keys = [key for key, feature in info["features"].items() if feature.get("dtype") == "video"]
+    for name, default in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
+        template = info.get(name)
+        if not isinstance(template, str):
+            continue
+        if not is_template(template):
+            raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
+        for key in keys or [""]:
+            file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))
 
 
 def is_template(text: str) -> bool:
@@ -171,18 +192,6 @@ def _is_at_home(path: Path, root: Path) -> bool:
 def _real(path: Path) -> Path:
     """Where a path leads; `Path.resolve` raises where a link leads to itself."""
     return Path(os.path.realpath(path))
-
-
-def _check_templates(root: Path, info: Mapping[str, Any], features: Mapping[str, Mapping[str, Any]]) -> None:
-    keys = [key for key, feature in features.items() if feature.get("dtype") == "video"]
-    for name, default in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
-        template = info.get(name)
-        if not isinstance(template, str):
-            continue
-        if not is_template(template):
-            raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
-        for key in keys or [""]:
-            file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))
 
 
 def _values_held(footers: Iterable[pq.FileMetaData], keys: list[str]) -> dict[str, float]:

@@ -1,14 +1,17 @@
 """What is in a folder already, and whether episodes can be appended to it."""
 
 import json
+import os
 import shlex
 from pathlib import Path
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.utils.constants import DEFAULT_FEATURES
 
+from lerobot_playbyear.datasets.confines import OutsideError, check_templates
 from lerobot_playbyear.datasets.errors import DatasetWriteError
-from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, is_inside
+from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
 from lerobot_playbyear.datasets.settling import INFO
 
@@ -32,8 +35,16 @@ def check_root(root: Path, *, resume: bool) -> None:
 
 
 def has_dataset(root: Path) -> bool:
-    """Whether a folder holds a LeRobotDataset, however damaged."""
-    return (root / INFO).is_file() or any(root.glob("data/chunk-*/file-*")) or any(root.glob("meta/episodes/*/*"))
+    """Whether a folder holds a LeRobotDataset, however damaged.
+
+    Raises:
+        OSError: It, or a folder in it, cannot be listed: that says nothing of what it holds.
+    """
+    try:
+        os.listdir(root)
+    except FileNotFoundError:
+        return False
+    return any(list_files(root, name) for name in (INFO.as_posix(), "data/chunk-*/file-*", "meta/episodes/*/*"))
 
 
 def check_undamaged(root: Path) -> None:
@@ -55,13 +66,10 @@ def check_undamaged(root: Path) -> None:
             f"again, more closely, and `{command}` repairs it; episodes that are not whole are lost then, and those after "
             "them move up."
         )
-    for key in ("data_path", "video_path"):
-        try:
-            place = (info.get(key) or "data/x").format(video_key="camera", chunk_index=0, file_index=0)
-        except (LookupError, ValueError, AttributeError):
-            place = ""
-        if not is_inside(place):
-            raise DatasetDamagedError(f"{root / INFO}: {key} is {info[key]!r}, which leads out of the dataset.")
+    try:
+        check_templates(root, info)
+    except OutsideError as error:
+        raise DatasetDamagedError(f"{error} Nothing was changed.") from error
 
 
 def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str, dict]) -> None:
