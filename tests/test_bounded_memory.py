@@ -26,7 +26,7 @@ from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
-from lerobot_playbyear.datasets.repair import check_dataset, copying, repair_dataset
+from lerobot_playbyear.datasets.repair import carry_out, check_dataset, repair_dataset
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import episode_sound
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
@@ -70,13 +70,13 @@ def peak_of_process(work: Callable[[], object]) -> int:
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Pieces of 16 kB, so that a short episode has many."""
-    for module in (parquet_files, spooled_sound, copying):
+    for module in (parquet_files, spooled_sound, carry_out):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**14)
 
 
 @pytest.fixture
 def megabyte_pieces(monkeypatch):
-    for module in (parquet_files, spooled_sound, copying):
+    for module in (parquet_files, spooled_sound, carry_out):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**20)
 
 
@@ -248,7 +248,7 @@ def test_repairing_in_pieces_gives_the_same_dataset(tmp_path, small_pieces, use_
         (data,) = root.glob("data/*/*.parquet")
         data.write_bytes(data.read_bytes()[:-8])  # as a recording that was killed leaves it
         assert repair_dataset(root).kept == {0: 0, 1: 1, 2: 2}
-        for module in (parquet_files, copying):
+        for module in (parquet_files, carry_out):
             module.PIECE_BYTES = 2**26
     tables = [pq.read_table(root / "data") for root in (*roots, tmp_path / "whole")]
     assert tables[0].equals(tables[1])

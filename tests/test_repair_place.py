@@ -8,7 +8,7 @@ import pytest
 from recording_factory import FEATURES, FPS, REPO_ID, differences, episode_frames, load
 
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset, copying, repair_dataset, replacing
+from lerobot_playbyear.datasets.repair import DatasetDamagedError, carry_out, check_dataset, repair_dataset, replacing
 from lerobot_playbyear.datasets.repair.replacing import finish_repair
 
 N_EPISODES = 3
@@ -58,7 +58,7 @@ def kill_in_step(monkeypatch, root: Path, step: str) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "rmtree", lambda *_, **__: None)
         if step == "copying":
-            patch.setattr(copying, "write_own_info", die)
+            patch.setattr(carry_out, "write_json", die)
         elif step == "copied":
             patch.setattr(replacing.os, "replace", die)  # of the mark
         else:

@@ -21,7 +21,7 @@ from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_compatible, check_root, check_undamaged, has_dataset
 from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, publish
 from lerobot_playbyear.datasets.locking import DatasetLock
-from lerobot_playbyear.datasets.repair.repairing import finish_repair
+from lerobot_playbyear.datasets.repair.replacing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
 from lerobot_playbyear.datasets.staging import Staging, remove_leftovers
 from lerobot_playbyear.datasets.writable import check_features

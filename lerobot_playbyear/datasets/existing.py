@@ -61,10 +61,11 @@ def check_undamaged(root: Path) -> None:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
     if not report.is_sound:
         command = f"playbyear-repair --root={shlex.quote(str(root))}"
+        first = "Correct by hand what has to be decided. Then " if report.undecided else ""
         raise DatasetDamagedError(
-            f"{report}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "
-            f"again, more closely, and `{command}` repairs it; episodes that are not whole are lost then, and those after "
-            "them move up."
+            f"{report}\nNothing was changed, and nothing is appended to a damaged dataset. {first}`{command} --dry_run=true` "
+            f"looks again, more closely, and `{command}` repairs it; episodes that are not whole are lost then, and those "
+            "after them move up."
         )
     try:
         check_templates(root, info)

@@ -24,9 +24,8 @@ def find_damage(folder: Path) -> str | None:
         return " ".join(str(error).split())
     except (OSError, MemoryError) as error:
         return f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
-    lost = [f"episode {number} is lost: {reason}" for number, reason in sorted(report.dropped.items())]
-    lines = [*report.findings, *lost]
-    if not lines:
+    if report.is_sound:
         return None
-    more = f"; and {len(lines) - _LISTED} more" if len(lines) > _LISTED else ""
-    return f"{'; '.join(lines[:_LISTED])}{more}. Repair it: playbyear-repair --root={folder}"
+    more = f"; and {len(report.wrong) - _LISTED} more" if len(report.wrong) > _LISTED else ""
+    first = "Correct by hand what has to be decided, then repair it" if report.undecided else "Repair it"
+    return f"{'; '.join(report.wrong[:_LISTED])}{more}. {first}: playbyear-repair --root={folder}"

@@ -1,14 +1,23 @@
-"""Repairing datasets on disk: those that a killed recording left half-written, and those that were damaged later."""
+"""Repairing datasets on disk: those that a killed recording left half-written, and those that were damaged later.
+
+A survey reads a dataset once and says how each thing was found; a plan follows from it without a look at the disk; and
+what is planned is carried out in a copy, which then takes the dataset's place.
+"""
 
 from typing import TYPE_CHECKING
 
 from lerobot_playbyear import lazy_names
 
 if TYPE_CHECKING:
-    from lerobot_playbyear.datasets.repair.info import DatasetDamagedError
-    from lerobot_playbyear.datasets.repair.repairing import RepairReport, check_dataset, repair_dataset
+    from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError
+    from lerobot_playbyear.datasets.repair.repairing import check_dataset, repair_dataset
+    from lerobot_playbyear.datasets.repair.report import RepairReport
 
 __all__ = ["DatasetDamagedError", "RepairReport", "check_dataset", "repair_dataset"]
 
-_REPAIRING = ("RepairReport", "check_dataset", "repair_dataset")
-__getattr__ = lazy_names(__name__, {"info": ("DatasetDamagedError",), "repairing": _REPAIRING})
+_HOMES = {
+    "findings": ("DatasetDamagedError",),
+    "repairing": ("check_dataset", "repair_dataset"),
+    "report": ("RepairReport",),
+}
+__getattr__ = lazy_names(__name__, _HOMES)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from lerobot_playbyear.datasets.files import INFO_PATH
 
 if TYPE_CHECKING:
-    from lerobot_playbyear.datasets.repair.repairing import RepairReport
+    from lerobot_playbyear.datasets.repair.report import RepairReport
 
 
 @dataclass

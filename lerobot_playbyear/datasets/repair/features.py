@@ -1,31 +1,32 @@
-"""Whether a dataset's features and its data files agree, and who is right where they do not."""
+"""Whether a dataset's features and its data files agree."""
 
-import contextlib
-import io
-import itertools
 import json
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import pyarrow as pa
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import DatasetInfo
 from lerobot.utils.constants import DEFAULT_FEATURES
-from PIL import Image
 
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing
-from lerobot_playbyear.datasets.repair.info import DatasetDamagedError
+from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError, Finding, State, Thing
 
 
-def settle_features(root: Path, info: DatasetInfo, features: dict[str, dict] | None, findings: list[str]) -> None:
-    """Makes the features agree with what the data files hold, where the caller knows better or a picture tells.
+def settle_features(
+    root: Path, info: DatasetInfo, features: dict[str, dict] | None
+) -> tuple[DatasetInfo, tuple[Finding, ...]]:
+    """Holds the features against what the data files hold. Where these differ, the caller's may be right.
 
     Args:
         root: The dataset's folder.
-        info: Is corrected.
+        info: What the dataset says about itself.
         features: The features as the caller knows them; None if it does not.
-        findings: Gets what was found wrong.
+
+    Returns:
+        The same, with the features of the data files, and what was found wrong.
 
     Raises:
         DatasetDamagedError: The files hold other columns than the features say, and nobody knows better.
@@ -34,6 +35,7 @@ def settle_features(root: Path, info: DatasetInfo, features: dict[str, dict] | N
     known = {**features, **DEFAULT_FEATURES} if features else None
     schemas = [schema for path in list_files(root, "data/*/*.parquet") if (schema := _own_schema(path)) is not None]
     reasons = [_disagreement(schema, info.features) for schema in schemas]
+    findings: list[Finding] = []
     if (reasons and all(reasons)) or (not reasons and _disagreement(None, info.features)):
         if known is None or any(_disagreement(schema, known) for schema in schemas):
             raise DatasetDamagedError(
@@ -41,13 +43,10 @@ def settle_features(root: Path, info: DatasetInfo, features: dict[str, dict] | N
                 "file back from a copy, or repair with --like=<folder of a dataset recorded with the same settings>."
             )
         what = reasons[0] if reasons else "it names a feature that LeRobot does not know"
-        findings.append(f"meta/info.json: {what}; the features are now those of this recording")
-        info.features = deepcopy(known)
-    for key, feature in info.features.items():
-        size = _picture_size(root, key) if feature["dtype"] == "image" else None
-        if size and not set(itertools.pairwise(feature["shape"])) & {size}:
-            findings.append(f"meta/info.json: '{key}' had shape {tuple(feature['shape'])}; its pictures are {size}")
-            feature["shape"] = (*size, feature["shape"][-1])
+        said = f"meta/info.json: {what}; the features are now those of this recording"
+        findings.append(Finding(Thing.FEATURE, State.DAMAGED, said))
+        info = replace(info, features=deepcopy(known))
+    return info, tuple(findings)
 
 
 def check_columns(found: pa.Schema, wanted: pa.Schema) -> str | None:
@@ -90,24 +89,3 @@ def _disagreement(schema: pa.Schema | None, features: dict[str, dict]) -> str | 
         return None if schema is None else check_columns(schema, wanted)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         return f"a feature is unknown to LeRobot ({error})"
-
-
-def _picture_size(root: Path, key: str) -> tuple[int, int] | None:
-    """Height and width of the first picture of a camera."""
-    for path in list_files(root, "data/*/*.parquet"):
-        data = _first_picture(path, key)
-        with contextlib.suppress(OSError, SyntaxError, ValueError, Image.DecompressionBombError):
-            if data is not None:
-                with Image.open(io.BytesIO(data)) as image:
-                    return image.height, image.width
-    return None
-
-
-def _first_picture(path: Path, key: str) -> bytes | None:
-    """The first picture of a file, encoded; None where there is none, or damage."""
-    try:
-        with open_checked(path) as file, parsing(path):
-            picture = file.read_row_group(0, columns=[key]).column(key)[0].as_py()
-            return picture["bytes"]
-    except (ParquetDamageError, TypeError):
-        return None

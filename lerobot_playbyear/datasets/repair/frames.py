@@ -1,100 +1,27 @@
 """The frames of a dataset: which rows of which data file can be read, and which episode they belong to."""
 
-import errno
 import io
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import DatasetInfo
 from PIL import Image, UnidentifiedImageError
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.files import list_files
-from lerobot_playbyear.datasets.parquet_files import (
-    ParquetDamageError,
-    open_checked,
-    open_parquet,
-    parsing,
-    read_row_groups,
-)
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
+from lerobot_playbyear.datasets.repair.data_file import INDEX_COLUMNS, DataFile, open_source, read_indices
 from lerobot_playbyear.datasets.repair.features import check_columns
-from lerobot_playbyear.datasets.repair.rescue import RescuedFile, rescue
-
-INDEX_COLUMNS = ["episode_index", "frame_index", "index", "task_index", "timestamp"]
-
-
-@dataclass
-class DataFile:
-    """A data file that can be read, at least in parts.
-
-    Args:
-        name: Relative to the dataset's folder.
-        source: What is read: the file, or what of it can be read with a new footer.
-        is_whole: Whether the file can be taken over as it is.
-        n_rows: How many rows can be read.
-    """
-
-    name: Path
-    source: Path | RescuedFile
-    is_whole: bool
-    n_rows: int = 0
-
-    def read(self, spans: Iterable[tuple[int, int]]) -> Iterator[tuple[int, pa.Table]]:
-        """Some of the rows that can be read, in parts of bounded size; spans in the file's order are read in one go.
-
-        Args:
-            spans: First row and number of rows of each, counted among those that can be read.
-
-        Returns:
-            The span's place among the spans, and rows of it.
-
-        Raises:
-            OSError: They cannot be read now, or are others than they were.
-        """
-        parts: Iterator[pa.Table] = iter(())
-        part, first = None, 0  # the rows that were read last, and the number of the first of them
-        for place, (start, length) in enumerate(spans):
-            if part is None or start < first:
-                parts, first = self._parts(), 0
-                part = next(parts)
-            at = start
-            while at < start + length:
-                while at >= first + len(part):
-                    first += len(part)
-                    part = next(parts)
-                rows = part.slice(at - first, start + length - at)
-                yield place, rows
-                at += len(rows)
-
-    @property
-    def schema(self) -> pa.Schema:
-        """Of its columns."""
-        with _open(self.source) as file:
-            return file.schema_arrow
-
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.source if isinstance(self.source, Path) else self.source.path
-
-    def _parts(self) -> Iterator[pa.Table]:
-        n_rows = 0
-        with _open(self.source) as file:
-            for table in read_row_groups(file, path=self.path):
-                if not isinstance(table, ParquetDamageError) and not isinstance(_indices(table), ParquetDamageError):
-                    n_rows += len(table)
-                    yield table
-        raise OSError(errno.EIO, f"{self.n_rows} of its rows could be read before, and now {n_rows}", str(self.name))
+from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing
+from lerobot_playbyear.datasets.repair.rescue import rescue
+from lerobot_playbyear.datasets.repair.rescued_file import RescuedFile
 
 
-@dataclass
+@dataclass(frozen=True)
 class Run:
     """Rows that follow each other and belong to one episode.
 
@@ -105,6 +32,7 @@ class Run:
         episode: The episode's number.
         first_frame: The first row's frame number within the episode.
         first_index: The first row's frame number within the dataset.
+        is_numbered: Whether the other rows' follow from it.
         tasks: The numbers of the tasks that occur.
         damage: What is wrong with one of the rows; None for nothing.
     """
@@ -115,102 +43,143 @@ class Run:
     episode: int
     first_frame: int
     first_index: int
-    tasks: list[int]
+    is_numbered: bool
+    tasks: tuple[int, ...]
     damage: str | None = None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Frames:
     """What can be read of a dataset's frames.
 
     Args:
-        files: The data files.
-        runs: Their rows.
+        runs: The rows of all data files.
         frame_seconds: The time between two frames; None where there are not two frames.
+        findings: What was found wrong.
     """
 
-    files: list[DataFile]
-    runs: list[Run]
+    runs: tuple[Run, ...]
     frame_seconds: float | None
+    findings: tuple[Finding, ...]
 
 
-def read_frames(root: Path, info: DatasetInfo, thorough: bool, findings: list[str]) -> Frames:
+def read_frames(root: Path, info: DatasetInfo, thorough: bool) -> Frames:
     """Goes through all data files.
 
     Args:
         root: The dataset's folder.
         info: What the dataset says about itself.
         thorough: Read everything, with checksums, and look at every picture; otherwise only the index columns.
-        findings: Gets what was found wrong.
 
     Raises:
         OSError: A file cannot be read now.
     """
     schema = get_hf_features_from_features(info.features).arrow_schema
     pictures = [key for key, feature in info.features.items() if feature["dtype"] == "image"] if thorough else []
-    files: list[DataFile] = []
+    findings: list[Finding] = []
+    sizes: set[tuple[str, tuple[int, int]]] = set()
     runs: list[Run] = []
     steps: list[float] = []
     for path in list_files(root, "data/*/*.parquet"):
         name = path.relative_to(root)
-        try:
-            file = _find_source(path, name, schema)
-        except ParquetDamageError as error:
-            findings.append(f"{name} cannot be read: {error}")
+        source = _find_source(path, name, schema)
+        if isinstance(source, Finding):
+            findings.append(source)
             continue
-        if not file.is_whole:
-            findings.append(f"{name} has no valid end, as if the recording had been killed: read from its beginning")
-        own, own_steps = _read_file(file, None if thorough else INDEX_COLUMNS, pictures, findings)
-        files.append(file)
-        runs.extend(own)
-        steps.extend(own_steps.tolist())
-    return Frames(files, runs, float(np.median(steps)) if steps else None)
+        rows = _read_rows(source, path, None if thorough else INDEX_COLUMNS, pictures)
+        own, own_steps = _runs(DataFile(name, source, source == path and not rows.problems, rows.n_rows), rows)
+        killed = f"{name} has no valid end, as if the recording had been killed: read from its beginning"
+        said = [] if source == path else [killed]
+        said += [f"{name}: {problem}" for problem in rows.problems]
+        said += [
+            f"{name}: the frames of episode {run.episode} are not numbered one after the other in 'index'"
+            for run in own
+            if not run.is_numbered
+        ]
+        findings += [Finding(Thing.FILE, State.DAMAGED, one) for one in said]
+        sizes |= rows.sizes
+        runs += own
+        steps += own_steps
+    findings += _check_shapes(info, sizes)
+    return Frames(tuple(runs), float(np.median(steps)) if steps else None, tuple(findings))
 
 
-def _find_source(path: Path, name: Path, schema: pa.Schema) -> DataFile:
-    """The file itself, or what can be rescued of it.
+def _check_shapes(info: DatasetInfo, sizes: Iterable[tuple[str, tuple[int, int]]]) -> list[Finding]:
+    other = {key: size for key, size in sorted(sizes) if size not in itertools.pairwise(info.features[key]["shape"])}
+    return [
+        Finding(
+            Thing.FEATURE,
+            State.UNDECIDED,
+            f"meta/info.json: '{key}' has shape {tuple(info.features[key]['shape'])}, but there are pictures {height} high "
+            f"and {width} wide. Correct the shape if these are right",
+        )
+        for key, (height, width) in other.items()
+    ]
 
-    Raises:
-        ParquetDamageError: Nothing can.
-    """
+
+def _find_source(path: Path, name: Path, schema: pa.Schema) -> Path | RescuedFile | Finding:
+    """The file itself, or what can be rescued of it; or why nothing can."""
+    state = State.DAMAGED
     try:
         with open_checked(path) as file:
-            if problem := check_columns(file.schema_arrow, schema):
-                raise ParquetDamageError(problem)
-        return DataFile(name, path, is_whole=True)
+            problem = check_columns(file.schema_arrow, schema)
+        if problem is None:
+            return path
+        state = State.UNDECIDED  # the rows may be whole
     except ParquetDamageError as error:
-        rescued = rescue(path, schema)
-        if rescued is None:
-            raise ParquetDamageError(f"{error}, and no complete episode could be found in it") from error
-        return DataFile(name, rescued, is_whole=False)
+        problem = str(error)
+    if rescued := rescue(path, schema):
+        return rescued
+    remedy = "" if state is State.DAMAGED else ". Correct the features in meta/info.json, or take the file away"
+    said = f"{name} cannot be read: {problem}, and no complete episode could be found in it{remedy}"
+    return Finding(Thing.FILE, state, said)
 
 
-def _read_file(
-    file: DataFile, columns: list[str] | None, pictures: list[str], findings: list[str]
-) -> tuple[list[Run], np.ndarray]:
+@dataclass(frozen=True)
+class _Rows:
+    """The rows of a file that can be read: their index columns, which have a damaged picture, and what is wrong; and for
+    each camera the sizes of its pictures."""
+
+    index: dict[str, np.ndarray]
+    n_rows: int
+    spoilt: dict[int, str]
+    problems: tuple[str, ...]
+    sizes: set[tuple[str, tuple[int, int]]]
+
+
+def _read_rows(source: Path | RescuedFile, path: Path, columns: list[str] | None, pictures: list[str]) -> _Rows:
     parts: list[dict[str, np.ndarray]] = []
     spoilt: dict[int, str] = {}
+    sizes: set[tuple[str, tuple[int, int]]] = set()
+    problems: list[str] = []
     n_rows = 0
-    with _open(file.source) as opened:
-        for number, table in enumerate(read_row_groups(opened, columns, file.path)):
-            found = table if isinstance(table, ParquetDamageError) else _indices(table)
+    with open_source(source) as opened:
+        for number, table in enumerate(read_row_groups(opened, columns, path)):
+            found = table if isinstance(table, ParquetDamageError) else read_indices(table)
             if isinstance(table, ParquetDamageError) or isinstance(found, ParquetDamageError):
-                findings.append(f"{file.name}: row group {number} is damaged: {found}")
-                file.is_whole = False
+                problems.append(f"row group {number} is damaged: {found}")
                 continue
             parts.append(found)
             for key in pictures:
-                spoilt.update({n_rows + row: what for row, what in _spoilt_pictures(table.column(key), key)})
+                for row, seen in _look_at_pictures(table.column(key), key):
+                    if isinstance(seen, str):
+                        spoilt[n_rows + row] = seen
+                    else:
+                        sizes.add((key, seen))
             n_rows += len(table)
-    file.n_rows = n_rows
     if spoilt:
-        file.is_whole = False
-        findings.append(f"{file.name}: {len(spoilt)} pictures are damaged")
-    if not parts:
-        return [], np.empty(0)
-    index = {name: np.concatenate([part[name] for part in parts]) for name in INDEX_COLUMNS}
+        problems.append(f"{len(spoilt)} pictures are damaged")
+    index = {name: np.concatenate([part[name] for part in parts]) for name in INDEX_COLUMNS} if parts else {}
+    return _Rows(index, n_rows, spoilt, tuple(problems), sizes)
+
+
+def _runs(file: DataFile, rows: _Rows) -> tuple[list[Run], list[float]]:
+    """A file's rows, cut where another episode begins or frames are missing, and the times between them [s]."""
+    index = rows.index
+    if not rows.n_rows:
+        return [], []
     breaks = (np.diff(index["episode_index"]) != 0) | (np.diff(index["frame_index"]) != 1)
-    starts = [0, *(np.flatnonzero(breaks) + 1).tolist(), n_rows]
+    starts = [0, *(np.flatnonzero(breaks) + 1).tolist(), rows.n_rows]
     runs = [
         Run(
             file,
@@ -219,42 +188,24 @@ def _read_file(
             int(index["episode_index"][start]),
             int(index["frame_index"][start]),
             int(index["index"][start]),
-            np.unique(index["task_index"][start:stop]).tolist(),
-            next((spoilt[row] for row in range(start, stop) if row in spoilt), _jump(index["index"][start:stop])),
+            bool((np.diff(index["index"][start:stop]) == 1).all()),
+            tuple(np.unique(index["task_index"][start:stop]).tolist()),
+            next((rows.spoilt[row] for row in range(start, stop) if row in rows.spoilt), None),
         )
         for start, stop in itertools.pairwise(starts)
     ]
-    return runs, np.diff(index["timestamp"])[~breaks]
+    return runs, np.diff(index["timestamp"])[~breaks].tolist()
 
 
-def _indices(table: pa.Table) -> dict[str, np.ndarray] | ParquetDamageError:
-    """The index columns; where a number is missing, which rows these are is not known, and nothing of them is used."""
-    try:
-        return {name: column_to_numpy(table.column(name)) for name in INDEX_COLUMNS}
-    except ValueError as error:
-        return ParquetDamageError(str(error))
-
-
-def _jump(index: np.ndarray) -> str | None:
-    return None if (np.diff(index) == 1).all() else "its frames are not numbered one after the other"
-
-
-def _spoilt_pictures(column: pa.ChunkedArray, key: str) -> list[tuple[int, str]]:
-    spoilt = []
+def _look_at_pictures(column: pa.ChunkedArray, key: str) -> Iterator[tuple[int, str | tuple[int, int]]]:
+    """Of every picture in a column its row, and what is wrong with it, or its height and width."""
     for row, picture in enumerate(value.as_py() for value in column):
         try:
             if picture["bytes"] is not None:
                 with Image.open(io.BytesIO(picture["bytes"])) as image:
                     image.verify()
+                    yield row, (image.height, image.width)
         except UnidentifiedImageError:
-            spoilt.append((row, f"a picture of '{key}' is damaged (it is none)"))
+            yield row, f"a picture of '{key}' is damaged (it is none)"
         except (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError) as error:
-            spoilt.append((row, f"a picture of '{key}' is damaged ({error})"))
-    return spoilt
-
-
-def _open(source: Any) -> pq.ParquetFile:
-    if isinstance(source, Path):
-        return open_checked(source)
-    with parsing(source.path):
-        return open_parquet(source.open())
+            yield row, f"a picture of '{key}' is damaged ({error})"

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import re
+from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -21,85 +22,87 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.confines import is_template
-from lerobot_playbyear.datasets.files import is_listed, list_files, naming
+from lerobot_playbyear.datasets.files import is_listed, list_files, read_listed
+from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError, Finding, State, Thing
 
+_TOLERANCE = 0.01  # of rates
+_MOST_FPS = 1_000_000  # timestamps that are closer are none
 _KEPT: dict[str, type] = {"robot_type": str, "splits": dict, "tools": list}  # where the rest is made anew
 
 
-class DatasetDamagedError(ValueError):
-    """A dataset cannot be repaired; nothing was changed."""
-
-
-def read_info(root: Path, fps: int | None, features: dict[str, dict] | None, findings: list[str]) -> DatasetInfo:
+def read_info(
+    root: Path, fps: int | None, features: dict[str, dict] | None
+) -> tuple[DatasetInfo, dict[str, Any], tuple[Finding, ...]]:
     """Reads `meta/info.json`, or makes it from what the caller knows.
 
     Args:
         root: The dataset's folder.
         fps: Its frames per second, if the caller knows them.
         features: Its features, if the caller knows them.
-        findings: Gets what was found wrong.
+
+    Returns:
+        What it says, made good as far as it is proven; all fields that it has, also those of other tools, which LeRobot's
+        reader leaves out; and what was found wrong.
 
     Raises:
         DatasetDamagedError: It is unreadable and the caller does not know the features, or it is of another version.
         OSError: It cannot be read now.
     """
-    if not is_listed(root, INFO_PATH):
-        return _new_info(root, "is missing", fps, features, findings)
-    with naming(root / INFO_PATH):
-        data = (root / INFO_PATH).read_bytes()
-    try:
-        info = _known(_checked(json.loads(data)))
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        return _new_info(root, f"is damaged ({error})", fps, features, findings)
-    _check_version(root, info, findings)
-    for name, wanted in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
-        is_used = name == "data_path" or any(feature["dtype"] == "video" for feature in info.features.values())
-        if is_used and getattr(info, name) != wanted and not _leads_somewhere(root, getattr(info, name)):
-            findings.append(f"{INFO_PATH}: {name} was {getattr(info, name)!r}, where nothing is")
-            setattr(info, name, wanted)
-    return info
-
-
-def own_info(root: Path) -> dict[str, Any]:
-    """Everything that `meta/info.json` holds, as far as it is JSON; LeRobot's reader leaves unknown fields out.
-
-    Raises:
-        OSError: It cannot be read now.
-    """
-    if not is_listed(root, INFO_PATH):
-        return {}
-    with naming(root / INFO_PATH):
-        data = (root / INFO_PATH).read_bytes()
+    data = read_listed(root, INFO_PATH)
+    if data is None:
+        return _new_info(root, {}, State.MISSING, "is missing", fps, features)
+    fields: dict[str, Any] = {}
     try:
         raw = json.loads(data)
-    except (ValueError, RecursionError):
-        return {}
-    return raw if isinstance(raw, dict) else {}
+        fields = raw if isinstance(raw, dict) else {}
+        info = _known(_checked(fields))
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        return _new_info(root, fields, State.DAMAGED, f"is damaged ({error})", fps, features)
+    findings = list(_check_version(root, info))
+    for name, wanted in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
+        own = getattr(info, name)
+        is_used = name == "data_path" or any(feature["dtype"] == "video" for feature in info.features.values())
+        if not is_used or own == wanted or _leads_somewhere(root, own):
+            continue
+        if _leads_somewhere(root, wanted):
+            findings.append(Finding(Thing.INFO, State.DAMAGED, f"{INFO_PATH}: {name} was {own!r}, where nothing is"))
+            info = dataclasses.replace(info, **{name: wanted})
+        else:
+            said = f"{INFO_PATH}: {name} is {own!r}, where nothing is; nor is there at LeRobot's own {wanted!r}"
+            findings.append(Finding(Thing.INFO, State.UNDECIDED, f"{said}. Put the files, or the right path, there"))
+    return info, fields, tuple(findings)
 
 
-def correct_rates(info: DatasetInfo, frame_seconds: float | None, findings: list[str]) -> None:
-    """Makes the frame rate agree with the frames' timestamps, and the sample rates with the sound.
+def check_rates(info: DatasetInfo, frame_seconds: float | None) -> tuple[Finding, ...]:
+    """Holds the frame rate against the frames' timestamps, and the sample rates against the sound.
 
     Args:
-        info: Is corrected.
+        info: What the dataset says about itself.
         frame_seconds: The time between two frames, as the data have it; None where there are not two frames.
-        findings: Gets what was found wrong.
     """
-    if frame_seconds and abs(info.fps * frame_seconds - 1) > 0.01:
-        fps = round(1 / frame_seconds)
-        findings.append(f"{INFO_PATH}: fps was {info.fps}; the frames' timestamps are {fps} per second")
-        info.fps = fps
+    findings: list[str] = []
+    fps = frame_rate(info, frame_seconds)
+    if fps != info.fps:
+        findings.append(
+            f"fps is {info.fps}, but the frames' timestamps are {fps:g} per second. Write {fps:g} there if they are right"
+        )
     for key in audio_keys(info.features):
         feature = info.features[key]
-        details = feature.get("info") or {}
-        if "sample_rate" in details and len(feature["shape"]) == 1:
-            rate = feature["shape"][0] * info.fps
-            if details["sample_rate"] != rate:
-                findings.append(
-                    f"{INFO_PATH}: the sample rate of '{key}' was {details['sample_rate']!r}; {feature['shape'][0]} "
-                    f"samples per frame at {info.fps} frames per second are {rate} Hz"
-                )
-                feature["info"] = {**details, "sample_rate": rate}
+        rate = (feature.get("info") or {}).get("sample_rate")
+        if rate is not None and len(feature["shape"]) == 1 and rate != feature["shape"][0] * fps:
+            findings.append(
+                f"the sample rate of '{key}' is {rate!r}, but {feature['shape'][0]} samples per frame at {fps:g} frames "
+                f"per second are {feature['shape'][0] * fps:g} Hz. Write there what it was recorded at"
+            )
+    return tuple(Finding(Thing.INFO, State.UNDECIDED, f"{INFO_PATH}: {said}") for said in findings)
+
+
+def frame_rate(info: DatasetInfo, frame_seconds: float | None) -> float:
+    """The frames per second: as the dataset says where its frames' timestamps agree with it, otherwise theirs."""
+    rate = 1 / frame_seconds if frame_seconds and frame_seconds > 0 else 0
+    if not 0 < rate < _MOST_FPS or abs(info.fps / rate - 1) <= _TOLERANCE:
+        return info.fps
+    return round(rate) or rate
 
 
 def _known(raw: dict[str, Any]) -> DatasetInfo:
@@ -109,14 +112,12 @@ def _known(raw: dict[str, Any]) -> DatasetInfo:
     )
 
 
-def _checked(raw: Any) -> dict[str, Any]:
+def _checked(raw: dict[str, Any]) -> dict[str, Any]:
     """What LeRobot relies on without looking.
 
     Raises:
         ValueError: It is not there.
     """
-    if not isinstance(raw, dict):
-        raise ValueError("it holds no object")
     for name in ("fps", "total_episodes", "total_frames", "chunks_size"):
         if not isinstance(raw.get(name), int):
             raise ValueError(f"{name} is {raw.get(name)!r}")
@@ -138,7 +139,7 @@ def _checked(raw: Any) -> dict[str, Any]:
     return raw
 
 
-def _check_version(root: Path, info: DatasetInfo, findings: list[str]) -> None:
+def _check_version(root: Path, info: DatasetInfo) -> Iterator[Finding]:
     version = re.fullmatch(r"v(\d+)\.(\d+)(\..*)?", info.codebase_version)
     if version and version[1] == "3":
         return
@@ -158,13 +159,17 @@ def _check_version(root: Path, info: DatasetInfo, findings: list[str]) -> None:
             f"{root} was written by a newer LeRobot (format {info.codebase_version}); wanted {CODEBASE_VERSION}. "
             "Update lerobot."
         )
-    findings.append(f"{INFO_PATH}: codebase_version was {info.codebase_version!r}")
-    info.codebase_version = CODEBASE_VERSION
+    yield Finding(
+        Thing.INFO,
+        State.UNDECIDED,
+        f"{INFO_PATH}: codebase_version is {info.codebase_version!r}, which LeRobot does not open; the files are named as "
+        f"in {CODEBASE_VERSION}. Write that there if it is the dataset's format",
+    )
 
 
 def _new_info(
-    root: Path, reason: str, fps: int | None, features: dict[str, dict] | None, findings: list[str]
-) -> DatasetInfo:
+    root: Path, old: dict[str, Any], state: State, reason: str, fps: int | None, features: dict[str, dict] | None
+) -> tuple[DatasetInfo, dict[str, Any], tuple[Finding, ...]]:
     if not list_files(root, "data/*/*.parquet"):
         raise DatasetDamagedError(f"{root} holds no LeRobotDataset: {INFO_PATH} {reason}, and there is no data.")
     if fps is None or features is None:
@@ -174,16 +179,16 @@ def _new_info(
         )
     use_videos = any(feature["dtype"] == "video" for feature in features.values())
     info = create_empty_dataset_info(CODEBASE_VERSION, fps, {**deepcopy(features), **DEFAULT_FEATURES}, use_videos)
-    old = own_info(root)
     for name, kind in _KEPT.items():
         if isinstance(old.get(name), kind):
             setattr(info, name, old[name])
-    rest = "; robot_type, splits and all other fields are those that it had" if old else ""
-    findings.append(
-        f"{INFO_PATH} {reason}: made anew from the settings of this recording"
-        f"{rest or '; robot_type, splits, and what else it held besides them, is lost'}"
+    rest = (
+        "robot_type, splits and all other fields are those that it had"
+        if old
+        else "robot_type, splits, and what else it held besides them, is lost"
     )
-    return info
+    said = f"{INFO_PATH} {reason}: made anew from the settings of this recording; {rest}"
+    return info, old, (Finding(Thing.INFO, state, said),)
 
 
 def _leads_somewhere(root: Path, template: str | None) -> bool:

@@ -1,90 +1,133 @@
 """The tasks of a dataset: the table that names them, held against what the episodes say."""
 
 import io
-from collections import Counter, defaultdict
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 from lerobot.datasets.utils import DEFAULT_TASKS_PATH
 
-from lerobot_playbyear.datasets.files import is_listed, naming
+from lerobot_playbyear.datasets.files import read_listed
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, parsing
-from lerobot_playbyear.datasets.repair.episodes import Row
-from lerobot_playbyear.datasets.repair.frames import Run
+from lerobot_playbyear.datasets.repair.episode_tables import Row
+from lerobot_playbyear.datasets.repair.episodes import Episode
+from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing, name_episodes
 
 
-def read_tasks(root: Path, rows: dict[int, Row], runs: dict[int, Run], findings: list[str]) -> pd.DataFrame:
-    """The texts of the tasks, as LeRobot keeps them; where they are lost or wrong, from the rows of the episodes.
+@dataclass(frozen=True)
+class Tasks:
+    """The tasks of a dataset.
 
-    Raises:
-        OSError: The table cannot be read now.
+    Args:
+        table: As LeRobot keeps them: a task's number in `task_index`, its text as the index.
+        is_own: Whether it is the dataset's own, which stays as it is.
+        was_lost: Whether there was none that could be read.
+        findings: What was found wrong.
     """
-    if not runs and not is_listed(root, DEFAULT_TASKS_PATH):
-        return pd.DataFrame({"task_index": []}, index=pd.Index([], name="task"))
-    votes: dict[int, Counter[str]] = defaultdict(Counter)
-    for episode, run in runs.items():
-        texts = rows.get(episode, {}).get("tasks")
-        if isinstance(texts, list) and len(texts) == 1 and len(run.tasks) == 1:
-            votes[run.tasks[0]][str(texts[0])] += 1
-    own, problem = own_tasks(root)
-    known = {} if own is None else dict(zip(own["task_index"].tolist(), own.index.astype(str), strict=True))
-    if problem:
-        findings.append(f"{DEFAULT_TASKS_PATH} {problem}")
-    needed = {task for run in runs.values() for task in run.tasks}
-    for number in sorted(needed | set(votes)):
-        text = votes[number].most_common(1)[0][0] if votes[number] else known.get(number)
-        if text is None or text in (known.get(other) for other in known if other != number):
-            text = known.get(number) or _by_elimination(number, rows, runs, known) or f"unknown task {number}"
-        if number in known and not _is_misread(known[number], text):
-            text = known[number]  # somebody gave the task another name
-        elif number in known and known[number] != text:
-            findings.append(f"{DEFAULT_TASKS_PATH}: task {number} read {known[number]!r}; the episodes say {text!r}")
-        elif number not in known and text == f"unknown task {number}":
-            findings.append(f"{DEFAULT_TASKS_PATH}: the text of task {number} is lost; it now reads {text!r}")
-        known[number] = text
-    numbers = sorted(known)
-    if numbers != list(range(len(numbers))):  # LeRobot finds a task by its place
-        numbers = list(range(max(numbers, default=-1) + 1))
-        known = {number: known.get(number, f"unknown task {number}") for number in numbers}
-    texts = pd.Index([known[number] for number in numbers], name="task")
-    tasks = pd.DataFrame({"task_index": numbers}, index=texts)
-    if own is None or len(own.columns) == 1:
-        return tasks
-    others = own.drop_duplicates("task_index").set_index("task_index").reindex(numbers)
-    return pd.concat([tasks, others.set_index(texts)], axis=1)[list(own.columns)]
+
+    table: pd.DataFrame
+    is_own: bool
+    was_lost: bool
+    findings: tuple[Finding, ...]
 
 
-def own_tasks(root: Path) -> tuple[pd.DataFrame | None, str | None]:
+def read_tasks(root: Path) -> pd.DataFrame | Finding:
     """The table of a dataset's tasks as it is, or what is wrong with it.
 
     Raises:
         OSError: It cannot be read now.
     """
-    if not is_listed(root, DEFAULT_TASKS_PATH):
-        return None, "is missing"
-    with naming(root / DEFAULT_TASKS_PATH):
-        data = (root / DEFAULT_TASKS_PATH).read_bytes()
+    data = read_listed(root, DEFAULT_TASKS_PATH)
+    if data is None:
+        return Finding(Thing.TASKS, State.MISSING, f"{DEFAULT_TASKS_PATH} is missing")
     try:
         with parsing():
-            table = pd.read_parquet(io.BytesIO(data))
-            return table.astype({"task_index": int}), None
-    except ParquetDamageError as error:
-        return None, f"cannot be read: {error}"
-    except TypeError as error:
-        return None, f"cannot be read: {error}"
+            return pd.read_parquet(io.BytesIO(data)).astype({"task_index": int})
+    except (ParquetDamageError, TypeError) as error:
+        return Finding(Thing.TASKS, State.DAMAGED, f"{DEFAULT_TASKS_PATH} cannot be read: {error}")
 
 
-def _is_misread(one: str, other: str) -> bool:
-    """Whether two texts differ in no more than one character, as a flipped bit makes them."""
-    return len(one) == len(other) and sum(a != b for a, b in zip(one, other, strict=True)) <= 1
+def settle_tasks(own: pd.DataFrame | Finding, episodes: Sequence[Episode], rows: Mapping[int, Row]) -> Tasks:
+    """Holds the texts of the tasks against the rows of the episodes, from which those are taken that the table lacks.
+
+    Only what all episodes of a task say is taken, and only of those with one task: which of several texts belongs to
+    which number their rows do not say.
+
+    Args:
+        own: The table, or what is wrong with it.
+        episodes: The whole ones count.
+        rows: Their rows, and those of others.
+    """
+    whole = [episode for episode in episodes if episode.is_whole]
+    if isinstance(own, Finding) and own.state is State.MISSING and not whole:  # it has only been begun
+        return Tasks(pd.DataFrame({"task_index": []}, index=pd.Index([], name="task")), True, True, ())
+    said = _texts(whole, rows)
+    findings = [own] if isinstance(own, Finding) else []
+    table = None if isinstance(own, Finding) else own
+    table_has = {} if table is None else dict(zip(table["task_index"].tolist(), table.index.astype(str), strict=True))
+    known = dict(table_has)
+    for number in sorted({task for episode in whole if episode.run for task in episode.run.tasks}):
+        texts = said.get(number, {})
+        if number in table_has:
+            findings += _differences(number, table_has[number], texts)
+        elif len(texts) == 1 and next(iter(texts)) not in known.values():
+            known[number] = next(iter(texts))
+            if table is not None:
+                said_now = f"the text of task {number} was missing; it is {known[number]!r}, as its episodes say"
+                findings.append(_finding(State.MISSING, said_now))
+        elif table is None:
+            known[number] = unknown_task(number)
+            others = f": the episodes name it {', '.join(map(repr, sorted(texts)))}" if texts else ""
+            lost_text = f"the text of task {number} is lost{others}; it now reads {known[number]!r}"
+            findings.append(_finding(State.MISSING, lost_text))
+        else:
+            remedy = "Put a table from a copy in its place, or correct the frames' task_index"
+            findings.append(_finding(State.UNDECIDED, f"frames are of task {number}, which has no text. {remedy}"))
+    if table is not None and known == table_has:
+        return Tasks(table, True, False, tuple(findings))
+    return Tasks(_table(table, known), False, table is None, tuple(findings))
 
 
-def _by_elimination(number: int, rows: dict[int, Row], runs: dict[int, Run], known: dict[int, str]) -> str | None:
-    """The one text of an episode with this task that no other of its tasks has."""
-    for episode, run in runs.items():
-        if number in run.tasks:
-            others = {known.get(task) for task in run.tasks if task != number}
-            texts = [text for text in rows.get(episode, {}).get("tasks") or [] if text not in others]
-            if len(texts) == 1 and None not in others:
-                return str(texts[0])
-    return None
+def unknown_task(number: int) -> str:
+    """What stands for a text that is lost."""
+    return f"unknown task {number}"
+
+
+def _texts(whole: Sequence[Episode], rows: Mapping[int, Row]) -> dict[int, dict[str, list[int]]]:
+    """What the episodes with one task call it: for each task's number, each text and the episodes that say it."""
+    said: dict[int, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
+    for episode in whole:
+        texts = rows.get(episode.number, {}).get("tasks")
+        if episode.run and isinstance(texts, list) and len(texts) == 1 and len(episode.run.tasks) == 1:
+            said[episode.run.tasks[0]][str(texts[0])].append(episode.number)
+    return said
+
+
+def _differences(number: int, text: str, texts: Mapping[str, list[int]]) -> list[Finding]:
+    return [
+        _finding(
+            State.ODD,
+            f"task {number} reads {text!r}; the row{'s' if len(numbers) > 1 else ''} of {name_episodes(numbers)} in "
+            f"meta/episodes say{'' if len(numbers) > 1 else 's'} {other!r}. If nobody renamed it, lerobot-edit-dataset "
+            "with --operation.type=modify_tasks sets the right one",
+        )
+        for other, numbers in texts.items()
+        if other != text
+    ]
+
+
+def _finding(state: State, said: str) -> Finding:
+    return Finding(Thing.TASKS, state, f"{DEFAULT_TASKS_PATH}: {said}")
+
+
+def _table(own: pd.DataFrame | None, known: dict[int, str]) -> pd.DataFrame:
+    """The table with these texts, and the columns of other tools that it had."""
+    numbers = range(max(known, default=-1) + 1)  # LeRobot finds a task by its place
+    texts = pd.Index([known.get(number, unknown_task(number)) for number in numbers], name="task")
+    tasks = pd.DataFrame({"task_index": list(numbers)}, index=texts)
+    if own is None or len(own.columns) == 1:
+        return tasks
+    others = own.drop_duplicates("task_index").set_index("task_index").reindex(list(numbers))
+    return pd.concat([tasks, others.set_index(texts)], axis=1)[list(own.columns)]

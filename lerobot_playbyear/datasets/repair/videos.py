@@ -1,185 +1,160 @@
-"""The videos of a dataset: whether each episode's pictures are in them, and where."""
+"""Whether each episode's pictures are in the videos, and where."""
 
-import glob
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from lerobot.datasets.utils import DatasetInfo
 
-from lerobot_playbyear.datasets.files import is_listed, list_files, naming
-from lerobot_playbyear.datasets.repair.episodes import Row, name_episodes
-from lerobot_playbyear.datasets.repair.frames import Run
-from lerobot_playbyear.datasets.repair.video_times import picture_times
-from lerobot_playbyear.datasets.video_seal import is_intact
-
-_TOLERANCE = 1e-4  # seconds, LeRobot's own
-_BOX_HEADER = 8
+from lerobot_playbyear.datasets.repair.camera import TOLERANCE, Camera, numbers
+from lerobot_playbyear.datasets.repair.episode_tables import Row, video_places
+from lerobot_playbyear.datasets.repair.episodes import Episode
+from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing, name_episodes
 
 
 def check_videos(
-    root: Path,
-    info: DatasetInfo,
-    runs: dict[int, Run],
-    rows: dict[int, Row],
-    thorough: bool,
-    reasons: dict[int, str],
-    findings: list[str],
-) -> None:
-    """Takes away the episodes whose pictures are lost, and finds the pictures of those without a row.
+    root: Path, info: DatasetInfo, fps: float, episodes: Sequence[Episode], rows: Mapping[int, Row], thorough: bool
+) -> tuple[tuple[Episode, ...], tuple[Finding, ...]]:
+    """Finds out which episodes have lost their pictures, and where those are of episodes without a row.
 
     Args:
         root: The dataset's folder.
         info: What it says about itself.
-        runs: The episodes whose frames are complete; those without pictures are removed.
-        rows: Their rows; those that are missing are begun, with the place of the videos.
+        fps: Its frames per second, as the frames' timestamps have them.
+        episodes: All there are.
+        rows: What the tables say of them, and of their videos.
         thorough: Read every video to its end; otherwise only look whether it is cut off.
-        reasons: Gets, for each episode that is removed, why.
-        findings: Gets what was found wrong.
+
+    Returns:
+        The episodes: those without pictures are not whole, and rows that are lost are begun with the videos' places.
+        And what was found wrong.
 
     Raises:
         OSError: A video cannot be read now.
     """
+    findings: list[Finding] = []
     for key, feature in info.features.items():
-        if feature["dtype"] != "video":
-            continue
-        camera = _Camera(root, info, key, thorough)
-        if any(f"videos/{key}/file_index" not in rows.get(episode, {}) for episode in runs):
-            _place(camera, runs, rows)
-        lost: dict[str, list[int]] = {}
-        for episode, run in list(runs.items()):
-            problem = _problem(camera, rows.get(episode, {}), run.length)
-            if problem:
-                lost.setdefault(problem, []).append(episode)
-                reasons[episode] = f"its video of '{key}' is lost: {problem}"
-                del runs[episode]
-        findings.extend(f"{problem}: {name_episodes(episodes)}" for problem, episodes in lost.items())
+        if feature["dtype"] == "video":
+            camera = Camera(root, info, key, fps, thorough)
+            known = [
+                episode.row if episode.is_whole else video_places(rows.get(episode.number, {}), info)
+                for episode in episodes
+            ]
+            episodes, own = _check_camera(camera, episodes, known, info.chunks_size)
+            findings += own
+    return tuple(episodes), tuple(findings)
 
 
-class _Camera:
-    """The video files of one camera.
-
-    Args:
-        root: The dataset's folder.
-        info: What it says about itself.
-        key: The camera.
-        thorough: Read files to their end.
-    """
-
-    def __init__(self, root: Path, info: DatasetInfo, key: str, thorough: bool) -> None:
-        self.key, self.fps = key, info.fps
-        paths = list_files(root, f"videos/{glob.escape(key)}/*/*.mp4")
-        self.names = [path.relative_to(root) for path in paths]
-        self._root, self._info, self._thorough = root, info, thorough
-        self._problems: dict[Path, str | None] = {}
-        self._sealed: set[Path] = set()
-        self._times: dict[Path, np.ndarray] = {}
-
-    def name(self, row: Row) -> Path:
-        """The file in which an episode's row says that its pictures are."""
-        return video_file(self._info, self.key, row)
-
-    def problem(self, name: Path) -> str | None:
-        """What is wrong with a file as a whole."""
-        if name not in self._problems:
-            with naming(self._root / name):
-                self._problems[name] = self._find_problem(name)
-        return self._problems[name]
-
-    def _find_problem(self, name: Path) -> str | None:
-        if not is_listed(self._root, name):
-            return "is missing"
-        problem = _cut_off(self._root / name)
-        if problem or not self._thorough:
-            return problem
-        intact = is_intact(self._root / name)
-        if intact:
-            self._sealed.add(name)
-        return "is not what was recorded: its checksum differs" if intact is False else None
-
-    def shows(self, name: Path, start: float, length: int, certainly: bool = False) -> bool:
-        """Whether a file has a picture for each frame of an episode that begins at `start` [s].
-
-        Args:
-            name: The file.
-            start: When the episode begins in it [s].
-            length: The episode's frames.
-            certainly: Decode it, even where its checksum, or a less thorough check, makes that unnecessary.
-        """
-        if self.problem(name):
-            return False
-        if not certainly and (name in self._sealed or not self._thorough):
-            return True
-        times = self._picture_times(name, also_sealed=certainly)
-        if self.problem(name) or len(times) == 0:
-            return False
-        wanted = start + np.arange(length) / self._info.fps
-        after = np.minimum(np.searchsorted(times, wanted), len(times) - 1)
-        before = np.maximum(after - 1, 0)
-        return bool((np.minimum(abs(times[after] - wanted), abs(times[before] - wanted)) < _TOLERANCE).all())
-
-    def _picture_times(self, name: Path, also_sealed: bool) -> np.ndarray:
-        """Of one file; all others that will be asked for are decoded in one go."""
-        if name not in self._times:
-            sound = [other for other in self.names if not self.problem(other)]
-            names = {name, *(other for other in sound if also_sealed or other not in self._sealed)}
-            for other, answer in picture_times(names, self._root).items():
-                self._times[other] = np.array([] if isinstance(answer, str) else answer)
-                if isinstance(answer, str):
-                    self._problems[other] = f"cannot be decoded: {answer}"
-        return self._times[name]
+def _check_camera(
+    camera: Camera, episodes: Sequence[Episode], known: Sequence[Row], chunks_size: int
+) -> tuple[list[Episode], list[Finding]]:
+    """As `check_videos`, for one camera. `known`: of each episode what is said of where its pictures are."""
+    places: Mapping[int, Row] = {}
+    unclaimed: list[Path] = []
+    if any(episode.is_whole and not camera.has_place(row) for episode, row in zip(episodes, known, strict=True)):
+        places = _find_places(camera, episodes, known, chunks_size)
+        unclaimed = _unclaimed(camera, [*known, *places.values()])
+        places = {} if unclaimed else places  # pictures of an episode that is gone may lie between them
+    checked: list[Episode] = []
+    lost: dict[str, list[int]] = defaultdict(list)
+    unplaced: dict[int, Collection[Path]] = {}
+    for episode, row in zip(episodes, known, strict=True):
+        place = places.get(episode.number, row)
+        problem = _problem(camera, place, episode.run.length) if episode.run else None
+        if not problem or episode.run is None:
+            checked.append(replace(episode, row={**episode.row, **places.get(episode.number, {})}))
+        elif files := _may_be_in(camera, place, episode.run.length, unclaimed):
+            unplaced[episode.number] = files
+            checked.append(episode)
+        else:
+            lost[problem].append(episode.number)
+            checked.append(episode.lost(State.MISSING, f"its video of '{camera.key}' is lost: {problem}"))
+    findings = [
+        Finding(Thing.VIDEO, State.DAMAGED, f"{problem}: {name_episodes(numbers)}") for problem, numbers in lost.items()
+    ]
+    return checked, [*findings, *_unplaced(camera, unplaced)]
 
 
-def video_file(info: DatasetInfo, key: str, row: Row) -> Path:
-    """The file in which an episode's row says that a camera's pictures are, relative to the dataset's folder."""
-    chunk, file = row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]
-    return Path(str(info.video_path).format(video_key=key, chunk_index=int(chunk), file_index=int(file)))
-
-
-def _problem(camera: _Camera, row: Row, length: int) -> str | None:
-    if f"videos/{camera.key}/file_index" not in row:
+def _problem(camera: Camera, row: Row, length: int) -> str | None:
+    if not camera.has_place(row):
         return f"no video of '{camera.key}' has its pictures"
     name = camera.name(row)
     if problem := camera.problem(name):
         return f"{name} {problem}"
-    if camera.shows(name, row[f"videos/{camera.key}/from_timestamp"], length):
+    if camera.shows(name, camera.span(row)[0], length):
         return None
     return f"{name} {camera.problem(name) or 'lacks some of the pictures'}"
 
 
-def _cut_off(path: Path) -> str | None:
-    """Whether the boxes that an mp4 file is made of are all there; this takes no time."""
-    size, at, kinds = path.stat().st_size, 0, set()
-    with path.open("rb") as file:
-        while at < size:
-            file.seek(at)
-            head = file.read(2 * _BOX_HEADER)
-            length = int.from_bytes(head[:4], "big")
-            if length == 1:
-                length = int.from_bytes(head[8:16], "big")
-            kinds.add(head[4:8])
-            if length < _BOX_HEADER or at + length > size:
-                return "is cut off"
-            at += length
-    return None if b"moov" in kinds else "is cut off"
+def _may_be_in(camera: Camera, row: Row, length: int, unclaimed: Collection[Path]) -> Collection[Path]:
+    """The files that may have an episode's pictures after all: its row does not say where they are, or says two things."""
+    if not camera.has_place(row):
+        return unclaimed
+    name, (start, end) = camera.name(row), camera.span(row)
+    is_wrong = abs((end - start) * camera.fps - length) > 1
+    return [name] if is_wrong and not camera.problem(name) else []
 
 
-def _place(camera: _Camera, runs: dict[int, Run], rows: dict[int, Row]) -> None:
-    """Finds the pictures of episodes without a row: LeRobot puts one episode behind the other until a file is full."""
-    key, at, start = camera.key, 0, 0.0
-    for episode in sorted(runs):
-        row = rows.get(episode, {})
-        if f"videos/{key}/file_index" in row:
-            name = camera.name(row)
-            at = camera.names.index(name) if name in camera.names else at
-            start = float(row[f"videos/{key}/to_timestamp"])
+def _find_places(
+    camera: Camera, episodes: Sequence[Episode], known: Sequence[Row], chunks_size: int
+) -> Mapping[int, Row]:
+    """Finds the pictures of episodes without a row: LeRobot puts one episode behind the other until a file is full.
+
+    So an episode's place follows from that of the one before it, if this is known: nothing may be lost between them.
+    """
+    claimed = [(camera.name(row), *camera.span(row)) for row in known if camera.has_place(row)]
+    found: dict[int, Row] = {}
+    before: tuple[Path, float] | None = None  # where the episode before ends
+    for episode, row in zip(episodes, known, strict=True):
+        if camera.has_place(row):
+            before = camera.name(row), camera.span(row)[1]
             continue
-        length = runs[episode].length
-        while at < len(camera.names) and not camera.shows(camera.names[at], start, length, certainly=True):
-            at, start = at + 1, 0.0
-        if at == len(camera.names):
-            return
-        end = start + length / camera.fps
-        chunk, file = (int(part.rsplit("-", 1)[-1]) for part in camera.names[at].with_suffix("").parts[-2:])
-        place = {"chunk_index": chunk, "file_index": file, "from_timestamp": start, "to_timestamp": end}
-        rows.setdefault(episode, {}).update({f"videos/{key}/{what}": value for what, value in place.items()})
-        start = end
+        may_follow = episode.run is not None and (before is not None or episode.number == 0)
+        candidates = _next_places(camera, before, chunks_size) if may_follow else []
+        before = None
+        for name, start in candidates:
+            length = episode.run.length if episode.run else 0
+            end = start + length / camera.fps
+            is_free = not any(
+                name == other and start < stop - TOLERANCE and first < end - TOLERANCE for other, first, stop in claimed
+            )
+            if is_free and camera.shows(name, start, length, certainly=True):
+                found[episode.number] = camera.place(name, start, length)
+                before = name, end
+    return found
+
+
+def _next_places(camera: Camera, before: tuple[Path, float] | None, chunks_size: int) -> list[tuple[Path, float]]:
+    """Where an episode can begin: in the file of the one before, or in the next where that is full; the first in the first."""
+    wanted = (0, 0)
+    if before is not None:
+        name, end = before
+        times = camera.times(name)
+        if len(times) == 0 or times[-1] > end - TOLERANCE:
+            return [(name, end)]
+        chunk, file = numbers(name) or (0, -1)
+        wanted = (chunk, file + 1) if file + 1 < chunks_size else (chunk + 1, 0)
+    return [(other, 0.0) for other in camera.names if numbers(other) == wanted]
+
+
+def _unclaimed(camera: Camera, known: Iterable[Row]) -> list[Path]:
+    """The files that are whole and have more pictures than is known of where episodes are."""
+    n_claimed: dict[Path, int] = defaultdict(int)
+    for row in known:
+        if camera.has_place(row):
+            start, end = camera.span(row)
+            n_claimed[camera.name(row)] += round((end - start) * camera.fps)
+    return [name for name in camera.names if len(camera.times(name)) > n_claimed[name]]
+
+
+def _unplaced(camera: Camera, unplaced: Mapping[int, Collection[Path]]) -> list[Finding]:
+    if not unplaced:
+        return []
+    names = ", ".join(map(str, sorted({name for files in unplaced.values() for name in files})))
+    said = (
+        f"meta/episodes does not say, or not rightly, where the pictures of '{camera.key}' of {name_episodes(unplaced)} "
+        f"are: they may be in {names}. Put the table, or videos that are missing, back from a copy. To give these "
+        "episodes up, take these files away, with whatever else is in them"
+    )
+    return [Finding(Thing.VIDEO, State.UNDECIDED, said)]

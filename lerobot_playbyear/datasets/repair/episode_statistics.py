@@ -14,8 +14,8 @@ from lerobot.datasets.utils import DatasetInfo
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.confines import file_inside, open_picture
-from lerobot_playbyear.datasets.repair.episodes import Row
-from lerobot_playbyear.datasets.repair.videos import video_file
+from lerobot_playbyear.datasets.repair.camera import video_file
+from lerobot_playbyear.datasets.repair.episode_tables import Row
 from lerobot_playbyear.datasets.statistics import Stats, channel_stats, numeric_stats, repeated_stats
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 

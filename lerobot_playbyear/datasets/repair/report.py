@@ -1,0 +1,102 @@
+"""What is said about a dataset that was checked or repaired."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot_playbyear.datasets.repair.findings import State
+from lerobot_playbyear.datasets.repair.plan import Plan
+
+_MOST_MOVES = 20  # that are named
+
+
+@dataclass
+class RepairReport:
+    """What was wrong with a dataset, and what became of it.
+
+    Args:
+        root: Its folder.
+        findings: What was proven to be wrong, a line each; empty for a sound dataset.
+        kept: Where each complete episode is now: its number before, and now.
+        dropped: The episodes that are not complete: their number before, and why.
+        undecided: What looks wrong and is not proven, and what a person can do about it; before that nothing is repaired.
+        odd: What looks odd, and stays as it is; no repair depends on it.
+        remade: What of the rest was made anew, is other than it was, or stays behind in `original`, a line each.
+        original: Where the damaged dataset was put; None where nothing was changed.
+    """
+
+    root: Path
+    findings: list[str] = field(default_factory=list)
+    kept: dict[int, int] = field(default_factory=dict)
+    dropped: dict[int, str] = field(default_factory=dict)
+    undecided: list[str] = field(default_factory=list)
+    odd: list[str] = field(default_factory=list)
+    remade: list[str] = field(default_factory=list)
+    original: Path | None = None
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing is wrong; what is odd does not count."""
+        return not self.is_damaged and not self.undecided
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether something is proven to be wrong."""
+        return bool(self.findings or self.dropped)
+
+    @property
+    def changed(self) -> bool:
+        """Whether the dataset was repaired."""
+        return self.original is not None
+
+    @property
+    def wrong(self) -> list[str]:
+        """Everything that is wrong, a line each."""
+        lost = [f"episode {number} is lost: {reason}" for number, reason in sorted(self.dropped.items())]
+        return [*self.findings, *lost, *self.undecided]
+
+    def __str__(self) -> str:
+        lines = [self._verdict(), *_items(self.wrong[: len(self.wrong) - len(self.undecided)])]
+        if self.undecided:
+            lines += [
+                "What looks wrong, and nothing proves; nothing is repaired before you decide it:",
+                *_items(self.undecided),
+            ]
+        if not self.is_sound:
+            lines.append(f"{'Kept' if self.changed else 'Can be kept'}: {len(self.kept)} complete episodes.")
+        moved = {old: new for old, new in self.kept.items() if old != new}
+        if moved:
+            pairs = ", ".join(f"{old} is now {new}" for old, new in sorted(moved.items())[:_MOST_MOVES])
+            lines.append(f"Numbered anew: {pairs}{' ...' if len(moved) > _MOST_MOVES else ''}.")
+        lines += _items(self.remade)
+        if self.odd:
+            lines += ["What looks odd, and stays as it is:", *_items(self.odd)]
+        if self.changed:
+            lines.append(f"The damaged dataset is untouched in {self.original}; delete it when you no longer need it.")
+        return "\n".join(lines)
+
+    def _verdict(self) -> str:
+        if self.is_sound:
+            return f"{self.root}: {len(self.kept)} episodes, nothing wrong."
+        if not self.is_damaged:
+            return f"{self.root} contradicts itself."
+        return f"{self.root} was damaged:" if self.changed else f"{self.root} is damaged:"
+
+
+def describe(root: Path, plan: Plan) -> RepairReport:
+    """Says what was found, and what the plan makes of it."""
+
+    def found(*states: State) -> list[str]:
+        return [finding.said for finding in plan.survey.findings if finding.state in states]
+
+    return RepairReport(
+        root,
+        found(State.DAMAGED, State.MISSING),
+        {kept.run.episode: kept.number for kept in plan.kept},
+        dict(plan.dropped),
+        found(State.UNDECIDED),
+        found(State.ODD),
+    )
+
+
+def _items(lines: list[str]) -> list[str]:
+    return [f"  - {line}" for line in lines]
