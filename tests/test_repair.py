@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from lerobot.configs.video import RGBEncoderConfig
@@ -297,6 +298,19 @@ def test_a_feature_of_another_name_is_not_believed(copy):
         repair_dataset(root)
     report = repair_dataset(root, fps=FPS, features=FEATURES)
     check_kept(root, report, FEATURES)
+
+
+def test_a_file_with_another_column_costs_no_episode(copy):
+    root = copy("ours")
+    path = files(root / "data")[1]
+    table = pq.read_table(path).replace_schema_metadata(None)
+    pq.write_table(table.append_column("reward", pa.array(np.zeros(len(table)))), path)
+    before = {path: path.read_bytes() for path in files(root)}
+    with pytest.raises(
+        DatasetDamagedError, match=r"file-001\.parquet: its columns .*: reward\. Correct the features in"
+    ):
+        repair_dataset(root)
+    assert {path: path.read_bytes() for path in files(root)} == before
 
 
 def test_the_recorder_asks_for_the_repair_of_what_it_continues(copy):

@@ -28,7 +28,6 @@ class Camera:
 
     Attributes:
         key: The camera.
-        info: What the dataset says about itself.
         fps: The frames per second.
         names: Its files, in order.
     """
@@ -37,7 +36,7 @@ class Camera:
         self.key, self.fps = key, fps
         paths = list_files(root, f"videos/{glob.escape(key)}/*/*.mp4")
         self.names = [path.relative_to(root) for path in paths]
-        self._root, self.info, self._thorough = root, info, thorough
+        self._root, self._info, self._thorough = root, info, thorough
         self._problems: dict[Path, str | None] = {}
         self._sealed: set[Path] = set()
         self._times: dict[Path, np.ndarray] = {}
@@ -48,7 +47,7 @@ class Camera:
 
     def name(self, row: Row) -> Path:
         """The file in which an episode's row says that its pictures are."""
-        return video_file(self.info, self.key, row)
+        return video_file(self._info, self.key, row)
 
     def span(self, row: Row) -> tuple[float, float]:
         """From when to when in that file [s]."""

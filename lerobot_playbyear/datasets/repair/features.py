@@ -33,7 +33,7 @@ def settle_features(
         OSError: A file cannot be read now.
     """
     known = {**features, **DEFAULT_FEATURES} if features else None
-    schemas = [schema for path in list_files(root, "data/*/*.parquet") if (schema := _own_schema(path)) is not None]
+    schemas = [schema for path in list_files(root, "data/*/*.parquet") if (schema := own_schema(path)) is not None]
     reasons = [_disagreement(schema, info.features) for schema in schemas]
     findings: list[Finding] = []
     if (reasons and all(reasons)) or (not reasons and _disagreement(None, info.features)):
@@ -70,7 +70,7 @@ def _agree(found: pa.DataType, wanted: pa.DataType) -> bool:
     return True
 
 
-def _own_schema(path: Path) -> pa.Schema | None:
+def own_schema(path: Path) -> pa.Schema | None:
     """A data file's columns, if its end is whole: what it says twice, to Arrow and to `datasets`, must agree."""
     try:
         with open_checked(path) as file, parsing(path):

@@ -15,7 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
 from lerobot_playbyear.datasets.repair.data_file import INDEX_COLUMNS, DataFile, open_source, read_indices
-from lerobot_playbyear.datasets.repair.features import check_columns
+from lerobot_playbyear.datasets.repair.features import check_columns, own_schema
 from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing
 from lerobot_playbyear.datasets.repair.rescue import rescue
 from lerobot_playbyear.datasets.repair.rescued_file import RescuedFile
@@ -119,20 +119,18 @@ def _check_shapes(info: DatasetInfo, sizes: Iterable[tuple[str, tuple[int, int]]
 
 def _find_source(path: Path, name: Path, schema: pa.Schema) -> Path | RescuedFile | Finding:
     """The file itself, or what can be rescued of it; or why nothing can."""
-    state = State.DAMAGED
     try:
         with open_checked(path) as file:
             problem = check_columns(file.schema_arrow, schema)
         if problem is None:
             return path
-        state = State.UNDECIDED  # the rows may be whole
+        if own_schema(path) is not None:
+            remedy = "Correct the features in meta/info.json, or take the file away"
+            return Finding(Thing.FILE, State.UNDECIDED, f"{name}: {problem}. {remedy}")
     except ParquetDamageError as error:
         problem = str(error)
-    if rescued := rescue(path, schema):
-        return rescued
-    remedy = "" if state is State.DAMAGED else ". Correct the features in meta/info.json, or take the file away"
-    said = f"{name} cannot be read: {problem}, and no complete episode could be found in it{remedy}"
-    return Finding(Thing.FILE, state, said)
+    said = f"{name} cannot be read: {problem}, and no complete episode could be found in it"
+    return rescue(path, schema) or Finding(Thing.FILE, State.DAMAGED, said)
 
 
 @dataclass(frozen=True)
