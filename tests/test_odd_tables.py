@@ -14,7 +14,7 @@ from PIL import Image
 
 from lerobot_playbyear.datasets import EpisodeStore, write_audio
 from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets.repair import repair_dataset
+from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset, repair_dataset
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.inspection.source import DatasetSource
 from lerobot_playbyear.scripts.repair import main as repair_command
@@ -112,6 +112,17 @@ def test_a_template_that_cannot_be_filled_in_is_replaced(videos, path, field):
     report = repair_dataset(videos)
     assert len(report.kept) == len(LENGTHS)
     assert json.loads((videos / "meta/info.json").read_text())[path] == template
+
+
+@pytest.mark.parametrize("field", ["{nope}", "{}", "{chunk_index.x}", "{chunk_index:>99999999999}"])
+@pytest.mark.parametrize("path", ["data_path", "video_path"])
+def test_a_template_that_nothing_fits_is_for_a_person_to_decide(videos, path, field):
+    change_info(videos, **{path: f"{path}/{field}.mp4"})
+    shutil.move(videos / path.removesuffix("_path").replace("video", "videos"), videos.parent / "elsewhere")
+    report = check_dataset(videos)
+    assert f"{path} was '{path}/{field}.mp4', where nothing is, nor at" in report.undecided[0]
+    with pytest.raises(DatasetDamagedError):
+        repair_dataset(videos)
 
 
 @pytest.mark.parametrize("values", [[[1.0] * 4, [None] * 4, [1.0] * 4], [[1.0] * 4, None, [1.0] * 4], ["x", "y", "z"]])

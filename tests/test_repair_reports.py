@@ -156,6 +156,17 @@ def test_no_episode_gets_the_pictures_of_another(films):
     assert everything(films) == before
 
 
+def test_an_episode_whose_film_and_place_are_lost_does_not_take_the_next_ones(films):
+    place = f"videos/{FILM}/file_index"
+    files = pq.read_table(films / EPISODES).column(place).to_pylist()
+    change(films / EPISODES, f"videos/{FILM}/from_timestamp", 2, float("nan"))
+    sorted((films / "videos" / FILM).glob("*/*"))[2].unlink()
+    report = repair_dataset(films)
+    assert report.kept == {0: 0, 1: 1, 3: 2}
+    assert pq.read_table(films / EPISODES).column(place).to_pylist() == [files[0], files[1], files[3]]
+    assert not differences(load(films), {0: 0, 1: 1, 2: 3}, RICH_FEATURES)
+
+
 def test_a_correction_by_hand_makes_the_repair_go_on(root):
     (root / "meta/stats.json").unlink()
     path = root / "meta/info.json"

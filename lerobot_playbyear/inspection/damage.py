@@ -26,6 +26,7 @@ def find_damage(folder: Path) -> str | None:
         return f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
     if report.is_sound:
         return None
-    more = f"; and {len(report.wrong) - _LISTED} more" if len(report.wrong) > _LISTED else ""
+    lines = [*report.damage, *report.undecided]
+    more = f"; and {len(lines) - _LISTED} more" if len(lines) > _LISTED else ""
     first = "Correct by hand what has to be decided, then repair it" if report.undecided else "Repair it"
-    return f"{'; '.join(report.wrong[:_LISTED])}{more}. {first}: playbyear-repair --root={folder}"
+    return f"{'; '.join(lines[:_LISTED])}{more}. {first}: playbyear-repair --root={folder}"

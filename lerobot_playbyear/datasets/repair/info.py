@@ -64,12 +64,11 @@ def read_info(
         is_used = name == "data_path" or any(feature["dtype"] == "video" for feature in info.features.values())
         if not is_used or own == wanted or _leads_somewhere(root, own):
             continue
-        if _leads_somewhere(root, wanted):
-            findings.append(Finding(Thing.INFO, State.DAMAGED, f"{INFO_PATH}: {name} was {own!r}, where nothing is"))
-            info = dataclasses.replace(info, **{name: wanted})
-        else:
-            said = f"{INFO_PATH}: {name} is {own!r}, where nothing is; nor is there at LeRobot's own {wanted!r}"
-            findings.append(Finding(Thing.INFO, State.UNDECIDED, f"{said}. Put the files, or the right path, there"))
+        state, said = State.DAMAGED, f"{INFO_PATH}: {name} was {own!r}, where nothing is"
+        if not _leads_somewhere(root, wanted):
+            state, said = State.UNDECIDED, f"{said}, nor at {wanted!r}. Put the files, or the right path, there"
+        findings.append(Finding(Thing.INFO, state, said))
+        info = dataclasses.replace(info, **{name: wanted})
     return info, fields, tuple(findings)
 
 

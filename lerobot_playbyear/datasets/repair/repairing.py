@@ -67,7 +67,7 @@ def repair_dataset(
             return report
         source = fingerprint(root)
         _confirm(report, _look(root, fps, features, thorough)[0])
-        if not report.is_damaged:
+        if not report.damage:
             return report
         if report.undecided:
             raise DatasetDamagedError(f"{report}\nNothing was changed.")
@@ -101,11 +101,11 @@ def _confirm(first: RepairReport, second: RepairReport) -> None:
         OSError: It does not: what is read changes, so that nothing is proven.
     """
     if first != second:
-        lines = {*first.wrong, *first.odd} ^ {*second.wrong, *second.odd}
+        said = [{*report.damage, *report.undecided, *report.odd} for report in (first, second)]
         raise OSError(
             errno.EIO,
             "what is read changes from one time to the next, so that it may be the disk or the network that fails, and "
-            f"not the dataset ({'; '.join(sorted(lines)[:3])})",
+            f"not the dataset ({'; '.join(sorted(said[0] ^ said[1])[:3])})",
             str(first.root),
         )
 

@@ -34,28 +34,23 @@ class RepairReport:
     original: Path | None = None
 
     @property
-    def is_sound(self) -> bool:
-        """Whether nothing is wrong; what is odd does not count."""
-        return not self.is_damaged and not self.undecided
+    def damage(self) -> list[str]:
+        """What is proven to be wrong, and which episodes are lost to it, a line each."""
+        lost = [f"episode {number} is lost: {reason}" for number, reason in sorted(self.dropped.items())]
+        return [*self.findings, *lost]
 
     @property
-    def is_damaged(self) -> bool:
-        """Whether something is proven to be wrong."""
-        return bool(self.findings or self.dropped)
+    def is_sound(self) -> bool:
+        """Whether nothing is wrong; what is odd does not count."""
+        return not self.damage and not self.undecided
 
     @property
     def changed(self) -> bool:
         """Whether the dataset was repaired."""
         return self.original is not None
 
-    @property
-    def wrong(self) -> list[str]:
-        """Everything that is wrong, a line each."""
-        lost = [f"episode {number} is lost: {reason}" for number, reason in sorted(self.dropped.items())]
-        return [*self.findings, *lost, *self.undecided]
-
     def __str__(self) -> str:
-        lines = [self._verdict(), *_items(self.wrong[: len(self.wrong) - len(self.undecided)])]
+        lines = [self._verdict(), *_items(self.damage)]
         if self.undecided:
             lines += [
                 "What looks wrong, and nothing proves; nothing is repaired before you decide it:",
@@ -77,7 +72,7 @@ class RepairReport:
     def _verdict(self) -> str:
         if self.is_sound:
             return f"{self.root}: {len(self.kept)} episodes, nothing wrong."
-        if not self.is_damaged:
+        if not self.damage:
             return f"{self.root} contradicts itself."
         return f"{self.root} was damaged:" if self.changed else f"{self.root} is damaged:"
 

@@ -71,7 +71,7 @@ def _check_camera(
             lost[problem].append(episode.number)
             checked.append(episode.lost(State.MISSING, f"its video of '{camera.key}' is lost: {problem}"))
     findings = [
-        Finding(Thing.VIDEO, State.DAMAGED, f"{problem}: {name_episodes(numbers)}") for problem, numbers in lost.items()
+        Finding(Thing.VIDEO, State.DAMAGED, f"{problem}: {name_episodes(own)}") for problem, own in lost.items()
     ]
     return checked, [*findings, *_unplaced(camera, unplaced)]
 
