@@ -33,7 +33,7 @@ test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, def
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile
 
 test-slow: install  ## The tests that take minutes, side by side like the others
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -m slow -n $(TEST_JOBS) --dist loadfile
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -m slow --timeout 3600 -n $(TEST_JOBS) --dist loadfile
 
 bench: install  ## Measures speed and memory, beside alternatives, in a quarter of an hour
 	$(BIN)/python benchmarks/run.py

@@ -28,10 +28,6 @@ _TOP_NAMES = {"compat", "lazy_names", "__version__"}
 """What every package may import from the top."""
 
 _MOST_LINES, _FEWEST_LINES = 300, 25
-_STILL_TOO_LONG = {
-    "datasets/repair/copying.py",
-    "datasets/repair/rescue.py",
-}
 _SHORT = {
     "datasets/errors.py": "the error that all of the package raise; whoever catches it needs none of the rest",
 }
@@ -93,7 +89,7 @@ def test_every_module_lies_in_a_package_of_the_table():
 
 def test_no_module_is_too_long_to_be_read_nor_too_short_to_be_one():
     lengths = {path: len(text.splitlines()) for path, text in modules().items()}
-    long = {path: n for path, n in lengths.items() if n > _MOST_LINES and path not in _STILL_TOO_LONG}
+    long = {path: n for path, n in lengths.items() if n > _MOST_LINES}
     short = {path: n for path, n in lengths.items() if n < _FEWEST_LINES and not path.endswith("__init__.py")}
     assert not long
     assert not set(short) - set(_SHORT), short
