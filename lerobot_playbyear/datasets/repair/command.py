@@ -3,7 +3,7 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lerobot_playbyear.datasets.files import INFO_PATH
 
@@ -36,19 +36,9 @@ def repair(cfg: RepairConfig) -> "RepairReport":
         MemoryError: There is not enough of it. Nothing was changed.
     """
     _check_root(cfg.root)
-    from lerobot.datasets.utils import DatasetInfo
-    from lerobot.utils.constants import DEFAULT_FEATURES
-
     from lerobot_playbyear.datasets.repair.repairing import check_dataset, repair_dataset
 
-    known = {}
-    if cfg.like is not None:
-        try:
-            info = DatasetInfo.from_dict(json.loads((cfg.like / INFO_PATH).read_text()))
-            own = {key: feature for key, feature in info.features.items() if key not in DEFAULT_FEATURES}
-        except (ValueError, TypeError, AttributeError) as error:
-            raise ValueError(f"--like={cfg.like}: its {INFO_PATH} is none of a dataset: {error}") from error
-        known = {"fps": info.fps, "features": own}
+    known = {} if cfg.like is None else _settings(cfg.like)
     report = check_dataset(cfg.root, **known) if cfg.dry_run else repair_dataset(cfg.root, **known)
     print(report)
     return report
@@ -59,3 +49,16 @@ def _check_root(root: Path) -> None:
     beside = root.absolute().parent
     if not root.is_dir() and not (beside.is_dir() and any(root.name in path.name for path in beside.iterdir())):
         raise ValueError(f"{root} holds no LeRobotDataset: it is no folder.")
+
+
+def _settings(like: Path) -> dict[str, Any]:
+    """The frame rate and the features of another dataset."""
+    from lerobot.datasets.utils import DatasetInfo
+    from lerobot.utils.constants import DEFAULT_FEATURES
+
+    try:
+        info = DatasetInfo.from_dict(json.loads((like / INFO_PATH).read_text()))
+        own = {key: feature for key, feature in info.features.items() if key not in DEFAULT_FEATURES}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"--like={like}: its {INFO_PATH} is none of a dataset: {error}") from error
+    return {"fps": info.fps, "features": own}

@@ -1,4 +1,7 @@
-"""Finding out what is wrong with a dataset on disk, and putting it right beside the original."""
+"""Finding out what is wrong with a dataset on disk, and putting it right beside the original.
+
+What interrupted work left is finished before LeRobot, which takes seconds to import, is needed for the survey.
+"""
 
 import contextlib
 import errno
@@ -6,20 +9,21 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lerobot_playbyear.datasets.journal import finish_journal
 from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
-from lerobot_playbyear.datasets.repair.carry_out import write_copy
 from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError
-from lerobot_playbyear.datasets.repair.plan import Plan, make_plan
 from lerobot_playbyear.datasets.repair.replacing import begin_copy, fingerprint, finish_repair, replace
-from lerobot_playbyear.datasets.repair.report import RepairReport, describe
-from lerobot_playbyear.datasets.repair.survey import survey
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.datasets.repair.plan import Plan
+    from lerobot_playbyear.datasets.repair.report import RepairReport
 
 
 def check_dataset(
     root: str | Path, *, fps: int | None = None, features: dict[str, dict] | None = None, thorough: bool = True
-) -> RepairReport:
+) -> "RepairReport":
     """Looks for damage in a local dataset, changing nothing. Arguments and errors as for `repair_dataset`."""
     return _look(Path(root), fps, features, thorough)[0]
 
@@ -30,7 +34,7 @@ def repair_dataset(
     fps: int | None = None,
     features: dict[str, dict] | None = None,
     thorough: bool = True,
-) -> RepairReport:
+) -> "RepairReport":
     """Repairs a local dataset of ours or of LeRobot's; every complete episode is kept, bit for bit.
 
     A recording that was killed has lost its tables' ends, which are made anew from what is there; so are damaged or
@@ -73,6 +77,8 @@ def repair_dataset(
             raise DatasetDamagedError(f"{report}\nNothing was changed.")
         if not report.kept:
             raise DatasetDamagedError(f"{report}\nNo complete episode is left in {root}; nothing was changed.")
+        from lerobot_playbyear.datasets.repair.carry_out import write_copy
+
         copy = begin_copy(root)
         try:
             report.remade += write_copy(root, copy, plan)
@@ -89,12 +95,16 @@ def repair_dataset(
     return report
 
 
-def _look(root: Path, fps: int | None, features: dict[str, dict] | None, thorough: bool) -> tuple[RepairReport, Plan]:
+def _look(root: Path, fps: int | None, features: dict[str, dict] | None, thorough: bool) -> "tuple[RepairReport, Plan]":
+    from lerobot_playbyear.datasets.repair.plan import make_plan
+    from lerobot_playbyear.datasets.repair.report import describe
+    from lerobot_playbyear.datasets.repair.survey import survey
+
     plan = make_plan(survey(root, fps=fps, features=features, thorough=thorough))
     return describe(root, plan), plan
 
 
-def _confirm(first: RepairReport, second: RepairReport) -> None:
+def _confirm(first: "RepairReport", second: "RepairReport") -> None:
     """Whether a second look at a dataset finds the same.
 
     Raises:
