@@ -110,6 +110,7 @@ def test_lerobots_rollout_sees_the_experts_succeed(policy_config):
     assert all(observation["observation.audio.gripper"].abs().max() <= 1 for observation in policy.seen)
 
 
+@pytest.mark.slow
 def test_environments_in_processes_of_their_own_see_the_same():
     config = PlaybyearEnvConfig()
     observations = []

@@ -334,6 +334,7 @@ def recorded(tmp_path_factory) -> Path:
     return record(RecordConfig(PlaybyearEnvConfig(), dataset, num_workers=0))
 
 
+@pytest.mark.slow
 def test_a_page_of_fifty_episodes_opens_in_two_seconds_and_is_small(browser, recorded, tmp_path):
     source = DatasetSource.open("tests/recorded", recorded)
     with PageWriter(tmp_path / "page.html", source) as writer:

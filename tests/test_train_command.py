@@ -188,6 +188,7 @@ def test_its_batches_give_the_loss_of_lerobots(trained, root):
     assert torch.allclose(ours, theirs, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_it_reaches_the_loss_of_lerobot_train(command, tmp_path):
     root = tmp_path / "data"
     make_dataset(root, (12, 17, 9, 14), features=dataset_features(cameras=(), microphones=()))
