@@ -15,7 +15,6 @@ from pathlib import Path
 
 TASKS = ("OccludedGrasp-v0", "OccludedPickPlace-v0")
 DEMONSTRATION_SEED = 0  # recording counts up from here, below 1000
-TUNING_SEEDS = range(2000, 2100)
 EVALUATION_SEEDS = range(70000, 70100)
 DONOR_SEEDS = range(60000, 60040)  # expert episodes whose sounds the listening probes play
 TRAINING_SEEDS = (1, 2, 3)

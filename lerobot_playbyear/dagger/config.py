@@ -42,10 +42,6 @@ class DatasetSource:
     def folder(self) -> Path:
         return Path(self.root) if self.root else HF_LEROBOT_HOME / self.repo_id
 
-    def is_on_disk(self) -> bool:
-        """Whether the folder holds a dataset."""
-        return (self.folder / "meta" / "info.json").is_file()
-
 
 @dataclass
 class DaggerEvalConfig(EvalConfig):

@@ -18,7 +18,8 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError
-from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.datasets.journal import flush
+from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
 
 STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""
@@ -148,11 +149,11 @@ class RunFolder:
         with _errors_of_writing(self.path, partial):
             write(partial)
             for path in [*partial.rglob("*"), partial]:
-                _flush(path)
+                flush(path)
             if folder.exists():  # from a round that was not completed
                 shutil.rmtree(folder)
             os.replace(partial, folder)
-            _flush(self.checkpoints)
+            flush(self.checkpoints)
 
     def clean(self, state: RunState) -> None:
         """Remove checkpoints that are neither the newest nor milestones, and let `last` name the newest."""
@@ -183,40 +184,20 @@ class RunFolder:
         done = {"attempt": state.attempts, "round": state.round, "eval": state.evaluated_round}
         kept = []
         for text in path.read_text().splitlines():
-            line = _parsed(text)
-            if line is not None and line["attempt" if line["kind"] == "attempt" else "round"] <= done[line["kind"]]:
+            line = figures_in(text)
+            if line and line["attempt" if line["kind"] == "attempt" else "round"] <= done[line["kind"]]:
                 kept.append(text + "\n")
         with _errors_of_writing(self.path):
             _replace(path, "".join(kept))
-
-
-def _parsed(text: str) -> dict[str, Any] | None:
-    """A line of figures; None if it was cut off."""
-    try:
-        line: dict[str, Any] = json.loads(text)
-    except json.JSONDecodeError:
-        return None
-    return line
 
 
 def _replace(path: Path, content: str) -> None:
     """Write a file so that at every moment the old or the new one is there."""
     partial = path.with_name(path.name + _PARTIAL)
     partial.write_text(content)
-    _flush(partial)
+    flush(partial)
     os.replace(partial, path)
-    _flush(path.parent)
-
-
-def _flush(path: Path) -> None:
-    """Ask the operating system to put a file, or the entries of a folder, on the disk itself."""
-    if os.name == "nt" and path.is_dir():
-        return
-    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    flush(path.parent)
 
 
 @contextmanager

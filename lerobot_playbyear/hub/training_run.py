@@ -46,12 +46,12 @@ def evaluation_of(checkpoint: Path) -> dict[str, float] | None:
     if not (state.is_file() and metrics.is_file()):
         return None
     step = json.loads(state.read_text())["step"]
-    lines = [_figures(line) for line in metrics.read_text().splitlines()]
+    lines = [figures_in(line) for line in metrics.read_text().splitlines()]
     found = [line for line in lines if line.get("kind") == "eval" and line.get("step") == step and "pc_success" in line]
     return found[-1] if found else None
 
 
-def _figures(line: str) -> dict[str, Any]:
+def figures_in(line: str) -> dict[str, Any]:
     """What a line says; nothing if a run that was killed, or a full disk, cut it off."""
     try:
         figures = json.loads(line)

@@ -67,7 +67,7 @@ class KeyboardWindowTeleop(Teleoperator):
 
     Args:
         config: Its configuration.
-        keys: The window's keys; give them with `listen_to` before `connect` if they are not there yet.
+        keys: The window's keys; without them it cannot be connected.
     """
 
     config_class = KeyboardWindowTeleopConfig
@@ -76,10 +76,6 @@ class KeyboardWindowTeleop(Teleoperator):
     def __init__(self, config: KeyboardWindowTeleopConfig, keys: WindowKeys | None = None) -> None:
         super().__init__(config)
         self._keys, self._is_connected = keys, False
-
-    def listen_to(self, keys: WindowKeys) -> None:
-        """Whose keys they are."""
-        self._keys = keys
 
     @property
     def action_features(self) -> dict[str, Any]:
