@@ -4,8 +4,8 @@
     python -m experiments.curves noise
     python -m experiments.curves materials
 
-The last two take the full policies that `experiments.ablations` trained, as they are: nothing is trained on louder noise
-or on another material. Results that are there are kept.
+The last two take the full policies that `experiments.ablations` trained, as they are: those of the
+preset `cpu`, which mixes noise into the sound, and never heard another material. Results that are there are kept.
 """
 
 import argparse

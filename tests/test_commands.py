@@ -1,9 +1,11 @@
 """Every command answers at once what needs no LeRobot: its help, a misspelt option, a dataset that is not there."""
 
+import contextlib
 import importlib
 import json
 import re
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
@@ -184,6 +186,35 @@ def test_what_is_refused_at_once_the_full_parser_would_refuse_too(command, optio
 )
 def test_what_may_be_right_is_left_to_the_full_parser(command, options):
     assert mistake(command, *options) is None
+
+
+@dataclass
+class Values:
+    """One option of each kind that is checked before the full parser."""
+
+    resume: bool = False
+    steps: int = 0
+    start_s: float = 0.0
+
+
+_ODD_VALUES = [
+    *("1", "0", "y", "n", "yes", "No", "on", "OFF", "True", "t", "'true'", '"no"', "null", "~", "None"),
+    *("1_000", "0x1F", "0o17", "1e3", "1.0", "-3", ".5", "5.", "+2", "'3'", "1:30"),
+    *("inf", "-inf", ".inf", ".NaN", "Infinity"),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "option"), [("resume", "resume"), ("steps", "steps"), ("start_s", "sampling.start_s")]
+)
+def test_no_value_that_the_full_parser_takes_is_refused(name, option):
+    taken = []
+    for value in _ODD_VALUES:
+        with contextlib.suppress(SystemExit, DraccusException):
+            draccus.parse(Values, args=[f"--{name}={value}"])
+            taken.append(value)
+    assert len(taken) > 5
+    assert not [value for value in taken if mistake("playbyear-train", DATA, f"--{option}={value}")]
 
 
 def test_another_version_of_lerobot_may_have_other_options(monkeypatch, capsys):

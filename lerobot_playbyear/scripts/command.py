@@ -15,11 +15,9 @@ OPTIONS_FILE = Path(__file__).with_name("options.json")
 """The names of all options of each command; `python tools/list_options.py` writes it."""
 
 _NOTHING = ("", "~", "null", "none")
-_WORDS_OF_KIND = {
-    "bool": ("true", "false", "yes", "no", "on", "off"),
-    "int": ("true", "false"),
-    "float": ("true", "false", "inf", ".inf", "nan", ".nan", "infinity"),
-}
+_TRUTHS = ("true", "false", "yes", "no", "on", "off")  # YAML's, which also are 1 and 0
+_INFINITIES = ("inf", ".inf", "nan", ".nan", "infinity")
+_WORDS_OF_KIND = {"bool": _TRUTHS, "int": _TRUTHS, "float": (*_TRUTHS, *_INFINITIES)}
 _WANTED = {"bool": "true or false", "int": "a whole number", "float": "a number"}
 
 
@@ -83,7 +81,7 @@ def find_mistake(args: list[str], listed: Mapping[str, Any], policies: Mapping[s
 
 
 def _may_be(kind: str, value: str) -> bool:
-    word = value.strip().lower()
+    word = value.strip().strip("'\"").lower()
     if kind not in _WANTED or word in _NOTHING or word.startswith("include"):
         return True
     return word.lstrip("+-") in _WORDS_OF_KIND[kind] or (kind != "bool" and re.search(r"\d", word) is not None)

@@ -88,7 +88,7 @@ def frame_weights(store: EpisodeStore, sampling: SamplingConfig) -> Tensor:
 
 
 def validation_loss(parts: TrainingParts, windows: PolicyWindows, store: EpisodeStore, batch_size: int) -> float:
-    """The mean loss over held-out episodes; every frame counts once, but for those that do not fill a run."""
+    """The mean loss over held-out episodes: every frame lies in one run, the first of an episode may be shorter."""
     ends = [
         torch.arange(end - 1, start - 1, -windows.n_windows)
         for start, end in zip(store.starts, store.ends, strict=True)
