@@ -1,13 +1,15 @@
 """What is borrowed from the inside of LeRobot and torch is there, and borrowed in one place: a new version fails here first."""
 
 import ast
+import inspect
 from pathlib import Path
+from pkgutil import resolve_name
 
 import pytest
 import torch
 
 from lerobot_playbyear import compat
-from lerobot_playbyear.compat import BORROWED, Borrowed, CompatError
+from lerobot_playbyear.compat import BORROWED, CompatError
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = (ROOT / "lerobot_playbyear", ROOT / "envs")
@@ -18,37 +20,80 @@ OWN = {
     "_max_episode_steps",  # of our own environments, where LeRobot asks for it
     "_exit",  # of the standard library, documented
 }
+_PAD = "a gamepad that is not plugged in is not noticed"
+SAID = [
+    # Methods and arguments of ours that LeRobot has to call and to give
+    (
+        "policies.pretrained:PreTrainedPolicy.save_pretrained",
+        "self._save_pretrained(",
+        "policies on a GPU cannot be saved: their LSTM's weights are views of one buffer",
+    ),
+    (
+        "policies.pretrained:PreTrainedPolicy.from_pretrained",
+        "cls._load_as_safetensor(",
+        "weights that a checkpoint lacks stay at random without a word",
+    ),
+    (
+        "policies.pretrained:PreTrainedPolicy.push_model_to_hub",
+        "self.generate_model_card(",
+        "a policy's card does not say what it hears",
+    ),
+    (
+        "policies.factory:make_policy",
+        "set_dataset_feature_metadata(ds_meta.features)",
+        "the policy does not take its sample rate from the dataset",
+    ),
+    (
+        "policies.factory:make_policy",
+        'kwargs["dataset_meta"] = ds_meta',
+        "lerobot-train takes a dataset of another frame rate without a word",
+    ),
+    (
+        "configs.parser:wrap",
+        "argtype.__get_path_fields__()",
+        "playbyear-dagger and playbyear-video do not take --policy.path",
+    ),
+    # Attributes of LeRobot's objects
+    (
+        "datasets.dataset_metadata:LeRobotDatasetMetadata",
+        "self._metadata_buffer.clear()",
+        "an episode that could not be saved leaves a row in the dataset",
+    ),
+    (
+        "datasets.dataset_writer:DatasetWriter",
+        "self._streaming_encoder.finish_episode()",
+        "an episode that was filmed while it came in is lost when its saving fails",
+    ),
+    ("teleoperators.keyboard:KeyboardTeleop", "self.current_pressed[", "held keys are forgotten at every step"),
+    ("teleoperators.gamepad:GamepadTeleop", "self.gamepad = ", _PAD),
+    ("teleoperators.gamepad.gamepad_utils:GamepadController", "self.running = False", _PAD),
+]
+"""Where in LeRobot, what its source says there, and what does not work without."""
 
 
 @pytest.mark.parametrize("name", BORROWED)
 def test_what_is_borrowed_is_there(name):
-    if "mkldnn" in BORROWED[name].where and not torch.backends.mkldnn.is_available():
+    if "mkldnn" in BORROWED[name][0] and not torch.backends.mkldnn.is_available():
         pytest.skip("this build of torch has no oneDNN, and the policy does without")
-    BORROWED[name].load()
+    compat.load(*BORROWED[name])
 
 
-@pytest.mark.parametrize(
-    ("gone", "what"),
-    [
-        (
-            Borrowed("lerobot.policies.elsewhere:make", "lerobot 0.6.1", "nothing works"),
-            "there is no lerobot.policies.else",
-        ),
-        (
-            Borrowed("lerobot.policies:make_nothing", "lerobot 0.6.1", "nothing works"),
-            "there is no lerobot.policies:make_n",
-        ),
-        (
-            Borrowed("lerobot.policies.factory:make_policy", "lerobot 0.6.1", "nothing works", says="self._else"),
-            "make_policy does nothing with `self._else`",
-        ),
-    ],
-)
-def test_what_is_gone_is_missed_with_a_sentence(gone, what):
+@pytest.mark.parametrize(("where", "says", "breaks"), SAID)
+def test_lerobot_does_with_ours_what_we_hold_on_to(where, says, breaks):
+    assert says in inspect.getsource(resolve_name(f"lerobot.{where}")), f"{where} changed. Without it: {breaks}"
+
+
+def test_torch_counts_changes():
+    assert hasattr(torch.Tensor, "_version"), "a policy goes on acting by weights from before an update"
+
+
+@pytest.mark.parametrize("gone", ["lerobot.policies.elsewhere:make", "lerobot.policies:make_nothing"])
+def test_what_is_gone_is_missed_with_a_sentence(gone):
     with pytest.raises(
-        CompatError, match=rf"In lerobot [\d.]+ .*{what}.* in lerobot 0\.6\.1\. Without it: nothing works"
+        CompatError,
+        match=rf"In lerobot [\d.]+ there is no {gone} .* in lerobot 0\.6\.1\. Without it: nothing works",
     ):
-        gone.load()
+        compat.load(gone, "nothing works")
 
 
 def test_functions_are_imported_by_their_name():

@@ -15,9 +15,10 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import DaggerError, Expert, ExpertConfig, Verdict
+from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
 from lerobot_playbyear.dagger.loop import outcome_of
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
@@ -311,7 +312,7 @@ def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
 
 
 def test_an_expert_that_rescues_nothing_is_an_error(tmp_path):
-    with pytest.raises(DaggerError, match="3 of 3 attempts in a row failed in spite of the expert"):
+    with pytest.raises(PlaybyearError, match="3 of 3 attempts in a row failed in spite of the expert"):
         dagger(tmp_path, "--expert.type=test_verdicts", "--max_attempts=3")
 
 

@@ -142,11 +142,6 @@ def test_without_a_single_correction_there_is_a_clear_error():
         BalancedBatches(windows(4), store([40]), store([14], "." * 14), 8)
 
 
-def test_half_a_batch_must_be_a_whole_number():
-    with pytest.raises(ValueError, match="--batch_size=7 must be even"):
-        BalancedBatches(windows(4), store([40]), None, 7)
-
-
 def other_policys_windows(tmp_path, action_delta_indices):
     """What a policy of LeRobot's own is trained on: windows, demonstrations, attempts with random corrections."""
     make_dataset(tmp_path / "demos", (12, 9), image_size=8)

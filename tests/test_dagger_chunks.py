@@ -13,7 +13,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from safetensors.torch import load_file
 
-from lerobot_playbyear.dagger import DaggerError
+from lerobot_playbyear.datasets.errors import PlaybyearError
 
 FEATURES = dataset_features(image_size=16, microphones=())
 BY_EXPERT = "...xx......xxx.......x..."
@@ -93,7 +93,7 @@ def test_a_policy_whose_loss_knows_no_mask_is_refused_before_any_work(demos, tmp
     policy = checkpoint(vqbet, demos, tmp_path / "vqbet")
     attempts(tmp_path / "attempts", by_policy=0.0)
 
-    with pytest.raises(DaggerError, match=r"'vqbet' learns chunks of 11 actions.*would be imitated.*such as act"):
+    with pytest.raises(PlaybyearError, match=r"'vqbet' learns chunks of 11 actions.*would be imitated.*such as act"):
         corrected(policy, demos, tmp_path / "attempts", tmp_path / "out")
 
     assert not (tmp_path / "out").exists()

@@ -14,8 +14,10 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import DaggerConfig, DaggerError
+from lerobot_playbyear.dagger import DaggerConfig, loop
 from lerobot_playbyear.dagger.config import DatasetSource
+from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.episodes import frames, saving
 from lerobot_playbyear.scripts import dagger as dagger_script
 
 
@@ -44,7 +46,7 @@ def test_demonstrations_that_the_policy_was_not_made_for(features, message, tmp_
     features = {"image_size": 16, **features}
     fps = features.get("fps", 20)
     make_dataset(tmp_path / "demos", (5,), fps, features=dataset_features(**features))
-    with pytest.raises(DaggerError, match=message):
+    with pytest.raises(PlaybyearError, match=message):
         dagger(tmp_path, *QUICK, f"--demos.root={tmp_path / 'demos'}")
     assert not (tmp_path / "out").exists()
     assert not (tmp_path / "corrections").exists()
@@ -67,7 +69,7 @@ def test_demonstrations_that_the_policy_was_not_made_for(features, message, tmp_
     ],
 )
 def test_options_that_do_not_go_together(options, message, tmp_path):
-    with pytest.raises(DaggerError, match=message):
+    with pytest.raises(PlaybyearError, match=message):
         dagger(tmp_path, *QUICK, *options)
     assert not (tmp_path / "out").exists()
 
@@ -83,17 +85,17 @@ def test_options_that_do_not_go_together(options, message, tmp_path):
     ],
 )
 def test_numbers_out_of_their_range(options, message):
-    with pytest.raises(DaggerError, match=message):
+    with pytest.raises(PlaybyearError, match=message):
         DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), env=PlaybyearEnvConfig(), **options).check()
 
 
 def test_without_an_environment_or_a_policy(tmp_path):
     with pytest.raises(
-        DaggerError, match=r"No environment: give --env.type and --env.task, or --episodes=0 --updates=N"
+        PlaybyearError, match=r"No environment: give --env.type and --env.task, or --episodes=0 --updates=N"
     ):
         command(*arguments(tmp_path, "--episodes=1", env=()))
     without = [option for option in arguments(tmp_path, *QUICK) if not option.startswith("--policy")]
-    with pytest.raises(DaggerError, match=r"HG-DAgger improves a trained policy: give .* --policy.path"):
+    with pytest.raises(PlaybyearError, match=r"HG-DAgger improves a trained policy: give .* --policy.path"):
         command(*without)
 
 
@@ -101,7 +103,7 @@ def test_an_environment_without_a_gate(tmp_path, monkeypatch):
     from gym_playbyear.occluded_grasp import OccludedGraspEnv
 
     monkeypatch.setattr(OccludedGraspEnv, "intervention_gate", None)
-    with pytest.raises(DaggerError, match=r"needs an environment with `intervention_gate\(\)`.*own_expert.py"):
+    with pytest.raises(PlaybyearError, match=r"needs an environment with `intervention_gate\(\)`.*own_expert.py"):
         dagger(tmp_path)
 
 
@@ -116,7 +118,7 @@ def finished(tmp_path_factory):
 
 
 def test_the_folder_of_a_run_is_not_touched_without_resume(finished):
-    with pytest.raises(DaggerError, match=r"holds a run already: go on with it with --resume=true"):
+    with pytest.raises(PlaybyearError, match=r"holds a run already: go on with it with --resume=true"):
         dagger(finished, *QUICK)
 
 
@@ -131,12 +133,12 @@ def test_the_folder_of_a_run_is_not_touched_without_resume(finished):
     ],
 )
 def test_resuming_another_run_names_the_difference(finished, options, difference):
-    with pytest.raises(DaggerError, match=f"holds another run: {difference}"):
+    with pytest.raises(PlaybyearError, match=f"holds another run: {difference}"):
         dagger(finished, "--resume=true", *QUICK, *options)
 
 
 def test_the_output_of_another_command_is_refused(tmp_path):
-    with pytest.raises(DaggerError, match=r"holds files, but no run of playbyear-dagger"):
+    with pytest.raises(PlaybyearError, match=r"holds files, but no run of playbyear-dagger"):
         dagger(tmp_path, *QUICK, "--resume=true", f"--output_dir={base_folder() / 'train'}")
 
 
@@ -145,18 +147,41 @@ def test_a_dataset_that_something_else_changed_is_refused(finished, tmp_path):
     state = json.loads((tmp_path / "out/dagger_state.json").read_text())
     state["kept"] = state["round"] = 5
     (tmp_path / "out/dagger_state.json").write_text(json.dumps(state))
-    with pytest.raises(DaggerError, match="holds 1 attempts, and this run knows of 5"):
+    with pytest.raises(PlaybyearError, match="holds 1 attempts, and this run knows of 5"):
         command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=8")
 
 
 def test_nothing_to_do_is_said(finished, tmp_path):
-    with pytest.raises(DaggerError, match="holds 1 attempts already, and --episodes=1 asks for no more"):
+    with pytest.raises(PlaybyearError, match="holds 1 attempts already, and --episodes=1 asks for no more"):
         dagger(finished, *QUICK, "--episodes=1", f"--output_dir={tmp_path / 'out'}")
 
 
 def test_the_command_says_in_one_line_what_is_wrong(finished, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(finished, *QUICK)])
     with pytest.raises(SystemExit, match=r"^error: --output_dir=.* holds a run already"):
+        dagger_script.main()
+
+
+def test_a_fault_of_the_program_shows_where_it_happened(monkeypatch, tmp_path):
+    def play(*args, **kwargs):
+        raise ValueError("a fault")
+
+    monkeypatch.setattr(loop, "play", play)
+    monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(tmp_path, *QUICK)])
+    with pytest.raises(ValueError, match=r"^a fault$") as error:
+        dagger_script.main()
+    assert not isinstance(error.value, PlaybyearError)
+
+
+def test_an_environment_that_breaks_its_word_in_the_middle_is_told_in_one_line(monkeypatch, tmp_path):
+    def episode_frames(*args):
+        return [
+            {**frame, "observation.state": frame["observation.state"][:-1]} for frame in frames.episode_frames(*args)
+        ]
+
+    monkeypatch.setattr(saving, "episode_frames", episode_frames)
+    monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(tmp_path, *QUICK)])
+    with pytest.raises(SystemExit, match=r"^error: .*observation\.state"):
         dagger_script.main()
 
 
@@ -208,7 +233,9 @@ def test_demonstrations_alone_are_the_control(tmp_path):
 
 def test_corrections_without_a_correction(tmp_path):
     rollout_dataset(tmp_path / "rollout", (20,), lambda step: False)
-    with pytest.raises(DaggerError, match="None of the 20 frames of the intervention dataset has 'intervention' set"):
+    with pytest.raises(
+        PlaybyearError, match="None of the 20 frames of the intervention dataset has 'intervention' set"
+    ):
         learn(tmp_path, tmp_path / "rollout")
 
 
@@ -216,17 +243,19 @@ def test_corrections_that_do_not_say_who_acted(tmp_path):
     features = dataset_features(image_size=16)
     del features["intervention"]
     make_dataset(tmp_path / "data", (20,), features=features)
-    with pytest.raises(DaggerError, match=r"wanted 'intervention', bool \(1,\), and there is no such feature"):
+    with pytest.raises(PlaybyearError, match=r"wanted 'intervention', bool \(1,\), and there is no such feature"):
         learn(tmp_path, tmp_path / "data")
 
 
 def test_corrections_that_are_empty(tmp_path):
     LeRobotDataset.create("tests/corrections", 20, dataset_features(image_size=16), root=tmp_path / "data").finalize()
-    with pytest.raises(DaggerError, match="is empty"):
+    with pytest.raises(PlaybyearError, match="is empty"):
         learn(tmp_path, tmp_path / "data")
 
 
 def test_corrections_that_differ_from_the_demonstrations(tmp_path):
     make_dataset(tmp_path / "data", (20,), features=dataset_features(image_size=16, state_size=5))
-    with pytest.raises(DaggerError, match=r"the corrections differ: 'observation.state' is float32 \(7,\) there and"):
+    with pytest.raises(
+        PlaybyearError, match=r"the corrections differ: 'observation.state' is float32 \(7,\) there and"
+    ):
         learn(tmp_path, tmp_path / "data")

@@ -24,9 +24,9 @@ from dagger_factory import (
 from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
-from lerobot_playbyear.dagger import DaggerError
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.training.parts import TrainingParts
 
 RUN = (*QUICK, "--episodes=3", "--warmup_episodes=2")
@@ -265,7 +265,7 @@ def test_a_full_disk_is_reported_and_harms_nothing(tmp_path, n_bytes, message):
     run = (*RUN, "--env.episode_length=70", "--expert.n_steps=60")
     dagger(tmp_path, *run, "--episodes=2")
     before = weights(tmp_path), seeds(tmp_path)
-    with small_disk(n_bytes), pytest.raises(DaggerError, match=message):
+    with small_disk(n_bytes), pytest.raises(PlaybyearError, match=message):
         command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=4")
     assert seeds(tmp_path)[:2] == before[1]
     assert all(torch.equal(weights(tmp_path)[key], before[0][key]) for key in before[0])

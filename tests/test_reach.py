@@ -14,7 +14,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_playbyear.dagger import DaggerError
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training import loop
@@ -228,7 +228,7 @@ def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wide
 
 
 def test_the_range_of_a_trained_policy_is_not_changed_while_it_acts(base, tmp_path):
-    with pytest.raises(DaggerError, match=r"action_range=2.0.*trained with 1.0.*playbyear-train --policy.path"):
+    with pytest.raises(PlaybyearError, match=r"action_range=2.0.*trained with 1.0.*playbyear-train --policy.path"):
         dagger(base, tmp_path, *ENV, *QUICK, "--policy.action_range=2.0")
     assert not (tmp_path / "out").exists()
 

@@ -16,9 +16,11 @@ from lerobot.envs import EnvConfig
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.episodes import frames, saving
 from lerobot_playbyear.episodes.environment import RolloutError, env_spec
 from lerobot_playbyear.episodes.pool import RolloutPool
-from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, RecordError, record
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 
 
 def config(root: Path, num_episodes: int = 2, **options) -> RecordConfig:
@@ -125,12 +127,12 @@ def test_video_and_two_microphones(tmp_path):
 
 
 def test_an_existing_dataset_is_not_touched_without_resume(recorded):
-    with pytest.raises(RecordError, match=r"already holds a dataset.*resume=true"):
+    with pytest.raises(PlaybyearError, match=r"already holds a dataset.*resume=true"):
         record(config(recorded))
 
 
 def test_resuming_with_other_settings_names_the_difference(recorded):
-    with pytest.raises(RecordError, match=r"observation\.audio\.gripper is int16 \(800,\) at 16000 Hz there and"):
+    with pytest.raises(PlaybyearError, match=r"observation\.audio\.gripper is int16 \(800,\) at 16000 Hz there and"):
         record(config(recorded, 4, resume=True, env=PlaybyearEnvConfig(sample_rate=48000)))
     with pytest.raises(ValueError, match="fps is 20 there and 30 here"):
         DurableWriter(
@@ -140,24 +142,24 @@ def test_resuming_with_other_settings_names_the_difference(recorded):
 
 def test_a_folder_with_other_files_is_refused(tmp_path):
     (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(RecordError, match="is not empty and holds no dataset"):
+    with pytest.raises(PlaybyearError, match="is not empty and holds no dataset"):
         record(config(tmp_path, resume=True))
 
 
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordError, match="Cannot write"):
+    with pytest.raises(PlaybyearError, match="Cannot write"):
         record(config(tmp_path / "file" / "dataset"))
 
 
 def test_an_expert_that_never_succeeds(tmp_path):
-    with pytest.raises(RecordError, match="failed 20 times in a row"):
+    with pytest.raises(PlaybyearError, match="failed 20 times in a row"):
         record(config(tmp_path / "dataset", env=PlaybyearEnvConfig(episode_length=3)))
 
 
 def test_an_environment_that_does_not_start_says_why(tmp_path):
     env = PlaybyearEnvConfig(microphones=["ceiling"])
-    with pytest.raises(RecordError, match=r"does not start.*ceiling"):
+    with pytest.raises(PlaybyearError, match=r"does not start.*ceiling"):
         record(config(tmp_path / "dataset", env=env, num_workers=1))
 
 
@@ -165,7 +167,7 @@ def test_without_an_opengl_library_it_says_what_to_install(tmp_path, monkeypatch
     monkeypatch.setenv("MUJOCO_GL", "glfw")  # in the worker: needs a display
     for display in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(display, raising=False)
-    with pytest.raises(RecordError, match=r"No OpenGL context.*libegl1"):
+    with pytest.raises(PlaybyearError, match=r"No OpenGL context.*libegl1"):
         record(config(tmp_path / "dataset", num_workers=1))
     assert not (tmp_path / "dataset").exists()
 
@@ -207,9 +209,28 @@ class WithoutExpert(gym.Env):
 
 def test_an_environment_without_an_expert(tmp_path):
     gym.register("Nothing-v0", WithoutExpert)
-    with pytest.raises(RecordError, match="has no scripted expert"):
+    with pytest.raises(PlaybyearError, match="has no scripted expert"):
         record(config(tmp_path / "dataset", env=WithoutExpertConfig()))
     assert not (tmp_path / "dataset").exists()
+
+
+def test_a_fault_of_the_program_shows_where_it_happened(tmp_path, monkeypatch):
+    def save_episode(*args):
+        raise ValueError("a fault")
+
+    monkeypatch.setattr("lerobot_playbyear.recording.record.save_episode", save_episode)
+    with pytest.raises(ValueError, match=r"^a fault$") as error:
+        record(config(tmp_path / "dataset"))
+    assert not isinstance(error.value, PlaybyearError)
+
+
+def test_an_environment_that_breaks_its_word_in_the_middle_is_an_error_of_input(tmp_path, monkeypatch):
+    def frames_of(*args):
+        return [{**frame, "action": frame["action"][:-1]} for frame in frames.episode_frames(*args)]
+
+    monkeypatch.setattr(saving, "episode_frames", frames_of)
+    with pytest.raises(PlaybyearError, match="action"):
+        record(config(tmp_path / "dataset"))
 
 
 def test_the_command_prints_one_line_for_an_unknown_task(tmp_path):

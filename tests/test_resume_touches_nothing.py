@@ -14,9 +14,10 @@ from recording_factory import FEATURES, FPS, REPO_ID, differences, episode_frame
 
 from lerobot_playbyear.datasets import settling
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.existing import has_dataset
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, repair_dataset
-from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, RecordError, record
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 
 N_EPISODES = 4
 
@@ -197,6 +198,6 @@ def test_the_recording_command_says_what_to_do_and_touches_nothing(tmp_path):
     cut(data_files(root)[0])
     before = everything(tmp_path)
     dataset.num_episodes = 2
-    with pytest.raises(RecordError, match=r"playbyear-repair --root="):
+    with pytest.raises(PlaybyearError, match=r"playbyear-repair --root="):
         record(RecordConfig(PlaybyearEnvConfig(), dataset, num_workers=0, resume=True))
     assert everything(tmp_path) == before

@@ -21,10 +21,11 @@ from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
 from lerobot_playbyear.dagger.config import DatasetSource
 from lerobot_playbyear.dagger.loop import outcome_of
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play as play_episode
 from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
-from lerobot_playbyear.recording.record import RecordDatasetConfig, RecordError
+from lerobot_playbyear.recording.record import RecordDatasetConfig
 from lerobot_playbyear.teleoperation.actions import CLOSE, DELTAS, OPEN, STAY, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
 from lerobot_playbyear.teleoperation.controls import Controls
@@ -620,5 +621,5 @@ def test_only_a_script_or_a_person_demonstrates(tmp_path):
 
     dataset = RecordDatasetConfig("test/none", str(tmp_path / "none"))
     cfg = DemonstrationConfig(PlaybyearEnvConfig(), dataset, expert=CorrectsOnly())
-    with pytest.raises(RecordError, match="scripted or teleop"):
+    with pytest.raises(PlaybyearError, match="scripted or teleop"):
         record_demonstrations(cfg)

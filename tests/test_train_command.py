@@ -16,11 +16,12 @@ from safetensors.torch import load_file
 from torch.utils.data import default_collate
 
 from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts import train as train_script
 from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
-from lerobot_playbyear.training.loop import TrainError, frame_weights
+from lerobot_playbyear.training.loop import frame_weights
 from lerobot_playbyear.training.parts import PolicyWindows
 from lerobot_playbyear.training.presets import PRESETS, apply_preset
 
@@ -261,11 +262,11 @@ def test_a_truncated_dataset_and_an_existing_output_are_refused(command, tmp_pat
     make_dataset(tmp_path / "data", (3,), image_size=8)
     (tmp_path / "out").mkdir()
 
-    with pytest.raises(TrainError, match="already exists"):
+    with pytest.raises(PlaybyearError, match="already exists"):
         command(train, *TINY, *data(tmp_path / "data"), f"--output_dir={tmp_path / 'out'}")
     path = next((tmp_path / "data" / "data").glob("*/*.parquet"))
     path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(TrainError, match="is truncated"):
+    with pytest.raises(PlaybyearError, match="is truncated"):
         command(train, *TINY, *data(tmp_path / "data"), f"--output_dir={tmp_path / 'new'}")
 
 

@@ -1,16 +1,17 @@
 """HG-DAgger: an expert corrects a policy while it works, and the policy learns from the corrections."""
 
-from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
+from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.run import run_dagger
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig
 
 __all__ = [
     "DaggerConfig",
-    "DaggerError",
     "Expert",
     "ExpertConfig",
     "ExpertError",
+    "InputError",
     "ScriptedExpertConfig",
     "Verdict",
     "run_dagger",

@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.frames import INTERVENTION
 from lerobot_playbyear.training.parts import PolicyWindows
 
@@ -33,7 +34,7 @@ class BalancedBatches:
         seed: Of the random numbers.
 
     Raises:
-        ValueError: The batch size is odd, or no frame of `interventions` is an intervention.
+        InputError: No frame of `interventions` is an intervention.
     """
 
     def __init__(
@@ -44,10 +45,6 @@ class BalancedBatches:
         batch_size: int,
         seed: int = 0,
     ) -> None:
-        if batch_size < 2 or batch_size % 2:
-            raise ValueError(
-                f"--batch_size={batch_size} must be even: half of each batch comes from the demonstrations."
-            )
         self._windows, self._seed, self._n_half = windows, seed, batch_size // 2
         self._demonstrations, self._interventions = demonstrations, interventions
         self._deltas = {INTERVENTION: windows.action_deltas}
@@ -60,11 +57,11 @@ class BalancedBatches:
         """Take in a store, or the episodes that were appended to it since the last time.
 
         Raises:
-            ValueError: No frame is an intervention.
+            InputError: No frame is an intervention.
         """
         weights = intervention_run_weights(interventions, self._windows.n_windows)
         if not weights.any():
-            raise ValueError(
+            raise InputError(
                 f"None of the {len(interventions)} frames of the intervention dataset has '{INTERVENTION}' set: there is "
                 "nothing to learn from an expert. Give a dataset of corrections, or collect some with --episodes."
             )

@@ -10,8 +10,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_playbyear.dagger.config import DaggerError
 from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.frames import INTERVENTION
 from lerobot_playbyear.training.parts import PolicyWindows, TrainingParts, check_dataset_suits, dataset_names
 
@@ -30,7 +30,7 @@ def check_dataset(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename
     for name in names.values():
         seen_rate = (meta.features[name].get("info") or {}).get("sample_rate")
         if rate is not None and seen_rate is not None and int(seen_rate) != int(rate):
-            raise DaggerError(
+            raise InputError(
                 f"'{name}' was recorded at {seen_rate} Hz in the dataset '{meta.repo_id}', and the policy was trained with "
                 f"{rate} Hz: use data recorded at {rate} Hz, or train a policy for {seen_rate} Hz first."
             )
@@ -38,12 +38,12 @@ def check_dataset(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename
     for key, feature in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
         name = names.get(key, key)
         if name not in meta.features:
-            raise DaggerError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
+            raise InputError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
         seen = tuple(meta.features[name]["shape"])
         wanted = tuple(feature.shape)
         same = sorted(seen) == sorted(wanted) if feature.type is FeatureType.VISUAL else seen == wanted
         if not same:
-            raise DaggerError(
+            raise InputError(
                 f"'{name}' has shape {seen} in the dataset '{meta.repo_id}', and the policy was trained with {wanted}: use "
                 "the data that it was trained with, or data recorded alike."
             )
@@ -60,7 +60,7 @@ def check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, other: Featu
         what: What `other` is, for the message.
 
     Raises:
-        DaggerError: With every difference.
+        InputError: With every difference.
     """
     differences = [f"fps is {demos.fps} there and {fps} here"] if demos.fps != fps else []
     for key in (*keys, ACTION):
@@ -70,7 +70,7 @@ def check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, other: Featu
         if there != here:
             differences.append(f"'{key}' is {there} there and {here} here")
     if differences:
-        raise DaggerError(
+        raise InputError(
             f"The demonstrations '{demos.repo_id}' and {what} differ: {'; '.join(differences)}. Record with the same "
             "settings, or choose the environment's options (--env.*) as they were in the demonstrations."
         )
@@ -80,12 +80,12 @@ def check_corrections(meta: LeRobotDatasetMetadata) -> None:
     """Refuse a dataset without the feature `intervention`.
 
     Raises:
-        DaggerError: It is missing or not a bool of shape (1,).
+        InputError: It is missing or not a bool of shape (1,).
     """
     feature = meta.features.get(INTERVENTION)
     if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
         seen = "no such feature" if feature is None else f"{feature['dtype']} {tuple(feature['shape'])}"
-        raise DaggerError(
+        raise InputError(
             f"The dataset '{meta.repo_id}' does not say which frames an expert chose: wanted '{INTERVENTION}', bool (1,), and "
             f"there is {seen}. Give one that playbyear-dagger or lerobot-rollout --strategy.type=dagger wrote."
         )
@@ -99,11 +99,11 @@ def check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig) -> N
         trained: As its checkpoint says.
 
     Raises:
-        DaggerError: Their action ranges differ.
+        InputError: Their action ranges differ.
     """
     wanted, seen = (getattr(config, "action_range", None) for config in (policy, trained))
     if wanted != seen:
-        raise DaggerError(
+        raise InputError(
             f"--policy.action_range={wanted}: the policy was trained with {seen}, and would act differently from now on. "
             f"Train it on its demonstrations first: playbyear-train --policy.path={policy.pretrained_path} "
             f"--policy.action_range={wanted}."
@@ -116,7 +116,7 @@ def check_actions_can_be_masked(parts: TrainingParts, windows: PolicyWindows, de
     Whether it can is tried: with all actions masked by `action_is_pad`, no action may matter to the loss.
 
     Raises:
-        DaggerError: It cannot; with what to do.
+        InputError: It cannot; with what to do.
     """
     n_actions = len(windows.action_deltas)
     if n_actions <= 1:
@@ -133,7 +133,7 @@ def check_actions_can_be_masked(parts: TrainingParts, windows: PolicyWindows, de
     remedy = "Take a policy whose loss does, such as act, or one of single actions."
     if getattr(config, "do_mask_loss_for_padding", True) is False:
         remedy = "Give --policy.do_mask_loss_for_padding=true."
-    raise DaggerError(
+    raise InputError(
         f"The policy '{config.type}' learns chunks of {n_actions} actions, and its loss does not leave out those that "
         f"'{ACTION}_is_pad' masks: what the policy itself did before and after a correction would be imitated. {remedy}"
     )

@@ -13,6 +13,7 @@ from lerobot.configs.default import DatasetConfig, EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 
@@ -20,8 +21,8 @@ CONFIG_NAME = "dagger_config.json"
 """File in the output folder with the options of the run."""
 
 
-class DaggerError(ValueError):
-    """What a person asked for cannot be done, or not go on; the message says why, and what to do."""
+_FROM_0 = "episodes updates_per_episode updates episode_seed seed eval_every save_every eval_videos"
+_LEAST = dict.fromkeys(_FROM_0.split(), 0) | {"warmup_episodes": 1, "max_attempts": 1}
 
 
 @dataclass
@@ -133,28 +134,20 @@ class DaggerConfig:
         return range(self.seed, self.seed + n_batches * self.eval.batch_size)
 
     def check(self) -> None:
-        """Raise a DaggerError if a number is out of its range or an option is missing."""
-        least = {
-            "episodes": 0,
-            "updates_per_episode": 0,
-            "warmup_episodes": 1,
-            "updates": 0,
-            "episode_seed": 0,
-            "seed": 0,
-        }
-        for name, value in {**least, "max_attempts": 1, "eval_every": 0, "save_every": 0, "eval_videos": 0}.items():
-            if getattr(self, name) < value:
-                raise DaggerError(f"--{name}={getattr(self, name)}: give at least {value}.")
+        """Raise a InputError if a number is out of its range or an option is missing."""
+        for name, least in _LEAST.items():
+            if getattr(self, name) < least:
+                raise InputError(f"--{name}={getattr(self, name)}: give at least {least}.")
         if self.learning_rate is not None and not self.learning_rate > 0:
-            raise DaggerError(f"--learning_rate={self.learning_rate} must be above 0.")
+            raise InputError(f"--learning_rate={self.learning_rate} must be above 0.")
         if self.batch_size < 2 or self.batch_size % 2:
-            raise DaggerError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
+            raise InputError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
         if self.is_online and self.updates:
-            raise DaggerError("--updates is for --episodes=0; with episodes give --updates_per_episode.")
+            raise InputError("--updates is for --episodes=0; with episodes give --updates_per_episode.")
         if not self.is_online and not self.updates:
-            raise DaggerError("--episodes=0 collects nothing: give --updates, how many to make from what is there.")
+            raise InputError("--episodes=0 collects nothing: give --updates, how many to make from what is there.")
         if self.is_online and self.env is None:
-            raise DaggerError(
+            raise InputError(
                 "No environment: give --env.type and --env.task, or --episodes=0 --updates=N to learn from recorded "
                 "corrections alone."
             )

@@ -8,7 +8,7 @@ import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
 from lerobot_playbyear.dagger.checks import check_corrections
-from lerobot_playbyear.dagger.config import DaggerError, DatasetSource
+from lerobot_playbyear.dagger.config import DatasetSource
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.episodes.episode import Episode
@@ -38,7 +38,7 @@ class Corrections:
         """Of the dataset, on disk or on the Hub.
 
         Raises:
-            DaggerError: It does not say which frames an expert chose.
+            InputError: It does not say which frames an expert chose.
             ValueError: It is empty or damaged.
         """
         check_dataset_files(self._source.repo_id, self._source.root)
@@ -103,8 +103,7 @@ class Corrections:
 
     def last(self) -> dict[str, Any]:
         """Figures of the last attempt: its seed, its length and how much of it the expert chose."""
-        if self.store is None:
-            raise DaggerError(f"The intervention dataset in {self._source.folder} is empty.")
+        assert self.store is not None
         start, end = self.store.starts[-1], self.store.ends[-1]
         share = self.store.column(INTERVENTION)[start:end].float().mean()
         seed = self.store.column(SEED)[end - 1]

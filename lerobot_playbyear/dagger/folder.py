@@ -17,7 +17,8 @@ from typing import Any
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
-from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError
+from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
 
@@ -87,17 +88,17 @@ class RunFolder:
             The state of the run, or None when a new one begins.
 
         Raises:
-            DaggerError: The folder holds a run and `resume` is off, or it holds something else.
+            InputError: The folder holds a run and `resume` is off, or it holds something else.
         """
         is_run = (self.path / CONFIG_NAME).is_file()
         if not self.path.exists() or not any(self.path.iterdir()):
             return None
         if not is_run:
-            raise DaggerError(
+            raise InputError(
                 f"--output_dir={self.path} holds files, but no run of playbyear-dagger (no {CONFIG_NAME}): choose another."
             )
         if not resume:
-            raise DaggerError(
+            raise InputError(
                 f"--output_dir={self.path} holds a run already: go on with it with --resume=true, or choose another folder."
             )
         state = self.path / STATE_NAME
@@ -116,7 +117,7 @@ class RunFolder:
         """Make `state` the truth.
 
         Raises:
-            DaggerError: It cannot be written. The state before is unharmed.
+            InputError: It cannot be written. The state before is unharmed.
         """
         with _errors_of_writing(self.path):
             _replace(self.path / STATE_NAME, json.dumps(asdict(state), indent=1))
@@ -125,13 +126,13 @@ class RunFolder:
         """The folder of the newest weights, None before the first update.
 
         Raises:
-            DaggerError: It is not there any more.
+            InputError: It is not there any more.
         """
         if state.checkpoint is None:
             return None
         folder = self.checkpoints / state.checkpoint
         if not folder.is_dir():
-            raise DaggerError(f"{folder} is missing: the run cannot go on without its last checkpoint.")
+            raise InputError(f"{folder} is missing: the run cannot go on without its last checkpoint.")
         return folder
 
     def save_checkpoint(self, name: str, write: Callable[[Path], Any]) -> None:
@@ -142,7 +143,7 @@ class RunFolder:
             write: Writes the files into the folder it is given.
 
         Raises:
-            DaggerError: It cannot be written; those before are unharmed.
+            InputError: It cannot be written; those before are unharmed.
         """
         partial, folder = self.checkpoints / (name + _PARTIAL), self.checkpoints / name
         shutil.rmtree(partial, ignore_errors=True)
@@ -207,7 +208,7 @@ def _errors_of_writing(folder: Path, partial: Path | None = None) -> Iterator[No
     except (OSError, SafetensorError) as error:
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
-        raise DaggerError(
+        raise InputError(
             f"Cannot write to {folder}: {error}. What was saved before is complete; once there is room, go on with "
             "--resume=true."
         ) from error

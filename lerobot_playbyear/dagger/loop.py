@@ -4,6 +4,7 @@ import contextlib
 import io
 import logging
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -13,24 +14,26 @@ from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.compat import get_step_identifier
 from lerobot_playbyear.dagger.batches import BalancedBatches
-from lerobot_playbyear.dagger.config import DaggerConfig, DaggerError
+from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Episode, Verdict
 from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.episodes.play import Seconds, play
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.metrics import make_tracker
 from lerobot_playbyear.training.parts import TrainingParts
 from lerobot_playbyear.training.reach import Reach
+from lerobot_playbyear.training.report import is_due, make_tracker
 
 _ATTEMPT, _UPDATES = 0, 1  # what random numbers are for
 _LOSS_BATCHES = 10**9  # numbers from here on are of batches that are only looked at
 
 
+@dataclass
 class Loop:
     """The rounds of a run.
 
@@ -49,37 +52,29 @@ class Loop:
         scene: The environment, the policy in it, and the expert; None to learn from recorded corrections alone.
     """
 
-    def __init__(
-        self,
-        cfg: DaggerConfig,
-        training: PlaybyearTrainConfig,
-        folder: RunFolder,
-        state: RunState,
-        parts: TrainingParts,
-        demonstrations: EpisodeStore,
-        corrections: Corrections,
-        batches: BalancedBatches,
-        reach: Reach,
-        report: Report,
-        scene: tuple[gym.Env, PolicyActor, Expert] | None,
-    ) -> None:
-        self._cfg, self._training = cfg, training
-        self._folder, self._state = folder, state
-        self._parts, self._batches, self._reach = parts, batches, reach
-        self._demonstrations, self._corrections = demonstrations, corrections
-        self._report, self._scene = report, scene
+    cfg: DaggerConfig
+    training: PlaybyearTrainConfig
+    folder: RunFolder
+    state: RunState
+    parts: TrainingParts
+    demonstrations: EpisodeStore
+    corrections: Corrections
+    batches: BalancedBatches
+    reach: Reach
+    report: Report
+    scene: tuple[gym.Env, PolicyActor, Expert] | None
 
     def run(self) -> None:
         """Go on until the run is complete, or until the policy needs the expert no more.
 
         Raises:
-            DaggerError: No attempt succeeds even with the expert, or something cannot be written.
+            PlaybyearError: No attempt succeeds even with the expert, or something cannot be written.
         """
         self._note_unnoted_attempt()
         self._evaluate_if_due()
         while not self._is_complete():
             start, seconds = time.perf_counter(), Seconds()
-            if self._scene is not None and self._state.kept == self._state.round and not self._collect(seconds):
+            if self.scene is not None and self.state.kept == self.state.round and not self._collect(seconds):
                 break
             losses = self._update(seconds)
             self._finish_round(start, seconds, losses)
@@ -87,52 +82,52 @@ class Loop:
         self._evaluate_if_due(is_last=True)
 
     def _is_complete(self) -> bool:
-        if self._scene is None:
-            return self._state.step >= self._cfg.updates
-        return self._corrections.n_episodes >= self._cfg.episodes and self._state.kept == self._state.round
+        if self.scene is None:
+            return self.state.step >= self.cfg.updates
+        return self.corrections.n_episodes >= self.cfg.episodes and self.state.kept == self.state.round
 
     # Attempts
 
     def _note_unnoted_attempt(self) -> None:
         """Counts an attempt that was written to disk just before the run was killed."""
-        state = self._state
+        state = self.state
         n_noted = (state.first_episodes or 0) + state.kept
-        n_unnoted = self._corrections.n_episodes - n_noted
-        if self._scene is None or n_unnoted == 0:
+        n_unnoted = self.corrections.n_episodes - n_noted
+        if self.scene is None or n_unnoted == 0:
             return
         if n_unnoted != 1 or state.kept != state.round:
-            raise DaggerError(
-                f"The intervention dataset holds {self._corrections.n_episodes} attempts, and this run knows of {n_noted}: "
+            raise InputError(
+                f"The intervention dataset holds {self.corrections.n_episodes} attempts, and this run knows of {n_noted}: "
                 "something else changed it. Begin a new run in another --output_dir; it may append to the same dataset."
             )
-        figures = self._corrections.last()
+        figures = self.corrections.last()
         state.attempts, state.kept, state.next_seed = state.attempts + 1, state.kept + 1, figures["seed"] + 1
-        self._report.write("attempt", {**figures, "outcome": "kept", "success": True, "recovered": True})
-        self._report.advance()
-        self._folder.commit(state)
+        self.report.write("attempt", {**figures, "outcome": "kept", "success": True, "recovered": True})
+        self.report.bar.update(1)
+        self.folder.commit(state)
 
     def _collect(self, seconds: Seconds) -> bool:
         """Attempts until one is kept. Returns False when there is none among `max_attempts`."""
         outcomes: list[str] = []
-        while len(outcomes) < self._cfg.max_attempts:
-            self._report.doing("acting")
+        while len(outcomes) < self.cfg.max_attempts:
+            self.report.doing("acting")
             spent = Seconds()
             episode = self._attempt(spent)
             outcomes.append(outcome_of(episode))
             if outcomes[-1] == "kept":
                 with spent.of("episode_saving"):
-                    self._corrections.append(episode)
-                    assert self._corrections.store is not None
-                    self._batches.set_interventions(self._corrections.store)
+                    self.corrections.append(episode)
+                    assert self.corrections.store is not None
+                    self.batches.set_interventions(self.corrections.store)
             self._note(episode, outcomes[-1], spent)
             seconds.add(spent)
             if outcomes[-1] == "kept":
-                self._report.advance()
+                self.report.bar.update(1)
                 by_expert = torch.from_numpy(episode.actions[episode.interventions])
-                self._reach.warn(by_expert, f"the corrections of attempt {self._state.attempts}")
+                self.reach.warn(by_expert, f"the corrections of attempt {self.state.attempts}")
                 return True
         if outcomes.count("failed") > len(outcomes) / 2:
-            raise DaggerError(
+            raise InputError(
                 f"{outcomes.count('failed')} of {len(outcomes)} attempts in a row failed in spite of the expert: it cannot "
                 "rescue this policy. Begin with a better one, or look at the environment's options."
             )
@@ -142,89 +137,89 @@ class Loop:
         return False
 
     def _attempt(self, spent: Seconds) -> Episode:
-        assert self._scene is not None
-        while self._state.next_seed in self._cfg.eval_seeds:
-            self._state.next_seed += 1
-        set_seed(self._random_seed(_ATTEMPT, self._state.next_seed))
-        env, actor, expert = self._scene
-        return play(env, actor, self._state.next_seed, expert=expert, seconds=spent)
+        assert self.scene is not None
+        while self.state.next_seed in self.cfg.eval_seeds:
+            self.state.next_seed += 1
+        set_seed(self._random_seed(_ATTEMPT, self.state.next_seed))
+        env, actor, expert = self.scene
+        return play(env, actor, self.state.next_seed, expert=expert, seconds=spent)
 
     def _note(self, episode: Episode, outcome: str, spent: Seconds) -> None:
         """Counts an attempt."""
-        state = self._state
+        state = self.state
         state.attempts += 1
         setattr(state, outcome, getattr(state, outcome) + 1)
         state.next_seed = episode.seed + 1
-        self._report.attempt(episode, outcome, spent.spent)
-        self._folder.commit(state)
+        self.report.attempt(episode, outcome, spent.spent)
+        self.folder.commit(state)
 
     # Learning
 
     def _n_updates(self) -> int:
-        if self._scene is None:
-            return min(max(self._cfg.updates_per_episode, 1), self._cfg.updates - self._state.step)
-        is_warm = (self._state.first_episodes or 0) + self._state.kept >= self._cfg.warmup_episodes
-        return self._cfg.updates_per_episode if is_warm else 0
+        if self.scene is None:
+            return min(max(self.cfg.updates_per_episode, 1), self.cfg.updates - self.state.step)
+        is_warm = (self.state.first_episodes or 0) + self.state.kept >= self.cfg.warmup_episodes
+        return self.cfg.updates_per_episode if is_warm else 0
 
     def _update(self, seconds: Seconds) -> dict[str, Any]:
         """The round's updates. Returns losses and the like, none without updates."""
         n_updates = self._n_updates()
         if n_updates == 0:
             return {}
-        parts = self._parts
-        assert self._training.optimizer is not None
-        set_seed(self._random_seed(_UPDATES, self._state.round))
-        tracker = make_tracker(self._cfg.batch_size, self._demonstrations, parts.step)
+        parts = self.parts
+        assert self.training.optimizer is not None
+        set_seed(self._random_seed(_UPDATES, self.state.round))
+        tracker = make_tracker(self.cfg.batch_size, self.demonstrations, parts.step)
         for number in range(n_updates):
-            self._report.doing(f"learning {number + 1}/{n_updates}")
+            self.report.doing(f"learning {number + 1}/{n_updates}")
             with seconds.of("batch"):
-                batch = self._batches.batch(parts.step)
+                batch = self.batches.batch(parts.step)
             for group in parts.optimizer.param_groups:
-                group["lr"] = self._cfg.rate(parts.step, number, n_updates)
+                group["lr"] = self.cfg.rate(parts.step, number, n_updates)
             with seconds.of("update"):
-                parts.update(batch, tracker, self._training.optimizer.grad_clip_norm)
+                parts.update(batch, tracker, self.training.optimizer.grad_clip_norm)
             tracker.step()
-            if self._scene is None:
-                self._report.advance()
+            if self.scene is None:
+                self.report.bar.update(1)
         figures = {key: tracker.to_dict()[key] for key in ("loss", "grad_norm")}
         with seconds.of("loss"):
-            halves = self._batches.halves(_LOSS_BATCHES + self._state.round)
+            halves = self.batches.halves(_LOSS_BATCHES + self.state.round)
             figures["loss_demonstrations"], figures["loss_interventions"] = (parts.loss(half) for half in halves)
         return {"n_updates": n_updates, **figures}
 
     def _finish_round(self, start: float, seconds: Seconds, losses: dict[str, Any]) -> None:
         """Saves the weights and makes the round count."""
-        cfg, state = self._cfg, self._state
+        cfg, state = self.cfg, self.state
         state.round += 1
         if losses:
-            self._report.doing("saving")
-            name = get_step_identifier(self._parts.step, self._training.steps)
+            self.report.doing("saving")
+            name = get_step_identifier(self.parts.step, self.training.steps)
             with seconds.of("checkpoint_saving"):
-                self._folder.save_checkpoint(name, lambda path: self._parts.write_checkpoint(path, self._training))
-            state.checkpoint, state.step = name, self._parts.step
-            if _is_due(state.round, cfg.eval_every) or _is_due(state.round, cfg.save_every):
+                self.folder.save_checkpoint(name, lambda path: self.parts.write_checkpoint(path, self.training))
+            state.checkpoint, state.step = name, self.parts.step
+            if is_due(state.round, cfg.eval_every) or is_due(state.round, cfg.save_every):
                 state.milestones.append(name)
         total = time.perf_counter() - start
         spent = {f"{name}_s": round(value, 4) for name, value in seconds.spent.items()}
-        self._report.write("round", {**losses, **spent, "total_s": round(total, 4)})
-        self._folder.commit(state)
-        self._folder.clean(state)
+        self.report.write("round", {**losses, **spent, "total_s": round(total, 4)})
+        self.folder.commit(state)
+        self.folder.clean(state)
 
     def _evaluate_if_due(self, is_last: bool = False) -> None:
-        cfg, state = self._cfg, self._state
-        is_due = cfg.eval_every > 0 and (is_last or state.round % cfg.eval_every == 0)
-        if cfg.env is None or not is_due or state.evaluated_round == state.round:
+        cfg, state = self.cfg, self.state
+        wanted = cfg.eval_every > 0 and (is_last or is_due(state.round, cfg.eval_every))
+        if cfg.env is None or not wanted or state.evaluated_round == state.round:
             return
-        self._report.doing("evaluating")
+        self.report.doing("evaluating")
         start = time.perf_counter()
         with contextlib.redirect_stderr(io.StringIO()):  # LeRobot's own progress bars; ours goes on
-            info = self._parts.evaluate(self._training, cfg.eval_videos)
+            info = self.parts.evaluate(self.training, cfg.eval_videos)
         state.evaluated_round, state.success = state.round, float(info["overall"]["pc_success"])
-        self._report.evaluation(info, time.perf_counter() - start)
-        self._folder.commit(state)
+        self.report.write_evaluation(info, evaluation_s=round(time.perf_counter() - start, 3))
+        self.folder.commit(state)
 
     def _random_seed(self, purpose: int, number: int) -> int:
-        return int(np.random.SeedSequence([self._cfg.seed, purpose, number]).generate_state(1)[0])
+        return int(np.random.SeedSequence([self.cfg.seed, purpose, number]).generate_state(1)[0])
 
 
 def outcome_of(episode: Episode) -> str:
@@ -234,7 +229,3 @@ def outcome_of(episode: Episode) -> str:
     if not episode.success:
         return "failed"
     return "kept" if episode.intervention_share > 0 else "unneeded"
-
-
-def _is_due(round_number: int, every: int) -> bool:
-    return every > 0 and round_number % every == 0

@@ -1,33 +1,31 @@
 """A run of HG-DAgger from its options: what it needs is made and checked, then `Loop` runs."""
 
 import logging
-import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
-import gymnasium as gym
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
-from lerobot.utils.utils import init_logging, inside_slurm
+from lerobot.utils.utils import init_logging
 
 from lerobot_playbyear.dagger.batches import BalancedBatches, frames_by_expert
 from lerobot_playbyear.dagger.checks import check_action_range, check_actions_can_be_masked, check_alike, check_dataset
-from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DaggerError, differences
+from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, differences
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.dagger.loop import Loop
 from lerobot_playbyear.dagger.report import Report
-from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
-from lerobot_playbyear.datasets.errors import DatasetWriteError
-from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
+from lerobot_playbyear.datasets import check_dataset_files
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.policies import push_policy
-from lerobot_playbyear.hub.pushing import HubError, warn_without_login
+from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.hub.training_run import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.loop import read_store
 from lerobot_playbyear.training.parts import PolicyWindows, dataset_names, make_training_parts
 from lerobot_playbyear.training.reach import Reach, action_names
 
@@ -42,22 +40,25 @@ def run_dagger(cfg: DaggerConfig) -> Path:
         The output folder.
 
     Raises:
-        DaggerError: If options, policy, data and environment do not go together, before any work is done; or if the
-            run cannot go on. What was saved before is safe.
+        InputError: If options, policy, data and environment do not go together, before any work is done.
+        PlaybyearError: If the run cannot go on. What was saved before is safe.
     """
     init_logging()
     logging.getLogger("lerobot.configs.video").setLevel(
         logging.WARNING
     )  # it has a line for every attempt that is saved
-    with _errors_of_input():
-        cfg.check()
-        folder = RunFolder(cfg.output_dir)
-        state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
-        with ExitStack() as stack:
-            _run(cfg, folder, state, stack)
+    with ExitStack() as stack:
+        with errors_of_input(FileNotFoundError, MemoryError):
+            cfg.check()
+            folder = RunFolder(cfg.output_dir)
+            state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
+            loop = _make_loop(cfg, folder, state, stack)
+        loop.run()
     _print_results(cfg, folder, state)
     if cfg.policy is not None and cfg.policy.push_to_hub and state.checkpoint is not None:
-        _push(cfg.policy, folder)
+        assert cfg.policy.repo_id is not None
+        checkpoint = folder.checkpoints / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
+        print(f"On the Hub:  {push_policy(checkpoint, cfg.policy.repo_id, PushOptions(cfg.policy.private))}")
     return folder.path
 
 
@@ -69,7 +70,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     overrides = list(parser.get_cli_overrides("policy") or [])
     if state is None:
         if given is None:
-            raise DaggerError(
+            raise InputError(
                 "HG-DAgger improves a trained policy: give its folder or its name on the Hub, --policy.path."
             )
         if (folder.path / CONFIG_NAME).is_file():
@@ -80,7 +81,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
         if given is not None and given != state.policy_path:
             changed.append(f"--policy.path was {state.policy_path} and is {given}")
         if changed:
-            raise DaggerError(
+            raise InputError(
                 f"--output_dir={folder.path} holds another run: {'; '.join(changed)}. Leave these options out to go on "
                 "with it, or choose another folder."
             )
@@ -93,7 +94,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     if overrides:
         check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
-        raise DaggerError(
+        raise InputError(
             "--policy.push_to_hub=true needs a name: give --policy.repo_id, or --policy.push_to_hub=false."
         )
     if cfg.policy.push_to_hub:
@@ -101,14 +102,17 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     return state
 
 
-def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack) -> None:
+def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack) -> Loop:
+    """What the run needs, checked; `stack` closes it."""
     assert cfg.policy is not None
     check_dataset_files(cfg.demos.repo_id, cfg.demos.root)
     demos = LeRobotDataset(cfg.demos.repo_id, root=cfg.demos.root, video_backend=cfg.demos.video_backend)
     check_dataset(cfg.policy, demos.meta, cfg.rename_map)
-    env = _make_env(cfg, stack) if cfg.is_online else None
-    expert = cfg.expert.make(env) if env is not None else None
-    if expert is not None:
+    env = expert = None
+    if cfg.is_online and cfg.env is not None:
+        env = env_spec(cfg.env).make()
+        stack.callback(env.close)
+        expert = cfg.expert.make(env)
         stack.callback(expert.close)
     corrections = Corrections(cfg.interventions)
     stack.callback(corrections.close)
@@ -129,7 +133,7 @@ def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack
     training.resume, training.checkpoint_path = state.checkpoint is not None, folder.checkpoint(state)
     parts = make_training_parts(training, demos.meta, keep_normalization=True)
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
-    demonstrations = _read(demos, windows, cfg)
+    demonstrations = read_store(demos, windows, training)
     check_actions_can_be_masked(parts, windows, demonstrations)
     corrections.read(windows.keys, demonstrations.device)
     reach = Reach(cfg.policy, parts.preprocessor, action_names(demos.meta.features[ACTION]))
@@ -145,35 +149,20 @@ def _run(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack
         policy = parts.accelerator.unwrap_model(parts.policy)
         actor = PolicyActor(policy, cfg.env, parts.preprocessor, parts.postprocessor, parts.accelerator.autocast)
         scene = (env, actor, expert)
-    Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, reach, report, scene).run()
-
-
-def _make_env(cfg: DaggerConfig, stack: ExitStack) -> gym.Env:
-    assert cfg.env is not None
-    env = env_spec(cfg.env).make()
-    stack.callback(env.close)
-    return env
+    return Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, reach, report, scene)
 
 
 def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, corrections: Corrections) -> None:
     if not cfg.is_online and corrections.n_episodes == 0:
-        raise DaggerError(
+        raise InputError(
             f"The intervention dataset '{cfg.interventions.repo_id}' is empty: collect attempts with --episodes, or give one "
             "that holds some."
         )
     if cfg.is_online and state.kept == 0 and corrections.n_episodes >= cfg.episodes:
-        raise DaggerError(
+        raise InputError(
             f"The intervention dataset holds {corrections.n_episodes} attempts already, and --episodes={cfg.episodes} asks for "
             "no more: give a larger number, or --episodes=0 --updates=N to learn from what is there."
         )
-
-
-def _read(dataset: LeRobotDataset, windows: PolicyWindows, cfg: DaggerConfig) -> EpisodeStore:
-    start = time.perf_counter()
-    backend = cfg.demos.video_backend
-    store = EpisodeStore.from_dataset(dataset, windows.keys, cfg.store.device, backend, progress=not inside_slurm())
-    logging.info(f"{store.n_episodes} demonstrations in memory after {time.perf_counter() - start:.1f} s")
-    return store
 
 
 def _make_report(cfg: DaggerConfig, folder: RunFolder, state: RunState, training: PlaybyearTrainConfig) -> Report:
@@ -183,26 +172,6 @@ def _make_report(cfg: DaggerConfig, folder: RunFolder, state: RunState, training
     state.wandb_run_id = training.wandb.run_id = report.wandb_run_id
     training.resume = False  # checkpoints of a resumed run are those of one that was not
     return report
-
-
-def _push(policy: PreTrainedConfig, folder: RunFolder) -> None:
-    assert policy.repo_id is not None
-    try:
-        checkpoint = folder.checkpoints / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
-        url = push_policy(checkpoint, policy.repo_id, private=policy.private)
-    except HubError as error:
-        raise DaggerError(str(error)) from error
-    print(f"On the Hub:  {url}")
-
-
-@contextmanager
-def _errors_of_input() -> Iterator[None]:
-    try:
-        yield
-    except DaggerError:
-        raise
-    except (ValueError, FileExistsError, FileNotFoundError, MemoryError, RolloutError, DatasetWriteError) as error:
-        raise DaggerError(str(error)) from error
 
 
 def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.confines import check_links
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.datasets.opening import open_dataset
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from lerobot_playbyear.datasets.spooled_sound import EpisodesSound
 
 
-class AttachError(ValueError):
+class AttachError(InputError):
     """Sound cannot be attached; nothing was written."""
 
 

@@ -8,6 +8,7 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from torch import Tensor
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.reading import INDEX_KEYS, read_dataset
@@ -190,11 +191,11 @@ class EpisodeStore:
             The episode's position among the store's episodes.
 
         Raises:
-            ValueError: If there are no frames, a feature is missing or has another shape or dtype, or a value is NaN
+            InputError: If there are no frames, a feature is missing or has another shape or dtype, or a value is NaN
                 or infinite. The store is then unchanged.
         """
         if len(frames) == 0:
-            raise ValueError("An episode without frames cannot be appended.")
+            raise InputError("An episode without frames cannot be appended.")
         start, end = self._n_frames, self._n_frames + len(frames)
         tasks = list(self.tasks)
         columns = {key: self._stack(key, frames) for key in self._columns if key not in INDEX_KEYS}
@@ -221,7 +222,7 @@ class EpisodeStore:
         """One feature of new frames, (n, ...), in the store's shape and dtype."""
         missing = [i for i, frame in enumerate(frames) if key not in frame]
         if missing:
-            raise ValueError(
+            raise InputError(
                 f"'{key}' is missing in frame {missing[0]} of the new episode; the store holds {self.keys}."
             )
         shape, dtype = self._columns[key].shape[1:], self._columns[key].dtype
@@ -229,17 +230,17 @@ class EpisodeStore:
         if values.dtype.is_floating_point != dtype.is_floating_point or (values.dtype == torch.bool) != (
             dtype == torch.bool
         ):
-            raise ValueError(f"'{key}' has dtype {values.dtype} in the new episode, and {dtype} in the store.")
+            raise InputError(f"'{key}' has dtype {values.dtype} in the new episode, and {dtype} in the store.")
         if len(shape) == 3 and values.shape[1:] != shape:
             values = values.movedim(-1, 1)  # (n, H, W, C) -> (n, C, H, W)
         if not shape and values.shape[1:] == (1,):
             values = values.squeeze(1)
         if values.shape[1:] != shape:
-            raise ValueError(
+            raise InputError(
                 f"'{key}' has shape {tuple(values.shape[1:])} in the new episode, and {tuple(shape)} in the store."
             )
         if values.dtype.is_floating_point and not values.isfinite().all():
-            raise ValueError(f"'{key}' holds NaN or infinite values in the new episode; wanted finite numbers.")
+            raise InputError(f"'{key}' holds NaN or infinite values in the new episode; wanted finite numbers.")
         return values.to(dtype)
 
     def _index_columns(self, frames: Sequence[Mapping[str, Any]], start: int, tasks: list[str]) -> dict[str, Tensor]:

@@ -1,7 +1,21 @@
-"""What can go wrong with writing a dataset."""
+"""What can go wrong through no fault of the program. Commands say it in one line."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 
-class DatasetWriteError(RuntimeError):
+class PlaybyearError(Exception):
+    """Something that was asked for cannot be done; the message says why, and what to do.
+
+    Any other error is a fault of the program, and a command that ends with one shows where it happened.
+    """
+
+
+class InputError(PlaybyearError, ValueError):
+    """Options, data, policy or environment cannot be used, or do not go together."""
+
+
+class DatasetWriteError(PlaybyearError, RuntimeError):
     """An episode could not be written; the episodes saved before it are complete on disk.
 
     Attributes:
@@ -11,3 +25,22 @@ class DatasetWriteError(RuntimeError):
     def __init__(self, message: str, can_be_repeated: bool = False) -> None:
         super().__init__(message)
         self.can_be_repeated = can_be_repeated
+
+
+@contextmanager
+def errors_of_input(*more: type[Exception]) -> Iterator[None]:
+    """For the time in which options and data are read: what is raised of some kinds says what is wrong with them.
+
+    Args:
+        more: Kinds besides `ValueError` and `FileExistsError`.
+
+    Raises:
+        InputError: In place of these.
+    """
+    kinds: tuple[type[Exception], ...] = (ValueError, FileExistsError, *more)
+    try:
+        yield
+    except PlaybyearError:
+        raise
+    except kinds as error:
+        raise InputError(str(error)) from error

@@ -7,6 +7,7 @@ import numpy as np
 from lerobot.datasets.feature_utils import get_hf_features_from_features, validate_frame
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys, check_audio_features
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 
 
 def check_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> None:
@@ -17,10 +18,10 @@ def check_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> None:
         fps: Frames per second.
 
     Raises:
-        ValueError: Naming the key, the value seen and the value wanted.
+        InputError: Naming the key, the value seen and the value wanted.
     """
     if not isinstance(fps, int) or isinstance(fps, bool) or fps < 1:
-        raise ValueError(f"fps={fps!r}: wanted a whole number of frames per second, 1 or more.")
+        raise InputError(f"fps={fps!r}: wanted a whole number of frames per second, 1 or more.")
     microphones = audio_keys(features)
     for key, feature in features.items():
         _check_shape(key, feature)
@@ -39,18 +40,19 @@ def check_frame(frame: Mapping[str, Any], features: Mapping[str, Mapping[str, An
         features: All features of the dataset.
 
     Raises:
-        ValueError: Naming the key, the value seen and the value wanted.
+        InputError: Naming the key, the value seen and the value wanted.
     """
-    validate_frame(dict(frame), dict(features))
+    with errors_of_input():
+        validate_frame(dict(frame), dict(features))
     if not isinstance(frame["task"], str):
-        raise ValueError(f"'task' is {frame['task']!r}; wanted a text that says what is done.")
+        raise InputError(f"'task' is {frame['task']!r}; wanted a text that says what is done.")
     for key in audio_keys(features):
         sound = frame[key]
         if np.issubdtype(sound.dtype, np.floating):
             wrong = ~(np.abs(sound) <= 1)  # true for NaN
             if wrong.any():
                 index = int(wrong.argmax())
-                raise ValueError(
+                raise InputError(
                     f"'{key}': sample {index} is {sound[index]:g}; floats are sound in [-1, 1]. Divide integers by "
                     "their full scale (32768 for 16 bits), clip what is louder, and put 0 where nothing was heard."
                 )
@@ -59,11 +61,11 @@ def check_frame(frame: Mapping[str, Any], features: Mapping[str, Mapping[str, An
 def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
     for name in ("dtype", "shape"):
         if name not in feature:
-            raise ValueError(f"'{key}' has no {name}: give dtype, shape and names, as LeRobot's features have them.")
+            raise InputError(f"'{key}' has no {name}: give dtype, shape and names, as LeRobot's features have them.")
     shape = feature["shape"]
     sizes = shape if isinstance(shape, tuple | list) else [None]
     if not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
-        raise ValueError(f"'{key}' has shape {shape!r}; wanted a tuple of positive whole numbers.")
+        raise InputError(f"'{key}' has shape {shape!r}; wanted a tuple of positive whole numbers.")
     if key in audio_keys([key]) and len(shape) > 1:
         n_channels = min(shape)
         advice = (
@@ -72,7 +74,7 @@ def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
             else f"every microphone is its own key: write {n_channels} features of shape ({max(shape)},), such as "
             f"'{key}_left' and '{key}_right'"
         )
-        raise ValueError(f"'{key}' has shape {tuple(shape)}; {advice}.")
+        raise InputError(f"'{key}' has shape {tuple(shape)}; {advice}.")
 
 
 def _check_type(key: str, feature: Mapping[str, Any]) -> None:
@@ -81,7 +83,7 @@ def _check_type(key: str, feature: Mapping[str, Any]) -> None:
     try:
         get_hf_features_from_features(own).arrow_schema  # noqa: B018  (raises for what it does not know)
     except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(
+        raise InputError(
             f"'{key}' has dtype {feature['dtype']!r} and shape {feature['shape']!r}, which no dataset can hold: {error}"
         ) from error
 
@@ -90,4 +92,4 @@ def _check_rate(key: str, feature: Mapping[str, Any]) -> None:
     """A reader takes any number that is whole; what is written is plain."""
     rate = feature["info"]["sample_rate"]
     if not isinstance(rate, int) or isinstance(rate, bool):
-        raise ValueError(f"'{key}' has sample_rate {rate!r}; wanted a whole number of Hz, a Python int such as 16000.")
+        raise InputError(f"'{key}' has sample_rate {rate!r}; wanted a whole number of Hz, a Python int such as 16000.")

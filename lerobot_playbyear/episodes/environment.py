@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 
+from lerobot_playbyear.datasets.errors import PlaybyearError
+
 if TYPE_CHECKING:  # a process that plays scripts imports nothing of LeRobot
     from lerobot.envs import EnvConfig
 
 
-class RolloutError(RuntimeError):
+class RolloutError(PlaybyearError, RuntimeError):
     """No episode can be played in the environment; the message says why."""
 
 

@@ -12,10 +12,11 @@ import draccus
 import gymnasium as gym
 import numpy as np
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Observation, Verdict
 
 
-class ExpertError(ValueError):
+class ExpertError(InputError):
     """The environment and the expert do not go together; the message says what is missing."""
 
 

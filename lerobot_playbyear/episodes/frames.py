@@ -19,6 +19,7 @@ from lerobot.utils.constants import (
 )
 
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts
 from lerobot_playbyear.episodes.episode import Episode, Observation
 
@@ -35,7 +36,7 @@ def dataset_features(facts: EnvFacts, video: bool = False) -> dict[str, dict[str
         video: Whether pictures become video.
 
     Raises:
-        ValueError: An observation has no place in a LeRobotDataset.
+        InputError: An observation has no place in a LeRobotDataset.
     """
     features: dict[str, dict[str, Any]] = {}
     for key, space in _observation_boxes(facts.observation_space).items():
@@ -93,9 +94,9 @@ def _observation_boxes(space: gym.spaces.Dict) -> dict[str, gym.spaces.Box]:
     boxes = _flat_observation(dict(space.spaces))
     for key, box in boxes.items():
         if not isinstance(box, gym.spaces.Box) or (key.startswith(AUDIO_PREFIX) and box.dtype != np.int16):
-            raise ValueError(f"The observation {key!r} cannot be recorded: its space is {box}.")
+            raise InputError(f"The observation {key!r} cannot be recorded: its space is {box}.")
         if key.startswith(AUDIO_PREFIX) and len(box.shape) != 1:
-            raise ValueError(
+            raise InputError(
                 f"The observation {key!r} has shape {box.shape}; wanted (S,): every microphone is its own key."
             )
     return boxes

@@ -16,6 +16,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts, EnvSpec, RolloutError, env_facts
 from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.play import play
@@ -35,7 +36,7 @@ class RolloutPool:
 
     def __init__(self, spec: EnvSpec, num_workers: int = 0):
         if num_workers < 0:
-            raise ValueError(f"num_workers={num_workers}: give 0 for none, or how many processes.")
+            raise InputError(f"num_workers={num_workers}: give 0 for none, or how many processes.")
         self._spec, self._num_workers = spec, num_workers
         self._env: gym.Env | None = None
         self._executor: ProcessPoolExecutor | None = None

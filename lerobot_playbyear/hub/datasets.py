@@ -11,7 +11,7 @@ from lerobot_playbyear.datasets.confines import OutsideError, check_links, entri
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview
-from lerobot_playbyear.hub.pushing import HubError, push_patiently
+from lerobot_playbyear.hub.pushing import HubError, PushOptions, push_patiently
 from lerobot_playbyear.hub.repository import HubRepository
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
@@ -24,15 +24,7 @@ _LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratc
 logger = logging.getLogger(__name__)
 
 
-def push_dataset(
-    repo_id: str,
-    root: str | Path | None = None,
-    *,
-    private: bool | None = None,
-    tags: list[str] | None = None,
-    license: str = "apache-2.0",
-    film: Path | None = None,
-) -> str:
+def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOptions | None = None) -> str:
     """Makes the Hub's repository hold exactly what is in a dataset's folder; its earlier content stays in its history.
 
     Whoever loads the dataset meanwhile gets the earlier version, until the tag of LeRobot's format moves at the end.
@@ -40,10 +32,7 @@ def push_dataset(
     Args:
         repo_id: Its name on the Hub, `user/name`.
         root: Its folder. None: in LeRobot's own cache, under its name.
-        private: Whether a repository that is created is private. None: as the account's default says.
-        tags: For its card, besides LeRobot's and those of sound.
-        license: Of the data, as the Hub names licences.
-        film: An mp4 for the card. None: a film of one episode is made.
+        options: Whether it is private, and what its card says besides. None: the usual.
 
     Returns:
         Its address on the Hub.
@@ -51,11 +40,9 @@ def push_dataset(
     Raises:
         HubError: There is no whole dataset in the folder, or it could not be uploaded.
     """
-    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
-    if "/" not in repo_id:
-        raise HubError(f"dataset.repo_id={repo_id!r}: to push, give it as user/name.")
-    if film is not None and not film.is_file():
-        raise HubError(f"preview={film}: there is no such file.")
+    folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
+    check_name(repo_id)
+    options.check()
     try:
         source = DatasetSource.open(repo_id, folder)
         check_links(folder)
@@ -63,21 +50,23 @@ def push_dataset(
     except (InspectionError, OutsideError, OSError) as error:
         raise HubError(f"Not pushed. {error}") from error
     with TemporaryDirectory() as scratch:
-        card = _make_card(source, repo_id, Path(scratch), film, tags, license)
-        return push_patiently(
-            partial(_push, repo_id, files, card, private),
-            f"The dataset is complete in {folder}",
-            _command(repo_id, root, private, tags, license, film),
-        )
+        card = _make_card(source, repo_id, Path(scratch), options)
+        push = partial(_push, repo_id, files, card, options.private)
+        later = [f"--dataset.repo_id={repo_id}", *([f"--dataset.root={root}"] if root is not None else [])]
+        return push_patiently(push, f"The dataset is complete in {folder}", later, options)
 
 
-def _make_card(
-    source: DatasetSource, repo_id: str, scratch: Path, film: Path | None, tags: list[str] | None, license: str
-) -> dict[str, Path]:
+def check_name(repo_id: str) -> None:
+    """Raise a HubError if a dataset of this name has no place on the Hub."""
+    if "/" not in repo_id:
+        raise HubError(f"dataset.repo_id={repo_id!r}: to push, give it as user/name.")
+
+
+def _make_card(source: DatasetSource, repo_id: str, scratch: Path, options: PushOptions) -> dict[str, Path]:
     """The files that go up beside the dataset, by their names there."""
     from lerobot.datasets.utils import create_lerobot_dataset_card
 
-    preview = None
+    preview, film = None, options.preview
     if film is None:
         try:
             preview = film_preview(source, scratch / FILM)
@@ -88,9 +77,9 @@ def _make_card(
             logger.warning("No film could be made for the dataset's card", exc_info=True)
     url = f"{HfApi().endpoint}/datasets/{repo_id}/resolve/main/{FILM}" if film is not None else None
     card = create_lerobot_dataset_card(
-        tags=card_tags(source, tags),
+        tags=card_tags(source, options.tags),
         dataset_info=source.dataset.meta.info,
-        license=license,
+        license=options.license or "apache-2.0",
         repo_id=repo_id,
         dataset_description=describe_dataset(source, repo_id, url, preview),
     )
@@ -113,19 +102,3 @@ def _files(folder: Path) -> dict[str, Path]:
     """What goes up, by the names there."""
     names = {path.relative_to(folder): path for path in entries_below(folder) if path.is_file()}
     return {name.as_posix(): path for name, path in names.items() if name.parts[0] not in _LEFT_OUT}
-
-
-def _command(
-    repo_id: str,
-    root: str | Path | None,
-    private: bool | None,
-    tags: list[str] | None,
-    license: str,
-    film: Path | None,
-) -> list[str]:
-    command = ["playbyear-push", f"--dataset.repo_id={repo_id}"]
-    command += [f"--dataset.root={root}"] if root is not None else []
-    command += [f"--private={str(private).lower()}"] if private is not None else []
-    command += [f"--tags=[{','.join(tags)}]"] if tags else []
-    command += [f"--license={license}"] if license != "apache-2.0" else []
-    return command + ([f"--preview={film}"] if film is not None else [])

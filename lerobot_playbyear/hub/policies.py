@@ -12,7 +12,7 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME
 
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.hub.datasets import CARD, FILM
-from lerobot_playbyear.hub.pushing import HubError, push_patiently
+from lerobot_playbyear.hub.pushing import PushOptions, push_patiently
 from lerobot_playbyear.hub.repository import HubRepository
 from lerobot_playbyear.hub.training_run import evaluation_of, find_checkpoint, training_options
 from lerobot_playbyear.policy.card import write_card
@@ -21,25 +21,14 @@ _NO_RESULTS = "_No evaluation results have been provided for this policy yet._" 
 _FILES = ("*.safetensors", "*.json", "*.yaml")  # as LeRobot uploads them
 
 
-def push_policy(
-    path: str | Path,
-    repo_id: str,
-    *,
-    private: bool | None = None,
-    tags: list[str] | None = None,
-    license: str | None = None,
-    film: Path | None = None,
-) -> str:
+def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
     """Uploads a checkpoint of any LeRobot policy.
 
     Args:
         path: The folder `pretrained_model` of a checkpoint, or one that it is in: a checkpoint, or the output folder of a
             training, whose last checkpoint is taken.
         repo_id: Its name on the Hub, `user/name`.
-        private: Whether a repository that is created is private. None: as the account's default says.
-        tags: For its card, besides LeRobot's, the policy's own and those of sound.
-        license: As the Hub names licences. None: the policy's own, or else apache-2.0.
-        film: An mp4 that the card shows.
+        options: Whether it is private, and what its card says besides.
 
     Returns:
         Its address on the Hub.
@@ -48,22 +37,21 @@ def push_policy(
         HubError: There is no checkpoint, or it could not be uploaded.
     """
     folder = find_checkpoint(Path(path))
-    if film is not None and not film.is_file():
-        raise HubError(f"preview={film}: there is no such file.")
+    options.check()
     config = PreTrainedConfig.from_pretrained(folder)
     config.repo_id, config.device = repo_id, "cpu"
-    config.license = license or (word(config.license) if config.license else None)
-    config.tags = [*(config.tags or []), *(tags or [])]
+    config.license = options.license or (word(config.license) if config.license else None)
+    config.tags = [*(config.tags or []), *(options.tags or [])]
     policy = get_policy_class(config.type).from_pretrained(folder, config=config)
 
     def push() -> str:
-        repository = HubRepository(repo_id, "model", private)
+        repository = HubRepository(repo_id, "model", options.private)
         config.repo_id = repository.repo_id  # with the user's name, for the card
         with TemporaryDirectory() as scratch:
             files = {file.name: file for pattern in _FILES for file in folder.glob(pattern)}
             card = _make_card(policy, folder)
-            if film is not None:
-                files[FILM] = film
+            if options.preview is not None:
+                files[FILM] = options.preview
                 url = f"{repository.api.endpoint}/{repository.repo_id}/resolve/main/{FILM}"
                 card.text = f'\n<video controls width="480" src="{url}"></video>\n{card.text}'
             files[CARD] = Path(scratch) / CARD
@@ -71,12 +59,8 @@ def push_policy(
             repository.commit(files, "Upload policy")
         return str(repository.url)
 
-    later = ["playbyear-push", f"--policy.path={path}", f"--policy.repo_id={repo_id}"]
-    later += [f"--private={str(private).lower()}"] if private is not None else []
-    later += [f"--tags=[{','.join(tags)}]"] if tags else []
-    later += [f"--license={license}"] if license is not None else []
-    later += [f"--preview={film}"] if film is not None else []
-    return push_patiently(push, f"The policy is complete in {folder}", later)
+    later = [f"--policy.path={path}", f"--policy.repo_id={repo_id}"]
+    return push_patiently(push, f"The policy is complete in {folder}", later, options)
 
 
 def push_checkpoint(folder: Path, repo_id: str, private: bool | None = None) -> None:

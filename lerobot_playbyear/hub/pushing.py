@@ -4,13 +4,15 @@ import json
 import logging
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
 from huggingface_hub import constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
 
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.hub.client import patient_hub
 
 _WAITS_S = (1, 2, 5)
@@ -19,17 +21,47 @@ _PASSING = (408, 409, 412, 425, 429)  # besides all from 500; 412: a newer commi
 logger = logging.getLogger(__name__)
 
 
-class HubError(RuntimeError):
+class HubError(PlaybyearError, RuntimeError):
     """Nothing was uploaded, or not all; the message says why, and how to go on."""
 
 
-def push_patiently(push: Callable[[], str], what: str, later: Sequence[str]) -> str:
+@dataclass
+class PushOptions:
+    """How something is uploaded.
+
+    Args:
+        private: Whether a repository that is created is private. None: as the account's default says.
+        tags: For the card, besides those that it gets by itself.
+        license: As the Hub names licences. None: the policy's own, or else apache-2.0.
+        preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
+    """
+
+    private: bool | None = None
+    tags: list[str] | None = None
+    license: str | None = None
+    preview: Path | None = None
+
+    def check(self) -> None:
+        """Raise a HubError if there is no such film."""
+        if self.preview is not None and not self.preview.is_file():
+            raise HubError(f"preview={self.preview}: there is no such file.")
+
+    def on_command_line(self) -> list[str]:
+        """As `playbyear-push` takes them."""
+        private = None if self.private is None else str(self.private).lower()
+        tags = f"[{','.join(self.tags)}]" if self.tags else None
+        given = {"private": private, "tags": tags, "license": self.license, "preview": self.preview}
+        return [f"--{name}={value}" for name, value in given.items() if value is not None]
+
+
+def push_patiently(push: Callable[[], str], what: str, later: list[str], options: PushOptions) -> str:
     """Uploads something.
 
     Args:
         push: Uploads it, in steps that `insist`. Called again later, it sends what has not arrived.
         what: Where it is safe on this machine, "The dataset is complete in outputs/demo".
-        later: The command that uploads it later.
+        later: The options that name it for `playbyear-push`.
+        options: Further ones.
 
     Returns:
         What `push` returns: its address on the Hub.
@@ -41,9 +73,10 @@ def push_patiently(push: Callable[[], str], what: str, later: Sequence[str]) -> 
         with patient_hub():
             return push()
     except Exception as error:  # whatever the client, its Rust extension or the file system raise
+        command = ["playbyear-push", *later, *options.on_command_line()]
         raise HubError(
             f"{what}, but it could not be uploaded: {reason(error)}. Upload it later with\n"
-            f"  {shlex.join(later)}\nwhich does not send again what has arrived."
+            f"  {shlex.join(command)}\nwhich does not send again what has arrived."
         ) from error
 
 

@@ -75,12 +75,6 @@ class HubRepository:
             move: Take the name from the commit that has it.
         """
         if move:
-            insist(lambda: self._delete_tag(tag))
-        insist(lambda: self._create_tag(tag, commit))
-
-    def _delete_tag(self, tag: str) -> None:
-        with contextlib.suppress(RevisionNotFoundError):
-            self.api.delete_tag(self.repo_id, tag=tag, repo_type=self._kind)
-
-    def _create_tag(self, tag: str, commit: str | None) -> None:
-        self.api.create_tag(self.repo_id, tag=tag, revision=commit, repo_type=self._kind, exist_ok=True)
+            with contextlib.suppress(RevisionNotFoundError):
+                insist(lambda: self.api.delete_tag(self.repo_id, tag=tag, repo_type=self._kind))
+        insist(lambda: self.api.create_tag(self.repo_id, tag=tag, revision=commit, repo_type=self._kind, exist_ok=True))

@@ -1,10 +1,9 @@
 """`playbyear-push`: a dataset or a policy goes to the Hub, with its card."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from lerobot_playbyear.hub.datasets import push_dataset
-from lerobot_playbyear.hub.pushing import HubError
+from lerobot_playbyear.hub.pushing import HubError, PushOptions
 
 
 @dataclass
@@ -34,7 +33,7 @@ class PushPolicyConfig:
 
 
 @dataclass
-class PushConfig:
+class PushConfig(PushOptions):
     """Options of `playbyear-push`. One of `dataset` and `policy` has to be given.
 
     Args:
@@ -48,10 +47,6 @@ class PushConfig:
 
     dataset: PushDatasetConfig = field(default_factory=PushDatasetConfig)
     policy: PushPolicyConfig = field(default_factory=PushPolicyConfig)
-    private: bool | None = None
-    tags: list[str] | None = None
-    license: str | None = None
-    preview: Path | None = None
 
 
 def push(cfg: PushConfig) -> str:
@@ -67,10 +62,7 @@ def push(cfg: PushConfig) -> str:
     if (dataset.repo_id is None) == (policy.repo_id is None):
         raise HubError("Give either --dataset.repo_id (and --dataset.root), or --policy.path and --policy.repo_id.")
     if dataset.repo_id is not None:
-        license = cfg.license or "apache-2.0"
-        url = push_dataset(
-            dataset.repo_id, dataset.root, private=cfg.private, tags=cfg.tags, license=license, film=cfg.preview
-        )
+        url = push_dataset(dataset.repo_id, dataset.root, cfg)
         print(f"Dataset: {url}\nLoad it anywhere: playbyear-inspect --dataset.repo_id={dataset.repo_id}")
         return url
     if policy.path is None or policy.repo_id is None:
@@ -80,8 +72,6 @@ def push(cfg: PushConfig) -> str:
     from lerobot_playbyear.hub.policies import push_policy
 
     register_third_party_plugins()
-    url = push_policy(
-        policy.path, policy.repo_id, private=cfg.private, tags=cfg.tags, license=cfg.license, film=cfg.preview
-    )
+    url = push_policy(policy.path, policy.repo_id, cfg)
     print(f"Policy: {url}\nTry it anywhere: lerobot-eval --policy.path={policy.repo_id} --env.type=...")
     return url

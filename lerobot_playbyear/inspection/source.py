@@ -14,6 +14,7 @@ import numpy as np
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.confines import ClaimError, OutsideError, file_inside, open_picture
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound
@@ -29,7 +30,7 @@ INTERVENTION = "intervention"
 _PICTURES_AT_ONCE = 128  # encoded ones that are taken out of the table together
 
 
-class InspectionError(RuntimeError):
+class InspectionError(PlaybyearError, RuntimeError):
     """The dataset cannot be opened at all; the message is for the person who asked."""
 
 

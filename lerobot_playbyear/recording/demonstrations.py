@@ -8,11 +8,12 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
 from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.recording.record import RecordConfig, RecordError, record
+from lerobot_playbyear.recording.record import RecordConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
 
@@ -89,13 +90,13 @@ def record_demonstrations(cfg: DemonstrationConfig) -> Path:
         The dataset's folder.
 
     Raises:
-        RecordError: As `record`; or the person's window or teleoperator cannot be had.
+        PlaybyearError: As `record`; or the person's window or teleoperator cannot be had.
     """
     if isinstance(cfg.expert, ScriptedExpertConfig):
         return record(cfg)
     expert = cfg.expert
     if not isinstance(expert, TeleopExpertConfig):
-        raise RecordError(
+        raise InputError(
             f"--expert.type={expert.type} corrects a policy and does not demonstrate: give scripted or teleop."
         )
     return record(cfg, lambda: PersonRollouts(env_spec(cfg.env).make(), expert))

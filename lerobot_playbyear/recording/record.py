@@ -12,21 +12,17 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input
 from lerobot_playbyear.datasets.existing import check_root
-from lerobot_playbyear.episodes.environment import EnvFacts, RolloutError, env_spec
+from lerobot_playbyear.episodes.environment import EnvFacts, env_spec
 from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
-from lerobot_playbyear.hub.datasets import push_dataset
-from lerobot_playbyear.hub.pushing import HubError, warn_without_login
+from lerobot_playbyear.hub.datasets import check_name, push_dataset
+from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 
 _MIN_ATTEMPTS_PER_SUCCESS = 20  # attempts in a row without one success after which recording gives up
-
-
-class RecordError(RuntimeError):
-    """Recording cannot begin or go on; the message is for the person who asked for it."""
 
 
 @dataclass
@@ -107,37 +103,40 @@ def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = Non
         The dataset's folder.
 
     Raises:
-        RecordError: Bad options, a folder that cannot be written, an environment without an expert, a dataset that
+        PlaybyearError: Bad options, a folder that cannot be written, an environment without an expert, a dataset that
             does not fit, a full disk, a Hub that cannot be reached. Episodes saved before are safe.
     """
     root = cfg.dataset.folder
     try:
-        _check_options(cfg)
-        check_root(root, resume=cfg.resume)
-        with make_rollouts() if make_rollouts else RolloutPool(env_spec(cfg.env), cfg.num_workers or 0) as pool:
+        with errors_of_input():
+            _check_options(cfg)
+            check_root(root, resume=cfg.resume)
+            rollouts = make_rollouts() if make_rollouts else RolloutPool(env_spec(cfg.env), cfg.num_workers or 0)
+        with rollouts as pool:
             facts = pool.facts()
             _check_facts(facts, cfg.env)
             features = dataset_features(facts, cfg.dataset.video)
-            with DurableWriter(
-                cfg.dataset.repo_id, root, facts.fps, features, resume=cfg.resume, robot_type=cfg.env.type
-            ) as writer:
+            with errors_of_input():
+                writer = DurableWriter(
+                    cfg.dataset.repo_id, root, facts.fps, features, resume=cfg.resume, robot_type=cfg.env.type
+                )
+            with writer:
                 _record_episodes(cfg, pool, writer)
                 summary = f"{writer.num_episodes} episodes, {writer.num_frames} frames"
-    except (DatasetWriteError, RolloutError, FileExistsError, ValueError) as error:
-        raise RecordError(str(error)) from error
     except MemoryError as error:
-        raise RecordError(
+        raise PlaybyearError(
             f"There is not enough memory to record to {root}. What was saved before is complete."
         ) from error
     except OSError as error:
-        raise RecordError(f"Cannot write to {root}: {error}") from error
+        raise PlaybyearError(f"Cannot write to {root}: {error}") from error
     print(f"\nDataset: {root} ({summary})")
     print(
         "Train on it: playbyear-train --policy.type=playbyear --policy.push_to_hub=false "
         f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={root}"
     )
     if cfg.dataset.push_to_hub:
-        _push(cfg.dataset)
+        options = PushOptions(cfg.dataset.private, cfg.dataset.tags)
+        print(f"On the Hub: {push_dataset(cfg.dataset.repo_id, cfg.dataset.root, options)}")
     return root
 
 
@@ -157,7 +156,7 @@ def _record_episodes(cfg: RecordConfig, pool: Rollouts, writer: DurableWriter) -
                 progress.update()
             progress.set_postfix_str(f"success rate {successes / attempts:.0%} of {attempts} attempts")
             if failures_in_a_row >= _MIN_ATTEMPTS_PER_SUCCESS:
-                raise RecordError(
+                raise InputError(
                     f"The expert failed {failures_in_a_row} times in a row, up to seed {episode.seed}: something is "
                     f"wrong with the task's options. {writer.num_episodes} episodes are saved in {writer.root}."
                 )
@@ -167,28 +166,19 @@ def _record_episodes(cfg: RecordConfig, pool: Rollouts, writer: DurableWriter) -
 
 def _check_options(cfg: RecordConfig) -> None:
     if cfg.dataset.num_episodes < 1:
-        raise RecordError(f"dataset.num_episodes={cfg.dataset.num_episodes}: give at least 1.")
+        raise InputError(f"dataset.num_episodes={cfg.dataset.num_episodes}: give at least 1.")
     if cfg.seed < 0:
-        raise RecordError(f"seed={cfg.seed}: give 0 or more.")
-    if cfg.dataset.push_to_hub and "/" not in cfg.dataset.repo_id:
-        raise RecordError(f"dataset.repo_id={cfg.dataset.repo_id!r}: to push, give it as user/name.")
+        raise InputError(f"seed={cfg.seed}: give 0 or more.")
     if cfg.dataset.push_to_hub:
+        check_name(cfg.dataset.repo_id)
         warn_without_login()
 
 
 def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:
     if not facts.has_expert:
-        raise RecordError(
+        raise InputError(
             f"--env.type={env.type} --env.task={env.task} has no scripted expert, so there is nobody to record. "
             "Record a person with --expert.type=teleop."
         )
     if facts.fps != env.fps:
-        raise RecordError(f"--env.fps={env.fps}, but the environment runs at {facts.fps} steps per second: give that.")
-
-
-def _push(dataset: RecordDatasetConfig) -> None:
-    try:
-        url = push_dataset(dataset.repo_id, dataset.root, private=dataset.private, tags=dataset.tags)
-    except HubError as error:
-        raise RecordError(str(error)) from error
-    print(f"On the Hub: {url}")
+        raise InputError(f"--env.fps={env.fps}, but the environment runs at {facts.fps} steps per second: give that.")

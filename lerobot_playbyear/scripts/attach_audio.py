@@ -20,24 +20,21 @@ mean is in docs/dataset.md.
   --pad=false                  fill what a file lacks with silence; otherwise that is an error
 """
 
-import sys
-
-from lerobot_playbyear.scripts.command import answer_at_once, read_options
+from lerobot_playbyear.scripts.command import run_alone, run_command
 
 
 def main() -> None:
     """The command."""
-    answer_at_once("playbyear-attach-audio", __doc__)
-    from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, attach_audio
-    from lerobot_playbyear.hub.client import patient_hub
+    run_command("playbyear-attach-audio", __doc__, _attach)
+
+
+def _attach() -> None:
+    from lerobot_playbyear.datasets.attach import AttachError, attach_audio
 
     try:
-        with patient_hub():
-            attach_audio(read_options(AttachAudioConfig))
-    except AttachError as error:
-        sys.exit(f"error: {error}")
+        run_alone(attach_audio)
     except OSError as error:
-        sys.exit(f"error: The copy cannot be written: {error}")
+        raise AttachError(f"The copy cannot be written: {error}") from error
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""What every command does before its work: answer at once what needs no imports, then read its options."""
+"""What every command does around its work: answer at once what needs no imports, read its options, say what went wrong."""
 
 import difflib
+import inspect
 import json
 import re
 import sys
@@ -87,30 +88,63 @@ def _may_be(kind: str, value: str) -> bool:
     return word.lstrip("+-") in _WORDS_OF_KIND[kind] or (kind != "bool" and re.search(r"\d", word) is not None)
 
 
-def read_options[Options](config_class: type[Options]) -> Options:
-    """The options of a command that can do without LeRobot's parser."""
-    import draccus
-    from draccus.utils import DecodingError
-
-    try:
-        return draccus.parse(config_class)
-    except DecodingError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
-
-
-def run_with_lerobot[Result](work: Callable[..., Result]) -> Result:
-    """Does the work of a command with the options that LeRobot's parser reads, once LeRobot knows all plugins.
+def run_command(name: str, short_help: str | None, work: Callable[[], object], interrupted: int | str = 130) -> None:
+    """A command: what needs no imports is answered at once, and what cannot be done is said in one line.
 
     Args:
-        work: Takes an instance of the configuration that its first argument is annotated with.
+        name: Its name.
+        short_help: What `--help` prints.
+        work: Imports what it needs, and does the rest.
+        interrupted: What Ctrl-C ends it with: an exit status, or what is to be said.
     """
+    answer_at_once(name, short_help)
+    from lerobot_playbyear.datasets.errors import PlaybyearError
+
+    try:
+        work()
+    except (PlaybyearError, MemoryError) as error:
+        sys.exit(f"error: {str(error) or 'there is not enough memory'}")
+    except KeyboardInterrupt:
+        sys.exit(interrupted)
+
+
+def run_alone[Result](work: Callable[[Any], Result]) -> Result:
+    """Does the work of a command that can do without LeRobot's parser.
+
+    Args:
+        work: Takes an instance of the configuration that its argument is annotated with.
+
+    Raises:
+        InputError: An option has no meaning.
+    """
+    import draccus
+
+    return _run(work, draccus.parse)
+
+
+def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
+    """The same with the options that LeRobot's parser reads, once LeRobot knows all plugins."""
     from lerobot.configs import parser
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    from lerobot_playbyear.hub.client import patient_hub
+    def parse(kind: type) -> Any:
+        def options(cfg: kind) -> Any:  # type: ignore[valid-type]
+            return cfg
+
+        return parser.wrap()(options)()
 
     register_third_party_plugins()
+    return _run(work, parse)
+
+
+def _run[Result](work: Callable[[Any], Result], parse: Callable[[type], Any]) -> Result:
+    from draccus.utils import DecodingError
+
+    from lerobot_playbyear.datasets.errors import errors_of_input
+    from lerobot_playbyear.hub.client import patient_hub
+
+    (argument,) = inspect.signature(work).parameters.values()
     with patient_hub():
-        result: Result = parser.wrap()(work)()
-    return result
+        with errors_of_input(DecodingError, OSError):
+            cfg = parse(argument.annotation)
+        return work(cfg)

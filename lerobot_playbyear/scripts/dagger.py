@@ -46,25 +46,24 @@ What comes out
 
 import sys
 
-from lerobot_playbyear.scripts.command import answer_at_once, run_with_lerobot
+from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
 from lerobot_playbyear.training.heap import keep_freed_memory
 
 
 def main() -> None:
     """The command."""
-    answer_at_once("playbyear-dagger", __doc__)
+    again = "Interrupted. Go on with --resume=true and the same --output_dir."
+    run_command("playbyear-dagger", __doc__, _correct, again)
+
+
+def _correct() -> None:
     keep_freed_memory()
-    from lerobot_playbyear.dagger.config import DaggerError, with_saved_options
+    from lerobot_playbyear.dagger.config import with_saved_options
     from lerobot_playbyear.dagger.run import run_dagger
     from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
 
     sys.argv[1:] = with_saved_options(sys.argv[1:])
-    try:
-        run_with_lerobot(run_dagger)
-    except DaggerError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("Interrupted. Go on with --resume=true and the same --output_dir.")
+    run_with_lerobot(run_dagger)
 
 
 if __name__ == "__main__":

@@ -19,27 +19,26 @@ The exit status is 0, 1 if a check found an error, and 2 if there is no dataset 
 import logging
 import sys
 
-from lerobot_playbyear.scripts.command import answer_at_once, read_options
+from lerobot_playbyear.scripts.command import run_alone, run_command
 
 
 def main() -> None:
     """The command."""
     sys.argv[1:] = ["--json=true" if argument == "--json" else argument for argument in sys.argv[1:]]
-    answer_at_once("playbyear-inspect", __doc__)
+    run_command("playbyear-inspect", __doc__, _inspect)
+
+
+def _inspect() -> None:
     logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.hub.client import patient_hub
-    from lerobot_playbyear.inspection.inspecting import InspectConfig, inspect
+    from lerobot_playbyear.inspection.inspecting import inspect
     from lerobot_playbyear.inspection.source import InspectionError
     from lerobot_playbyear.inspection.verdict import worst
 
     try:
-        with patient_hub():
-            verdicts = inspect(read_options(InspectConfig))
+        verdicts = run_alone(inspect)
     except InspectionError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
     sys.exit(worst(verdicts) == "error")
 
 

@@ -16,23 +16,21 @@ An upload that was interrupted goes on with the same command.
 """
 
 import logging
-import sys
 
-from lerobot_playbyear.scripts.command import answer_at_once, read_options
+from lerobot_playbyear.scripts.command import run_alone, run_command
 
 
 def main() -> None:
     """The command."""
-    answer_at_once("playbyear-push", __doc__)
-    logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.hub.uploads import HubError, PushConfig, push
+    again = "Interrupted. The same command goes on; what has arrived is not sent again."
+    run_command("playbyear-push", __doc__, _push, again)
 
-    try:
-        push(read_options(PushConfig))
-    except HubError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("Interrupted. The same command goes on; what has arrived is not sent again.")
+
+def _push() -> None:
+    logging.basicConfig(level=logging.WARNING)
+    from lerobot_playbyear.hub.uploads import push
+
+    run_alone(push)
 
 
 if __name__ == "__main__":

@@ -22,24 +22,20 @@ Only successful episodes are kept. Each is safe on the disk as soon as it is sav
 --help=all lists all of LeRobot's options.
 """
 
-import sys
-
-from lerobot_playbyear.scripts.command import answer_at_once, run_with_lerobot
+from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
 
 
 def main() -> None:
     """The command."""
-    answer_at_once("playbyear-record", __doc__)
+    again = "Interrupted. The saved episodes are safe; go on with the same command and --resume=true."
+    run_command("playbyear-record", __doc__, _record, again)
+
+
+def _record() -> None:
     # Here, because the processes that roll out import this module, and start in 2 seconds without LeRobot.
     from lerobot_playbyear.recording.demonstrations import record_demonstrations
-    from lerobot_playbyear.recording.record import RecordError
 
-    try:
-        run_with_lerobot(record_demonstrations)
-    except RecordError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("Interrupted. The saved episodes are safe; go on with the same command and --resume=true.")
+    run_with_lerobot(record_demonstrations)
 
 
 if __name__ == "__main__":

@@ -15,23 +15,26 @@ changed. The exit status is 1 where damage is left.
 
 import sys
 
-from lerobot_playbyear.scripts.command import answer_at_once, read_options
+from lerobot_playbyear.scripts.command import run_alone, run_command
 
 
 def main() -> None:
     """The command; it fails where damage is left."""
-    answer_at_once("playbyear-repair", __doc__)
-    from lerobot_playbyear.datasets.repair.command import RepairConfig, repair
+    run_command("playbyear-repair", __doc__, _repair)
 
-    try:
-        report = repair(read_options(RepairConfig))
-    except (OSError, MemoryError) as error:
-        sys.exit(
-            f"error: {str(error) or 'there is not enough memory'}\n"
-            "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
-        )
-    except ValueError as error:
-        sys.exit(f"error: {error}")
+
+def _repair() -> None:
+    from lerobot_playbyear.datasets.errors import errors_of_input
+    from lerobot_playbyear.datasets.repair.command import repair
+
+    with errors_of_input():
+        try:
+            report = run_alone(repair)
+        except (OSError, MemoryError) as error:
+            sys.exit(
+                f"error: {str(error) or 'there is not enough memory'}\n"
+                "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
+            )
     sys.exit(0 if report.is_sound or report.changed else 1)
 
 

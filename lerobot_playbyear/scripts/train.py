@@ -49,29 +49,24 @@ What comes of it
 
 import sys
 
-from lerobot_playbyear.scripts.command import answer_at_once, run_with_lerobot
+from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
 from lerobot_playbyear.training.heap import keep_freed_memory
-from lerobot_playbyear.training.presets import apply_preset
 
 
 def main() -> None:
     """The command."""
-    answer_at_once("playbyear-train", __doc__)
-    try:
-        sys.argv[1:] = apply_preset(sys.argv[1:])
-    except ValueError as error:
-        sys.exit(f"error: {error}")
-    keep_freed_memory()
-    from lerobot_playbyear.training.loop import TrainError, train
+    again = "Interrupted. Go on from the last checkpoint with --resume=true --config_path=<its train_config.json>."
+    run_command("playbyear-train", __doc__, _train, again)
 
-    try:
-        run_with_lerobot(train)
-    except TrainError as error:
-        sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit(
-            "Interrupted. Go on from the last checkpoint with --resume=true --config_path=<its train_config.json>."
-        )
+
+def _train() -> None:
+    from lerobot_playbyear.training.presets import apply_preset
+
+    sys.argv[1:] = apply_preset(sys.argv[1:])
+    keep_freed_memory()
+    from lerobot_playbyear.training.loop import train
+
+    run_with_lerobot(train)
 
 
 if __name__ == "__main__":

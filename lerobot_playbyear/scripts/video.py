@@ -15,22 +15,22 @@
 """
 
 import logging
-import sys
 
-from lerobot_playbyear.scripts.command import answer_at_once, run_with_lerobot
+from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
 
 
 def main() -> None:
     """The command."""
-    answer_at_once("playbyear-video", __doc__)
+    run_command("playbyear-video", __doc__, _film)
+
+
+def _film() -> None:
     logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.episodes.environment import RolloutError
+    from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.film.filming import film
 
-    try:
+    with errors_of_input(OSError):
         run_with_lerobot(film)
-    except (RolloutError, ValueError, OSError) as error:
-        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

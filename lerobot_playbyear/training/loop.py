@@ -7,8 +7,6 @@ and some moments can be drawn more often than others.
 
 import logging
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -20,17 +18,14 @@ from torch import Tensor
 
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.errors import errors_of_input
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 from lerobot_playbyear.hub.policies import push_policy
-from lerobot_playbyear.hub.pushing import HubError, warn_without_login
+from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.parts import PolicyWindows, TrainingParts, make_training_parts
 from lerobot_playbyear.training.reach import Reach, action_names
-from lerobot_playbyear.training.report import Report, print_results
-
-
-class TrainError(ValueError):
-    """What a person asked for cannot be trained; the message says why, and what to do."""
+from lerobot_playbyear.training.report import Report, is_due, print_results
 
 
 def train(cfg: PlaybyearTrainConfig) -> Path:
@@ -43,11 +38,11 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         The output folder.
 
     Raises:
-        TrainError: If an option, the dataset and the policy do not go together, before any work is done; or, after it, if
-            the Hub does not take the policy.
+        InputError: If an option, the dataset and the policy do not go together, before any work is done.
+        HubError: After it, if the Hub does not take the policy.
     """
     init_logging()
-    with _errors_of_input():
+    with errors_of_input(FileNotFoundError, MemoryError):
         cfg.validate()
         check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
         if cfg.policy is not None and cfg.policy.push_to_hub:
@@ -58,8 +53,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         dataset, held_out = make_train_eval_datasets(cfg)
         parts = make_training_parts(cfg, dataset.meta)
         windows = PolicyWindows(parts.policy.config, dataset.meta, cfg.rename_map)
-        store = _read(dataset, windows, cfg)
-        validation_store = None if held_out is None or cfg.eval_steps <= 0 else _read(held_out, windows, cfg)
+        store = read_store(dataset, windows, cfg)
+        validation_store = None if held_out is None or cfg.eval_steps <= 0 else read_store(held_out, windows, cfg)
 
     reach = Reach(parts.policy.config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
     reach.warn(store.column(ACTION), f"the dataset '{cfg.dataset.repo_id}'")
@@ -69,7 +64,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     _log_start(cfg, parts, store)
     with Report(cfg, store, parts) as report:
         _loop(cfg, parts, windows, store, sampler, validation_store, report)
-    print_results(cfg, report.last_success)
+    print_results(cfg, report.success)
     if cfg.policy is not None and cfg.policy.push_to_hub:
         _push(cfg, parts)
     return Path(str(cfg.output_dir))
@@ -115,17 +110,22 @@ def _loop(
         parts.update(batch, report.metrics, grad_clip_norm)
         report.updated()
         is_last = parts.step == cfg.steps
-        if _is_due(parts.step, cfg.log_freq):
+        if is_due(parts.step, cfg.log_freq):
             report.write_training()
-        if validation_store is not None and (_is_due(parts.step, cfg.eval_steps) or is_last):
+        if validation_store is not None and (is_due(parts.step, cfg.eval_steps) or is_last):
             report.write("validation", {"loss": validation_loss(parts, windows, validation_store, cfg.batch_size)})
-        if cfg.save_checkpoint and (_is_due(parts.step, cfg.save_freq) or is_last):
+        if cfg.save_checkpoint and (is_due(parts.step, cfg.save_freq) or is_last):
             report.saved(parts.save(cfg))
-        if cfg.env is not None and cfg.env_eval_freq > 0 and (_is_due(parts.step, cfg.env_eval_freq) or is_last):
+        if cfg.env is not None and cfg.env_eval_freq > 0 and (is_due(parts.step, cfg.env_eval_freq) or is_last):
             report.write_evaluation(parts.evaluate(cfg))
 
 
-def _read(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTrainConfig) -> EpisodeStore:
+def read_store(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTrainConfig) -> EpisodeStore:
+    """What a policy learns from, in memory.
+
+    Raises:
+        ValueError, MemoryError: As `EpisodeStore.from_dataset`.
+    """
     start = time.perf_counter()
     backend = cfg.dataset.video_backend
     store = EpisodeStore.from_dataset(dataset, windows.keys, cfg.store.device, backend, progress=not inside_slurm())
@@ -136,22 +136,10 @@ def _read(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTrainCo
     return store
 
 
-@contextmanager
-def _errors_of_input() -> Iterator[None]:
-    try:
-        yield
-    except (ValueError, FileExistsError, FileNotFoundError, MemoryError) as error:
-        raise TrainError(str(error)) from error
-
-
 def _configure_backends(cfg: PlaybyearTrainConfig) -> None:
     torch.backends.cudnn.deterministic = cfg.cudnn_deterministic
     torch.backends.cudnn.benchmark = not cfg.cudnn_deterministic
     torch.backends.cuda.matmul.allow_tf32 = True
-
-
-def _is_due(step: int, frequency: int) -> bool:
-    return frequency > 0 and step % frequency == 0
 
 
 def _log_start(cfg: PlaybyearTrainConfig, parts: TrainingParts, store: EpisodeStore) -> None:
@@ -167,8 +155,5 @@ def _push(cfg: PlaybyearTrainConfig, parts: TrainingParts) -> None:
     assert cfg.policy is not None
     assert cfg.policy.repo_id is not None
     folder = (Path(str(cfg.output_dir)) / "checkpoints" / "last") if cfg.save_checkpoint else parts.save(cfg)
-    try:
-        url = push_policy(folder / "pretrained_model", cfg.policy.repo_id, private=cfg.policy.private)
-    except HubError as error:
-        raise TrainError(str(error)) from error
+    url = push_policy(folder / "pretrained_model", cfg.policy.repo_id, PushOptions(cfg.policy.private))
     print(f"On the Hub: {url}")

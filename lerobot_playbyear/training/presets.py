@@ -7,6 +7,7 @@ bfloat16 the preset `cpu` switches `policy.use_amp` on.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.training.command_line import given_options
 
 
@@ -81,7 +82,7 @@ def apply_preset(args: Sequence[str]) -> list[str]:
             checkpoint holds all options and the preset changes nothing.
 
     Raises:
-        ValueError: If there is no such preset, or the policy is of another type.
+        InputError: If there is no such preset, or the policy is of another type.
     """
     given, _ = given_options(args)
     name = given.get("preset")
@@ -89,11 +90,11 @@ def apply_preset(args: Sequence[str]) -> list[str]:
         return list(args)
     if name not in PRESETS:
         known = "; ".join(f"{key} ({preset.purpose})" for key, preset in PRESETS.items())
-        raise ValueError(f"--preset={name} is not known. The presets are: {known}.")
+        raise InputError(f"--preset={name} is not known. The presets are: {known}.")
     preset = PRESETS[name]
     policy_type = given.get("policy.type")
     if policy_type not in (None, preset.network["policy.type"]):
-        raise ValueError(
+        raise InputError(
             f"--preset={name} is for --policy.type={preset.network['policy.type']}, not for {policy_type}: "
             "leave one of the two out."
         )

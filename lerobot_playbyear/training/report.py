@@ -1,11 +1,14 @@
 """What a training tells of itself: a bar, the log, a file of figures, and W&B."""
 
+import abc
 import json
 import logging
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, Self
 
+import torch
+from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.utils import inside_slurm
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -14,71 +17,136 @@ from lerobot_playbyear.compat import WandBLogger
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.hub.training_run import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.metrics import make_tracker
 from lerobot_playbyear.training.parts import TrainingParts
 
 
-class Report:
-    """Tells a person, a file and W&B how training goes."""
+class Counter(Protocol):
+    """What knows how many updates are done."""
 
-    def __init__(self, cfg: PlaybyearTrainConfig, store: EpisodeStore, parts: TrainingParts) -> None:
-        self._cfg, self._parts = cfg, parts
+    step: int
+
+
+class Progress(abc.ABC):
+    """A bar with the log above it, and W&B: what all that learns tells of itself in the same way.
+
+    Args:
+        cfg: Options, for W&B.
+        counter: Of updates; it is read, never changed.
+        total: What the bar counts to.
+        done: Where it begins.
+        unit: Of what it counts.
+        name: What stands before it.
+
+    Attributes:
+        bar: The bar.
+        success: What the last evaluation gave [%]; None before.
+    """
+
+    def __init__(
+        self, cfg: PlaybyearTrainConfig, counter: Counter, total: int, done: int, unit: str, name: str
+    ) -> None:
+        self._counter = counter
         self._wandb = WandBLogger(cfg) if cfg.wandb.enable and cfg.wandb.project else None
-        self._path = Path(str(cfg.output_dir)) / METRICS_NAME
-        self._path.parent.mkdir(parents=True, exist_ok=True)
         self._redirect = logging_redirect_tqdm()
-        self._bar: tqdm = tqdm(
-            total=cfg.steps, initial=parts.step, desc="Training", unit="step", disable=inside_slurm()
-        )
-        self._began, self._first_step = time.perf_counter(), parts.step
-        self.last_success: float | None = None
-        self.metrics = make_tracker(cfg.batch_size, store, parts.step)
+        self.bar: tqdm = tqdm(total=total, initial=done, desc=name, unit=unit, disable=inside_slurm())
+        self.success: float | None = None
 
-    def __enter__(self) -> "Report":
+    def __enter__(self) -> Self:
         self._redirect.__enter__()
+        for handler in logging.getLogger().handlers:  # tqdm's take the place of LeRobot's, but not their level
+            handler.setLevel(max(handler.level, logging.INFO))
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._bar.close()
+        self.bar.close()
         self._redirect.__exit__(*error)
+
+    @abc.abstractmethod
+    def write(self, kind: str, figures: dict[str, Any]) -> None:
+        """Figures of one kind at this step."""
+
+    def write_evaluation(self, info: dict[str, Any], **more: float) -> None:
+        """What a roll-out in the environment gave.
+
+        Args:
+            info: As LeRobot gives it.
+            more: Further figures.
+        """
+        overall = info["overall"]
+        self.success = float(overall["pc_success"])
+        self.write("eval", {k: v for k, v in overall.items() if isinstance(v, int | float)} | more)
+        if self._wandb and overall.get("video_paths"):
+            self._wandb.log_video(overall["video_paths"][0], self._counter.step, mode="eval")
+
+    def _to_wandb(self, kind: str, figures: dict[str, Any]) -> None:
+        if self._wandb:
+            self._wandb.log_dict(
+                figures, self._counter.step, mode="eval" if kind in ("eval", "validation") else "train"
+            )
+
+
+class Report(Progress):
+    """Tells a person, a file and W&B how training goes."""
+
+    def __init__(self, cfg: PlaybyearTrainConfig, store: EpisodeStore, parts: TrainingParts) -> None:
+        super().__init__(cfg, parts, cfg.steps, parts.step, "step", "Training")
+        self._path = Path(str(cfg.output_dir)) / METRICS_NAME
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._began = time.perf_counter()
+        self.metrics = make_tracker(cfg.batch_size, store, parts.step)
 
     def updated(self) -> None:
         """One more update is done."""
         self.metrics.step()
-        self._bar.update(1)
+        self.bar.update(1)
 
     def write_training(self) -> None:
         """The figures since the last time."""
         figures = self.metrics.to_dict()
-        self._bar.set_postfix(loss=f"{figures['loss']:.4f}", refresh=False)
+        self.bar.set_postfix(loss=f"{figures['loss']:.4f}", refresh=False)
         self.write("train", {key: value for key, value in figures.items() if key != "steps"}, str(self.metrics))
         self.metrics.reset_averages()
-
-    def write_evaluation(self, info: dict[str, Any]) -> None:
-        """What a roll-out in the environment gave."""
-        overall = info["overall"]
-        self.last_success = float(overall["pc_success"])
-        figures = {key: value for key, value in overall.items() if isinstance(value, int | float)}
-        self.write("eval", figures)
-        if self._wandb and overall.get("video_paths"):
-            self._wandb.log_video(overall["video_paths"][0], self._parts.step, mode="eval")
 
     def write(self, kind: str, figures: dict[str, Any], text: str | None = None) -> None:
         """Figures of one kind at this step."""
         numbers = ", ".join(f"{key} {value:.4g}" for key, value in figures.items())
-        logging.info(text or f"{kind} at step {self._parts.step}: {numbers}")
+        logging.info(text or f"{kind} at step {self._counter.step}: {numbers}")
         elapsed = round(time.perf_counter() - self._began, 2)
         with self._path.open("a") as file:
-            line = {"kind": kind, "step": self._parts.step, "elapsed_s": elapsed, **figures}
+            line = {"kind": kind, "step": self._counter.step, "elapsed_s": elapsed, **figures}
             file.write(json.dumps(line) + "\n")
-        if self._wandb:
-            self._wandb.log_dict(figures, self._parts.step, mode="train" if kind == "train" else "eval")
+        self._to_wandb(kind, figures)
 
     def saved(self, checkpoint: Path) -> None:
         """A checkpoint is on disk."""
         logging.info(f"Checkpoint: {checkpoint}")
         if self._wandb:
             self._wandb.log_policy(checkpoint)
+
+
+def make_tracker(batch_size: int, store: EpisodeStore, step: int = 0) -> MetricsTracker:
+    """The averages that LeRobot's `update_policy` writes to.
+
+    Args:
+        batch_size: Items per update.
+        store: What they are drawn from.
+        step: Updates done before.
+    """
+    meters = {
+        "loss": AverageMeter("loss", ":.3f"),
+        "grad_norm": AverageMeter("grdn", ":.3f"),
+        "lr": AverageMeter("lr", ":0.1e"),
+        "update_s": AverageMeter("updt_s", ":.3f"),
+        "dataloading_s": AverageMeter("data_s", ":.3f"),
+    }
+    if torch.cuda.is_available():
+        meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
+    return MetricsTracker(batch_size, len(store), store.n_episodes, meters, initial_step=step)
+
+
+def is_due(step: int, every: int) -> bool:
+    """Whether something that is done every so many steps is done after this one; 0: never."""
+    return every > 0 and step % every == 0
 
 
 def print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
