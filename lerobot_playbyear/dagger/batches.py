@@ -46,10 +46,10 @@ class BalancedBatches:
         seed: int = 0,
     ) -> None:
         self._windows, self._seed, self._n_half = windows, seed, batch_size // 2
-        self._demonstrations, self._interventions = demonstrations, interventions
+        self._demonstrations = demonstrations
         self._deltas = {INTERVENTION: windows.action_deltas}
         self._from_demonstrations = RunSampler(run_weights(demonstrations, windows.n_windows), seed)
-        self._from_interventions: RunSampler | None = None
+        self._interventions: EpisodeStore | None = None
         if interventions is not None:
             self.set_interventions(interventions)
 
@@ -65,11 +65,7 @@ class BalancedBatches:
                 f"None of the {len(interventions)} frames of the intervention dataset has '{INTERVENTION}' set: there is "
                 "nothing to learn from an expert. Give a dataset of corrections, or collect some with --episodes."
             )
-        self._interventions = interventions
-        if self._from_interventions is None:
-            self._from_interventions = RunSampler(weights, self._seed + 1)
-        else:
-            self._from_interventions.set_weights(weights)
+        self._interventions, self._from_interventions = interventions, RunSampler(weights, self._seed + 1)
 
     def batch(self, number: int) -> dict[str, Any]:
         """The batch of that number, counted from 0: the first half are demonstrations.
@@ -79,14 +75,13 @@ class BalancedBatches:
             action is not to be learned.
         """
         assert self._interventions is not None
-        assert self._from_interventions is not None
-        lasts = [
-            _draw(sampler, number, self._n_half) for sampler in (self._from_demonstrations, self._from_interventions)
-        ]
-        demonstrations = self._windows.batch(self._demonstrations, lasts[0])
-        interventions = self._windows.batch(self._interventions, lasts[1])
+        last = _draw(self._from_interventions, number, self._n_half)
+        interventions = self._windows.batch(self._interventions, last)
+        demonstrations = self._windows.batch(
+            self._demonstrations, _draw(self._from_demonstrations, number, self._n_half)
+        )
         if len(self._windows.action_deltas) > 1:
-            by_expert = self._by_expert(self._interventions, lasts[1])  # (B/2, K)
+            by_expert = self._by_expert(self._interventions, last)  # (B/2, K)
             is_learned = ~demonstrations[_IS_PAD]
             n, generator = int(min(is_learned.sum(), by_expert.sum())), self._generator(number)
             demonstrations[_IS_PAD] = ~_keep(is_learned, n, generator)

@@ -27,20 +27,17 @@ def check_dataset(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename
     check_dataset_suits(policy, meta, rename_map)
     names = dataset_names(policy, rename_map)
     rate = getattr(policy, "sample_rate", None)
-    for name in names.values():
+    for key, feature in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
+        name = names.get(key, key)
+        if name not in meta.features:
+            raise InputError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
         seen_rate = (meta.features[name].get("info") or {}).get("sample_rate")
         if rate is not None and seen_rate is not None and int(seen_rate) != int(rate):
             raise InputError(
                 f"'{name}' was recorded at {seen_rate} Hz in the dataset '{meta.repo_id}', and the policy was trained with "
                 f"{rate} Hz: use data recorded at {rate} Hz, or train a policy for {seen_rate} Hz first."
             )
-
-    for key, feature in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
-        name = names.get(key, key)
-        if name not in meta.features:
-            raise InputError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
-        seen = tuple(meta.features[name]["shape"])
-        wanted = tuple(feature.shape)
+        seen, wanted = tuple(meta.features[name]["shape"]), tuple(feature.shape)
         same = sorted(seen) == sorted(wanted) if feature.type is FeatureType.VISUAL else seen == wanted
         if not same:
             raise InputError(
@@ -64,9 +61,7 @@ def check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, other: Featu
     """
     differences = [f"fps is {demos.fps} there and {fps} here"] if demos.fps != fps else []
     for key in (*keys, ACTION):
-        there, here = (
-            _signature(features[key]) if key in features else "absent" for features in (demos.features, other)
-        )
+        there, here = (_signature(features.get(key)) for features in (demos.features, other))
         if there != here:
             differences.append(f"'{key}' is {there} there and {here} here")
     if differences:
@@ -139,7 +134,9 @@ def check_actions_can_be_masked(parts: TrainingParts, windows: PolicyWindows, de
     )
 
 
-def _signature(feature: Mapping[str, Any]) -> str:
+def _signature(feature: Mapping[str, Any] | None) -> str:
+    if feature is None:
+        return "absent"
     kind = "picture" if feature["dtype"] in ("image", "video") else feature["dtype"]
     rate = (feature.get("info") or {}).get("sample_rate")
     return f"{kind} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")

@@ -2,16 +2,18 @@
 
 import dataclasses
 from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+from lerobot.envs import EnvConfig
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
-from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig
+from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ScriptedExpertConfig
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.recording.record import RecordConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
@@ -28,45 +30,28 @@ class DemonstrationConfig(RecordConfig):
     expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
 
 
+@dataclass
 class PersonRollouts:
     """Episodes of a person, with the interface of `RolloutPool`.
 
     Args:
-        env: The environment; it is closed at the end.
-        expert: The person's options.
-
-    Raises:
-        ExpertError: Environment, teleoperator or screen do not do.
+        env: The environment.
+        expert: The person.
     """
 
-    def __init__(self, env: gym.Env, expert: TeleopExpertConfig) -> None:
-        self._env = env
-        try:
-            self._expert = expert.make_demonstrator(env)
-        except BaseException:
-            env.close()
-            raise
+    env: gym.Env
+    expert: Expert
 
     def facts(self) -> EnvFacts:
         """What the environment looks like; a person needs no script."""
-        return dataclasses.replace(env_facts(self._env), has_expert=True)
+        return dataclasses.replace(env_facts(self.env), has_expert=True)
 
     def episodes(self, seeds: Iterable[int]) -> Iterator[Episode]:
         """One episode per seed; those that the person throws away are done again."""
         for seed in seeds:
-            while (episode := play(self._env, Nobody(), seed, expert=self._expert)).verdict is Verdict.DISCARD:
+            while (episode := play(self.env, Nobody(), seed, expert=self.expert)).verdict is Verdict.DISCARD:
                 pass
             yield episode
-
-    def close(self) -> None:
-        self._expert.close()
-        self._env.close()
-
-    def __enter__(self) -> "PersonRollouts":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 class Nobody:
@@ -99,4 +84,10 @@ def record_demonstrations(cfg: DemonstrationConfig) -> Path:
         raise InputError(
             f"--expert.type={expert.type} corrects a policy and does not demonstrate: give scripted or teleop."
         )
-    return record(cfg, lambda: PersonRollouts(env_spec(cfg.env).make(), expert))
+    return record(cfg, lambda: _person(cfg.env, expert))
+
+
+@contextmanager
+def _person(env_cfg: EnvConfig, expert: TeleopExpertConfig) -> Iterator[PersonRollouts]:
+    with closing(env_spec(env_cfg).make()) as env, closing(expert.make_demonstrator(env)) as person:
+        yield PersonRollouts(env, person)

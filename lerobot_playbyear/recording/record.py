@@ -3,9 +3,11 @@
 import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Protocol
 
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -87,12 +89,8 @@ class Rollouts(Protocol):
         """One episode per seed, in their order."""
         ...
 
-    def __enter__(self) -> Self: ...
 
-    def __exit__(self, *_: object) -> None: ...
-
-
-def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = None) -> Path:
+def record(cfg: RecordConfig, make_rollouts: Callable[[], AbstractContextManager[Rollouts]] | None = None) -> Path:
     """Records expert episodes until the dataset has as many as asked for; only successes are kept.
 
     Args:
@@ -111,8 +109,8 @@ def record(cfg: RecordConfig, make_rollouts: Callable[[], Rollouts] | None = Non
         with errors_of_input():
             _check_options(cfg)
             check_root(root, resume=cfg.resume)
-            rollouts = make_rollouts() if make_rollouts else RolloutPool(env_spec(cfg.env), cfg.num_workers or 0)
-        with rollouts as pool:
+        make_pool = make_rollouts or partial(RolloutPool, env_spec(cfg.env), cfg.num_workers or 0)
+        with make_pool() as pool:
             facts = pool.facts()
             _check_facts(facts, cfg.env)
             features = dataset_features(facts, cfg.dataset.video)

@@ -8,6 +8,7 @@ from typing import Any
 import draccus
 from lerobot.configs import parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
+from lerobot.utils.utils import flatten_dict
 
 OWN_CONFIG_NAME = "playbyear_train_config.json"
 """File beside `train_config.json` that holds the options which lerobot-train does not know."""
@@ -113,18 +114,8 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         path = Path(pretrained_name_or_path)
         own = (path if path.is_dir() else path.parent) / OWN_CONFIG_NAME
         if own.is_file():
-            saved = _flatten(json.loads(own.read_text()))
-            cli_args = [f"--{k}={v}" for k, v in saved.items() if parser.parse_arg(k, cli_args) is None] + cli_args
+            saved = flatten_dict(json.loads(own.read_text()), sep=".").items()
+            given = [f"--{k}={v}" for k, v in saved if v is not None and parser.parse_arg(k, cli_args) is None]
+            cli_args = given + cli_args
         config = super().from_pretrained(pretrained_name_or_path, cli_args=cli_args, **kwargs)
         return config  # type: ignore[return-value]
-
-
-def _flatten(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested options with their names joined by dots; options that are None are left out."""
-    flat: dict[str, Any] = {}
-    for key, value in options.items():
-        if isinstance(value, dict):
-            flat.update(_flatten(value, f"{prefix}{key}."))
-        elif value is not None:
-            flat[f"{prefix}{key}"] = value
-    return flat
