@@ -32,7 +32,7 @@ _IMPORTED_LATER = (
     "lerobot_playbyear.hub.policies",
     "lerobot_playbyear.hub.uploads",
     "lerobot_playbyear.inspection.page_writer",
-    "lerobot_playbyear.recording.demonstrations",
+    "lerobot_playbyear.recording.record",
     "lerobot_playbyear.training.loop",
     "lerobot_env_playbyear",
 )

@@ -21,8 +21,8 @@ from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
-from lerobot_playbyear.recording.record import RecordDatasetConfig
+from lerobot_playbyear.recording.demonstrations import Nobody
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 from lerobot_playbyear.teleoperation.expert import PersonLeftError
 from lerobot_playbyear.teleoperation.panel import FRAME
@@ -240,10 +240,10 @@ def demonstrate(screen):
 def test_playbyear_record_records_a_persons_demonstrations(screen, tmp_path):
     dataset = RecordDatasetConfig("test/person", str(tmp_path / "person"), num_episodes=1)
     env_cfg = env_config(episode_length=2000)
-    cfg = DemonstrationConfig(env_cfg, dataset, seed=7, expert=TeleopExpertConfig(play_sound=False))
+    cfg = RecordConfig(env_cfg, dataset, seed=7, expert=TeleopExpertConfig(play_sound=False))
     person = threading.Thread(target=person_demonstrates, args=(screen,))
     person.start()
-    root = record_demonstrations(cfg)
+    root = record(cfg)
     person.join(timeout=60)
     recorded = LeRobotDataset("test/person", root=root, video_backend="pyav")
     assert recorded.num_episodes == 1

@@ -24,8 +24,8 @@ from lerobot_playbyear.dagger.loop import outcome_of
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play as play_episode
-from lerobot_playbyear.recording.demonstrations import DemonstrationConfig, Nobody, record_demonstrations
-from lerobot_playbyear.recording.record import RecordDatasetConfig
+from lerobot_playbyear.recording.demonstrations import Nobody
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.teleoperation.actions import CLOSE, DELTAS, OPEN, STAY, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
 from lerobot_playbyear.teleoperation.controls import Controls
@@ -548,7 +548,7 @@ def test_long_texts_stay_inside_the_panel():
 
 def parsed(*options):
     args = ["--env.type=playbyear", "--dataset.repo_id=test/none", "--expert.type=teleop", *options]
-    return draccus.parse(DemonstrationConfig, args=args).expert
+    return draccus.parse(RecordConfig, args=args).expert
 
 
 def test_the_options_choose_a_teleoperator_and_survive_being_saved():
@@ -620,6 +620,6 @@ def test_only_a_script_or_a_person_demonstrates(tmp_path):
         def make(self, env): ...
 
     dataset = RecordDatasetConfig("test/none", str(tmp_path / "none"))
-    cfg = DemonstrationConfig(PlaybyearEnvConfig(), dataset, expert=CorrectsOnly())
+    cfg = RecordConfig(PlaybyearEnvConfig(), dataset, expert=CorrectsOnly())
     with pytest.raises(PlaybyearError, match="scripted or teleop"):
-        record_demonstrations(cfg)
+        record(cfg)

@@ -21,7 +21,7 @@ from lerobot_playbyear.film.filming import VideoConfig
 from lerobot_playbyear.hub.uploads import PushConfig
 from lerobot_playbyear.inspection.inspecting import InspectConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.recording.demonstrations import DemonstrationConfig
+from lerobot_playbyear.recording.record import RecordConfig
 from lerobot_playbyear.scripts.command import OPTIONS_FILE
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
@@ -30,7 +30,7 @@ CONFIGS: dict[str, type] = {
     "playbyear-dagger": DaggerConfig,
     "playbyear-inspect": InspectConfig,
     "playbyear-push": PushConfig,
-    "playbyear-record": DemonstrationConfig,
+    "playbyear-record": RecordConfig,
     "playbyear-repair": RepairConfig,
     "playbyear-train": PlaybyearTrainConfig,
     "playbyear-video": VideoConfig,

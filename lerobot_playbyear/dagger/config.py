@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,7 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 CONFIG_NAME = "dagger_config.json"
 """File in the output folder with the options of the run."""
 
-
-_FROM_0 = "episodes updates_per_episode updates episode_seed seed eval_every save_every eval_videos"
-_LEAST = dict.fromkeys(_FROM_0.split(), 0) | {"warmup_episodes": 1, "max_attempts": 1}
+_LEAST = {"warmup_episodes": 1, "max_attempts": 1}  # of the other whole numbers: 0
 
 
 @dataclass
@@ -135,11 +133,11 @@ class DaggerConfig:
 
     def check(self) -> None:
         """Raise a InputError if a number is out of its range or an option is missing."""
-        for name, least in _LEAST.items():
-            if getattr(self, name) < least:
-                raise InputError(f"--{name}={getattr(self, name)}: give at least {least}.")
         if self.learning_rate is not None and not self.learning_rate > 0:
             raise InputError(f"--learning_rate={self.learning_rate} must be above 0.")
+        for name, value in vars(self).items():
+            if isinstance(value, int) and value < _LEAST.get(name, 0):
+                raise InputError(f"--{name}={value}: give at least {_LEAST.get(name, 0)}.")
         if self.batch_size < 2 or self.batch_size % 2:
             raise InputError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
         if self.is_online and self.updates:
@@ -181,27 +179,17 @@ class DaggerConfig:
 
     def training(self) -> PlaybyearTrainConfig:
         """The same as options of playbyear-train, for what HG-DAgger shares with it."""
+        shared = vars(self).keys() & {option.name for option in fields(PlaybyearTrainConfig)}  # they mean the same
         assert self.policy is not None
         optimizer = self.policy.get_optimizer_preset()
         optimizer.lr = self.largest_rate
-        source = self.demos
         return PlaybyearTrainConfig(
-            dataset=DatasetConfig(source.repo_id, root=source.root, video_backend=source.video_backend),
-            env=self.env,
-            policy=self.policy,
-            output_dir=self.output_dir,
-            job_name=self.job_name,
-            resume=self.resume,
-            seed=self.seed,
-            batch_size=self.batch_size,
+            dataset=DatasetConfig(self.demos.repo_id, root=self.demos.root, video_backend=self.demos.video_backend),
             steps=self.total_updates,
             num_workers=0,
             env_eval_freq=0,
             optimizer=optimizer,
-            eval=self.eval,
-            wandb=self.wandb,
-            rename_map=self.rename_map,
-            store=self.store,
+            **{name: getattr(self, name) for name in shared},
         )
 
     def options(self) -> dict[str, Any]:

@@ -79,9 +79,8 @@ class Corrections:
     def _read(self) -> None:
         backend = self._source.video_backend
         dataset = LeRobotDataset(self._source.repo_id, root=self._source.root, video_backend=backend)
-        has_seeds = SEED in dataset.meta.features
-        keys = self._keys and [*self._keys, *([SEED] if has_seeds else [])]
-        self.store = EpisodeStore.from_dataset(dataset, keys, self._device, backend)
+        seeds = [SEED] if SEED in dataset.meta.features else []
+        self.store = EpisodeStore.from_dataset(dataset, self._keys and self._keys + seeds, self._device, backend)
 
     @property
     def n_episodes(self) -> int:

@@ -70,7 +70,7 @@ def _make_card(source: DatasetSource, repo_id: str, scratch: Path, options: Push
     if film is None:
         try:
             preview = film_preview(source, scratch / FILM)
-            film = preview.path
+            film = scratch / FILM
         except OutsideError as error:
             raise HubError(f"Not pushed. {error}") from error
         except Exception:  # a film is not worth an upload

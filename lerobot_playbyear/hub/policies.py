@@ -6,6 +6,7 @@ from typing import Any
 
 from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import get_policy_class
 from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME
@@ -14,7 +15,7 @@ from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.hub.datasets import CARD, FILM
 from lerobot_playbyear.hub.pushing import PushOptions, push_patiently
 from lerobot_playbyear.hub.repository import HubRepository
-from lerobot_playbyear.hub.training_run import evaluation_of, find_checkpoint, training_options
+from lerobot_playbyear.hub.training_run import evaluation_of, find_checkpoint
 from lerobot_playbyear.policy.card import write_card
 
 _NO_RESULTS = "_No evaluation results have been provided for this policy yet._"  # LeRobot's template
@@ -78,7 +79,8 @@ def push_checkpoint(folder: Path, repo_id: str, private: bool | None = None) -> 
 
 
 def _make_card(policy: Any, folder: Path) -> ModelCard:
-    config, training = policy.config, training_options(folder)
+    config = policy.config
+    training = TrainPipelineConfig.from_pretrained(folder) if (folder / TRAIN_CONFIG_NAME).is_file() else None
     dataset = training.dataset if training is not None else None
     meta = None
     if dataset is not None:

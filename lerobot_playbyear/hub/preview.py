@@ -22,13 +22,11 @@ class Preview:
     """What a film shows.
 
     Args:
-        path: The film.
-        episode: Its episode's index.
+        episode: The index of its episode.
         microphones: The keys of those that are heard: the first two where they have one rate, left and right.
         is_whole: Whether it shows the whole episode.
     """
 
-    path: Path
     episode: int
     microphones: tuple[str, ...]
     is_whole: bool
@@ -54,7 +52,7 @@ def film_preview(source: DatasetSource, path: Path) -> Preview:
     heard, sample_rate = at_a_rate_of_aac(amplify(episode_sound(stacked)), stacked.shape[1] * source.fps)
     pictures, sound = itertools.islice(_pictures(source, shown), n_frames), heard[:]
     write_film(path, compose(pictures, n_frames, sound, sample_rate), source.fps, sound, sample_rate)
-    return Preview(path, episode.index, tuple(microphones), n_frames == len(episode))
+    return Preview(episode.index, tuple(microphones), n_frames == len(episode))
 
 
 def _pictures(source: DatasetSource, episode: Episode) -> Iterator[np.ndarray]:

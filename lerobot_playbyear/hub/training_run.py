@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from huggingface_hub.constants import CONFIG_NAME, SAFETENSORS_SINGLE_FILE
-from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
 from lerobot_playbyear.hub.pushing import HubError
@@ -28,11 +27,6 @@ def find_checkpoint(path: Path) -> Path:
         f"policy.path={path}: there is no checkpoint with {CONFIG_NAME} and {SAFETENSORS_SINGLE_FILE}. Give the folder "
         f"`{PRETRAINED_MODEL_DIR}` of one, or the output folder of a training."
     )
-
-
-def training_options(folder: Path) -> TrainPipelineConfig | None:
-    """The options that a checkpoint was trained with, if it holds them."""
-    return TrainPipelineConfig.from_pretrained(folder) if (folder / TRAIN_CONFIG_NAME).is_file() else None
 
 
 def evaluation_of(checkpoint: Path) -> dict[str, float] | None:

@@ -3,31 +3,17 @@
 import dataclasses
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
 from lerobot.envs import EnvConfig
 
-from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
-from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ScriptedExpertConfig
+from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.recording.record import RecordConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
-
-
-@dataclass
-class DemonstrationConfig(RecordConfig):
-    """Options of `playbyear-record`, with who demonstrates.
-
-    Args:
-        expert: `--expert.type=scripted`, the environment's own script, or `teleop`, a person.
-    """
-
-    expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
 
 
 @dataclass
@@ -65,29 +51,13 @@ class Nobody:
         return self._action
 
 
-def record_demonstrations(cfg: DemonstrationConfig) -> Path:
-    """Record a script, or a person.
-
-    Args:
-        cfg: The options.
-
-    Returns:
-        The dataset's folder.
+@contextmanager
+def person_rollouts(env_cfg: EnvConfig, expert: TeleopExpertConfig) -> Iterator[PersonRollouts]:
+    """Episodes of a person, whose window and environment are closed at the end.
 
     Raises:
-        PlaybyearError: As `record`; or the person's window or teleoperator cannot be had.
+        RolloutError: The environment cannot be made.
+        ExpertError: Environment, teleoperator or screen do not do.
     """
-    if isinstance(cfg.expert, ScriptedExpertConfig):
-        return record(cfg)
-    expert = cfg.expert
-    if not isinstance(expert, TeleopExpertConfig):
-        raise InputError(
-            f"--expert.type={expert.type} corrects a policy and does not demonstrate: give scripted or teleop."
-        )
-    return record(cfg, lambda: _person(cfg.env, expert))
-
-
-@contextmanager
-def _person(env_cfg: EnvConfig, expert: TeleopExpertConfig) -> Iterator[PersonRollouts]:
     with closing(env_spec(env_cfg).make()) as env, closing(expert.make_demonstrator(env)) as person:
         yield PersonRollouts(env, person)

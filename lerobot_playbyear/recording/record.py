@@ -2,12 +2,9 @@
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
@@ -17,12 +14,14 @@ from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input
 from lerobot_playbyear.datasets.existing import check_root
 from lerobot_playbyear.episodes.environment import EnvFacts, env_spec
-from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.hub.datasets import check_name, push_dataset
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
+from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
+from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
 _MIN_ATTEMPTS_PER_SUCCESS = 20  # attempts in a row without one success after which recording gives up
 
@@ -59,12 +58,13 @@ class RecordConfig:
     """Options of `playbyear-record`.
 
     Args:
-        env: The environment, `--env.type=playbyear --env.task=OccludedGrasp-v0`; it must have a scripted expert.
+        env: The environment, `--env.type=playbyear --env.task=OccludedGrasp-v0`.
         dataset: What is written, and where.
         seed: The first attempt's seed; each further attempt takes the next one.
         resume: Append to a dataset that is there already, up to `num_episodes`, with the seeds after its largest.
         num_workers: Processes that play. 0: none but this one. None: as many as there are processor cores, at
             most 8. The dataset does not depend on it.
+        expert: Who demonstrates: `--expert.type=scripted`, the environment's own script, or `teleop`, a person.
     """
 
     env: EnvConfig
@@ -72,45 +72,33 @@ class RecordConfig:
     seed: int = 0
     resume: bool = False
     num_workers: int | None = None
+    expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
 
     def __post_init__(self) -> None:
         if self.num_workers is None:
             self.num_workers = min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1, 8)
 
 
-class Rollouts(Protocol):
-    """Where episodes come from: a pool of processes in which a script plays, or a person."""
-
-    def facts(self) -> EnvFacts:
-        """What the environment looks like."""
-        ...
-
-    def episodes(self, seeds: Iterable[int]) -> Iterator[Episode]:
-        """One episode per seed, in their order."""
-        ...
-
-
-def record(cfg: RecordConfig, make_rollouts: Callable[[], AbstractContextManager[Rollouts]] | None = None) -> Path:
-    """Records expert episodes until the dataset has as many as asked for; only successes are kept.
+def record(cfg: RecordConfig) -> Path:
+    """Records episodes of a script or of a person until the dataset has as many as asked for; only successes are kept.
 
     Args:
         cfg: The options.
-        make_rollouts: Makes what the episodes come from. None: the environment's script, in `num_workers` processes.
 
     Returns:
         The dataset's folder.
 
     Raises:
         PlaybyearError: Bad options, a folder that cannot be written, an environment without an expert, a dataset that
-            does not fit, a full disk, a Hub that cannot be reached. Episodes saved before are safe.
+            does not fit, a full disk, a Hub that cannot be reached; or the person's window or teleoperator cannot be had.
+            Episodes saved before are safe.
     """
     root = cfg.dataset.folder
     try:
         with errors_of_input():
             _check_options(cfg)
             check_root(root, resume=cfg.resume)
-        make_pool = make_rollouts or partial(RolloutPool, env_spec(cfg.env), cfg.num_workers or 0)
-        with make_pool() as pool:
+        with _rollouts(cfg) as pool:
             facts = pool.facts()
             _check_facts(facts, cfg.env)
             features = dataset_features(facts, cfg.dataset.video)
@@ -138,7 +126,14 @@ def record(cfg: RecordConfig, make_rollouts: Callable[[], AbstractContextManager
     return root
 
 
-def _record_episodes(cfg: RecordConfig, pool: Rollouts, writer: DurableWriter) -> None:
+def _rollouts(cfg: RecordConfig) -> AbstractContextManager[RolloutPool | PersonRollouts]:
+    """Where episodes come from."""
+    if isinstance(cfg.expert, TeleopExpertConfig):
+        return person_rollouts(cfg.env, cfg.expert)
+    return RolloutPool(env_spec(cfg.env), cfg.num_workers or 0)
+
+
+def _record_episodes(cfg: RecordConfig, pool: RolloutPool | PersonRollouts, writer: DurableWriter) -> None:
     wanted = cfg.dataset.num_episodes
     first_seed = next_seed(writer.root, cfg.seed)
     attempts = successes = failures_in_a_row = 0
@@ -167,6 +162,10 @@ def _check_options(cfg: RecordConfig) -> None:
         raise InputError(f"dataset.num_episodes={cfg.dataset.num_episodes}: give at least 1.")
     if cfg.seed < 0:
         raise InputError(f"seed={cfg.seed}: give 0 or more.")
+    if not isinstance(cfg.expert, ScriptedExpertConfig | TeleopExpertConfig):
+        raise InputError(
+            f"--expert.type={cfg.expert.type} corrects a policy and does not demonstrate: give scripted or teleop."
+        )
     if cfg.dataset.push_to_hub:
         check_name(cfg.dataset.repo_id)
         warn_without_login()

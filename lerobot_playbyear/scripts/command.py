@@ -108,22 +108,31 @@ def run_command(name: str, short_help: str | None, work: Callable[[], object], i
         sys.exit(interrupted)
 
 
-def run_alone[Result](work: Callable[[Any], Result]) -> Result:
-    """Does the work of a command that can do without LeRobot's parser.
+def run_alone[Result](work: Callable[[Any], Result], parse: Callable[[type], Any] | None = None) -> Result:
+    """Does the work of a command.
 
     Args:
         work: Takes an instance of the configuration that its argument is annotated with.
+        parse: Reads the options for such a configuration. None: without LeRobot.
 
     Raises:
         InputError: An option has no meaning.
     """
     import draccus
+    from draccus.utils import DecodingError
 
-    return _run(work, draccus.parse)
+    from lerobot_playbyear.datasets.errors import errors_of_input
+    from lerobot_playbyear.hub.client import patient_hub
+
+    (argument,) = inspect.signature(work).parameters.values()
+    with patient_hub():
+        with errors_of_input(DecodingError, OSError):
+            cfg = (parse or draccus.parse)(argument.annotation)
+        return work(cfg)
 
 
 def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
-    """The same with the options that LeRobot's parser reads, once LeRobot knows all plugins."""
+    """The same with LeRobot's parser, once LeRobot knows all plugins."""
     from lerobot.configs import parser
     from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -134,17 +143,4 @@ def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
         return parser.wrap()(options)()
 
     register_third_party_plugins()
-    return _run(work, parse)
-
-
-def _run[Result](work: Callable[[Any], Result], parse: Callable[[type], Any]) -> Result:
-    from draccus.utils import DecodingError
-
-    from lerobot_playbyear.datasets.errors import errors_of_input
-    from lerobot_playbyear.hub.client import patient_hub
-
-    (argument,) = inspect.signature(work).parameters.values()
-    with patient_hub():
-        with errors_of_input(DecodingError, OSError):
-            cfg = parse(argument.annotation)
-        return work(cfg)
+    return run_alone(work, parse)

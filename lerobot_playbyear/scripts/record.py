@@ -33,9 +33,9 @@ def main() -> None:
 
 def _record() -> None:
     # Here, because the processes that roll out import this module, and start in 2 seconds without LeRobot.
-    from lerobot_playbyear.recording.demonstrations import record_demonstrations
+    from lerobot_playbyear.recording.record import record
 
-    run_with_lerobot(record_demonstrations)
+    run_with_lerobot(record)
 
 
 if __name__ == "__main__":

@@ -4,10 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from accelerate import Accelerator
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
@@ -31,18 +30,22 @@ from lerobot_playbyear.datasets import EpisodeStore, audio_keys
 from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
 
 _DTYPES = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}
 
 
-def make_accelerator(policy: PreTrainedConfig) -> Accelerator:
+def make_accelerator(policy: PreTrainedConfig) -> "Accelerator":
     """The Accelerator that lerobot-train makes for a policy: its device and precision, one process.
 
     Raises:
         ValueError: If several processes were launched.
     """
+    from accelerate import Accelerator  # late, like the policy below: both take a second, and a dataset may be wrong
+
     mixed_precision = _DTYPES.get(getattr(policy, "dtype", ""))
     if not hasattr(policy, "dtype") and policy.use_amp:
         dtype = torch.get_autocast_dtype(torch.device(str(policy.device)).type)
@@ -125,7 +128,7 @@ class TrainingParts:
         step: Updates done.
     """
 
-    accelerator: Accelerator
+    accelerator: "Accelerator"
     policy: PreTrainedPolicy
     optimizer: torch.optim.Optimizer
     scheduler: Any
@@ -228,6 +231,8 @@ def make_training_parts(
     check_dataset_suits(policy_cfg, meta, cfg.rename_map)
     accelerator = make_accelerator(policy_cfg)
     policy = make_policy(cfg=policy_cfg, ds_meta=meta, rename_map=cfg.rename_map)
+    from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+
     if keep_normalization and isinstance(policy, PlaybyearPolicy):
         policy.keep_normalization()
     stats = None if cfg.resume or keep_normalization else meta.stats

@@ -35,8 +35,7 @@ class Reach:
 
     def warn(self, actions: Tensor, what: str) -> None:
         """Log the warning about actions that cannot be learned, if there are any; arguments as for `warning`."""
-        text = self.warning(actions, what)
-        if text is not None:
+        if text := self.warning(actions, what):
             logging.warning(text)
 
     def warning(self, actions: Tensor, what: str) -> str | None:
