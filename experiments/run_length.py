@@ -46,7 +46,7 @@ def held_out_loss(job: Job) -> float:
     losses = []
     for part in np.array_split(np.arange(len(store)), max(1, len(store) // 256)):
         batch = preprocessor(windows.batch(store, torch.from_numpy(part)))
-        losses.append(len(part) * policy.forward(batch)[1]["mse"])
+        losses.append(len(part) * float(policy.forward(batch)[0]))
     return float(sum(losses) / len(store))
 
 

@@ -159,10 +159,11 @@ def test_reading_a_long_video_holds_its_tensor_and_little_else(tmp_path):
         "timestamp": (np.arange(n_frames) / FPS).astype(np.float32),
     }
     dataset.reader.hf_dataset = type(dataset.hf_dataset)(pa.table(columns))
-    from lerobot_playbyear.datasets.tensors import read_videos
+    from lerobot_playbyear.datasets.reading import _gathered
+    from lerobot_playbyear.datasets.tensors import video_pieces
 
     kept: list[torch.Tensor] = []
-    grown = peak_of_process(lambda: kept.append(read_videos(dataset, CAMERA, "pyav")))
+    grown = peak_of_process(lambda: kept.append(_gathered(video_pieces(dataset, CAMERA, 0, "pyav"), n_frames)))
     assert kept[0].shape == (n_frames, 3, *size)
     assert grown < 1.5 * kept[0].nbytes
 

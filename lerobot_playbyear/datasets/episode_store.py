@@ -1,6 +1,7 @@
 """Episodes in contiguous memory, and windows of them by indexing."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,8 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.reading import INDEX_KEYS, read_dataset
-
-_GROWTH = 1.5
+from lerobot_playbyear.datasets.rows import as_lerobot_has, write_rows
+from lerobot_playbyear.datasets.shrinking import shrink
 
 
 class EpisodeStore:
@@ -29,11 +30,13 @@ class EpisodeStore:
         fps: Frames per second [Hz].
         tasks: The task texts that the column `task_index` counts.
         device: Where the tensors are kept.
+        image_size: The size that pictures were shrunk to, if they were [pixels]. Appended ones will be, too.
 
     Attributes:
         fps: Frames per second [Hz].
         tasks: The task texts.
         device: Where the tensors are kept.
+        image_size: The size that pictures were shrunk to, or None.
     """
 
     def __init__(
@@ -44,8 +47,10 @@ class EpisodeStore:
         fps: int,
         tasks: Sequence[str] = ("",),
         device: str | torch.device = "cpu",
+        image_size: int | None = None,
     ) -> None:
         self.fps = fps
+        self.image_size = image_size
         self.tasks = list(tasks)
         self.device = torch.device(device)
         self._n_frames = int(ends[-1]) if len(ends) else 0
@@ -53,10 +58,13 @@ class EpisodeStore:
         # Column by column, so that the copy on the other device never doubles the whole store.
         self._columns = {key: values.to(self.device) for key, values in columns.items()}
         lengths = torch.tensor(self._ends) - torch.tensor(self._starts)
+        # Where windows lie is reckoned on the host, which then never waits for a GPU.
         self._bounds = torch.stack(  # (N, 2): first frame, and last one, of the episode of each frame
             [torch.tensor(edge).repeat_interleave(lengths) for edge in (self._starts, [e - 1 for e in self._ends])],
             dim=1,
-        ).to(self.device)
+        )
+        task_index = columns.get("task_index")
+        self._task_index = torch.zeros(self._n_frames, dtype=torch.long) if task_index is None else task_index.cpu()
 
     @classmethod
     def from_dataset(
@@ -66,6 +74,9 @@ class EpisodeStore:
         device: str | torch.device | None = None,
         video_backend: str | None = None,
         progress: bool = False,
+        place: str = "memory",
+        image_size: int | None = None,
+        cache: Path | None = None,
     ) -> "EpisodeStore":
         """Read a dataset, local or from the Hub; the episodes it was opened with.
 
@@ -76,15 +87,18 @@ class EpisodeStore:
                 and the CPU otherwise.
             video_backend: LeRobot's video decoder ("pyav", "torchcodec"); None takes its default.
             progress: Show a progress bar for the cameras.
+            place: "memory", or "disk" for files that are mapped into memory, which the next run finds again.
+            image_size: Keep pictures no larger than this, shrunk as the policy `playbyear` does [pixels].
+            cache: Folder of the files; None takes one beside LeRobot's cache.
 
         Raises:
             ValueError: If a key is missing or cannot be kept, sound breaks the contract, a value is NaN or infinite,
-                or there are no frames.
+                there are no frames, or the disk has no room.
             MemoryError: If the tensors do not fit into the memory.
         """
-        columns, starts, ends = read_dataset(dataset, keys, device, video_backend, progress)
-        device = columns["index"].device
-        return cls(columns, starts, ends, dataset.fps, list(dataset.meta.tasks.index), device)
+        columns, starts, ends = read_dataset(dataset, keys, device, video_backend, progress, place, image_size, cache)
+        tasks, device = list(dataset.meta.tasks.index), columns["index"].device
+        return cls(columns, starts, ends, dataset.fps, tasks, device, image_size)
 
     @classmethod
     def load(
@@ -156,7 +170,7 @@ class EpisodeStore:
             ValueError: If a key is not in the store.
             IndexError: If a frame is not in the store.
         """
-        last = torch.as_tensor(last_frames, dtype=torch.long).to(self.device)  # (B,)
+        last = torch.as_tensor(last_frames, dtype=torch.long).cpu()  # (B,)
         if last.numel() and not (int(last.min()) >= 0 and int(last.max()) < self._n_frames):
             raise IndexError(
                 f"Frames {int(last.min())} to {int(last.max())} wanted, but the store has {self._n_frames}."
@@ -167,17 +181,17 @@ class EpisodeStore:
         for key, offsets in deltas.items():
             offsets = tuple(offsets)
             if offsets not in placed:
-                wanted = last.unsqueeze(1) + torch.tensor(offsets, device=self.device)  # (B, T)
+                wanted = last.unsqueeze(1) + torch.tensor(offsets)  # (B, T)
                 inside = torch.minimum(torch.maximum(wanted, first_valid), last_valid)
-                placed[offsets] = (inside, inside != wanted)
+                placed[offsets] = (self._sent(inside), self._sent(inside != wanted))
             index, is_pad = placed[offsets]
             batch[key] = self._gather(key, index, as_lerobot)
             batch[f"{key}_is_pad"] = is_pad.clone()
         if as_lerobot:
             others = [key for key in self._columns if key not in deltas]
-            batch.update({key: self._gather(key, last, as_lerobot) for key in others})
-        task_index = self.column("task_index")[last].tolist() if "task_index" in self._columns else [0] * len(last)
-        batch["task"] = [self.tasks[i] for i in task_index]
+            index = self._sent(last)
+            batch.update({key: self._gather(key, index, as_lerobot) for key in others})
+        batch["task"] = [self.tasks[i] for i in self._task_index[last].tolist()]
         return batch
 
     def append_episode(self, frames: Sequence[Mapping[str, Any]]) -> int:
@@ -201,14 +215,21 @@ class EpisodeStore:
         columns = {key: self._stack(key, frames) for key in self._columns if key not in INDEX_KEYS}
         columns.update(self._index_columns(frames, start, tasks))
         for key, values in columns.items():
-            self._columns[key] = _write(self._columns[key], start, values.to(self.device))
-        bounds = torch.tensor([[start, end - 1]], device=self.device).expand(len(frames), 2)
-        self._bounds = _write(self._bounds, start, bounds)
+            self._columns[key] = write_rows(self._columns[key], start, values.to(self.device))
+        self._bounds = write_rows(self._bounds, start, torch.tensor([[start, end - 1]]).expand(len(frames), 2))
+        task_index = columns.get("task_index", torch.zeros(len(frames), dtype=torch.long))
+        self._task_index = write_rows(self._task_index, start, task_index)
         self.tasks = tasks
         self._n_frames = end
         self._starts.append(start)
         self._ends.append(end)
         return self.n_episodes - 1
+
+    def _sent(self, values: Tensor) -> Tensor:
+        """Small numbers of the host, on the store's device; nothing waits for them."""
+        if self.device.type == "cuda":
+            return values.pin_memory().to(self.device, non_blocking=True)
+        return values.to(self.device)
 
     def _gather(self, key: str, index: Tensor, as_lerobot: bool) -> Tensor:
         """The rows `index` (B,) or (B, T) of one column."""
@@ -216,7 +237,7 @@ class EpisodeStore:
         # On the CPU NumPy copies whole rows without waking threads, which costs more than the copy of a batch.
         on_cpu = values.device.type == "cpu"
         rows = torch.from_numpy(values.numpy().take(index.numpy(), axis=0)) if on_cpu else values[index]
-        return _as_lerobot(rows) if as_lerobot else rows
+        return as_lerobot_has(rows) if as_lerobot else rows
 
     def _stack(self, key: str, frames: Sequence[Mapping[str, Any]]) -> Tensor:
         """One feature of new frames, (n, ...), in the store's shape and dtype."""
@@ -231,8 +252,10 @@ class EpisodeStore:
             dtype == torch.bool
         ):
             raise InputError(f"'{key}' has dtype {values.dtype} in the new episode, and {dtype} in the store.")
-        if len(shape) == 3 and values.shape[1:] != shape:
+        if len(shape) == 3 and values.dim() == 4 and values.shape[1] != shape[0]:
             values = values.movedim(-1, 1)  # (n, H, W, C) -> (n, C, H, W)
+        if len(shape) == 3 and values.dim() == 4 and self.image_size is not None:
+            values = torch.from_numpy(shrink(values.numpy(), self.image_size))
         if not shape and values.shape[1:] == (1,):
             values = values.squeeze(1)
         if values.shape[1:] != shape:
@@ -256,27 +279,3 @@ class EpisodeStore:
             "timestamp": frame_index.to(torch.float32) / self.fps,
         }
         return {key: values for key, values in columns.items() if key in self._columns}
-
-
-def _as_lerobot(rows: Tensor) -> Tensor:
-    """Stored values in the dtypes of LeRobot's loader: images as floats in [0, 1], integers as int64."""
-    if rows.dtype in (torch.bool, torch.float32, torch.int64):
-        return rows
-    if rows.device.type != "cpu":
-        return rows.float() / 255 if rows.dtype == torch.uint8 else rows.long()
-    # NumPy converts in one pass and into huge pages: four times faster than PyTorch for a batch of images.
-    values = rows.numpy()
-    if rows.dtype == torch.uint8:
-        return torch.from_numpy(np.divide(values, np.float32(255), dtype=np.float32))
-    return torch.from_numpy(values.astype(np.int64))
-
-
-def _write(values: Tensor, position: int, new: Tensor) -> Tensor:
-    """Put `new` at `position`; where there is no room the tensor is copied into one with room to spare."""
-    end = position + len(new)
-    if end > len(values):
-        roomy = values.new_empty((max(end, int(len(values) * _GROWTH)), *values.shape[1:]))
-        roomy[:position] = values[:position]
-        values = roomy
-    values[position:end] = new
-    return values

@@ -1,26 +1,37 @@
-"""A whole LeRobotDataset as one tensor per feature, on the device where there is room for it."""
+"""A whole LeRobotDataset as one tensor per feature: in memory, or in files that are mapped into it."""
 
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.language import LANGUAGE_COLUMNS
+from lerobot.utils.import_utils import get_safe_default_video_backend
 from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_feature import check_audio_features
 from lerobot_playbyear.datasets.columns import episode_bounds
+from lerobot_playbyear.datasets.disk_columns import DEFAULT_CACHE, disk_columns
 from lerobot_playbyear.datasets.free_memory import available_memory
+from lerobot_playbyear.datasets.identity import dataset_identity
 from lerobot_playbyear.datasets.long_dataset import LongDataset
-from lerobot_playbyear.datasets.tensors import read_images, read_values, read_videos
+from lerobot_playbyear.datasets.shrinking import shrink, shrunk_size
+from lerobot_playbyear.datasets.tensors import image_pieces, value_pieces, video_pieces
 
 INDEX_KEYS = ("index", "episode_index", "frame_index", "task_index", "timestamp")
 """The columns that every LeRobotDataset has."""
 
+PLACES = ("memory", "disk", "auto")
+"""Where a dataset's frames are kept."""
+
 _CAMERA_DTYPES = ("image", "video")
 _GPU_SHARE = 0.5  # of the free memory: the network and its gradients need the rest
+_MEMORY_SHARE = 0.5  # of what is free; what is on the disk is as fast as memory where it fits into it
 
 
 def read_dataset(
@@ -29,6 +40,9 @@ def read_dataset(
     device: str | torch.device | None = None,
     video_backend: str | None = None,
     progress: bool = False,
+    place: str = "memory",
+    image_size: int | None = None,
+    cache: Path | None = None,
 ) -> tuple[dict[str, Tensor], list[int], list[int]]:
     """Read the episodes that a dataset was opened with; arguments and errors as for `EpisodeStore.from_dataset`.
 
@@ -40,24 +54,78 @@ def read_dataset(
     features = _select_features(dataset, keys)
     with_rate = {key: f for key, f in features.items() if "sample_rate" in (f.get("info") or {})}
     check_audio_features(with_rate, dataset.fps)
-    device = _choose_device(device, sum(_row_bytes(feature) for feature in features.values()) * len(dataset))
-
-    columns: dict[str, Tensor] = {}
+    row_bytes = {key: _row_bytes(feature, image_size) for key, feature in features.items()}
+    n_bytes = sum(row_bytes.values()) * len(dataset)
+    device = _choose_device(device, n_bytes)
     n_cameras = sum(feature["dtype"] in _CAMERA_DTYPES for feature in features.values())
     bar = tqdm(
         total=n_cameras * len(dataset), desc="Reading frames", unit="frame", disable=not (progress and n_cameras)
     )
     with bar:
-        for key, feature in features.items():
-            if feature["dtype"] == "video":
-                values = read_videos(dataset, key, video_backend, lambda _, n: bar.update(n))
-            elif feature["dtype"] == "image":
-                values = read_images(dataset, key, lambda _, n: bar.update(n))
-            else:
-                values = read_values(dataset, key)
-            columns[key] = values.to(device)  # one by one, so that a copy never doubles the whole dataset
+        pieces = partial(_pieces, dataset, video_backend, image_size, bar)
+        if place == "disk":
+            cache = cache or DEFAULT_CACHE
+            identity = {
+                **dataset_identity(dataset, features, cache),
+                "image_size": image_size,
+                "decoder": video_backend or get_safe_default_video_backend(),
+            }
+            on_disk = disk_columns(identity, row_bytes, len(dataset), pieces, cache)
+            columns = {key: values.to(device) for key, values in on_disk.items()}
+        else:
+            _check_memory(n_bytes, device)
+            # One by one, so that a copy on another device never doubles the whole dataset.
+            columns = {key: _gathered(pieces(key, 0), len(dataset)).to(device) for key in features}
     starts, ends = _episodes(columns, dataset.repo_id)
     return columns, starts, ends
+
+
+def choose_place(place: str, dataset: LeRobotDataset | LongDataset, keys: Iterable[str] | None = None) -> str:
+    """Where to keep a dataset: "memory" or "disk". "auto" is memory where its frames fill at most half of what is free.
+
+    Raises:
+        ValueError: There is no such place.
+    """
+    if place not in PLACES:
+        raise ValueError(f"--store={place} is not known: wanted one of {', '.join(PLACES)}.")
+    if place != "auto":
+        return place
+    n_bytes = sum(map(_row_bytes, _select_features(dataset, keys).values())) * len(dataset)
+    return "memory" if n_bytes <= _MEMORY_SHARE * available_memory() else "disk"
+
+
+def _pieces(
+    dataset: LeRobotDataset | LongDataset,
+    video_backend: str | None,
+    image_size: int | None,
+    bar: tqdm,
+    key: str,
+    first: int,
+) -> Iterator[np.ndarray]:
+    """A column from row `first` on, pictures at the size at which they are kept."""
+    dtype = dataset.meta.features[key]["dtype"]
+    if dtype not in _CAMERA_DTYPES:
+        yield from value_pieces(dataset, key, first)
+        return
+    bar.update(first)  # made by an earlier run
+    is_video = dtype == "video"
+    for piece in video_pieces(dataset, key, first, video_backend) if is_video else image_pieces(dataset, key, first):
+        yield piece if image_size is None else shrink(piece, image_size)
+        bar.update(len(piece))
+
+
+def _gathered(pieces: Iterator[np.ndarray], n_rows: int) -> Tensor:
+    """All pieces of a column as one tensor, (N, ...)."""
+    values: np.ndarray | None = None
+    position = 0
+    for piece in pieces:
+        if values is None:
+            values = np.empty((n_rows, *piece.shape[1:]), piece.dtype)
+        values[position : position + len(piece)] = piece
+        position += len(piece)
+    assert values is not None
+    assert position == n_rows
+    return torch.from_numpy(values)
 
 
 def _select_features(dataset: LeRobotDataset | LongDataset, keys: Iterable[str] | None) -> dict[str, Any]:
@@ -77,24 +145,29 @@ def _select_features(dataset: LeRobotDataset | LongDataset, keys: Iterable[str] 
     return {key: features[key] for key in keys}
 
 
-def _row_bytes(feature: Mapping[str, Any]) -> int:
-    dtype = feature["dtype"]
-    itemsize = 1 if dtype in _CAMERA_DTYPES else 4 if dtype.startswith("float") else np.dtype(dtype).itemsize
-    return int(np.prod(feature["shape"])) * itemsize
+def _row_bytes(feature: Mapping[str, Any], image_size: int | None = None) -> int:
+    """Of a camera kept at `image_size`, at most."""
+    dtype, shape = feature["dtype"], tuple(feature["shape"])
+    if dtype in _CAMERA_DTYPES:
+        channels, height, width = shape if shape[0] in (1, 3) else (shape[2], *shape[:2])
+        return channels * math.prod((height, width) if image_size is None else shrunk_size(height, width, image_size))
+    return math.prod(shape) * (4 if dtype.startswith("float") else np.dtype(dtype).itemsize)
 
 
-def _choose_device(device: str | torch.device | None, nbytes: int) -> torch.device:
+def _choose_device(device: str | torch.device | None, n_bytes: int) -> torch.device:
     if device is None:
-        fits = torch.cuda.is_available() and nbytes <= _GPU_SHARE * torch.cuda.mem_get_info()[0]
+        fits = torch.cuda.is_available() and n_bytes <= _GPU_SHARE * torch.cuda.mem_get_info()[0]
         device = "cuda" if fits else "cpu"
-    device = torch.device(device)
+    return torch.device(device)
+
+
+def _check_memory(n_bytes: int, device: torch.device) -> None:
     free = available_memory()
-    if device.type == "cpu" and nbytes > free:
+    if device.type == "cpu" and n_bytes > free:
         raise MemoryError(
-            f"The dataset needs {nbytes / 2**30:.1f} GiB in memory, and {free / 2**30:.1f} GiB are free. Choose fewer "
-            "episodes (--dataset.episodes), end other programs, or use lerobot-train, which reads from the disk."
+            f"The dataset needs {n_bytes / 2**30:.1f} GiB in memory, and {free / 2**30:.1f} GiB are free. Keep it on the "
+            "disk (--store=disk), choose fewer episodes (--dataset.episodes), or end other programs."
         )
-    return device
 
 
 def _episodes(columns: Mapping[str, Tensor], repo_id: str) -> tuple[list[int], list[int]]:

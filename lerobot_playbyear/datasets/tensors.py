@@ -1,36 +1,36 @@
-"""The columns of a LeRobotDataset as whole tensors, read once and in order.
+"""The columns of a LeRobotDataset as arrays, a piece at a time and in order.
 
-LeRobot reads row by row, and every row passes through Python lists. Here a parquet column becomes one numpy array
+LeRobot reads row by row, and every row passes through Python lists. Here a parquet column becomes numpy arrays
 through Arrow, an image column is decoded by a few threads, and a video is decoded from its first frame to its last.
-Besides the tensor that is asked for, only a bounded piece is in memory at a time.
+Whoever takes the pieces decides where they are kept; only a bounded piece is in memory at a time.
 """
 
+import itertools
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import torch
 from lerobot.datasets import LeRobotDataset
-from torch import Tensor
 
 from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.confines import file_inside, open_picture
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 
+_PICTURES_AT_ONCE = 32
 _ROWS_AT_ONCE = 128  # images
 _VALUES_AT_ONCE = 2**22
-Progress = Callable[[str, int], Any]
-"""Called with a key and the number of its frames that were just decoded."""
 
 
-def read_values(dataset: LeRobotDataset | LongDataset, key: str) -> Tensor:
-    """A numeric column, (N,) or (N, *shape): floats as float32, integers and booleans as they are stored.
+def value_pieces(dataset: LeRobotDataset | LongDataset, key: str, first: int = 0) -> Iterator[np.ndarray]:
+    """A numeric column from row `first` on, in pieces (n,) or (n, *shape).
+
+    Floats come as float32, integers and booleans as they are stored.
 
     Raises:
         ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values.
@@ -39,10 +39,9 @@ def read_values(dataset: LeRobotDataset | LongDataset, key: str) -> Tensor:
     shape = () if shape == (1,) else shape  # LeRobot keeps one value per row as a scalar
     column = dataset.hf_dataset.data.column(key)
     rows = max(_VALUES_AT_ONCE // max(math.prod(shape), 1), 1)
-    values: np.ndarray | None = None
     finite = np.ones(len(column), bool)
-    for first in range(0, len(column), rows):
-        part = column.slice(first, rows)
+    for position in range(first, len(column), rows):
+        part = column.slice(position, rows)
         try:
             read = column_to_numpy(part).reshape(len(part), *shape)
         except ValueError as error:
@@ -50,16 +49,11 @@ def read_values(dataset: LeRobotDataset | LongDataset, key: str) -> Tensor:
                 f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
                 "Record the damaged episodes again, or leave them out with --dataset.episodes."
             ) from error
-        is_float = np.issubdtype(read.dtype, np.floating)
-        if values is None:
-            values = np.empty((len(column), *shape), np.float32 if is_float else read.dtype)
-        if is_float:
-            finite[first : first + rows] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
-        values[first : first + rows] = read
-    if values is None:
-        raise ValueError(f"'{key}' of dataset '{dataset.repo_id}' has no rows.")
+        if np.issubdtype(read.dtype, np.floating):
+            read = read.astype(np.float32, copy=False)
+            finite[position : position + rows] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
+        yield read
     check_finite(finite, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
-    return torch.from_numpy(values)
 
 
 def check_finite(finite: np.ndarray, key: str, episode_index: np.ndarray) -> None:
@@ -82,68 +76,53 @@ def check_finite(finite: np.ndarray, key: str, episode_index: np.ndarray) -> Non
         )
 
 
-def read_images(dataset: LeRobotDataset | LongDataset, key: str, progress: Progress | None = None) -> Tensor:
-    """All frames of an image column, (N, C, H, W) uint8.
+def image_pieces(dataset: LeRobotDataset | LongDataset, key: str, first: int = 0) -> Iterator[np.ndarray]:
+    """The frames of an image column from row `first` on, in pieces (n, C, H, W) uint8.
 
     Raises:
-        ValueError: If a frame has another size than the feature, is empty, or lies outside the dataset's folder.
+        ValueError: If a frame has another size than the one before, is empty, or lies outside the dataset's folder.
     """
-    column = dataset.hf_dataset.data.column(key)
+    column = dataset.hf_dataset.data.column(key).slice(first)
     root, feature = Path(dataset.root), dataset.meta.features[key]
     mode = "L" if 1 in _channel_candidates(feature) else "RGB"
-    frames: Tensor | None = None
-    position = 0
+    position, size = first, None
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
         for rows in _few_rows(column):
-            for image in pool.map(lambda row: _decode_image(row, root, key, feature, mode), rows.to_pylist()):
-                if frames is None:
-                    frames = torch.empty((len(column), *image.shape), dtype=torch.uint8)
-                if image.shape != frames.shape[1:]:
+            images = list(pool.map(lambda row: _decode_image(row, root, key, feature, mode), rows.to_pylist()))
+            size = size or images[0].shape
+            for image in images:
+                if image.shape != size:
                     raise ValueError(
-                        f"'{key}': frame {position} is {image.shape}, the first one {tuple(frames.shape[1:])} (C, H, W). "
+                        f"'{key}': frame {position} is {image.shape}, the first one {size} (C, H, W). "
                         "All frames must have one size: record again, or resize the column."
                     )
-                frames[position].numpy()[:] = image
                 position += 1
-                if progress:
-                    progress(key, 1)
-    if frames is None:
-        raise ValueError(f"'{key}' of dataset '{dataset.repo_id}' has no frames.")
-    return frames
+            yield np.stack(images)
 
 
-def read_videos(
-    dataset: LeRobotDataset | LongDataset,
-    key: str,
-    video_backend: str | None = None,
-    progress: Progress | None = None,
-) -> Tensor:
-    """All frames of a video feature, (N, C, H, W) uint8, decoded episode by episode as LeRobot decodes them.
+def video_pieces(
+    dataset: LeRobotDataset | LongDataset, key: str, first: int = 0, video_backend: str | None = None
+) -> Iterator[np.ndarray]:
+    """The frames of a video feature from row `first` on, in pieces (n, C, H, W) uint8, episode by episode.
 
     Args:
         dataset: The dataset.
         key: The camera.
+        first: The row to begin with.
         video_backend: LeRobot's decoder ("pyav", "torchcodec"); None takes its default.
-        progress: Told of every decoded episode.
     """
     episode_index = column_to_numpy(dataset.hf_dataset.data.column("episode_index"))
     timestamps = column_to_numpy(dataset.hf_dataset.data.column("timestamp"))
-    frames: Tensor | None = None
     for start, end in zip(*episode_bounds(episode_index), strict=True):
+        if end <= first:
+            continue
         episode = int(episode_index[start])
         path = file_inside(Path(dataset.root), dataset.meta.get_video_file_path(episode, key))
         offset = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
-        times = [offset + float(timestamp) for timestamp in timestamps[start:end]]
-        for position, picture in enumerate(video_pictures(path, times, dataset.tolerance_s, video_backend), start):
-            pixels = torch.from_numpy(picture).permute(2, 0, 1)  # (C, H, W)
-            if frames is None:
-                frames = torch.empty((len(episode_index), *pixels.shape), dtype=torch.uint8)
-            frames[position] = pixels
-        if progress:
-            progress(key, end - start)
-    if frames is None:
-        raise ValueError(f"'{key}' of dataset '{dataset.repo_id}' has no frames.")
-    return frames
+        times = [offset + float(timestamp) for timestamp in timestamps[max(start, first) : end]]
+        pictures = video_pictures(path, times, dataset.tolerance_s, video_backend)
+        while piece := list(itertools.islice(pictures, _PICTURES_AT_ONCE)):
+            yield np.stack(piece).transpose(0, 3, 1, 2)
 
 
 def _few_rows(column: pa.ChunkedArray) -> Iterator[pa.StructArray]:

@@ -28,12 +28,13 @@ class Augmentation(nn.Module):
         self.register_buffer("yiq", _YIQ.clone(), persistent=False)
         self.register_buffer("rgb", torch.linalg.inv(_YIQ), persistent=False)
 
-    def forward(self, images: Tensor, size: int) -> Tensor:
+    def forward(self, images: Tensor, size: int, recorded: tuple[int, ...] | None = None) -> Tensor:
         """Augments runs of images and resizes them; all images of a run get the same draw.
 
         Args:
             images: (B, T, 3, H, W) in [0, 1].
             size: Height and width wanted [pixels].
+            recorded: Height and width of the camera's pictures [pixels], which `images` may be shrunk from.
 
         Returns:
             (B, T, 3, size, size).
@@ -41,7 +42,7 @@ class Augmentation(nn.Module):
         height, width = images.shape[-2:]
         if height > size or width > size:  # first: there is less to recolour, the same but where a colour saturates
             images = resize(images, size)
-        return self._warp(self._recolour(images), size, (height, width))
+        return self._warp(self._recolour(images), size, recorded or (height, width))
 
     def _recolour(self, images: Tensor) -> Tensor:
         n_runs, device = images.shape[0], images.device
@@ -56,7 +57,7 @@ class Augmentation(nn.Module):
         recoloured = (matrix.to(images.dtype) @ flat).clamp_(0, 1)
         return recoloured.view(images.shape[0], 3, images.shape[1], *images.shape[3:]).transpose(1, 2)
 
-    def _warp(self, images: Tensor, size: int, original: tuple[int, int]) -> Tensor:
+    def _warp(self, images: Tensor, size: int, original: tuple[int, ...]) -> Tensor:
         n_runs, n_frames = images.shape[:2]
         height, width = original
         device = images.device

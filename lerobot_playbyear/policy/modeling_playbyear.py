@@ -99,7 +99,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
             reduction: "mean" for one loss, "none" for one of every item, (B,), as LeRobot's sample weights want it.
 
         Returns:
-            The loss, and numbers for the log.
+            The loss, and no other numbers for the log.
 
         Raises:
             ValueError: A key is missing or sound is not finite.
@@ -113,11 +113,10 @@ class PlaybyearPolicy(PreTrainedPolicy):
             weight = weight * ~batch[f"{ACTION}_is_pad"][:, -n_windows:]
         if reduction == "none":
             losses = (error * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)  # (B,)
-            return losses, {"mse": losses.mean().item()}
+            return losses, {}
         # Over the mean weight of all processes: the mean of their losses is then that of one with all their items.
         total = mean_over_processes(weight.sum()) if self.training else weight.sum()
-        loss = (error * weight).sum() / total.clamp(min=1e-8)
-        return loss, {"mse": loss.item()}
+        return (error * weight).sum() / total.clamp(min=1e-8), {}
 
     def predict_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
         """Actions of the last `n_steps` (default K) frames of every item, (B, n_steps, n_actions), normalised."""

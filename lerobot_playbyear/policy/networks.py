@@ -82,9 +82,8 @@ class PlaybyearNetwork(nn.Module):
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n, embedding size)."""
         n_stacked = self.config.frame_stack
-        images = self.prepare_images(
-            newest(batch, key, n_frames + n_stacked - 1)
-        )  # (B, n + n_stacked - 1, 3, size, size)
+        images = newest(batch, key, n_frames + n_stacked - 1)  # (B, n + n_stacked - 1, 3, H, W)
+        images = self.prepare_images(images, self.config.feature_shape(key)[-2:])  # (..., 3, size, size)
         stacks = torch.cat(
             [images[:, i : i + n_frames] for i in range(n_stacked)], dim=2
         )  # (B, n, 3 n_stacked, size, size)
@@ -123,12 +122,15 @@ class PlaybyearNetwork(nn.Module):
             values = values + self.config.low_dimensional_noise * torch.randn_like(values)
         return self.config.low_dimensional_gain * values
 
-    def prepare_images(self, images: Tensor) -> Tensor:
-        """(B, T, 3, H, W) bytes or in [0, 1] -> (B, T, 3, size, size) in [0, 1], in training augmented."""
+    def prepare_images(self, images: Tensor, recorded: tuple[int, ...] | None = None) -> Tensor:
+        """(B, T, 3, H, W) bytes or in [0, 1] -> (B, T, 3, size, size) in [0, 1], in training augmented.
+
+        `recorded` is the height and width of the camera's pictures, where they may have been shrunk since [pixels].
+        """
         size = self.config.image_size
         with torch.autocast(images.device.type, enabled=False):  # colours keep their 8 bits
             images = images.float() / 255 if images.dtype == torch.uint8 else images
-            return self.augment(images, size) if self.training else resize(images, size)
+            return self.augment(images, size, recorded) if self.training else resize(images, size)
 
     def _normalize(self, embeddings: Tensor) -> Tensor:
         """(N, E) -> (N, E), of the same size whatever the sense."""

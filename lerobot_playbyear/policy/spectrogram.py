@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-import torchaudio
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -112,6 +111,7 @@ class LogSpectrogram(nn.Module):
         keeps_statistics: Whether the running statistics stay as they are in training too.
     """
 
+    window: Tensor
     mean: Tensor
     variance: Tensor
     n_batches: Tensor
@@ -125,20 +125,19 @@ class LogSpectrogram(nn.Module):
             )
         self.n_bins, self.momentum = n_bins, momentum
         self.keeps_statistics = False
-        self.transform = torchaudio.transforms.Spectrogram(
-            n_fft=self.segment, hop_length=self.hop, center=False, power=None, normalized=False
-        )
-        # Not part of a checkpoint, and in storage of its own: torch's is a slice, which safetensors refuses to save.
-        self.transform.register_buffer("window", self.transform.window.clone(), persistent=False)
+        self.register_buffer("window", torch.hann_window(self.segment), persistent=False)
         # A full-scale sine has power 1 in its bin, whatever the segment's length.
-        self.scale = 4.0 / float(self.transform.window.sum()) ** 2
+        self.scale = 4.0 / float(self.window.sum()) ** 2
         self.register_buffer("mean", torch.zeros(n_bins))
         self.register_buffer("variance", torch.ones(n_bins))
         self.register_buffer("n_batches", torch.zeros((), dtype=torch.long))
 
     def log_power(self, wave: Tensor) -> Tensor:
         """(B, samples) in [-1, 1] -> (B, n_bins, n_segments), in units of 10 dB re full scale."""
-        spectrum = torch.view_as_real(self.transform(wave)[:, : self.n_bins])
+        spectrum = torch.stft(
+            wave, self.segment, self.hop, window=self.window, center=False, return_complex=True
+        )  # (B, bins, n_segments)
+        spectrum = torch.view_as_real(spectrum[:, : self.n_bins])
         power = spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
         return torch.log10(power * self.scale + _POWER_FLOOR)
 
@@ -206,5 +205,6 @@ def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int) -> Tensor:
     spectrum = functional.pad(spectrum, (0, 0, 1, 0))  # (B, bins + 1, 2)
     noise = torch.fft.irfft(torch.view_as_complex(spectrum), n=n_samples) * (n_samples / 2)  # broadband power 1
     blocks = wave[:, : n_samples // 16 * 16].unflatten(1, (16, -1))
-    floor = blocks.square().mean(dim=2).sqrt().quantile(0.25, dim=1, keepdim=True)  # (B, 1)
+    levels = blocks.square().mean(dim=2).sqrt().sort(dim=1).values  # (B, 16)
+    floor = levels[:, 3:4].lerp(levels[:, 4:5], 0.75)  # (B, 1), the first quartile; torch's own asks the host
     return wave + floor * 10 ** (level / 20) * noise

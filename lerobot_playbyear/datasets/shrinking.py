@@ -1,0 +1,28 @@
+"""Pictures brought to the size at which a policy looks at them, before they are kept."""
+
+import numpy as np
+import torch
+from torch.nn import functional
+
+
+def shrunk_size(height: int, width: int, image_size: int) -> tuple[int, int]:
+    """The height and width at which pictures are kept: at most `image_size` each [pixels]."""
+    return min(height, image_size), min(width, image_size)
+
+
+def shrink(pictures: np.ndarray, image_size: int) -> np.ndarray:
+    """Shrinks pictures as the policy `playbyear` does: every pixel is the weighted mean of those that it covers.
+
+    Args:
+        pictures: (n, C, H, W) uint8.
+        image_size: Largest height and width wanted [pixels].
+
+    Returns:
+        (n, C, h, w) uint8, `pictures` themselves where they are no larger. They differ from what the policy makes of the
+        recorded ones by rounding, one level of 255.
+    """
+    size = shrunk_size(*pictures.shape[-2:], image_size)
+    if size == pictures.shape[-2:]:
+        return pictures
+    values = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 2, 3, 1))).permute(0, 3, 1, 2)
+    return functional.interpolate(values, size, mode="bilinear", align_corners=False, antialias=True).numpy()

@@ -1,0 +1,69 @@
+"""What makes updates faster without changing what is learned: weights laid out for GPUs, a fused optimizer, compiled networks."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
+
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.networks import VisionEncoder
+
+_DIMENSIONS = 4  # of a convolution's weights
+
+
+def prefer_channels_last(policy: nn.Module, optimizer: Optimizer) -> None:
+    """Lays the weights of convolutions out as a GPU's tensor cores read them, and the optimizer's state with them.
+
+    Checkpoints stay as they are: safetensors saves contiguous tensors alone, and so the optimizer hands its state out.
+
+    Args:
+        policy: Whatever learns.
+        optimizer: Of its parameters; it may have a state already.
+    """
+    policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer.register_state_dict_post_hook(_contiguous)
+    optimizer.register_load_state_dict_post_hook(_like_parameters)
+    _like_parameters(optimizer)
+
+
+def fuse(optimizer: Optimizer) -> None:
+    """Makes Adam's step one kernel. Its state need not lie on the host, so nothing waits for it."""
+    if not isinstance(optimizer, Adam):
+        return
+    for group in optimizer.param_groups:
+        group.update(fused=True, foreach=False)
+        for parameter in group["params"]:
+            state = optimizer.state.get(parameter, {})
+            if "step" in state:
+                state["step"] = state["step"].to(parameter.device)
+
+
+def compile_networks(policy: nn.Module) -> None:
+    """Compiles the encoders and the head of a policy `playbyear` when they are first used; names of weights stay.
+
+    Raises:
+        ValueError: The policy is another one.
+    """
+    if not isinstance(policy, PlaybyearPolicy):
+        raise ValueError("--compile=true is for --policy.type=playbyear: leave it out.")
+    network = policy.model
+    parts = [encoder.network for encoder in network.modules() if isinstance(encoder, VisionEncoder)]
+    parts += [*(network.hearing.values() if policy.config.use_audio else []), network.fusion, network.memory_head.head]
+    for part in parts:
+        part.compile()
+
+
+def _contiguous(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    def saved(values: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value.contiguous() if isinstance(value, Tensor) else value for key, value in values.items()}
+
+    return {**state, "state": {number: saved(values) for number, values in state["state"].items()}}
+
+
+def _like_parameters(optimizer: Optimizer) -> None:
+    for parameter, values in optimizer.state.items():
+        for key, value in values.items():
+            if isinstance(value, Tensor) and value.dim() == _DIMENSIONS:
+                values[key] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
