@@ -20,7 +20,7 @@ from experiments.protocol import RESULTS, RUN_LENGTHS, TASKS, TRAINING_SEEDS, Re
 from experiments.training import Job, train_and_evaluate
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.training.parts import PolicyWindows
+from lerobot_playbyear.training.windows import PolicyWindows
 
 STUDY = "run_length"
 N_WINDOWS = 64  # per update

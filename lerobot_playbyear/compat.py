@@ -3,7 +3,7 @@
 Where a version changes, look here first. `BORROWED` says of each thing where it is and what no longer works without it.
 Functions are imported from here by their name, and found when they are:
 
-    from lerobot_playbyear.compat import update_policy
+    from lerobot_playbyear.compat import save_checkpoint
 
 What lives on other people's objects has a function of its own at the end; what LeRobot has to do with ours stands in
 `tests/test_compat.py`. Ordinary imports of documented names stay where they are used. This module imports neither LeRobot nor
@@ -40,7 +40,6 @@ _TRAINS = "playbyear-train and playbyear-dagger cannot"
 _ACTS = "no policy acts on a CPU"
 
 BORROWED = {
-    "update_policy": ("lerobot.scripts.lerobot_train:update_policy", f"{_TRAINS} learn"),
     "eval_policy_all": ("lerobot.scripts.lerobot_eval:eval_policy_all", f"{_TRAINS} evaluate"),
     "get_step_checkpoint_dir": ("lerobot.common.train_utils:get_step_checkpoint_dir", f"{_TRAINS} name a checkpoint"),
     "get_step_identifier": ("lerobot.common.train_utils:get_step_identifier", f"{_TRAINS} name a film"),

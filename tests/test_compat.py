@@ -97,11 +97,11 @@ def test_what_is_gone_is_missed_with_a_sentence(gone):
 
 
 def test_functions_are_imported_by_their_name():
-    from lerobot.scripts.lerobot_train import update_policy
+    from lerobot.common.train_utils import save_checkpoint
 
-    assert compat.update_policy is update_policy
-    with pytest.raises(ImportError, match="cannot import name 'update_polic'"):
-        from lerobot_playbyear.compat import update_polic  # noqa: F401
+    assert compat.save_checkpoint is save_checkpoint
+    with pytest.raises(ImportError, match="cannot import name 'save_checkpoin'"):
+        from lerobot_playbyear.compat import save_checkpoin  # noqa: F401
 
 
 def test_nothing_is_borrowed_elsewhere():

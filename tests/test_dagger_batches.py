@@ -11,7 +11,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot_playbyear.dagger.batches import BalancedBatches, intervention_run_weights
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.training.parts import PolicyWindows
+from lerobot_playbyear.training.windows import PolicyWindows
 
 N_DEMONSTRATIONS = 1000
 """Actions of the demonstrations are below it, those of the attempts above: a window tells where it is from."""

@@ -17,7 +17,7 @@ from torch import nn
 
 from lerobot_playbyear.policy.precision import training_dtype
 from lerobot_playbyear.training import loop
-from lerobot_playbyear.training.parts import make_accelerator
+from lerobot_playbyear.training.processes import make_accelerator
 
 train = parser.wrap()(loop.train)
 

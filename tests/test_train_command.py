@@ -22,8 +22,8 @@ from lerobot_playbyear.scripts import train as train_script
 from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.loop import frame_weights
-from lerobot_playbyear.training.parts import PolicyWindows
 from lerobot_playbyear.training.presets import PRESETS, apply_preset
+from lerobot_playbyear.training.windows import PolicyWindows
 
 train = parser.wrap()(loop.train)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.frames import INTERVENTION
-from lerobot_playbyear.training.parts import PolicyWindows
+from lerobot_playbyear.training.windows import PolicyWindows
 
 _IS_PAD = f"{ACTION}_is_pad"
 

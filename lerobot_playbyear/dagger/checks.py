@@ -13,7 +13,8 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.frames import INTERVENTION
-from lerobot_playbyear.training.parts import PolicyWindows, TrainingParts, check_dataset_suits, dataset_names
+from lerobot_playbyear.training.parts import TrainingParts, check_dataset_suits
+from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
 
 Features = Mapping[str, Mapping[str, Any]]
 

@@ -61,18 +61,19 @@ class Corrections:
         folder = self._source.folder
         self._writer = DurableWriter(self._source.repo_id, folder, fps, features, resume=True, robot_type=robot_type)
 
-    def read(self, keys: Sequence[str] | None, device: torch.device) -> None:
+    def read(self, keys: Sequence[str] | None, device: torch.device, image_size: int | None = None) -> None:
         """Take what the dataset holds into memory; nothing while it is empty.
 
         Args:
             keys: The features that the policy's windows are cut from; None for all.
             device: Where the store is kept.
+            image_size: The size that the demonstrations' pictures were shrunk to, if they were [pixels].
 
         Raises:
             ValueError: It is damaged.
         """
         self._keys = None if keys is None else [*keys, INTERVENTION]
-        self._device = device
+        self._device, self._image_size = device, image_size
         if self.n_episodes:
             self._read()
 
@@ -80,7 +81,8 @@ class Corrections:
         backend = self._source.video_backend
         dataset = LeRobotDataset(self._source.repo_id, root=self._source.root, video_backend=backend)
         seeds = [SEED] if SEED in dataset.meta.features else []
-        self.store = EpisodeStore.from_dataset(dataset, self._keys and self._keys + seeds, self._device, backend)
+        keys = self._keys and self._keys + seeds
+        self.store = EpisodeStore.from_dataset(dataset, keys, self._device, backend, image_size=self._image_size)
 
     @property
     def n_episodes(self) -> int:

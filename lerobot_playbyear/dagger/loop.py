@@ -25,9 +25,11 @@ from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.episodes.play import Seconds, play
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.figures import Figures
 from lerobot_playbyear.training.parts import TrainingParts
+from lerobot_playbyear.training.processes import Orders
 from lerobot_playbyear.training.reach import Reach
-from lerobot_playbyear.training.report import is_due, make_tracker
+from lerobot_playbyear.training.report import is_due
 
 _ATTEMPT, _UPDATES = 0, 1  # what random numbers are for
 _LOSS_BATCHES = 10**9  # numbers from here on are of batches that are only looked at
@@ -47,6 +49,7 @@ class Loop:
         demonstrations: Half of each batch.
         corrections: The other half.
         batches: Draws from both.
+        orders: Gives other processes their share of a batch.
         reach: Knows which corrections the policy cannot learn.
         report: Tells how it goes.
         scene: The environment, the policy in it, and the expert; None to learn from recorded corrections alone.
@@ -60,6 +63,7 @@ class Loop:
     demonstrations: EpisodeStore
     corrections: Corrections
     batches: BalancedBatches
+    orders: Orders
     reach: Reach
     report: Report
     scene: tuple[gym.Env, PolicyActor, Expert] | None
@@ -168,20 +172,24 @@ class Loop:
             return {}
         parts = self.parts
         assert self.training.optimizer is not None
-        set_seed(self._random_seed(_UPDATES, self.state.round))
-        tracker = make_tracker(self.cfg.batch_size, self.demonstrations, parts.step)
+        seed, grad_clip_norm = self._random_seed(_UPDATES, self.state.round), self.training.optimizer.grad_clip_norm
+        set_seed(seed)
+        tracker = Figures(self.cfg.batch_size, self.demonstrations, parts.step)
         for number in range(n_updates):
             self.report.doing(f"learning {number + 1}/{n_updates}")
+            rate = self.cfg.rate(parts.step, number, n_updates)
             with seconds.of("batch"):
                 batch = self.batches.batch(parts.step)
+                begins = seed if number == 0 else None
+                batch = self.orders.give(batch, rate=rate, seed=begins, grad_clip_norm=grad_clip_norm)
             for group in parts.optimizer.param_groups:
-                group["lr"] = self.cfg.rate(parts.step, number, n_updates)
+                group["lr"] = rate
             with seconds.of("update"):
-                parts.update(batch, tracker, self.training.optimizer.grad_clip_norm)
-            tracker.step()
+                tracker.add(parts.update(batch, grad_clip_norm))
             if self.scene is None:
                 self.report.bar.update(1)
-        figures = {key: tracker.to_dict()[key] for key in ("loss", "grad_norm")}
+        averages, _ = tracker.read()
+        figures = {key: averages[key] for key in ("loss", "grad_norm")}
         with seconds.of("loss"):
             halves = self.batches.halves(_LOSS_BATCHES + self.state.round)
             figures["loss_demonstrations"], figures["loss_interventions"] = (parts.loss(half) for half in halves)

@@ -14,6 +14,7 @@ from lerobot_playbyear.dagger.checks import check_action_range, check_actions_ca
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, differences
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
+from lerobot_playbyear.dagger.helpers import help_to_learn, is_first_process
 from lerobot_playbyear.dagger.loop import Loop
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import check_dataset_files
@@ -26,8 +27,10 @@ from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.hub.training_run import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.loop import read_store
-from lerobot_playbyear.training.parts import PolicyWindows, dataset_names, make_training_parts
+from lerobot_playbyear.training.parts import make_training_parts
+from lerobot_playbyear.training.processes import Orders, share_of
 from lerobot_playbyear.training.reach import Reach, action_names
+from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
 
 
 def run_dagger(cfg: DaggerConfig) -> Path:
@@ -52,6 +55,9 @@ def run_dagger(cfg: DaggerConfig) -> Path:
             cfg.check()
             folder = RunFolder(cfg.output_dir)
             state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
+            if not is_first_process():
+                help_to_learn(cfg, _training_options(cfg, folder, state))
+                return folder.path
             loop = _make_loop(cfg, folder, state, stack)
         loop.run()
     _print_results(cfg, folder, state)
@@ -129,13 +135,15 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         state.next_seed = next_seed(cfg.interventions.folder, cfg.episode_seed) if cfg.is_online else 0
     _check_there_is_something_to_do(cfg, state, corrections)
 
-    training = cfg.training()
-    training.resume, training.checkpoint_path = state.checkpoint is not None, folder.checkpoint(state)
+    training = _training_options(cfg, folder, state)
     parts = make_training_parts(training, demos.meta, keep_normalization=True)
+    share_of(parts.accelerator, cfg.batch_size)
+    orders = Orders(parts.accelerator)
+    stack.callback(orders.end)
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = read_store(demos, windows, training)
     check_actions_can_be_masked(parts, windows, demonstrations)
-    corrections.read(windows.keys, demonstrations.device)
+    corrections.read(windows.keys, demonstrations.device, demonstrations.image_size)
     reach = Reach(cfg.policy, parts.preprocessor, action_names(demos.meta.features[ACTION]))
     reach.warn(demonstrations.column(ACTION), "the demonstrations")
     if corrections.store is not None:
@@ -149,7 +157,13 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         policy = parts.accelerator.unwrap_model(parts.policy)
         actor = PolicyActor(policy, cfg.env, parts.preprocessor, parts.postprocessor, parts.accelerator.autocast)
         scene = (env, actor, expert)
-    return Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, reach, report, scene)
+    return Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, orders, reach, report, scene)
+
+
+def _training_options(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> PlaybyearTrainConfig:
+    training = cfg.training()
+    training.resume, training.checkpoint_path = state.checkpoint is not None, folder.checkpoint(state)
+    return training
 
 
 def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, corrections: Corrections) -> None:

@@ -47,6 +47,7 @@ What comes out
 import sys
 
 from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
+from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.heap import keep_freed_memory
 
 
@@ -62,7 +63,7 @@ def _correct() -> None:
     from lerobot_playbyear.dagger.run import run_dagger
     from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
 
-    sys.argv[1:] = with_saved_options(sys.argv[1:])
+    sys.argv[1:] = with_saved_options(with_long_store(sys.argv[1:]))
     run_with_lerobot(run_dagger)
 
 

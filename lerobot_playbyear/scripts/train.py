@@ -5,6 +5,7 @@ other's), and trains through LeRobot's own update. The dataset is read once and 
 
     playbyear-train --preset=cpu --dataset.repo_id=me/demos --dataset.root=outputs/demos \\
         --output_dir=outputs/train
+    accelerate launch --num_processes=2 $(which playbyear-train) ...   # several processes
     playbyear-train --resume=true --steps=6000 \\
         --config_path=outputs/train/checkpoints/last/pretrained_model/train_config.json
 
@@ -13,7 +14,9 @@ What is trained on
   --dataset.root=null          its folder; else LeRobot's cache, or the Hub
   --dataset.episodes=null      only these, like [0,1,2]
   --dataset.eval_split=0.0     share of the episodes that are held out
-  --store.device=null          where the dataset is kept, cpu or cuda; else where there is room
+  --store=auto                 where frames are kept: memory, disk (files, found again by the
+                               next run), or auto: memory where they fill half of it at most
+  --store.device=null          cpu or cuda; else cuda where there is room
 
 What is trained
   --preset=null                named defaults: cpu (two cores, within the hour), paper (a GPU)
@@ -31,6 +34,7 @@ How
   --sampling.start_weight=1.0  how often the first frames of episodes are drawn, as a factor
   --sampling.loud_weight=1.0   the same for frames after a sudden sound
   --policy.use_amp=false       bfloat16 or float16 where the machine computes in it
+  --compile=false              compile the network first; faster updates on a GPU
 
 What comes of it
   --output_dir=null            folder of checkpoints and figures; must not be there yet
@@ -50,6 +54,7 @@ What comes of it
 import sys
 
 from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
+from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.heap import keep_freed_memory
 
 
@@ -62,7 +67,7 @@ def main() -> None:
 def _train() -> None:
     from lerobot_playbyear.training.presets import apply_preset
 
-    sys.argv[1:] = apply_preset(sys.argv[1:])
+    sys.argv[1:] = apply_preset(with_long_store(sys.argv[1:]))
     keep_freed_memory()
     from lerobot_playbyear.training.loop import train
 

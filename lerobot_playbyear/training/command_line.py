@@ -24,3 +24,15 @@ def given_options(args: Sequence[str]) -> tuple[dict[str, str | None], list[str]
         else:
             options.setdefault(name[2:], rest.pop(0))
     return options, strays
+
+
+def with_long_store(args: Sequence[str]) -> list[str]:
+    """`--store=disk`, or `--store disk`, as the parser knows it: `--store.place=disk`."""
+    rest, long = list(args), []
+    while rest:
+        name, has_value, value = rest.pop(0).partition("=")
+        if name == "--store" and not has_value and rest and not rest[0].startswith("--"):
+            value = rest.pop(0)
+        is_short = name == "--store" and value and not value.endswith((".json", ".yaml"))
+        long.append(f"--store.place={value}" if is_short else name + has_value + value)
+    return long

@@ -13,7 +13,7 @@ from lerobot.utils.utils import flatten_dict
 OWN_CONFIG_NAME = "playbyear_train_config.json"
 """File beside `train_config.json` that holds the options which lerobot-train does not know."""
 
-_OWN_FIELDS = ("preset", "sampling", "store")
+_OWN_FIELDS = ("preset", "sampling", "store", "compile")
 
 
 @dataclass
@@ -47,18 +47,23 @@ class SamplingConfig:
 
 @dataclass
 class StoreConfig:
-    """Where the dataset is kept in memory.
+    """Where the dataset is kept; `--store=disk` is short for `--store.place=disk`.
 
     Attributes:
+        place: "memory"; "disk" for files that are mapped into memory, with pictures no larger than the policy looks at them;
+            "auto" is memory where the recorded frames fill at most half of what is free.
         device: "cpu" or "cuda"; None means the GPU when at most half of its free memory is needed, otherwise the CPU.
+        cache: Folder of the files; None means one beside LeRobot's cache.
     """
 
+    place: str = "auto"
     device: str | None = None
+    cache: str | None = None
 
 
 @dataclass
 class PlaybyearTrainConfig(TrainPipelineConfig):
-    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*` and `--store.*`.
+    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*`, `--store.*` and `--compile`.
 
     A checkpoint keeps lerobot-train's options in its `train_config.json` and the others in a file of their own, so
     that lerobot-train can resume what playbyear-train began, and the other way round.
@@ -67,11 +72,14 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         preset: A named set of defaults, see `lerobot_playbyear.training.presets`.
         sampling: Which moments are learned from more often.
         store: Where the dataset is kept.
+        compile: Whether torch compiles the encoders and the head: a minute or more before the first update, and faster
+            ones on a GPU.
     """
 
     preset: str | None = None
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
+    compile: bool = False
 
     def validate(self) -> None:
         """As for lerobot-train; options that need its data loader are refused.

@@ -1,13 +1,15 @@
 """`playbyear-train`: lerobot-train with the dataset in memory.
 
-Takes lerobot-train's options, keeps its output folder and its checkpoints (each resumes the other's), and trains
-through LeRobot's own `update_policy`. What is added: the dataset is read once, runs of windows are cut out of memory,
-and some moments can be drawn more often than others.
+Takes lerobot-train's options, keeps its output folder and its checkpoints (each resumes the other's), and makes the same
+updates. What is added: the dataset is read once, runs of windows are cut out of memory or of files that are mapped into
+it, some moments can be drawn more often than others, and a GPU never waits for the host.
 """
 
 import logging
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lerobot.datasets import LeRobotDataset, make_train_eval_datasets
@@ -19,13 +21,20 @@ from torch import Tensor
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.datasets.errors import errors_of_input
+from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
-from lerobot_playbyear.training.parts import PolicyWindows, TrainingParts, make_training_parts
+from lerobot_playbyear.training.parts import TrainingParts, make_training_parts
+from lerobot_playbyear.training.prefetch import pinned, prefetched
+from lerobot_playbyear.training.processes import make_accelerator, share_of
 from lerobot_playbyear.training.reach import Reach, action_names
 from lerobot_playbyear.training.report import Report, is_due, print_results
+from lerobot_playbyear.training.windows import PolicyWindows
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
 
 
 def train(cfg: PlaybyearTrainConfig) -> Path:
@@ -47,11 +56,19 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
         if cfg.policy is not None and cfg.policy.push_to_hub:
             warn_without_login()
+        if cfg.policy is None:
+            raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
+        accelerator = make_accelerator(cfg.policy)
+        if not accelerator.is_main_process:
+            logging.getLogger().setLevel(logging.ERROR)
         if cfg.seed is not None:
             set_seed(cfg.seed)
         _configure_backends(cfg)
-        dataset, held_out = make_train_eval_datasets(cfg)
-        parts = make_training_parts(cfg, dataset.meta)
+        with accelerator.main_process_first():  # it downloads, and the others find what is there
+            dataset, held_out = make_train_eval_datasets(cfg)
+        parts = make_training_parts(cfg, dataset.meta, accelerator=accelerator)
+        if cfg.seed is not None and accelerator.num_processes > 1:
+            set_seed(cfg.seed + accelerator.process_index)  # each its own noise
         windows = PolicyWindows(parts.policy.config, dataset.meta, cfg.rename_map)
         store = read_store(dataset, windows, cfg)
         validation_store = None if held_out is None or cfg.eval_steps <= 0 else read_store(held_out, windows, cfg)
@@ -64,9 +81,11 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     _log_start(cfg, parts, store)
     with Report(cfg, store, parts) as report:
         _loop(cfg, parts, windows, store, sampler, validation_store, report)
-    print_results(cfg, report.success)
-    if cfg.policy is not None and cfg.policy.push_to_hub:
-        _push(cfg, parts)
+    if accelerator.is_main_process:
+        print_results(cfg, report.success)
+        if cfg.policy.push_to_hub:
+            _push(cfg, parts)
+    accelerator.end_training()
     return Path(str(cfg.output_dir))
 
 
@@ -103,35 +122,68 @@ def _loop(
     report: Report,
 ) -> None:
     grad_clip_norm = cfg.optimizer.grad_clip_norm if cfg.optimizer is not None else 0.0
+    accelerator = parts.accelerator
+    is_first = accelerator.is_main_process
+    batches = _batches(cfg, accelerator, windows, store, sampler)
     while parts.step < cfg.steps:
         start = time.perf_counter()
-        batch = windows.batch(store, sampler.draw(cfg.batch_size))
-        report.metrics.dataloading_s = time.perf_counter() - start
-        parts.update(batch, report.metrics, grad_clip_norm)
-        report.updated()
+        batch = next(batches)
+        waited = time.perf_counter() - start
+        report.updated({**parts.update(batch, grad_clip_norm), "dataloading_s": waited})
         is_last = parts.step == cfg.steps
         if is_due(parts.step, cfg.log_freq):
             report.write_training()
-        if validation_store is not None and (is_due(parts.step, cfg.eval_steps) or is_last):
+        if validation_store is not None and is_first and (is_due(parts.step, cfg.eval_steps) or is_last):
             report.write("validation", {"loss": validation_loss(parts, windows, validation_store, cfg.batch_size)})
-        if cfg.save_checkpoint and (is_due(parts.step, cfg.save_freq) or is_last):
+        if cfg.save_checkpoint and is_first and (is_due(parts.step, cfg.save_freq) or is_last):
             report.saved(parts.save(cfg))
-        if cfg.env is not None and cfg.env_eval_freq > 0 and (is_due(parts.step, cfg.env_eval_freq) or is_last):
+        is_tried = cfg.env is not None and cfg.env_eval_freq > 0 and is_first
+        if is_tried and (is_due(parts.step, cfg.env_eval_freq) or is_last):
             report.write_evaluation(parts.evaluate(cfg))
 
 
+def _batches(
+    cfg: PlaybyearTrainConfig,
+    accelerator: "Accelerator",
+    windows: PolicyWindows,
+    store: EpisodeStore,
+    sampler: RunSampler,
+) -> Iterator[dict[str, Any]]:
+    """This process's share of every batch. All draw the same runs, so that together they have those of one process."""
+    n_runs = cfg.batch_size * accelerator.num_processes
+    share = share_of(accelerator, n_runs)
+
+    def cut() -> dict[str, Any]:
+        return windows.batch(store, sampler.draw(n_runs)[share])
+
+    if accelerator.device.type == "cuda" and store.device.type == "cpu":
+        return prefetched(lambda: pinned(cut()))
+    return iter(cut, None)
+
+
 def read_store(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTrainConfig) -> EpisodeStore:
-    """What a policy learns from, in memory.
+    """What a policy learns from, in memory or on the disk.
 
     Raises:
         ValueError, MemoryError: As `EpisodeStore.from_dataset`.
     """
     start = time.perf_counter()
-    backend = cfg.dataset.video_backend
-    store = EpisodeStore.from_dataset(dataset, windows.keys, cfg.store.device, backend, progress=not inside_slurm())
+    options = cfg.store
+    place = choose_place(options.place, dataset, windows.keys)
+    store = EpisodeStore.from_dataset(
+        dataset,
+        windows.keys,
+        options.device,
+        cfg.dataset.video_backend,
+        progress=not inside_slurm(),
+        place=place,
+        image_size=windows.image_size if place == "disk" else None,
+        cache=None if options.cache is None else Path(options.cache),
+    )
+    where = f"on the disk, {store.device}" if place == "disk" else f"in memory, {store.device}"
     logging.info(
-        f"{len(store)} frames of {store.n_episodes} episodes in memory ({store.nbytes / 2**20:.0f} MiB on "
-        f"{store.device}) after {time.perf_counter() - start:.1f} s"
+        f"{len(store)} frames of {store.n_episodes} episodes {where} ({store.nbytes / 2**20:.0f} MiB) after "
+        f"{time.perf_counter() - start:.1f} s"
     )
     return store
 

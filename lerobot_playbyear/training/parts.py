@@ -1,5 +1,6 @@
-"""The parts of a training run, made as lerobot-train makes them, and the batches an `EpisodeStore` gives them."""
+"""The parts of a training run, made as lerobot-train makes them."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -8,14 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.utils.constants import ACTION, OBS_STR
-from lerobot.utils.logging_utils import MetricsTracker
-from torch import Tensor
+from lerobot.utils.constants import OBS_STR
 
 from lerobot_playbyear.compat import (
     eval_policy_all,
@@ -24,94 +23,14 @@ from lerobot_playbyear.compat import (
     load_training_state,
     save_checkpoint,
     update_last_checkpoint,
-    update_policy,
 )
-from lerobot_playbyear.datasets import EpisodeStore, audio_keys
 from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
-from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.windows import dataset_names
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
-
-_DTYPES = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}
-
-
-def make_accelerator(policy: PreTrainedConfig) -> "Accelerator":
-    """The Accelerator that lerobot-train makes for a policy: its device and precision, one process.
-
-    Raises:
-        ValueError: If several processes were launched.
-    """
-    from accelerate import Accelerator  # late, like the policy below: both take a second, and a dataset may be wrong
-
-    mixed_precision = _DTYPES.get(getattr(policy, "dtype", ""))
-    if not hasattr(policy, "dtype") and policy.use_amp:
-        dtype = torch.get_autocast_dtype(torch.device(str(policy.device)).type)
-        mixed_precision = {torch.bfloat16: "bf16", torch.float16: "fp16"}[dtype]
-    accelerator = Accelerator(
-        step_scheduler_with_optimizer=False, mixed_precision=mixed_precision, cpu=policy.device == "cpu"
-    )
-    if accelerator.num_processes > 1:
-        raise ValueError("playbyear-train runs in one process; use lerobot-train for several GPUs.")
-    return accelerator
-
-
-class PolicyWindows:
-    """Cuts the batches a policy trains on out of stores.
-
-    The policy `playbyear` gets its observations only as far back as each is looked at, as bytes and 16-bit sound;
-    other policies get exactly what LeRobot's data loader would give them.
-
-    Args:
-        policy: The policy's configuration, complete with its features.
-        meta: The dataset's metadata.
-        rename_map: The dataset's names of observations, with what the policy calls them.
-
-    Attributes:
-        n_windows: Windows per item that lie in a run of frames, K.
-        action_deltas: Where the actions of an item lie, in frames from its last or, of a chunk, its first one; empty for a
-            policy that learns single actions.
-    """
-
-    def __init__(
-        self, policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
-    ) -> None:
-        self._as_lerobot = not isinstance(policy, PlaybyearConfig)
-        if isinstance(policy, PlaybyearConfig):
-            names = dataset_names(policy, rename_map)
-            self._deltas = {names[key]: list(range(1 - n, 1)) for key, n in _history(policy).items()}
-            self._deltas[ACTION] = list(policy.action_delta_indices)
-        else:
-            timestamps = resolve_delta_timestamps(policy, meta) or {}
-            self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
-        self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
-        self.action_deltas: list[int] = self._deltas.get(ACTION, [])
-
-    @property
-    def keys(self) -> list[str] | None:
-        """The features that a store has to hold; None means all that it can."""
-        return None if self._as_lerobot else list(self._deltas)
-
-    def batch(self, store: EpisodeStore, last_frames: Tensor) -> dict[str, Any]:
-        """The training items whose last frames are `last_frames` (B,), on the store's device."""
-        return store.windows(last_frames, self._deltas, as_lerobot=self._as_lerobot)
-
-
-def dataset_names(policy: PreTrainedConfig, rename_map: Mapping[str, str] | None = None) -> dict[str, str]:
-    """What the dataset calls each observation of the policy."""
-    original = {renamed: key for key, renamed in (rename_map or {}).items()}
-    return {key: original.get(key, key) for key in policy.input_features or {}}
-
-
-def _history(policy: PlaybyearConfig) -> dict[str, int]:
-    """How many frames of each observation a training item holds."""
-    return {
-        **dict.fromkeys(policy.camera_keys if policy.use_vision else [], policy.n_image_frames),
-        **dict.fromkeys(audio_keys(policy.input_features or {}) if policy.use_audio else [], policy.n_audio_frames),
-        **dict.fromkeys(policy.low_dimensional_keys, policy.n_run_frames),
-    }
 
 
 @dataclass
@@ -136,27 +55,48 @@ class TrainingParts:
     postprocessor: PolicyProcessorPipeline
     step: int = 0
 
-    def update(self, batch: Mapping[str, Any], metrics: MetricsTracker, grad_clip_norm: float) -> MetricsTracker:
-        """One update through LeRobot's `update_policy`, on a batch that the preprocessor has not seen yet."""
-        metrics, _ = update_policy(
-            metrics,
-            self.policy,
-            self.preprocessor(dict(batch)),
-            self.optimizer,
-            grad_clip_norm,
-            accelerator=self.accelerator,
-            lr_scheduler=self.scheduler,
-        )
+    def update(self, batch: Mapping[str, Any], grad_clip_norm: float) -> dict[str, Any]:
+        """One update, as LeRobot's `update_policy` makes it, on a batch that the preprocessor has not seen yet.
+
+        LeRobot's waits for the GPU twice, for two numbers of the log; here they are returned as tensors.
+
+        Returns:
+            Figures of this update: numbers, or tensors of one number.
+        """
+        start, policy, accelerator = time.perf_counter(), self.policy, self.accelerator
+        policy.train()
+        with accelerator.autocast():
+            loss, figures = policy.forward(self.preprocessor(dict(batch)))
+        accelerator.backward(loss)
+        if grad_clip_norm > 0:
+            norm = accelerator.clip_grad_norm_(policy.parameters(), grad_clip_norm)
+        else:
+            norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), float("inf"))
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        if self.scheduler is not None:
+            self.scheduler.step()
+        if callable(follow := getattr(self._unwrapped(), "update", None)):  # a policy with buffers of its own
+            follow()
         self.step += 1
-        return metrics
+        figures = {
+            **(figures or {}),
+            "loss": loss.detach(),
+            "grad_norm": norm,
+            "lr": self.optimizer.param_groups[0]["lr"],
+        }
+        if accelerator.device.type == "cuda":
+            figures["gpu_mem_gb"] = torch.cuda.max_memory_allocated() / 2**30
+        return {**figures, "update_s": time.perf_counter() - start}
 
     @torch.no_grad()
     def loss(self, batch: Mapping[str, Any]) -> float:
         """The policy's loss on a batch, as it would be in a rollout: no augmentation, no dropout."""
-        self.policy.eval()
+        policy = self._unwrapped()
+        policy.eval()
         with self.accelerator.autocast():
-            loss, _ = self.policy.forward(self.preprocessor(dict(batch)))
-        self.policy.train()
+            loss, _ = policy.forward(self.preprocessor(dict(batch)))
+        policy.train()
         return float(loss)
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
@@ -174,12 +114,12 @@ class TrainingParts:
             checkpoint_dir=folder,
             step=self.step,
             cfg=cfg,
-            policy=self.accelerator.unwrap_model(self.policy),
+            policy=self._unwrapped(),
             optimizer=self.optimizer,
             scheduler=self.scheduler,
             preprocessor=self.preprocessor,
             postprocessor=self.postprocessor,
-            num_processes=1,
+            num_processes=self.accelerator.num_processes,
             batch_size=cfg.batch_size,
         )
 
@@ -193,7 +133,7 @@ class TrainingParts:
             with torch.no_grad(), self.accelerator.autocast():
                 return eval_policy_all(
                     envs=envs,
-                    policy=self.accelerator.unwrap_model(self.policy),
+                    policy=self._unwrapped(),
                     env_preprocessor=env_preprocessor,
                     env_postprocessor=env_postprocessor,
                     preprocessor=self.preprocessor,
@@ -210,9 +150,17 @@ class TrainingParts:
             close_envs(envs)
             self.policy.train()
 
+    def _unwrapped(self) -> PreTrainedPolicy:
+        """The policy itself, of one process. The wrapped one waits for the others."""
+        policy: PreTrainedPolicy = self.accelerator.unwrap_model(self.policy)
+        return policy
+
 
 def make_training_parts(
-    cfg: PlaybyearTrainConfig, meta: LeRobotDatasetMetadata, keep_normalization: bool = False
+    cfg: PlaybyearTrainConfig,
+    meta: LeRobotDatasetMetadata,
+    keep_normalization: bool = False,
+    accelerator: "Accelerator | None" = None,
 ) -> TrainingParts:
     """Make policy, processors, optimizer and schedule for a dataset; where the run is resumed, from its checkpoint.
 
@@ -221,6 +169,7 @@ def make_training_parts(
         meta: The dataset's metadata.
         keep_normalization: Whether a checkpoint's statistics stay as they are, those of sound included; otherwise the
             dataset's take their place.
+        accelerator: Of `make_accelerator`; None makes one.
 
     Raises:
         ValueError: If the dataset does not suit the policy, before the policy is made.
@@ -229,18 +178,31 @@ def make_training_parts(
     if policy_cfg is None:
         raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
     check_dataset_suits(policy_cfg, meta, cfg.rename_map)
-    accelerator = make_accelerator(policy_cfg)
+    from lerobot_playbyear.training.acceleration import compile_networks, fuse, prefer_channels_last
+
     policy = make_policy(cfg=policy_cfg, ds_meta=meta, rename_map=cfg.rename_map)
     from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
     if keep_normalization and isinstance(policy, PlaybyearPolicy):
         policy.keep_normalization()
+    if accelerator is None:
+        from lerobot_playbyear.training.processes import (
+            make_accelerator,
+        )  # late: it takes a second, and the data may be wrong
+
+        accelerator = make_accelerator(policy_cfg)
     stats = None if cfg.resume or keep_normalization else meta.stats
     preprocessor, postprocessor = _make_processors(cfg, policy, stats, accelerator.device)
     optimizer, scheduler = make_optimizer_and_scheduler(cfg, policy)
     step = 0
     if cfg.resume and cfg.checkpoint_path is not None:
         step, optimizer, scheduler = load_training_state(cfg.checkpoint_path, optimizer, scheduler)
+    if accelerator.device.type == "cuda":
+        policy.to(accelerator.device)  # before its weights and the optimizer's state are laid out anew
+        prefer_channels_last(policy, optimizer)
+        fuse(optimizer)
+    if cfg.compile:
+        compile_networks(policy)
     policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
     policy.train()
     return TrainingParts(accelerator, policy, optimizer, scheduler, preprocessor, postprocessor, step)

@@ -4,11 +4,11 @@ import abc
 import json
 import logging
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-import torch
-from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
+from accelerate import PartialState
 from lerobot.utils.utils import inside_slurm
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -17,6 +17,7 @@ from lerobot_playbyear.compat import WandBLogger
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.hub.training_run import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.figures import Figures
 from lerobot_playbyear.training.parts import TrainingParts
 
 
@@ -46,9 +47,12 @@ class Progress(abc.ABC):
         self, cfg: PlaybyearTrainConfig, counter: Counter, total: int, done: int, unit: str, name: str
     ) -> None:
         self._counter = counter
-        self._wandb = WandBLogger(cfg) if cfg.wandb.enable and cfg.wandb.project else None
+        self._is_told = PartialState().is_main_process
+        is_uploaded = self._is_told and cfg.wandb.enable and cfg.wandb.project
+        self._wandb = WandBLogger(cfg) if is_uploaded else None
         self._redirect = logging_redirect_tqdm()
-        self.bar: tqdm = tqdm(total=total, initial=done, desc=name, unit=unit, disable=inside_slurm())
+        quiet = inside_slurm() or not self._is_told
+        self.bar: tqdm = tqdm(total=total, initial=done, desc=name, unit=unit, disable=quiet)
         self.success: float | None = None
 
     def __enter__(self) -> Self:
@@ -93,22 +97,23 @@ class Report(Progress):
         self._path = Path(str(cfg.output_dir)) / METRICS_NAME
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._began = time.perf_counter()
-        self.metrics = make_tracker(cfg.batch_size, store, parts.step)
+        self._figures = Figures(cfg.batch_size, store, parts.step, parts.accelerator)
 
-    def updated(self) -> None:
-        """One more update is done."""
-        self.metrics.step()
+    def updated(self, figures: Mapping[str, Any]) -> None:
+        """One more update is done, with these figures."""
+        self._figures.add(figures)
         self.bar.update(1)
 
     def write_training(self) -> None:
-        """The figures since the last time."""
-        figures = self.metrics.to_dict()
+        """The figures since the last time. Every process has to call it."""
+        figures, line = self._figures.read()
         self.bar.set_postfix(loss=f"{figures['loss']:.4f}", refresh=False)
-        self.write("train", {key: value for key, value in figures.items() if key != "steps"}, str(self.metrics))
-        self.metrics.reset_averages()
+        self.write("train", {key: value for key, value in figures.items() if key != "steps"}, line)
 
     def write(self, kind: str, figures: dict[str, Any], text: str | None = None) -> None:
-        """Figures of one kind at this step."""
+        """Figures of one kind at this step, of the first process."""
+        if not self._is_told:
+            return
         numbers = ", ".join(f"{key} {value:.4g}" for key, value in figures.items())
         logging.info(text or f"{kind} at step {self._counter.step}: {numbers}")
         elapsed = round(time.perf_counter() - self._began, 2)
@@ -122,26 +127,6 @@ class Report(Progress):
         logging.info(f"Checkpoint: {checkpoint}")
         if self._wandb:
             self._wandb.log_policy(checkpoint)
-
-
-def make_tracker(batch_size: int, store: EpisodeStore, step: int = 0) -> MetricsTracker:
-    """The averages that LeRobot's `update_policy` writes to.
-
-    Args:
-        batch_size: Items per update.
-        store: What they are drawn from.
-        step: Updates done before.
-    """
-    meters = {
-        "loss": AverageMeter("loss", ":.3f"),
-        "grad_norm": AverageMeter("grdn", ":.3f"),
-        "lr": AverageMeter("lr", ":0.1e"),
-        "update_s": AverageMeter("updt_s", ":.3f"),
-        "dataloading_s": AverageMeter("data_s", ":.3f"),
-    }
-    if torch.cuda.is_available():
-        meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
-    return MetricsTracker(batch_size, len(store), store.n_episodes, meters, initial_step=step)
 
 
 def is_due(step: int, every: int) -> bool:

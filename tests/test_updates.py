@@ -1,0 +1,233 @@
+"""Updates: LeRobot's to the last bit, and faster ones that learn the same."""
+
+import itertools
+import shutil
+import sys
+import threading
+
+import pytest
+import torch
+from dataset_factory import make_dataset
+from lerobot.configs import parser
+from lerobot.datasets import LeRobotDataset
+from lerobot.scripts.lerobot_train import update_policy
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
+from safetensors.torch import load_file
+from test_fake_cuda import Waits, move_to_card, on_card, without_cudnn
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
+from lerobot_playbyear.training.acceleration import compile_networks, fuse, prefer_channels_last
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
+from lerobot_playbyear.training.figures import Figures
+from lerobot_playbyear.training.parts import make_training_parts
+from lerobot_playbyear.training.prefetch import prefetched
+from lerobot_playbyear.training.windows import PolicyWindows
+
+TINY = (
+    "--policy.type=playbyear",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+    "--policy.image_size=32",
+    "--policy.vision_width=8",
+    "--policy.audio_window_s=0.9",
+    "--policy.n_memory_steps=3",
+    "--policy.n_supervised_steps=4",
+    "--policy.hidden_size=64",
+    "--policy.audio_noise_db=6",
+    "--batch_size=4",
+    "--steps=20",
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    register_third_party_plugins()
+    n_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(n_threads)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data") / "noise"
+    make_dataset(root, (12, 17, 14), image_size=16)
+    return LeRobotDataset("tests/noise", root)
+
+
+@pytest.fixture
+def make(dataset, monkeypatch, tmp_path):
+    """Makes the parts of a training, with the same weights each time."""
+
+    def parts(*options):
+        arguments = [*TINY, "--dataset.repo_id=tests/noise", f"--dataset.root={dataset.root}", *options]
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+
+        @parser.wrap()
+        def validated(cfg: PlaybyearTrainConfig):
+            cfg.output_dir = tmp_path / "out"
+            shutil.rmtree(cfg.output_dir, ignore_errors=True)
+            cfg.validate()
+            return cfg
+
+        cfg = validated()
+        torch.manual_seed(0)
+        return cfg, make_training_parts(cfg, dataset.meta)
+
+    return parts
+
+
+@pytest.fixture
+def batches(dataset):
+    """The same batches each time."""
+
+    def of(parts):
+        windows = PolicyWindows(parts.policy.config, dataset.meta)
+        store = EpisodeStore.from_dataset(dataset, windows.keys, "cpu")
+        sampler = RunSampler(run_weights(store, windows.n_windows))
+        return (windows.batch(store, sampler.draw(4)) for _ in itertools.count())
+
+    return of
+
+
+def learn(parts, batches, n_updates):
+    torch.manual_seed(1)
+    return [float(parts.update(batch, 1.0)["loss"]) for batch in itertools.islice(batches, n_updates)]
+
+
+def weights(parts):
+    return {key: value.clone() for key, value in parts.policy.state_dict().items()}
+
+
+def test_an_update_is_lerobots_to_the_last_bit(make, batches):
+    _, ours = make()
+    losses = learn(ours, batches(ours), 4)
+    _, theirs = make()
+    tracker = MetricsTracker(4, 43, 3, {key: AverageMeter(key) for key in ("loss", "grad_norm", "lr", "update_s")})
+    torch.manual_seed(1)
+    for loss, batch in zip(losses, batches(theirs), strict=False):
+        update_policy(
+            tracker,
+            theirs.policy,
+            theirs.preprocessor(batch),
+            theirs.optimizer,
+            1.0,
+            theirs.accelerator,
+            lr_scheduler=theirs.scheduler,
+        )
+        assert tracker.loss.val == loss
+    expected = weights(theirs)
+    for key, value in weights(ours).items():
+        assert torch.equal(value, expected[key]), key
+
+
+def test_a_whole_update_never_waits_for_the_card(make, batches, monkeypatch):
+    """Preprocessor, forward, clipping, the fused optimizer, the schedule, and the figures of the log.
+
+    The backward pass, torch's own, asks the driver for the card; here gradients are there without it.
+    """
+    _, parts = make()
+    batch = next(batches(parts))
+    fuse(parts.optimizer.optimizer)
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        move_to_card(parts.policy)
+        parameters = iter(list(parts.policy.parameters()))
+        for group in parts.optimizer.optimizer.param_groups:
+            group["params"] = [next(parameters) for _ in group["params"]]
+        on_it = {key: on_card(value) if isinstance(value, Tensor) else value for key, value in batch.items()}
+        parts.preprocessor.steps = [_moved(step) for step in parts.preprocessor.steps]
+        monkeypatch.setattr(parts.accelerator, "backward", lambda loss: _give_gradients(parts.policy))
+        figures = Figures(4, type("Store", (), {"__len__": lambda _: 43, "n_episodes": 3})())
+        with Waits() as waits, without_cudnn():
+            for _ in range(2):
+                figures.add(parts.update(on_it, 1.0))
+        assert waits.lines == []
+
+
+def _give_gradients(policy):
+    for parameter in policy.parameters():
+        parameter.grad = torch.empty_like(parameter)
+
+
+def _moved(step):
+    """A step of the preprocessor that takes the card for its device."""
+    if hasattr(step, "tensor_device"):
+        step.device = "cuda"
+        step.tensor_device = torch.device("cuda")
+        step.non_blocking = True
+    if hasattr(step, "_tensor_stats"):
+        step.device = "cuda"
+        step._tensor_stats = {k: {n: on_card(v) for n, v in stats.items()} for k, stats in step._tensor_stats.items()}
+    return step
+
+
+def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(make, batches, tmp_path):
+    _, plain = make()
+    expected = learn(plain, batches(plain), 3)
+    cfg, parts = make()
+    prefer_channels_last(parts.policy, parts.optimizer.optimizer)
+    fuse(parts.optimizer.optimizer)
+    given = batches(parts)
+    assert learn(parts, given, 3) == pytest.approx(expected, rel=1e-4)
+    folder = tmp_path / "checkpoint"
+    parts.write_checkpoint(folder, cfg)
+    plain.write_checkpoint(tmp_path / "plain", cfg)
+    for name in ("training_state/optimizer_state.safetensors", "pretrained_model/model.safetensors"):
+        ours, theirs = load_file(folder / name), load_file(tmp_path / "plain" / name)
+        assert {k: (v.shape, v.dtype) for k, v in ours.items()} == {k: (v.shape, v.dtype) for k, v in theirs.items()}
+
+    state = parts.optimizer.optimizer.state
+    moments = [
+        value for values in state.values() for value in values.values() if value.dim() == 4 and value.shape[1] > 1
+    ]
+    assert moments
+    assert all(value.is_contiguous(memory_format=torch.channels_last) for value in moments)
+    further = learn(parts, given, 2)
+
+    from lerobot_playbyear.compat import load_training_state
+
+    cfg, resumed = make()
+    resumed.policy.load_state_dict(load_file(folder / "pretrained_model" / "model.safetensors"))
+    prefer_channels_last(resumed.policy, resumed.optimizer.optimizer)
+    resumed.step, _, _ = load_training_state(folder, resumed.optimizer.optimizer, resumed.scheduler)
+    again = batches(resumed)
+    for _ in range(3):
+        next(again)
+    assert learn(resumed, again, 2) == pytest.approx(further, rel=1e-4)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch compiles for a CPU with g++, which is not here")
+def test_a_compiled_policy_learns_the_same(make, batches):
+    _, plain = make()
+    expected = learn(plain, batches(plain), 3)
+    _, parts = make("--compile=true")
+    assert learn(parts, batches(parts), 3) == pytest.approx(expected, rel=1e-3)
+    assert weights(parts).keys() == weights(plain).keys()
+
+
+def test_only_our_policy_is_compiled():
+    with pytest.raises(ValueError, match=r"--compile=true is for --policy\.type=playbyear"):
+        compile_networks(torch.nn.Linear(1, 1))
+
+
+def test_batches_come_ahead_in_order_and_a_failure_comes_with_its_batch():
+    made, threads = [], set()
+
+    def make_batch():
+        threads.add(threading.current_thread().name)
+        made.append(len(made))
+        if made[-1] == 5:
+            raise ValueError("batch 5")
+        return {"number": made[-1]}
+
+    batches = prefetched(make_batch)
+    assert [next(batches)["number"] for _ in range(5)] == [0, 1, 2, 3, 4]
+    with pytest.raises(ValueError, match="batch 5"):
+        next(batches)
+    assert len(threads) == 1
+    assert threading.current_thread().name not in threads
+    assert len(made) >= 6
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("batches")]
