@@ -53,7 +53,7 @@ What comes of it
 
 import sys
 
-from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
+from lerobot_playbyear.scripts.command import check_local_dataset, run_command, run_with_lerobot
 from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.heap import keep_freed_memory
 
@@ -69,7 +69,13 @@ def _train() -> None:
 
     sys.argv[1:] = apply_preset(with_long_store(sys.argv[1:]))
     keep_freed_memory()
-    from lerobot_playbyear.training.loop import train
+    from lerobot_playbyear.training.config import PlaybyearTrainConfig
+
+    def train(cfg: PlaybyearTrainConfig) -> None:
+        check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
+        from lerobot_playbyear.training import loop
+
+        loop.train(cfg)
 
     run_with_lerobot(train)
 

@@ -125,5 +125,4 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
             saved = flatten_dict(json.loads(own.read_text()), sep=".").items()
             given = [f"--{k}={v}" for k, v in saved if v is not None and parser.parse_arg(k, cli_args) is None]
             cli_args = given + cli_args
-        config = super().from_pretrained(pretrained_name_or_path, cli_args=cli_args, **kwargs)
-        return config  # type: ignore[return-value]
+        return super().from_pretrained(pretrained_name_or_path, cli_args=cli_args, **kwargs)  # type: ignore[return-value]
