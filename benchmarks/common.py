@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import statistics
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
+
+import psutil
 
 BENCH = Path("outputs/bench.json")
 _LESS_IS_BETTER = ("ms", "s", "MiB")
@@ -52,14 +55,16 @@ class Row:
         return self.theirs / self.ours if self.unit in _LESS_IS_BETTER else self.ours / self.theirs
 
 
-def parser_for(doc: str | None) -> argparse.ArgumentParser:
-    """A command line that prints the module's docstring as help."""
+def parser_for(doc: str | None, turns: int | None = None) -> argparse.ArgumentParser:
+    """A command line that prints the module's docstring as help, with the number of turns where one is given."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=BENCH, help="JSON file that the figures are merged into")
+    if turns is not None:
+        parser.add_argument("--turns", type=int, default=turns)
     return parser
 
 
-def in_turns(works: Mapping[str, Callable[[], object]], n_turns: int, warm_up: int = 1) -> dict[str, list[float]]:
+def in_turns[K](works: Mapping[K, Callable[[], object]], n_turns: int, warm_up: int = 1) -> dict[K, list[float]]:
     """Times several pieces of work in turns, so that whatever else the machine does hits all of them.
 
     Args:
@@ -70,7 +75,7 @@ def in_turns(works: Mapping[str, Callable[[], object]], n_turns: int, warm_up: i
     Returns:
         The seconds of every call.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in works}
+    seconds: dict[K, list[float]] = {name: [] for name in works}
     for turn in range(warm_up + n_turns):
         for name, work in works.items():
             start = time.perf_counter()
@@ -80,7 +85,7 @@ def in_turns(works: Mapping[str, Callable[[], object]], n_turns: int, warm_up: i
     return seconds
 
 
-def medians(seconds: Mapping[str, Sequence[float]]) -> dict[str, float]:
+def medians[K](seconds: Mapping[K, Sequence[float]]) -> dict[K, float]:
     """The median of every list."""
     return {name: statistics.median(values) for name, values in seconds.items()}
 
@@ -145,20 +150,14 @@ def serve(work: Callable[[str], float]) -> None:
 
 def machine() -> dict[str, object]:
     """What ran, and whether it ran alone."""
-    model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
-        ]
-        model = names[0] if names else model
-    installed = {name: metadata.version(name) for name in _VERSIONS}
+    model = re.search(r"^model name\s*: (.*)", info.read_text(), re.MULTILINE) if info.is_file() else None
     return {
-        "processor": model,
+        "processor": model[1] if model else platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "threads": os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())),
         "python": platform.python_version(),
-        **installed,
+        **{name: metadata.version(name) for name in _VERSIONS},
         "load_before": round(os.getloadavg()[0], 2),
     }
 
@@ -173,11 +172,22 @@ def report(section: str, rows: Sequence[Row], output: Path, started: dict[str, o
         started: `machine()` from before the work.
     """
     print("\n".join(markdown(rows)), flush=True)
-    figures = json.loads(output.read_text()) if output.is_file() else {}
     entries = [{**asdict(row), "times_better": row.times_better} for row in rows]
-    figures[section] = {"machine": started, "rows": entries}
+    merge({section: {"machine": started, "rows": entries}}, output)
+
+
+def merge(sections: dict[str, object], output: Path) -> None:
+    """Puts sections into the file of figures; the others stay."""
+    figures = json.loads(output.read_text()) if output.is_file() else {}
     output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(figures, indent=1) + "\n")
+    output.write_text(json.dumps({**figures, **sections}, indent=1) + "\n")
+
+
+def occupied(*processes: psutil.Process) -> tuple[int, int]:
+    """Bytes of memory of processes, and those of them that are no files, which the system cannot take back."""
+    memories = [process.memory_info() for process in processes]
+    total = sum(memory.rss for memory in memories)
+    return total, total - sum(getattr(memory, "shared", 0) for memory in memories)
 
 
 def rows_of(section: Mapping[str, object]) -> list[Row]:

@@ -2,7 +2,7 @@
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -24,6 +24,14 @@ def make_policy(n_cameras: int = 1, n_microphones: int = 1, **options) -> Playby
         input_features=inputs, output_features=action, sample_rate=16000, device="cpu", push_to_hub=False, **options
     )
     return PlaybyearPolicy(config)
+
+
+def bare_resnet(n_frames: int, image_size: int) -> tuple[nn.Module, Tensor]:
+    """The vision encoder's ResNet alone, and frames that are already as it reads them."""
+    policy = make_policy(use_audio=False)
+    encoder = policy.model.vision[CAMERA.removeprefix("observation.").replace(".", "_")]
+    frames = torch.rand(n_frames, 9, image_size, image_size).contiguous(memory_format=torch.channels_last)
+    return encoder.network, frames
 
 
 def random_runs(config: PlaybyearConfig, n: int) -> dict[str, Tensor]:

@@ -151,10 +151,9 @@ def measure_room(folder: Path) -> None:
 def main() -> None:
     os.environ.setdefault("SVT_LOG", "1")
     datasets.disable_progress_bars()
-    parser = parser_for(__doc__)
+    parser = parser_for(__doc__, turns=5)
     parser.add_argument("--paced", action="store_true", help="at the rate of the robot instead; takes 5 minutes")
     parser.add_argument("--frames", type=int, default=200, help="of an episode")
-    parser.add_argument("--turns", type=int, default=5)
     args = parser.parse_args()
     started = machine()
     with tempfile.TemporaryDirectory() as folder:

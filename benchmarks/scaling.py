@@ -70,25 +70,24 @@ def update_work(n_sensors: int) -> Callable[[], object]:
 
 
 def main() -> None:
-    parser = parser_for(__doc__)
-    parser.add_argument("--turns", type=int, default=5)
+    parser = parser_for(__doc__, turns=5)
     args = parser.parse_args()
     started, rows = machine(), []
     small = {"image_size": 48, "vision_width": 16}
     for n in EPISODES:
         seconds = medians(in_turns({"windows": windows_work(n)}, args.turns))["windows"]
         rows.append(Row(f"windows from a store of {n} episodes", 20 * _BATCH / seconds, "windows/s"))
-    steps = medians(in_turns({str(n): step_work(n, **small) for n in ENVIRONMENTS}, 5 * args.turns, warm_up=3))
+    steps = medians(in_turns({n: step_work(n, **small) for n in ENVIRONMENTS}, 5 * args.turns, warm_up=3))
     rows += [
-        Row(f"control step of {n} environments in one batch, preset `cpu`'s network", 1e3 * steps[str(n)], "ms")
+        Row(f"control step of {n} environments in one batch, preset `cpu`'s network", 1e3 * steps[n], "ms")
         for n in ENVIRONMENTS
     ]
     sensors = {n: step_work(1, n_cameras=n, n_microphones=n, **small) for n in SENSORS}
-    latency = medians(in_turns({str(n): work for n, work in sensors.items()}, 5 * args.turns, warm_up=3))
-    updates = medians(in_turns({str(n): update_work(n) for n in SENSORS}, args.turns))
+    latency = medians(in_turns(sensors, 5 * args.turns, warm_up=3))
+    updates = medians(in_turns({n: update_work(n) for n in SENSORS}, args.turns))
     for n in SENSORS:
-        rows.append(Row(f"control step, {n} cameras and {n} microphones, the same", 1e3 * latency[str(n)], "ms"))
-        rate = 4 * 8 / updates[str(n)]
+        rows.append(Row(f"control step, {n} cameras and {n} microphones, the same", 1e3 * latency[n], "ms"))
+        rate = 4 * 8 / updates[n]
         rows.append(Row(f"training, 84 px, width 16, {n} cameras and {n} microphones", rate, "windows/s"))
     report("scaling", rows, args.output, started)
 

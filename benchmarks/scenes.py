@@ -7,15 +7,23 @@ import numpy as np
 
 from lerobot_playbyear.datasets import audio_feature
 
+CAMERAS = ("observation.images.front", "observation.images.wrist")
+MICROPHONES = ("observation.audio.left", "observation.audio.right")
+
 
 def dataset_features(
-    image_size: int | tuple[int, int], sample_rate: int, fps: int, n_microphones: int = 1, dtype: str = "image"
+    image_size: tuple[int, int],
+    sample_rate: int,
+    fps: int,
+    n_microphones: int = 1,
+    dtype: str = "image",
+    n_cameras: int = 1,
 ) -> dict[str, dict[str, Any]]:
-    """A camera, microphones, the arm's state and the action."""
-    shape = (*((image_size, image_size) if isinstance(image_size, int) else image_size), 3)
+    """Cameras, microphones, the arm's state and the action."""
+    camera = {"dtype": dtype, "shape": (*image_size, 3), "names": ["height", "width", "channels"]}
     return {
-        "observation.images.front": {"dtype": dtype, "shape": shape, "names": ["height", "width", "channels"]},
-        **{f"observation.audio.{i}": audio_feature(sample_rate, fps) for i in range(n_microphones)},
+        **{key: dict(camera) for key in CAMERAS[:n_cameras]},
+        **{key: audio_feature(sample_rate, fps) for key in MICROPHONES[:n_microphones]},
         "observation.state": {"dtype": "float32", "shape": (7,), "names": None},
         "action": {"dtype": "float32", "shape": (4,), "names": None},
     }

@@ -64,23 +64,22 @@ def our_update(n_supervised_steps: int, image_size: int, amp: bool = False) -> C
     return update_of(policy, loss)
 
 
-def bare_resnet(n_frames: int, image_size: int) -> Callable[[], None]:
-    """Forward and backward pass of the vision encoder's ResNet alone, on frames that are already as it reads them."""
-    from policies import CAMERA, make_policy
+def bare_passes(n_frames: int, image_size: int) -> Callable[[], None]:
+    """Forward and backward pass of the vision encoder's ResNet alone."""
+    from policies import bare_resnet
 
-    network = make_policy(use_audio=False).train().model.vision[CAMERA.removeprefix("observation.").replace(".", "_")]
-    frames = torch.rand(n_frames, 9, image_size, image_size).contiguous(memory_format=torch.channels_last)
+    network, frames = bare_resnet(n_frames, image_size)
+    network.train()
 
     def passes() -> None:
-        network.network(frames).square().mean().backward()
+        network(frames).square().mean().backward()
         network.zero_grad()
 
     return passes
 
 
 def main() -> None:
-    parser = parser_for(__doc__)
-    parser.add_argument("--turns", type=int, default=4)
+    parser = parser_for(__doc__, turns=4)
     parser.add_argument("--image_size", type=int, default=224)
     parser.add_argument("--reference", action="store_true", help="be the process of the published scheme")
     args = parser.parse_args()
@@ -100,7 +99,7 @@ def main() -> None:
     theirs: list[float] = []
     works: dict[str, Callable[[], object]] = {f"K={k}": our_update(k, args.image_size) for k in RUNS}
     works |= {f"bfloat16 {k}": our_update(k, args.image_size, amp=True) for k in wanted_times}
-    works |= {f"bare {k}": bare_resnet(frames[k], args.image_size) for k in wanted_times}
+    works |= {f"bare {k}": bare_passes(frames[k], args.image_size) for k in wanted_times}
     works["reference"] = lambda: theirs.append(helper.measure())
     seconds = medians(in_turns(works, args.turns))
     seconds["reference"] = medians({"reference": theirs[1:]})["reference"]

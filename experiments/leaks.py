@@ -8,7 +8,6 @@ frames in contact from the twin's same frames; its area under the curve on held-
 Rows are sensors, columns what the network is shown.
 """
 
-import argparse
 import json
 from dataclasses import replace
 
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from experiments.protocol import RESULTS
+from experiments.protocol import RESULTS, command_line, save
 from gym_playbyear.experts import ExpertConfig, GraspExpert
 from gym_playbyear.proprioception import NO_SENSOR_NOISE, SensorNoise
 from lerobot_playbyear.episodes.episode import Observation
@@ -115,7 +114,7 @@ def contact_auc(windows: np.ndarray, touched: np.ndarray, held_out: np.ndarray, 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--n_episodes", type=int, default=200)
     n_episodes = parser.parse_args().n_episodes
     report = {}
@@ -126,9 +125,7 @@ def main() -> None:
             part: round(contact_auc(windows, touched, held_out, list(dims)), 3) for part, dims in _PARTS.items()
         }
         print(name, f"{touched.sum()} of {len(touched)} frames in contact", json.dumps(report[name]), flush=True)
-    output = RESULTS / "leaks.json"
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(report, indent=1) + "\n")
+    save(RESULTS / "leaks.json", report, indent=1)
 
 
 if __name__ == "__main__":
