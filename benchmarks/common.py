@@ -1,6 +1,7 @@
 """What the benchmarks share: turns of measuring, helpers in processes of their own, the table, and the file of figures."""
 
 import argparse
+import contextlib
 import json
 import os
 import platform
@@ -110,21 +111,16 @@ class Helper:
 
     def ask(self, question: str = "") -> None:
         """Lets it begin."""
-        assert self._process.stdin is not None
-        try:
+        with contextlib.suppress(BrokenPipeError):  # `answer` tells why
             self._process.stdin.write(question + "\n")
             self._process.stdin.flush()
-        except BrokenPipeError:
-            self._fail()
 
     def answer(self) -> float:
         """Waits for its number."""
-        assert self._process.stdout is not None
         for line in self._process.stdout:
             if line.startswith("answer "):
                 return float(line.split()[1])
-        self._fail()
-        raise AssertionError
+        raise RuntimeError(f"A helper did not run:\n{self._process.stderr.read()[-2000:]}")
 
     def measure(self, question: str = "") -> float:
         """Asks and waits."""
@@ -133,13 +129,8 @@ class Helper:
 
     def close(self) -> None:
         """Ends it."""
-        assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait(timeout=60)
-
-    def _fail(self) -> None:
-        assert self._process.stderr is not None
-        raise RuntimeError(f"A helper did not run:\n{self._process.stderr.read()[-2000:]}")
 
 
 def serve(work: Callable[[str], float]) -> None:

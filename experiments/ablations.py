@@ -16,7 +16,6 @@ from experiments.protocol import (
     record,
     run,
     save,
-    tool,
     wilson_interval,
 )
 from experiments.training import Job, side_by_side
@@ -29,7 +28,7 @@ def blind_floor(task: str) -> None:
     if blind_path(task).exists():
         return
     output, seeds = RUNS / f"{task}-blind.json", EVALUATION_SEEDS
-    command = [tool("python"), "-m", "gym_playbyear.baselines", "--task", task]
+    command = ["python", "-m", "gym_playbyear.baselines", "--task", task]
     command += ["--n_episodes", str(len(seeds)), "--seed", str(seeds.start), "--output", str(output)]
     run(command, f"blind-{task}", threads=1)
     save(blind_path(task), load(output)[0])

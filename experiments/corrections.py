@@ -30,7 +30,6 @@ from experiments.protocol import (
     record,
     save,
     shown,
-    tool,
 )
 from experiments.training import Job, clocked, evaluate, train
 
@@ -95,7 +94,7 @@ def correct(job: Job) -> Corrected:
     train_command, _ = train(job)
     folder = RUNS / "dagger" / job.name
     dagger = [
-        tool("playbyear-dagger"),
+        "playbyear-dagger",
         f"--policy.path={job.checkpoint}",
         *options_of(job.dataset, "demos"),
         *options_of(RUNS / "datasets" / f"corrections-{job.name}", "interventions"),

@@ -55,19 +55,18 @@ def twin_sweeps(sensors: SensorNoise, seeds: range) -> tuple[np.ndarray, np.ndar
     env = gym.make(f"gym_playbyear:gym_playbyear/{TASK}", image_size=8, sound="none", disable_env_checker=True)
     task = env.unwrapped
     task.variant = replace(task.variant, sensors=sensors)
-    windows, touched, of_seed = [], [], []
+    windows, labels = [], []
     for seed in seeds:
         states, contacts = _sweep(env, seed, None)
         without, _ = _sweep(env, seed, (_ASIDE, float(task.cube_position[1])))
-        for t in (t for t in contacts if _HISTORY <= t + 1 <= len(without)):
-            for episode, label in ((states, True), (without, False)):
-                window = np.stack(episode[t + 1 - _HISTORY : t + 1])
-                window[:, :3] -= window[-1, :3]
-                windows.append(window)
-                touched.append(label)
-                of_seed.append(seed)
+        for end in (t + 1 for t in contacts if _HISTORY <= t + 1 <= len(without)):
+            windows += [states[end - _HISTORY : end], without[end - _HISTORY : end]]
+            labels += [(True, seed), (False, seed)]
     env.close()
-    return np.stack(windows), np.array(touched), np.array(of_seed)
+    touched, of_seed = map(np.array, zip(*labels, strict=True))
+    stacked = np.array(windows)
+    stacked[..., :3] -= stacked[:, -1:, :3]
+    return stacked, touched, of_seed
 
 
 def _sweep(env: gym.Env, seed: int, cube: tuple[float, float] | None) -> tuple[list[np.ndarray], list[int]]:

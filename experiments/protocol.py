@@ -128,13 +128,8 @@ def library_versions() -> dict[str, str]:
     return {name: version(name) for name in ("lerobot", "torch", "mujoco")}
 
 
-def tool(name: str) -> str:
-    """A command that is installed beside this Python."""
-    return str(Path(sys.executable).with_name(name))
-
-
 def run(command: list[str], name: str, threads: int) -> None:
-    """Runs a command, its output in a log of this name.
+    """Runs a command that is installed beside this Python, its output in a log of this name.
 
     Raises:
         RuntimeError: It failed; the message ends with its last lines.
@@ -142,16 +137,19 @@ def run(command: list[str], name: str, threads: int) -> None:
     log = RUNS / "logs" / f"{name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     environment = {"MUJOCO_GL": "egl", **os.environ, "OMP_NUM_THREADS": str(threads)}
+    program = str(Path(sys.executable).with_name(command[0]))
     with log.open("a") as file:
-        code = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, env=environment, check=False).returncode
-    if code:
+        done = subprocess.run(
+            [program, *command[1:]], stdout=file, stderr=subprocess.STDOUT, env=environment, check=False
+        )
+    if done.returncode:
         tail = "\n".join(log.read_text(errors="replace").replace("\r", "\n").splitlines()[-15:])
-        raise RuntimeError(f"{shown(command)} ended with {code}; {log} ends with\n{tail}")
+        raise RuntimeError(f"{shown(command)} ended with {done.returncode}; {log} ends with\n{tail}")
 
 
 def shown(command: list[str]) -> str:
     """A command as a person would type it: without the folders of this machine."""
-    return " ".join([Path(command[0]).name, *(arg.replace(f"{RUNS}/", "outputs/experiments/") for arg in command[1:])])
+    return " ".join(command).replace(f"{RUNS}/", "outputs/experiments/")
 
 
 def dataset_root(task: str) -> Path:
@@ -173,7 +171,7 @@ def record(task: str, n_episodes: int, root: Path | None = None) -> None:
     """
     root = root or dataset_root(task)
     command = [
-        tool("playbyear-record"),
+        "playbyear-record",
         "--env.type=playbyear",
         f"--env.task={task}",
         *options_of(root),

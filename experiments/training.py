@@ -22,7 +22,6 @@ from experiments.protocol import (
     run,
     save,
     shown,
-    tool,
 )
 
 
@@ -103,7 +102,7 @@ def train(job: Job) -> tuple[str, float]:
     folder = RUNS / "train" / job.name
     episodes, named = str(list(range(job.n_demonstrations))), f"[0..{job.n_demonstrations - 1}]"
     command = [
-        tool("playbyear-train"),
+        "playbyear-train",
         *job.start,
         *options_of(job.dataset or dataset_root(job.task)),
         *([] if job.dataset else [f"--dataset.episodes={episodes}"]),
@@ -120,7 +119,7 @@ def train(job: Job) -> tuple[str, float]:
     if (folder / "checkpoints" / f"{job.steps:06}").exists():
         todo = []
     elif last.exists():
-        todo = [tool("playbyear-train"), "--resume=true", f"--config_path={last}"]
+        todo = ["playbyear-train", "--resume=true", f"--config_path={last}"]
     elif folder.exists():  # interrupted before its first checkpoint
         shutil.rmtree(folder)
     return shown(command).replace(episodes, named), clocked(todo, folder, job.threads)
@@ -141,7 +140,7 @@ def clocked(command: list[str], folder: Path, threads: int) -> float:
     spent = float(clock.read_text()) if clock.exists() else 0.0
     if command:
         start = time.monotonic()
-        run(command, f"{Path(command[0]).name}-{folder.name}", threads)
+        run(command, f"{command[0]}-{folder.name}", threads)
         spent += (time.monotonic() - start) / 60
         clock.write_text(str(spent))
     return spent
@@ -162,7 +161,7 @@ def evaluate(
     label = f"{name or job.study}-{job.name}"
     output = RUNS / "eval" / label
     command = [
-        tool("lerobot-eval"),
+        "lerobot-eval",
         f"--policy.path={checkpoint or job.checkpoint}",
         "--env.type=playbyear",
         f"--env.task={job.task}",
