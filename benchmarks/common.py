@@ -65,6 +65,13 @@ def parser_for(doc: str | None, turns: int | None = None) -> argparse.ArgumentPa
     return parser
 
 
+def seconds_of(work: Callable[[], object]) -> float:
+    """How long a call takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
 def in_turns[K](works: Mapping[K, Callable[[], object]], n_turns: int, warm_up: int = 1) -> dict[K, list[float]]:
     """Times several pieces of work in turns, so that whatever else the machine does hits all of them.
 
@@ -79,10 +86,9 @@ def in_turns[K](works: Mapping[K, Callable[[], object]], n_turns: int, warm_up: 
     seconds: dict[K, list[float]] = {name: [] for name in works}
     for turn in range(warm_up + n_turns):
         for name, work in works.items():
-            start = time.perf_counter()
-            work()
+            took = seconds_of(work)
             if turn >= warm_up:
-                seconds[name].append(time.perf_counter() - start)
+                seconds[name].append(took)
     return seconds
 
 

@@ -15,11 +15,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import datasets
 import numpy as np
-from common import Row, in_turns, machine, medians, parser_for, report
+from common import Row, in_turns, machine, medians, parser_for, report, seconds_of
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
@@ -105,14 +106,9 @@ def measure_paced(case: Case, root: Path) -> None:
         for episode in range(N_EPISODES):
             begun = time.perf_counter()
             for i, frame in enumerate(frames(case.features, SECONDS * case.fps, episode)):
-                due = begun + i / case.fps
-                time.sleep(max(0.0, due - time.perf_counter()))
-                started = time.perf_counter()
-                writer.add_frame(frame)
-                waits.append(time.perf_counter() - started)
-            started = time.perf_counter()
-            writer.save_episode()
-            saves.append(time.perf_counter() - started)
+                time.sleep(max(0.0, begun + i / case.fps - time.perf_counter()))
+                waits.append(seconds_of(partial(writer.add_frame, frame)))
+            saves.append(seconds_of(writer.save_episode))
     late = sum(wait > 1 / case.fps for wait in waits)
     print(
         f"{case.name}: {len(waits)} frames, {late} late; longest wait {1e3 * max(waits):.1f} ms "
@@ -122,13 +118,15 @@ def measure_paced(case: Case, root: Path) -> None:
 
 
 def measure_room(folder: Path) -> None:
-    own = {"observation.audio.gripper": audio_feature(_ROOM_RATE, 20)}
-    own["action"] = {"dtype": "float32", "shape": (4,), "names": None}
-    rng = np.random.default_rng(0)
+    n, rng = _ROOM_RATE // 20, np.random.default_rng(0)
+    own = {
+        "observation.audio.gripper": audio_feature(_ROOM_RATE, 20),
+        "action": {"dtype": "float32", "shape": (4,), "names": None},
+    }
     sounds: dict[str, Callable[[], np.ndarray]] = {
-        "noise at full scale": lambda: rng.integers(-32768, 32768, _ROOM_RATE // 20),
-        "a quiet room (noise of 100 of 32,768)": lambda: rng.normal(0, 100, _ROOM_RATE // 20),
-        "silence": lambda: np.zeros(_ROOM_RATE // 20),
+        "noise at full scale": lambda: rng.integers(-32768, 32768, n),
+        "a quiet room (noise of 100 of 32,768)": lambda: rng.normal(0, 100, n),
+        "silence": lambda: np.zeros(n),
     }
     for number, (name, sound) in enumerate(sounds.items()):
         root = folder / str(number)

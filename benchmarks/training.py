@@ -8,11 +8,10 @@ is the time that the ResNet's forward and backward pass alone take for the frame
 """
 
 import sys
-import time
 from collections.abc import Callable
 
 import torch
-from common import Helper, Row, in_turns, machine, medians, parser_for, report, serve
+from common import Helper, Row, in_turns, machine, medians, parser_for, report, seconds_of, serve
 from reference import Reference, random_windows
 from torch import nn
 
@@ -41,13 +40,8 @@ def serve_reference() -> None:
     images, sound, state, action = random_windows(REFERENCE_WINDOWS)
     update = update_of(model, lambda: (model(images, sound, state) - action).square().mean())
 
-    def timed(_: str) -> float:
-        start = time.perf_counter()
-        update()
-        return time.perf_counter() - start
-
-    timed("")
-    serve(timed)
+    update()
+    serve(lambda _: seconds_of(update))
 
 
 def our_update(n_supervised_steps: int, image_size: int, amp: bool = False) -> Callable[[], None]:
