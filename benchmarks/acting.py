@@ -6,10 +6,11 @@ One episode, one step after the other, policies of the paper's width: what `sele
 scheme, which encodes the ten frames of its window at every step; the limit is the ResNet's forward pass for one frame.
 """
 
+import argparse
 from collections.abc import Callable
 
 import torch
-from common import Row, in_turns, machine, medians, parser_for, report
+from common import Row, in_turns, medians, parser_for, run
 from policies import bare_resnet, make_policy, random_observations
 from reference import Reference, random_windows
 
@@ -50,17 +51,15 @@ def forward_pass(image_size: int) -> Callable[[], object]:
     network, frame = bare_resnet(1, image_size)
     network.eval().to(memory_format=torch.channels_last)
 
-    def run() -> None:
+    def act() -> None:
         with torch.inference_mode():
             network(frame)
 
-    return run
+    return act
 
 
-def main() -> None:
-    parser = parser_for(__doc__, turns=300)
-    args = parser.parse_args()
-    started, rows = machine(), []
+def measure(args: argparse.Namespace) -> list[Row]:
+    rows = []
     re_encode = re_encoder()
     alternative = medians(in_turns({"re-encode": re_encode}, max(5, args.turns // 30)))["re-encode"]
     for size, (median_wanted, tail_wanted) in WANTED.items():
@@ -88,8 +87,8 @@ def main() -> None:
         )
         goal = {"wanted": f"under {tail_wanted:g} ms", "holds": tail < tail_wanted} if tail_wanted else {}
         rows.append(Row(f"control step, {size} px, 99th percentile", tail, "ms", **goal))
-    report("acting", rows, args.output, started)
+    return rows
 
 
 if __name__ == "__main__":
-    main()
+    run("acting", parser_for(__doc__, turns=300), measure)

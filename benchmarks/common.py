@@ -173,6 +173,12 @@ def report(section: str, rows: Sequence[Row], output: Path, started: dict[str, o
     merge({section: {"machine": started, "rows": entries}}, output)
 
 
+def run(section: str, parser: argparse.ArgumentParser, measure: Callable[[argparse.Namespace], Sequence[Row]]) -> None:
+    """What a benchmark does: measures with the options of the command line, and reports."""
+    args, started = parser.parse_args(), machine()
+    report(section, measure(args), args.output, started)
+
+
 def merge(sections: dict[str, object], output: Path) -> None:
     """Puts sections into the file of figures; the others stay."""
     figures = json.loads(output.read_text()) if output.is_file() else {}

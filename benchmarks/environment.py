@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from common import Helper, Row, in_turns, machine, medians, parser_for, report
+from common import Helper, Row, in_turns, medians, parser_for, run
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 WANTED_RATE, WANTED_TIMES = 250, 1.8
@@ -159,15 +159,9 @@ def measure(args: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = parser_for(__doc__, turns=5)
     parser.add_argument("--task", default="OccludedGrasp-v0")
     parser.add_argument("--steps", type=int, default=500, help="of a turn")
     parser.add_argument("--peers", default=",".join(_PEERS), help="which of them to measure beside it")
-    args = parser.parse_args()
-    started = machine()
-    report("environment", measure(args), args.output, started)
-
-
-if __name__ == "__main__":
-    main()
+    run("environment", parser, measure)

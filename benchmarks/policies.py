@@ -47,11 +47,11 @@ def random_runs(config: PlaybyearConfig, n: int) -> dict[str, Tensor]:
 
 def random_observations(config: PlaybyearConfig, n: int, n_episodes: int = 1) -> list[dict[str, Tensor]]:
     """Observations of n control steps in several episodes at once, noise, as LeRobot hands them to `select_action`."""
-    shapes = dict.fromkeys(config.camera_keys, (3, PIXELS, PIXELS))
-    quiet = {key: 0.02 * torch.randn(n, n_episodes, SAMPLES) for key in config.audio_keys}
     return [
-        {key: torch.rand(n_episodes, *shape) for key, shape in shapes.items()}
-        | {key: sound[step] for key, sound in quiet.items()}
-        | {STATE: torch.randn(n_episodes, 7)}
-        for step in range(n)
+        {
+            **{key: torch.rand(n_episodes, 3, PIXELS, PIXELS) for key in config.camera_keys},
+            **{key: 0.02 * torch.randn(n_episodes, SAMPLES) for key in config.audio_keys},
+            STATE: torch.randn(n_episodes, 7),
+        }
+        for _ in range(n)
     ]

@@ -14,9 +14,9 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import datasets
 import numpy as np
@@ -24,7 +24,7 @@ from common import Row, in_turns, machine, medians, parser_for, report, seconds_
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
-from scenes import dataset_features, frames
+from scenes import CAMERAS, dataset_features, frames
 
 from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -34,30 +34,23 @@ N_EPISODES = 3
 _ROOM_RATE = 48000  # Hz
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A robot's sensors."""
 
     name: str
     fps: int
-    height: int
-    width: int
-    microphones: int
-    dtype: str
+    features: dict[str, dict[str, Any]]
     streaming: bool = False
-    sample_rate: int = 48000
-
-    @property
-    def features(self) -> dict[str, dict]:
-        return dataset_features((self.height, self.width), self.sample_rate, self.fps, self.microphones, self.dtype)
 
 
-SIMULATION = Case("84 px pictures, one 16 kHz microphone", 20, 84, 84, 1, "image", sample_rate=16000)
+_ROBOT = ((480, 640), 48000, 30, 2)  # pixels, Hz, Hz, microphones
+_FILMED = dataset_features(*_ROBOT, "video")
+SIMULATION = Case("84 px pictures, one 16 kHz microphone", 20, dataset_features((84, 84), 16000, 20))
 PACED = (
-    Case("20 Hz, 84x84 pictures, one microphone", 20, 84, 84, 1, "image"),
-    Case("30 Hz, 640x480 pictures, two microphones", 30, 480, 640, 2, "image"),
-    Case("30 Hz, 640x480 video, two microphones", 30, 480, 640, 2, "video"),
-    Case("30 Hz, 640x480 video as it comes in, two microphones", 30, 480, 640, 2, "video", streaming=True),
+    Case("20 Hz, 84x84 pictures, one microphone", 20, dataset_features((84, 84), 48000, 20)),
+    Case("30 Hz, 640x480 pictures, two microphones", 30, dataset_features(*_ROBOT)),
+    Case("30 Hz, 640x480 video, two microphones", 30, _FILMED),
+    Case("30 Hz, 640x480 video as it comes in, two microphones", 30, _FILMED, streaming=True),
 )
 
 
@@ -75,7 +68,7 @@ def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
 
     def compress() -> None:
         for frame in episode:
-            Image.fromarray(frame["observation.images.front"]).save(io.BytesIO(), format="PNG", compress_level=1)
+            Image.fromarray(frame[CAMERAS[0]]).save(io.BytesIO(), format="PNG", compress_level=1)
 
     with DurableWriter("benchmark/ours", folder / "ours", fps, features) as ours:
         works = {"ours": lambda: write(ours), "stock": lambda: write(stock), "limit": compress}
@@ -99,7 +92,8 @@ def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
 
 def measure_paced(case: Case, root: Path) -> None:
     waits, saves = [], []
-    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if case.dtype == "video" else None
+    is_filmed = case.features[CAMERAS[0]]["dtype"] == "video"
+    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if is_filmed else None
     with DurableWriter(
         "benchmark/recording", root, case.fps, case.features, streaming_encoding=case.streaming, rgb_encoder=encoder
     ) as writer:

@@ -41,10 +41,10 @@ def pictures(height: int, width: int, rng: np.random.Generator) -> Callable[[int
 def frames(features: dict[str, dict[str, Any]], n: int, seed: int = 0) -> Iterator[dict[str, Any]]:
     """The frames of an episode, as `add_frame` takes them."""
     rng = np.random.default_rng(seed)
-    height, width, _ = features["observation.images.front"]["shape"]
+    height, width, _ = features[CAMERAS[0]]["shape"]
     picture = pictures(height, width, rng)
     for i in range(n):
-        frame: dict[str, Any] = {"observation.images.front": picture(i), "task": "listen"}
+        frame: dict[str, Any] = {CAMERAS[0]: picture(i), "task": "listen"}
         for key, feature in features.items():
             if feature["dtype"] == "int16":
                 frame[key] = rng.normal(0, 300, feature["shape"]).astype(np.int16)

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import psutil
-from common import Row, in_turns, machine, medians, occupied, parser_for, report
+from common import Row, in_turns, medians, occupied, parser_for, run
 from lerobot.datasets import LeRobotDataset
 from scenes import dataset_features, frames
 from torch import Tensor
@@ -77,7 +77,18 @@ def drawing(make_batch: Callable[[list[int]], Any], n_frames: int, n_batches: in
     return draw
 
 
-def measure(root: Path, args: argparse.Namespace) -> list[Row]:
+def measure(args: argparse.Namespace) -> list[Row]:
+    with tempfile.TemporaryDirectory() as folder:
+        if args.root is not None:
+            return measure_reading(args.root, args)
+        root = Path(folder) / "dataset"
+        # in another process, whose memory does not count
+        with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
+            pool.submit(record, root, args).result()
+        return measure_reading(root, args)
+
+
+def measure_reading(root: Path, args: argparse.Namespace) -> list[Row]:
     opened = LeRobotDataset(args.repo_id, root, video_backend="pyav")
     with own_memory() as sizes:
         store = EpisodeStore.from_dataset(opened, device="cpu")
@@ -130,7 +141,7 @@ def measure(root: Path, args: argparse.Namespace) -> list[Row]:
     ]
 
 
-def main() -> None:
+if __name__ == "__main__":
     parser = parser_for(__doc__, turns=5)
     parser.add_argument("--root", type=Path, help="folder of an existing dataset; one is recorded without it")
     parser.add_argument("--repo_id", default="benchmark/windows", help="name of that dataset")
@@ -140,15 +151,4 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--frames", type=int, default=100, help="per episode")
     parser.add_argument("--window", type=int, default=49, help="frames: 2 s of sound before a window of 10")
-    args = parser.parse_args()
-    started = machine()
-    with tempfile.TemporaryDirectory() as folder:
-        root = args.root or Path(folder) / "dataset"
-        if args.root is None:  # in another process, whose memory does not count
-            with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
-                pool.submit(record, root, args).result()
-        report("windows", measure(root, args), args.output, started)
-
-
-if __name__ == "__main__":
-    main()
+    run("windows", parser, measure)
