@@ -12,10 +12,9 @@ store, above what it has when the dataset is open.
 import argparse
 import multiprocessing
 import tempfile
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -45,25 +44,19 @@ def record(root: Path, args: argparse.Namespace) -> None:
             writer.save_episode()
 
 
-@contextmanager
-def own_memory() -> Iterator[list[int]]:
-    """The memory of its own that this process has before the block, while it runs and after it [bytes]; Linux.
+def with_peak[T](work: Callable[[], T]) -> tuple[T, int]:
+    """What a piece of work returns, and the most memory of its own that this process needs for it [bytes]; Linux.
 
     Pages of files that are mapped into memory do not count: the system takes them back when it needs them.
     """
-    process, done = psutil.Process(), threading.Event()
+    process = psutil.Process()
     sizes = [occupied(process)[1]]
-
-    def look() -> None:
-        while not done.wait(0.002):
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(work)
+        while not done.done():
+            time.sleep(0.002)
             sizes.append(occupied(process)[1])
-
-    watch = threading.Thread(target=look)
-    watch.start()
-    yield sizes
-    done.set()
-    watch.join()
-    sizes.append(occupied(process)[1])
+    return done.result(), max(sizes) - sizes[0]
 
 
 def drawing(make_batch: Callable[[list[int]], Any], n_frames: int, n_batches: int) -> Callable[[], None]:
@@ -90,8 +83,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
 
 def measure_reading(root: Path, args: argparse.Namespace) -> list[Row]:
     opened = LeRobotDataset(args.repo_id, root, video_backend="pyav")
-    with own_memory() as sizes:
-        store = EpisodeStore.from_dataset(opened, device="cpu")
+    store, peak = with_peak(lambda: EpisodeStore.from_dataset(opened, device="cpu"))
 
     policy = PlaybyearConfig(sample_rate=args.sample_rate, device="cpu")
     keys = [key for key in store.keys if key.startswith("observation.") or key == "action"]
@@ -116,7 +108,6 @@ def measure_reading(root: Path, args: argparse.Namespace) -> list[Row]:
     rates = {name: n * _BATCH / seconds[name] for name, n in n_batches.items()}
     what = f"dataset windows, {args.window} frames, "
     beside = {"beside": "stock LeRobotDataset", "theirs": rates["stock"]}
-    peak = max(sizes) - sizes[0]
     return [
         Row(
             what + "as training uses them",
