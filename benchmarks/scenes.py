@@ -7,15 +7,23 @@ import numpy as np
 
 from lerobot_playbyear.datasets import audio_feature
 
+CAMERAS = ("observation.images.front", "observation.images.wrist")
+MICROPHONES = ("observation.audio.left", "observation.audio.right")
+
 
 def dataset_features(
-    image_size: int | tuple[int, int], sample_rate: int, fps: int, n_microphones: int = 1, dtype: str = "image"
+    image_size: tuple[int, int],
+    sample_rate: int,
+    fps: int,
+    n_microphones: int = 1,
+    dtype: str = "image",
+    n_cameras: int = 1,
 ) -> dict[str, dict[str, Any]]:
-    """A camera, microphones, the arm's state and the action."""
-    shape = (*((image_size, image_size) if isinstance(image_size, int) else image_size), 3)
+    """Cameras, microphones, the arm's state and the action."""
+    camera = {"dtype": dtype, "shape": (*image_size, 3), "names": ["height", "width", "channels"]}
     return {
-        "observation.images.front": {"dtype": dtype, "shape": shape, "names": ["height", "width", "channels"]},
-        **{f"observation.audio.{i}": audio_feature(sample_rate, fps) for i in range(n_microphones)},
+        **{key: dict(camera) for key in CAMERAS[:n_cameras]},
+        **{key: audio_feature(sample_rate, fps) for key in MICROPHONES[:n_microphones]},
         "observation.state": {"dtype": "float32", "shape": (7,), "names": None},
         "action": {"dtype": "float32", "shape": (4,), "names": None},
     }
@@ -33,10 +41,10 @@ def pictures(height: int, width: int, rng: np.random.Generator) -> Callable[[int
 def frames(features: dict[str, dict[str, Any]], n: int, seed: int = 0) -> Iterator[dict[str, Any]]:
     """The frames of an episode, as `add_frame` takes them."""
     rng = np.random.default_rng(seed)
-    height, width, _ = features["observation.images.front"]["shape"]
+    height, width, _ = features[CAMERAS[0]]["shape"]
     picture = pictures(height, width, rng)
     for i in range(n):
-        frame: dict[str, Any] = {"observation.images.front": picture(i), "task": "listen"}
+        frame: dict[str, Any] = {CAMERAS[0]: picture(i), "task": "listen"}
         for key, feature in features.items():
             if feature["dtype"] == "int16":
                 frame[key] = rng.normal(0, 300, feature["shape"]).astype(np.int16)
