@@ -102,7 +102,7 @@ def parts_of_a_step(task: str) -> dict[str, Callable[[], object]]:
         "physics": lambda: env._advance(hold),
         "picture": lambda: camera.render(env.data, "front"),
         "sound": lambda: env._sound.step(forces, speed),
-        "inverse kinematics": lambda: env._controller.command(np.zeros(4), env.eef_position, 0.05),
+        "inverse kinematics": lambda: env._controller.command(np.zeros(4), env.eef_position),
     }
 
 

@@ -12,6 +12,9 @@ from mujoco import rollout
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, contact_pairs, pair_forces
 from gym_playbyear.arm import N_JOINTS, PHYSICS_TIMESTEP, CartesianController
+from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp
+from gym_playbyear.experts import CORRECTING_EXPERT, GraspExpert
+from gym_playbyear.gates import InterventionGate
 from gym_playbyear.materials import CUBE_MATERIALS
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
@@ -19,7 +22,6 @@ from gym_playbyear.rendering import SceneRenderer, Window
 from gym_playbyear.scene import model_xml
 from gym_playbyear.sound import ContactPair, ContactSound
 
-ACTION_SCALE = 0.05  # m of displacement per unit of action and step (the authors' code)
 CONTROL_HZ = 20
 SOUND_MODES = ("waveform", "contact_force", "none")
 _SETTLE_STEPS = 10
@@ -33,7 +35,8 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
     A copy (`copy.deepcopy`, `pickle`), of the environment alone or together with an expert or a gate, goes on as the original
     would and independently of it; what it renders with it opens itself, when it first draws.
 
-    Subclasses define `VARIANTS`, `task`, `task_description`, `_scene_xml`, `_scene_bodies`, `_place` and `_is_success`.
+    Subclasses define `VARIANTS`, `task`, `task_description`, `_expert`, `_blind`, `_scene_xml`, `_scene_bodies`, `_place` and
+    `_is_success`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
@@ -43,6 +46,8 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
     VARIANTS: ClassVar[dict[str, Any]]
     task: str
     task_description: str
+    _expert: type[GraspExpert]
+    _blind: type[BlindGrasp]
     _scene_bodies: tuple[str, ...]
     _start_position: tuple[float, float, float] = (-0.12, 0.0, 0.98)  # m, before each episode's own offset
     _start_spread = 0.02  # m
@@ -68,11 +73,9 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         if image_size < 8:
             raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
         self.variant = self.VARIANTS[variant]
-        self.control_hz = CONTROL_HZ
         self._max_episode_steps = int(horizon or self.variant.horizon)
         self.render_mode, self._render_size = render_mode, render_size
         self._image_size, self._sound_mode = image_size, sound
-        self._sample_rate = sample_rate
 
         self.pairs = contact_pairs(self._scene_bodies)
         self.model = mujoco.MjModel.from_xml_string(
@@ -130,17 +133,19 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
     def _is_success(self) -> bool:
         raise NotImplementedError
 
-    def scripted_expert(self):
-        """An expert for the current episode, with privileged knowledge: `act()` gives an action (4,). Make it after `reset`."""
-        raise NotImplementedError
+    # Scripts for the current episode, to be made after `reset`
 
-    def intervention_gate(self):
-        """The expert beside a policy in this episode: `wants_control(policy_action)` and `act()`. Make it after `reset`."""
-        raise NotImplementedError
+    def scripted_expert(self) -> GraspExpert:
+        """An expert with privileged knowledge: `act()` gives an action (4,)."""
+        return self._expert(self)
 
-    def blind_baselines(self) -> dict[str, Any]:
+    def intervention_gate(self) -> InterventionGate:
+        """The expert beside a policy: `wants_control(policy_action)` and `act()`."""
+        return InterventionGate(self, self._expert(self, CORRECTING_EXPERT))
+
+    def blind_baselines(self) -> dict[str, BlindGrasp]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""
-        raise NotImplementedError
+        return {strategy: self._blind(self, strategy) for strategy in BLIND_STRATEGIES}
 
     # Gymnasium's interface
 
@@ -186,7 +191,7 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
-        controls = self._controller.command(np.clip(action, -1, 1), self.eef_position, ACTION_SCALE)
+        controls = self._controller.command(np.clip(action, -1, 1), self.eef_position)
         self._advance(controls)
         self._n_steps += 1
         success = self._is_success()
@@ -226,12 +231,6 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             raise ClosedEnvironmentError(f"{call}() was called on a closed environment: call reset() to open it again.")
         if self._expert_rng is None:
             raise ResetNeeded(f"{call}() was called before the first episode: call reset() first.")
-
-    def cube_pixels(self) -> int:
-        """How many pixels of the policy's camera show the cube (segmentation rendering)."""
-        self._check_is_running("cube_pixels")
-        geom = self.model.geom("cube").id
-        return int((self._front_camera().segmentation(self.data, "front") == geom).sum())
 
     # One control step
 
@@ -282,13 +281,16 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             self._camera = SceneRenderer(self.model, self._image_size, self._image_size)
         return self._camera
 
-    def _place_cube(self, position: np.ndarray, yaw: float) -> None:
+    def _place_cube(self, options: dict[str, Any]) -> float:
+        """Where it is drawn to be, or `options` want it. Returns its y [m]."""
+        x, y = (self.np_random.uniform(*limits) for limits in (self.variant.cube_x, self.variant.cube_y))
+        yaw = self.np_random.uniform(-self.variant.cube_yaw, self.variant.cube_yaw)
+        x, y = options.get("cube_position", (x, y))
+        yaw = options.get("cube_yaw", yaw)
         address = self.model.joint("cube").qposadr[0]
-        self.data.qpos[address : address + 3] = position
+        self.data.qpos[address : address + 3] = (x, y, TABLE_TOP + CUBE_HALF_SIZE)
         self.data.qpos[address + 3 : address + 7] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
-
-    def _place_body(self, name: str, position: np.ndarray) -> None:
-        self.model.body(name).pos[:] = position
+        return float(y)
 
 
 def _check_option(name: str, value, allowed: tuple) -> None:

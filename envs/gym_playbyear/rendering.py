@@ -41,15 +41,6 @@ class SceneRenderer:
         self._renderer.update_scene(data, camera=camera, scene_option=self._option)
         return self._renderer.render()
 
-    def segmentation(self, data: mujoco.MjData, camera: str) -> np.ndarray:
-        """Which geom each pixel shows, (height, width) int32; -1 for none."""
-        self._renderer.enable_segmentation_rendering()
-        try:
-            self._renderer.update_scene(data, camera=camera, scene_option=self._option)
-            return self._renderer.render()[..., 0]
-        finally:
-            self._renderer.disable_segmentation_rendering()
-
     def close(self) -> None:
         self._renderer.close()
 

@@ -138,11 +138,10 @@ class PlaybyearEnvConfig(EnvConfig):
         return PolicyProcessorPipeline(steps=[PcmToFloatProcessorStep()]), PolicyProcessorPipeline(steps=[])
 
     def _check(self) -> None:
-        tasks = known_tasks()
-        _check_choice("task", self.task, tasks)
-        _check_choice("sound", self.sound, SOUND_MODES)
-        _check_choice("variant", self.variant, VARIANTS)
-        _check_choice("cube_material", self.cube_material, CUBE_MATERIALS)
+        known = {"task": known_tasks(), "sound": SOUND_MODES, "variant": VARIANTS, "cube_material": CUBE_MATERIALS}
+        for name, choices in known.items():
+            if getattr(self, name) not in choices:
+                raise _error(name, getattr(self, name), f"choose one of {', '.join(choices)}")
         if self.fps != CONTROL_HZ:
             raise _error("fps", self.fps, f"the tasks are controlled at {CONTROL_HZ} Hz, give {CONTROL_HZ}")
         if self.sample_rate <= 0 or self.sample_rate % self.fps:
@@ -166,11 +165,6 @@ def known_tasks() -> tuple[str, ...]:
 
     prefix = "gym_playbyear/"
     return tuple(sorted(key.removeprefix(prefix) for key in gym.registry if key.startswith(prefix)))
-
-
-def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise _error(name, value, f"choose one of {', '.join(choices)}")
 
 
 def _error(name: str, value: object, what_to_do: str) -> DecodingError:

@@ -7,6 +7,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_playbyear.inspection.source import INTERVENTION, SUCCESS, DatasetSource
 from lerobot_playbyear.inspection.verdict import Level, Verdict, name_episodes
+from lerobot_playbyear.inspection.waveform import runs
 
 _NORMALISED_SHARE = 0.9  # of all values in [-1, 1]: then the actions are taken to be normalised
 
@@ -82,5 +83,4 @@ def check_success(source: DatasetSource) -> Iterator[Verdict]:
 
 def intervention_spans(tagged: np.ndarray) -> list[tuple[int, int]]:
     """First and last frame of every span of True, from (n,) bool."""
-    edges = np.diff(np.concatenate([[False], tagged, [False]]).astype(np.int8))
-    return [(int(a), int(b) - 1) for a, b in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)]
+    return [(start, stop - 1) for start, stop in runs([tagged])]

@@ -41,7 +41,7 @@ class PersonRollouts:
     def __init__(self, env: gym.Env, expert: TeleopExpertConfig) -> None:
         self._env = env
         try:
-            self._expert = expert.make_demonstrator(env)
+            self._expert = expert.make(env, demonstrates=True)
         except BaseException:
             env.close()
             raise

@@ -56,14 +56,8 @@ class TeleopExpertConfig(ExpertConfig):
     begin_paused: bool = True
     play_sound: bool = True
 
-    def make(self, env: gym.Env) -> Expert:
-        return self._make(env, demonstrates=False)
-
-    def make_demonstrator(self, env: gym.Env) -> Expert:
-        """The same person with nobody else at the controls."""
-        return self._make(env, demonstrates=True)
-
-    def _make(self, env: gym.Env, demonstrates: bool) -> Expert:
+    def make(self, env: gym.Env, demonstrates: bool = False) -> Expert:
+        """The person, beside a policy or with nobody else at the controls."""
         self._check(env)
         kind, env_fps = self.teleop.type, float(env.metadata["render_fps"])
         fps = self.steps_per_second or env_fps

@@ -19,8 +19,8 @@ class SoundQueue:
         self._is_playing = False
         self._lock = threading.Lock()
 
-    def put(self, block: np.ndarray) -> None:
-        """Samples (S,) in [-1, 1]."""
+    def play(self, block: np.ndarray) -> None:
+        """What was heard in a step, (S,) in [-1, 1]."""
         with self._lock:
             self._samples = np.concatenate([self._samples, block])[-_MOST_BLOCKS * self._block_size :]
             self._is_playing |= len(self._samples) >= _LATENCY_BLOCKS * self._block_size
@@ -36,11 +36,12 @@ class SoundQueue:
         return played
 
     def clear(self) -> None:
+        """What has not been played yet is not played any more."""
         with self._lock:
             self._samples, self._is_playing = self._samples[:0], False
 
 
-class Speaker:
+class Speaker(SoundQueue):
     """The default output of the sound card.
 
     Args:
@@ -52,7 +53,7 @@ class Speaker:
     """
 
     def __init__(self, sample_rate: int, block_size: int) -> None:
-        self._queue = SoundQueue(block_size)
+        super().__init__(block_size)
         self._stream: Any = None
         self.problem = ""
         try:
@@ -70,14 +71,6 @@ class Speaker:
             self.problem = f"no sound card ({str(error).splitlines()[0]})"
             self.close()
 
-    def play(self, block: np.ndarray) -> None:
-        """What was heard in a step, (S,) in [-1, 1]."""
-        self._queue.put(block)
-
-    def clear(self) -> None:
-        """What has not been played yet is not played any more."""
-        self._queue.clear()
-
     def close(self) -> None:
         if self._stream is not None:
             with contextlib.suppress(Exception):
@@ -85,4 +78,4 @@ class Speaker:
             self._stream = None
 
     def _fill(self, out: np.ndarray, n_frames: int, time: Any, status: Any) -> None:
-        out[:, 0] = self._queue.take(n_frames)
+        out[:, 0] = self.take(n_frames)

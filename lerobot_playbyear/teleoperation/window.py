@@ -4,6 +4,7 @@ The window lives in a process of its own. It answers while the policy learns for
 the simulation, and the control loop never waits for it.
 """
 
+import copy
 import logging
 import os
 import subprocess
@@ -15,7 +16,7 @@ import numpy as np
 from lerobot_playbyear.episodes.expert import ExpertError
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 from lerobot_playbyear.teleoperation.status import Status
-from lerobot_playbyear.teleoperation.wire import receive, send
+from lerobot_playbyear.teleoperation.wire import Newest, receive, send
 
 _START_TIMEOUT_S = 60.0
 _MODULE = "lerobot_playbyear.teleoperation.window_process"
@@ -38,8 +39,7 @@ class Window:
         self.keys = WindowKeys()
         self._is_open = threading.Event()
         self._problem = ""
-        self._newest: tuple[str, np.ndarray | None] | None = None
-        self._has_newest = threading.Condition()
+        self._newest = Newest()
         self._process = subprocess.Popen(
             [sys.executable, "-m", _MODULE, title], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
@@ -65,43 +65,33 @@ class Window:
             status: What to tell.
             picture: (H, W, 3) uint8; None: the last one stays.
         """
-        text = status.to_json()  # now, because it goes on changing
-        with self._has_newest:
-            if picture is None and self._newest is not None:
-                picture = self._newest[1]
-            self._newest = (text, picture)
-            self._has_newest.notify()
+        self._newest.put(copy.deepcopy(status), picture)  # of the status as it is now, because it goes on changing
 
     def close(self) -> None:
         """Closes it; it may be closed already."""
         self._is_open.clear()
-        with self._has_newest:
-            self._has_newest.notify()
         self._process.terminate()
         try:
             self._process.wait(timeout=5)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._newest.put(Status(), None)  # wakes the thread that writes, and nobody is there to read: it ends
 
     def _write(self) -> None:
         assert self._process.stdin is not None
         while self._process.poll() is None:
-            with self._has_newest:
-                if self._newest is None:
-                    self._has_newest.wait(timeout=1.0)
-                newest, self._newest = self._newest, None
+            newest = self._newest.take(timeout_s=1.0)
             if newest is None:
                 continue
             try:
-                send(self._process.stdin, {"status": newest[0]}, newest[1])
+                send(self._process.stdin, newest)
             except (OSError, ValueError):
                 return
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        while (received := receive(self._process.stdout)) is not None:
-            message, _ = received
+        while (message := receive(self._process.stdout)) is not None:
             if "key" in message:
                 self.keys.note(message["key"], message["is_pressed"])
             elif "has_focus" in message:

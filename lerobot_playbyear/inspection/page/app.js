@@ -169,8 +169,8 @@ function toNextSound() {
 const KEYS = {
   " ": () => player.toggle(),
   k: () => player.toggle(),
-  ArrowLeft: (event) => player.step(event.shiftKey ? -10 : -1),
-  ArrowRight: (event) => player.step(event.shiftKey ? 10 : 1),
+  ArrowLeft: (event) => player.show(player.frame - (event.shiftKey ? 10 : 1)),
+  ArrowRight: (event) => player.show(player.frame + (event.shiftKey ? 10 : 1)),
   ArrowUp: () => open(wanted - 1),
   ArrowDown: () => open(wanted + 1),
   Home: () => player.show(0),

@@ -16,7 +16,6 @@ class Panel {
     const { context } = contextOf(this.canvas, this.height);
     this.paint(context, 3, this.height - 3);
   }
-  paint() {}
   // Shows the values of a moment in the legend.
   read() {}
 }
@@ -33,14 +32,7 @@ class MomentsPanel extends Panel {
   paint(context, top, bottom) {
     const { axis, episode } = this;
     drawGround(context, axis, top, bottom, [], () => 0, "");
-    for (const [first, last] of episode.interventions || []) {
-      const x = axis.x(first / fps);
-      const width = axis.x((last + 1) / fps) - x;
-      context.fillStyle = css("--expert");
-      context.globalAlpha = 0.8;
-      context.fillRect(x, bottom - 7, width, 7);
-      context.globalAlpha = 1;
-    }
+    fillInterventions(context, axis, episode, bottom - 7, bottom, 0.8);
     context.textBaseline = "middle";
     context.textAlign = "center";
     context.fillStyle = css("--sound");
