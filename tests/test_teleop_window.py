@@ -104,7 +104,7 @@ class Person(gym.Wrapper):
 
     @property
     def window(self):
-        return self.expert._desk.window
+        return self.expert.window
 
 
 class Remembering(PolicyActor):
@@ -268,7 +268,7 @@ def test_escape_ends_the_session(screen):
     expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
     screen.focus(screen.window(_TITLE))
     screen.press("s", "Escape")  # before an attempt has begun
-    wait_for(lambda: "escape" in expert._desk.window.keys._pressed_since)
+    wait_for(lambda: "escape" in expert.window.keys._pressed_since)
     with pytest.raises(PersonLeftError):
         play(env, Nobody(), seed=1, expert=expert)
     expert.close()

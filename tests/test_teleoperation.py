@@ -29,12 +29,12 @@ from lerobot_playbyear.recording.record import RecordDatasetConfig, RecordError
 from lerobot_playbyear.teleoperation.actions import CLOSE, DELTAS, OPEN, STAY, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
 from lerobot_playbyear.teleoperation.controls import Controls
-from lerobot_playbyear.teleoperation.expert import Desk, PersonLeftError, TeleopExpert
+from lerobot_playbyear.teleoperation.expert import PersonLeftError, TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig, WindowKeys
 from lerobot_playbyear.teleoperation.levels import FLOOR_DB, as_float, level_db
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.panel import FRAME, SIZE, draw
-from lerobot_playbyear.teleoperation.speaker import SoundQueue
+from lerobot_playbyear.teleoperation.speaker import SoundQueue, Speaker
 from lerobot_playbyear.teleoperation.status import Control, Status
 from lerobot_playbyear.teleoperation.window import Window
 from lerobot_playbyear.teleoperation.wire import Newest, receive, send
@@ -396,8 +396,9 @@ def play(script, teleop=None, begins_paused=False, demonstrates=False, horizon=3
         teleop.connect()
     mapping = ActionMapping(teleop.action_features, env.action_space, "x,y,z", 0.3)
     clock = Clock()
-    desk = Desk(window, teleop, mapping, Gripper(40), Pace(20, clock, clock.sleep), None, [])
-    expert = TeleopExpert(desk, begins_paused, demonstrates)
+    speaker = Speaker(16000, 800, "a test")
+    pace = Pace(20, clock, clock.sleep)
+    expert = TeleopExpert(window, teleop, mapping, Gripper(40), pace, speaker, [], begins_paused, demonstrates)
     try:
         return play_episode(env, Nobody(), seed=3, expert=expert), window
     finally:
@@ -496,7 +497,8 @@ def test_what_was_pressed_before_an_attempt_is_not_meant_for_it():
     teleop.connect()
     clock = Clock()
     mapping = ActionMapping(teleop.action_features, env.action_space, "x,y,z", 0.3)
-    expert = TeleopExpert(Desk(window, teleop, mapping, Gripper(40), Pace(20, clock, clock.sleep), None, []), False)
+    pace, speaker = Pace(20, clock, clock.sleep), Speaker(16000, 800, "a test")
+    expert = TeleopExpert(window, teleop, mapping, Gripper(40), pace, speaker, [], begins_paused=False)
     press(window.keys, "s", "g", "p", "right", "space")
     attempt = play_episode(env, Nobody(), seed=3, expert=expert)
     assert (attempt.verdict, len(attempt), attempt.intervention_share) == (None, 8, 0)

@@ -164,7 +164,6 @@ class CartesianController:
         self.config = config
         self.n_substeps = round(1 / (control_hz * PHYSICS_TIMESTEP))
         self._cooldown_steps = round(config.gripper_cooldown * control_hz)
-        self._finger_step = _FINGER_SPEED * PHYSICS_TIMESTEP
         xml = f"""<mujoco><compiler angle="radian"/><default>{ARM_DEFAULT_XML}</default>
             <worldbody>{arm_body_xml(config)}</worldbody></mujoco>"""
         self._model = mujoco.MjModel.from_xml_string(xml)
@@ -174,7 +173,6 @@ class CartesianController:
         self._lower = self._model.jnt_range[:N_JOINTS, 0] + 0.02
         self._upper = self._model.jnt_range[:N_JOINTS, 1] - 0.02
         self._orientation = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # hand pointing down, fingers open along y
-        self._workspace = np.array(config.workspace)
         self.reset(np.zeros(3))
 
     def reset(self, position: np.ndarray) -> np.ndarray:
@@ -202,7 +200,7 @@ class CartesianController:
         distance = float(np.linalg.norm(lead))
         if distance > self.config.max_lead:
             target = measured + lead * (self.config.max_lead / distance)
-        self.target = np.clip(target, self._workspace[0], self._workspace[1])
+        self.target = np.clip(target, *self.config.workspace)
         before = self.joints.copy()
         self._solve(iterations=2)
         self._update_gripper(action[3] > 0)
@@ -211,7 +209,7 @@ class CartesianController:
         controls = np.empty((self.n_substeps, N_JOINTS + 1))
         controls[:, :N_JOINTS] = before + ramp * (self.joints - before)
         goal = 0.0 if self._closed else self.config.max_opening / 2
-        travel = self._finger_step * np.arange(1, self.n_substeps + 1)
+        travel = _FINGER_SPEED * PHYSICS_TIMESTEP * np.arange(1, self.n_substeps + 1)
         sign = np.sign(goal - self.finger_target)
         fingers = self.finger_target + sign * np.minimum(travel, abs(goal - self.finger_target))
         controls[:, N_JOINTS] = fingers

@@ -95,11 +95,9 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             )
         self._tcp = self.model.site("tcp").id
         self._cube = self.model.body("cube").id
-        self._base = np.array(self.variant.arm.base)
-        self._state_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        self._rollout_state = np.empty((1, self._controller.n_substeps, self._state_size))
+        self._state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        self._rollout_state = np.empty((1, self._controller.n_substeps, len(self._state)))
         self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
-        self._state = np.empty(self._state_size)
         self._camera: SceneRenderer | None = None
         self._people_camera: SceneRenderer | None = None
         self._window: Window | None = None
@@ -151,10 +149,7 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         self.begin_episode(seed=seed, options=options)
-        observation = self._observe(self._rollout_sensors[0])
-        if self.render_mode == "human":
-            self.render()
-        return observation, {"is_success": False}
+        return self._observe(), {"is_success": False}
 
     def begin_episode(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """`reset` without the observation, for scripts that go on with `advance`: nothing is rendered, no OpenGL is needed."""
@@ -179,11 +174,8 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         self._first_cube_position, self._was_carried = self.cube_position, False
 
     def step(self, action):
-        reward, terminated, truncated, info = self.advance(action)
-        observation = self._observe(self._rollout_sensors[0])
-        if self.render_mode == "human":
-            self.render()
-        return observation, reward, terminated, truncated, info
+        outcome = self.advance(action)
+        return self._observe(), *outcome
 
     def advance(self, action) -> tuple[float, bool, bool, dict[str, Any]]:
         """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise."""
@@ -256,7 +248,9 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         distance = np.linalg.norm((self.cube_position - self._first_cube_position)[:2])
         return not self._was_carried and bool(distance > self.variant.max_shove)
 
-    def _observe(self, sensors: np.ndarray) -> dict[str, Any]:
+    def _observe(self) -> dict[str, Any]:
+        """The observation after a control step; a person who watches sees it, too."""
+        sensors = self._rollout_sensors[0]
         observation: dict[str, Any] = {
             "pixels": {"front": self._front_camera().render(self.data, "front")},
             "agent_pos": self._sensors.measure(self._true_proprioception(), self.np_random),
@@ -270,11 +264,15 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             silent = self.cube_position[2] > _LIFTED_SILENCE_HEIGHT
             force = np.zeros(6) if silent else sensors[:, -6:].mean(axis=0)
             observation["contact_force"] = force.astype(np.float32)
+        if self.render_mode == "human":
+            self.render()
         return observation
 
     def _true_proprioception(self) -> np.ndarray:
         fingers = slice(N_JOINTS, N_JOINTS + 2)
-        return np.concatenate([self.eef_position - self._base, self.data.qpos[fingers], self.data.qvel[fingers]])
+        return np.concatenate(
+            [self.eef_position - self.variant.arm.base, self.data.qpos[fingers], self.data.qvel[fingers]]
+        )
 
     def _front_camera(self) -> SceneRenderer:
         if self._camera is None:

@@ -30,11 +30,11 @@ class BlindGrasp(GraspExpert):
     def __init__(self, env, strategy: str):
         self.strategy = strategy
         self.n_attempts = 0
-        self._n_closing = 0
         super().__init__(env)
 
     def _begin(self) -> None:
         super()._begin()
+        self._n_closing = 0  # steps
         lower, upper = self.env.hidden_range
         match self.strategy:
             case "middle":
@@ -59,10 +59,8 @@ class BlindGrasp(GraspExpert):
     def _grasp(self):
         self._n_closing += 1
         if self._fingers_met():
-            self._n_closing = 0
             self._begin()
         elif self._n_closing > _CLOSING_STEPS:
-            self._n_closing = 0
             self.phase = "lift"
         return np.zeros(3), True
 

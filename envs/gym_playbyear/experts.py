@@ -105,15 +105,10 @@ class GraspExpert:
 
     def _retreat(self):
         goal = np.array([*self.env.eef_position[:2], TABLE_TOP + self.config.travel_height])
-        if self._near(goal, 0.02):
-            self.phase = "approach"
-        return self._towards(goal), False
+        return self._go(goal, 0.02, "approach")
 
     def _approach(self):
-        goal = self._on_line(self.sweep_start, self.config.travel_height)
-        if self._near(goal, 0.02):
-            self.phase = "lower"
-        return self._towards(goal), False
+        return self._go(self._on_line(self.sweep_start, self.config.travel_height), 0.02, "lower")
 
     def _lower(self):
         goal = self._on_line(self.sweep_start, self.config.sweep_height)
@@ -158,10 +153,7 @@ class GraspExpert:
         return self._towards(self._on_line(self.contact_y - self.config.back_off, self.config.clear_height)), False
 
     def _hop(self):
-        goal = self._on_line(self._grasp_y(), self.config.clear_height)
-        if self._near(goal, self.config.tolerance):
-            self.phase = "descend"
-        return self._towards(goal), False
+        return self._go(self._on_line(self._grasp_y(), self.config.clear_height), self.config.tolerance, "descend")
 
     def _grasp_y(self) -> float:
         return float(self.env.cube_position[1])
@@ -192,6 +184,12 @@ class GraspExpert:
         return bool(np.linalg.norm(self.env.cube_position - self.env.eef_position) > 0.1)
 
     # Motion
+
+    def _go(self, goal: np.ndarray, tolerance: float, next_phase: str) -> tuple[np.ndarray, bool]:
+        """With open fingers to a point (3,) [m, world frame]; that near to it, the next phase begins."""
+        if self._near(goal, tolerance):
+            self.phase = next_phase
+        return self._towards(goal), False
 
     def _has_waited(self) -> bool:
         """Whether the pause is over; if not, this is one step of it."""

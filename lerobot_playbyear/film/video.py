@@ -91,13 +91,12 @@ def spectrogram_strip(samples: np.ndarray, sample_rate: int, width: int, height:
     return np.stack([np.interp(level, scale, channel) for channel in _COLOURS.T], axis=-1).astype(np.uint8)
 
 
-def inset(picture: np.ndarray, view: np.ndarray, label: str = "policy's camera") -> np.ndarray:
+def inset(picture: np.ndarray, view: np.ndarray) -> np.ndarray:
     """Puts what the policy's camera sees into the lower left corner of a picture for people.
 
     Args:
         picture: (H, W, 3) uint8.
         view: (h, w, 3) uint8, any size.
-        label: Written above it.
     """
     height = int(picture.shape[0] * _INSET_SHARE)
     size = (round(height * view.shape[1] / view.shape[0]), height)
@@ -105,7 +104,7 @@ def inset(picture: np.ndarray, view: np.ndarray, label: str = "policy's camera")
     corner = (8, framed.height - height - 8)
     framed.paste((255, 255, 255), (corner[0] - 1, corner[1] - 1, corner[0] + size[0] + 1, corner[1] + size[1] + 1))
     framed.paste(Image.fromarray(view).resize(size, Image.Resampling.NEAREST), corner)
-    ImageDraw.Draw(framed).text((corner[0], corner[1] - 14), label, fill=(255, 255, 255))
+    ImageDraw.Draw(framed).text((corner[0], corner[1] - 14), "policy's camera", fill=(255, 255, 255))
     return np.asarray(framed)
 
 

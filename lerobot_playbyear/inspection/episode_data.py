@@ -13,10 +13,9 @@ from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR, REWARD
 from PIL import Image
 
 from lerobot_playbyear.film.video import TOP_FREQUENCY, WINDOW_S, gain_of, spectra
-from lerobot_playbyear.inspection.control_checks import intervention_spans
 from lerobot_playbyear.inspection.onsets import sudden_sounds
 from lerobot_playbyear.inspection.source import INTERVENTION, DatasetSource, Episode
-from lerobot_playbyear.inspection.waveform import FULL_SCALE, PIECE, EpisodeSound, Samples, block_levels, extremes
+from lerobot_playbyear.inspection.waveform import FULL_SCALE, PIECE, EpisodeSound, Samples, block_levels, extremes, runs
 
 _SHORTEST_HOP_S = 0.005
 _MAX_COLUMNS = 1200  # of a spectrogram or waveform: more than a screen shows
@@ -96,13 +95,16 @@ class EpisodeData:
     def draw(self, episode: Episode) -> dict[str, Any]:
         """Everything but the film, for JSON."""
         source = self._source
-        tagged = source.values(INTERVENTION)[episode.rows].astype(bool) if INTERVENTION in source.numbers else None
+        interventions = None  # or the first and the last frame of each
+        if INTERVENTION in source.numbers:
+            tagged = source.values(INTERVENTION)[episode.rows].astype(bool)
+            interventions = [(start, stop - 1) for start, stop in runs([tagged])]
         return {
             "microphones": [
                 self._draw_sound(*pair) for pair in zip(self.microphones, self.sound(episode), strict=True)
             ],
             "curves": [_base64(self._curve(curve["key"], episode)) for curve in self.curves],
-            "interventions": None if tagged is None else intervention_spans(tagged),
+            "interventions": interventions,
         }
 
     def preview(self, episode: Episode) -> list[int]:

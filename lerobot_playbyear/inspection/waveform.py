@@ -1,7 +1,6 @@
 """Sound that is read where it is indexed: an episode of hours has gigabytes of it."""
 
 from collections.abc import Iterable, Iterator
-from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -15,14 +14,6 @@ PIECE = 2**20
 """Samples that are looked at together."""
 
 _POWER_FLOOR = 1e-12
-
-
-class Samples(Protocol):
-    """What checks of sound need of an array (n,) in steps of 16-bit PCM: its length, and slices of it."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, span: slice, /) -> np.ndarray: ...
 
 
 class EpisodeSound:
@@ -48,6 +39,10 @@ class EpisodeSound:
         samples = column_to_numpy(self._column.slice(first, last - first)).reshape(-1)
         before = first * self.samples_per_frame
         return steps(samples[start - before : stop - before])
+
+
+Samples = np.ndarray | EpisodeSound
+"""Sound (n,) in steps of 16-bit PCM, in memory or not."""
 
 
 class Runs:

@@ -14,12 +14,7 @@ from torchvision.models import ResNet
 from lerobot_playbyear.compat import BasicBlock
 from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.extension import (
-    make_audio_encoder,
-    make_vision_encoder,
-    register_audio_encoder,
-    register_vision_encoder,
-)
+from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.history import before_episode, newest
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, to_float_wave
 
@@ -45,11 +40,13 @@ class PlaybyearNetwork(nn.Module):
         )
         n_fused = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
         if config.use_vision:
-            self.vision = nn.ModuleDict({_module_name(key): make_vision_encoder(config) for key in config.camera_keys})
+            encoders = {_module_name(key): make_encoder("vision_encoder", config) for key in config.camera_keys}
+            self.vision = nn.ModuleDict(encoders)
             n_fused += sum(encoder.embedding_size for encoder in self.vision.values())  # type: ignore[misc]
         if config.use_audio:
             self.spectrogram = nn.ModuleDict({_module_name(key): _log_spectrogram(config) for key in config.audio_keys})
-            self.hearing = nn.ModuleDict({_module_name(key): make_audio_encoder(config) for key in config.audio_keys})
+            encoders = {_module_name(key): make_encoder("audio_encoder", config) for key in config.audio_keys}
+            self.hearing = nn.ModuleDict(encoders)
             n_fused += sum(encoder.embedding_size for encoder in self.hearing.values())  # type: ignore[misc]
         self.fusion = Fusion(n_fused, config)
         self.memory_head = MemoryHead(config, config.action_feature.shape[0])
@@ -60,7 +57,7 @@ class PlaybyearNetwork(nn.Module):
         Where the episode had not begun, the first frame's encoding repeats.
         """
         encodings = self._encode(batch, n_frames).unflatten(0, (-1, n_frames))  # (B, n, D)
-        is_pad = before_episode(batch, self._padded_key(), n_frames)  # (B, n)
+        is_pad = before_episode(batch, n_frames)  # (B, n)
         if is_pad is None:
             return encodings
         before = is_pad.sum(dim=1).clamp(max=n_frames - 1)  # (B,)
@@ -100,7 +97,7 @@ class PlaybyearNetwork(nn.Module):
             assert config.sample_rate is not None
             wave = mix_in_noise(wave, config.audio_noise_db, config.sample_rate)
         begun = torch.ones_like(wave, dtype=torch.bool)  # (B, n_heard * S)
-        is_pad = before_episode(batch, key, n_heard)  # (B, n_heard)
+        is_pad = before_episode(batch, n_heard)  # (B, n_heard)
         if is_pad is not None:
             begun = ~is_pad.repeat_interleave(sound.shape[2], dim=1)
         spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
@@ -135,12 +132,6 @@ class PlaybyearNetwork(nn.Module):
         if not self.config.normalize_encodings:
             return embeddings
         return _ENCODING_SIZE * functional.layer_norm(embeddings, embeddings.shape[1:])
-
-    def _padded_key(self) -> str:
-        """An observation that every batch has."""
-        config = self.config
-        keys = [*config.low_dimensional_keys, *(config.camera_keys if config.use_vision else []), *config.audio_keys]
-        return keys[0]
 
 
 class VisionEncoder(nn.Module):

@@ -4,7 +4,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-import torchaudio
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -112,6 +111,7 @@ class LogSpectrogram(nn.Module):
         keeps_statistics: Whether the running statistics stay as they are in training too.
     """
 
+    window: Tensor
     mean: Tensor
     variance: Tensor
     n_batches: Tensor
@@ -125,20 +125,18 @@ class LogSpectrogram(nn.Module):
             )
         self.n_bins, self.momentum = n_bins, momentum
         self.keeps_statistics = False
-        self.transform = torchaudio.transforms.Spectrogram(
-            n_fft=self.segment, hop_length=self.hop, center=False, power=None, normalized=False
-        )
         # Not part of a checkpoint, and in storage of its own: torch's is a slice, which safetensors refuses to save.
-        self.transform.register_buffer("window", self.transform.window.clone(), persistent=False)
+        self.register_buffer("window", torch.hann_window(self.segment).clone(), persistent=False)
         # A full-scale sine has power 1 in its bin, whatever the segment's length.
-        self.scale = 4.0 / float(self.transform.window.sum()) ** 2
+        self.scale = 4.0 / float(self.window.sum()) ** 2
         self.register_buffer("mean", torch.zeros(n_bins))
         self.register_buffer("variance", torch.ones(n_bins))
         self.register_buffer("n_batches", torch.zeros((), dtype=torch.long))
 
     def log_power(self, wave: Tensor) -> Tensor:
         """(B, samples) in [-1, 1] -> (B, n_bins, n_segments), in units of 10 dB re full scale."""
-        spectrum = torch.view_as_real(self.transform(wave)[:, : self.n_bins])
+        spectrum = torch.stft(wave, self.segment, self.hop, window=self.window, center=False, return_complex=True)
+        spectrum = torch.view_as_real(spectrum[:, : self.n_bins])
         power = spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
         return torch.log10(power * self.scale + _POWER_FLOOR)
 

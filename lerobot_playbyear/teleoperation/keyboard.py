@@ -67,31 +67,19 @@ class KeyboardWindowTeleop(Teleoperator):
 
     config_class = KeyboardWindowTeleopConfig
     name = "keyboard_window"
+    action_features: dict[str, Any] = dict.fromkeys(DELTAS, float)
+    feedback_features: dict[str, Any] = {}  # noqa: RUF012 (LeRobot declares it so)
+    is_connected = False
+    is_calibrated = True
 
     def __init__(self, config: KeyboardWindowTeleopConfig, keys: WindowKeys | None = None) -> None:
         super().__init__(config)
-        self._keys, self._is_connected = keys, False
-
-    @property
-    def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(DELTAS, float)
-
-    @property
-    def feedback_features(self) -> dict[str, Any]:
-        return {}
-
-    @property
-    def is_connected(self) -> bool:
-        return self._is_connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
+        self._keys = keys
 
     def connect(self, calibrate: bool = True) -> None:
         if self._keys is None:
             raise ConnectionError("keyboard_window has no window: it works with --expert.type=teleop.")
-        self._is_connected = True
+        self.is_connected = True
 
     def calibrate(self) -> None:
         """Keys need none."""
@@ -112,4 +100,4 @@ class KeyboardWindowTeleop(Teleoperator):
         """Keys take none."""
 
     def disconnect(self) -> None:
-        self._is_connected = False
+        self.is_connected = False

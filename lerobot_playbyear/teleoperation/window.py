@@ -30,6 +30,7 @@ class Window:
 
     Attributes:
         keys: What a person presses in it.
+        is_open: Whether nobody has closed it.
 
     Raises:
         ExpertError: There is no screen, or something is not installed.
@@ -37,7 +38,7 @@ class Window:
 
     def __init__(self, title: str) -> None:
         self.keys = WindowKeys()
-        self._is_open = threading.Event()
+        self.is_open = False
         self._problem = ""
         self._newest = Newest()
         self._process = subprocess.Popen(
@@ -53,11 +54,6 @@ class Window:
                 f"{self._problem or 'it did not answer'}. A person as expert needs a screen and OpenGL."
             )
 
-    @property
-    def is_open(self) -> bool:
-        """Whether nobody has closed it."""
-        return self._is_open.is_set()
-
     def show(self, status: Status, picture: np.ndarray | None = None) -> None:
         """Show this as soon as possible, unless something newer comes before; returns at once.
 
@@ -69,7 +65,7 @@ class Window:
 
     def close(self) -> None:
         """Closes it; it may be closed already."""
-        self._is_open.clear()
+        self.is_open = False
         self._process.terminate()
         try:
             self._process.wait(timeout=5)
@@ -99,9 +95,9 @@ class Window:
             elif "problem" in message:
                 self._problem = message["problem"]
             elif message.get("is_open"):
-                self._is_open.set()
+                self.is_open = True
                 self._opened.set()
         if self.is_open:
             logging.info("The window was closed.")
-        self._is_open.clear()
+        self.is_open = False
         self._opened.set()
