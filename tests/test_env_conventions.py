@@ -120,7 +120,7 @@ def test_a_closed_environment_refuses_and_opens_nothing(call, was_reset):
     env.close()
     with pytest.raises(ClosedEnvironmentError, match=r"closed.*reset\(\)"):
         NEED_AN_EPISODE[call](env)
-    assert env._camera is env._people_camera is env._window is None
+    assert (env._cameras, env._window) == ({}, None)
 
 
 def test_a_copy_of_a_closed_environment_is_closed():

@@ -110,7 +110,7 @@ def test_pictures_do_not_depend_on_how_many_threads_draw_them():
 
 def cube_pixels(env):
     """How many pixels of the policy's camera show the cube, from what each pixel shows."""
-    renderer = env._front_camera()._renderer
+    renderer = env._cameras["front"]._renderer
     renderer.enable_segmentation_rendering()
     renderer.update_scene(env.data, camera="front")
     shown = renderer.render()[..., 0]

@@ -98,8 +98,7 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         self._state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._rollout_state = np.empty((1, self._controller.n_substeps, len(self._state)))
         self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
-        self._camera: SceneRenderer | None = None
-        self._people_camera: SceneRenderer | None = None
+        self._cameras: dict[str, SceneRenderer] = {}  # those that have drawn
         self._window: Window | None = None
         self._is_closed = False
         self._expert_rng: np.random.Generator | None = None  # None before the first episode
@@ -201,22 +200,20 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             return None
         if self.render_mode != "rgb_array":
             return None
-        if self._people_camera is None:
-            self._people_camera = SceneRenderer(self.model, self._render_size, self._render_size)
-        return self._people_camera.render(self.data, "people")
+        return self._picture("people", self._render_size)
 
     def close(self):
         """Closes window and OpenGL. Only `reset` opens them again, as in Gymnasium's own environments; until then `step` and
         `render` raise ClosedEnvironmentError."""
         self._is_closed = True
-        for resource in (self._camera, self._people_camera, self._window):
+        for resource in (*self._cameras.values(), self._window):
             if resource is not None:
                 resource.close()
-        self._camera = self._people_camera = self._window = None
+        self._cameras, self._window = {}, None
 
     def __getstate__(self) -> dict[str, Any]:
         # What is open belongs to this process and to this object: a copy opens its own.
-        return {**self.__dict__, "_camera": None, "_people_camera": None, "_window": None}
+        return {**self.__dict__, "_cameras": {}, "_window": None}
 
     def _check_is_running(self, call: str) -> None:
         if self._is_closed:
@@ -252,7 +249,7 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         """The observation after a control step; a person who watches sees it, too."""
         sensors = self._rollout_sensors[0]
         observation: dict[str, Any] = {
-            "pixels": {"front": self._front_camera().render(self.data, "front")},
+            "pixels": {"front": self._picture("front", self._image_size)},
             "agent_pos": self._sensors.measure(self._true_proprioception(), self.np_random),
         }
         if self._sound is not None:
@@ -274,10 +271,11 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             [self.eef_position - self.variant.arm.base, self.data.qpos[fingers], self.data.qvel[fingers]]
         )
 
-    def _front_camera(self) -> SceneRenderer:
-        if self._camera is None:
-            self._camera = SceneRenderer(self.model, self._image_size, self._image_size)
-        return self._camera
+    def _picture(self, camera: str, size: int) -> np.ndarray:
+        """(size, size, 3) uint8."""
+        if camera not in self._cameras:
+            self._cameras[camera] = SceneRenderer(self.model, size)
+        return self._cameras[camera].render(self.data, camera)
 
     def _place_cube(self, options: dict[str, Any]) -> float:
         """Where it is drawn to be, or `options` want it. Returns its y [m]."""

@@ -74,7 +74,7 @@ class EpisodeData:
             wanted.append(REWARD)  # one of 0 and 1 says no more than the mark of success
         curves = []
         for key in dict.fromkeys(key for key in wanted if key in self._source.numbers):
-            values = self._source.rows(key)[:, :_MAX_CURVES]
+            values = self._source.values(key).reshape(len(self._source), -1)[:, :_MAX_CURVES].astype(np.float64)
             finite = np.where(np.isfinite(values), values, 0)
             curves.append(
                 {

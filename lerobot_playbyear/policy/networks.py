@@ -79,12 +79,9 @@ class PlaybyearNetwork(nn.Module):
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n, embedding size)."""
         n_stacked = self.config.frame_stack
-        images = self.prepare_images(
-            newest(batch, key, n_frames + n_stacked - 1)
-        )  # (B, n + n_stacked - 1, 3, size, size)
-        stacks = torch.cat(
-            [images[:, i : i + n_frames] for i in range(n_stacked)], dim=2
-        )  # (B, n, 3 n_stacked, size, size)
+        # (B, n + n_stacked - 1, 3, size, size) -> (B, n, 3 n_stacked, size, size)
+        images = self.prepare_images(newest(batch, key, n_frames + n_stacked - 1))
+        stacks = torch.cat([images[:, i : i + n_frames] for i in range(n_stacked)], dim=2)
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
     def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
@@ -167,9 +164,8 @@ class SlimResNet(ResNet):
     """torchvision's ResNet-18 with another number of input channels and another width, without the classifier."""
 
     def __init__(self, in_channels: int, width: int):
-        super().__init__(
-            BasicBlock, [2, 2, 2, 2]
-        )  # what follows takes the place of its layers; forward is torchvision's
+        # What follows takes the place of its layers; forward is torchvision's.
+        super().__init__(BasicBlock, [2, 2, 2, 2])
         self.conv1 = nn.Conv2d(in_channels, width, kernel_size=7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)  # (N, W, size / 2, size / 2); then ReLU, and pooling by 2
         self.layer1 = _stage(width, width)  # (N, W, size / 4, size / 4)

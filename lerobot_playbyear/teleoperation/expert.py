@@ -92,7 +92,7 @@ class TeleopExpert(Expert):
             del levels[: -max(round(HISTORY_S * self.pace.fps), 1)]
         if blocks:
             self.speaker.play(next(iter(blocks.values())))
-        self._show(np.asarray(self._env.render()))
+        self._show(np.ascontiguousarray(self._env.render(), np.uint8))
         self.pace.wait()
         self._read()
         if self._is_paused and self._verdict is None:
