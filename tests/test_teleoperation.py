@@ -34,7 +34,7 @@ from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, Keybo
 from lerobot_playbyear.teleoperation.levels import FLOOR_DB, as_float, level_db
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.panel import FRAME, SIZE, draw
-from lerobot_playbyear.teleoperation.speaker import SoundQueue, Speaker
+from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.status import Control, Status
 from lerobot_playbyear.teleoperation.window import Window
 from lerobot_playbyear.teleoperation.wire import Newest, receive, send
@@ -194,15 +194,15 @@ def test_levels_are_those_of_full_scale():
 
 
 def test_sound_plays_on_without_gaps_until_nothing_is_left():
-    queue = SoundQueue(block_size=4)
-    queue.play(np.full(4, 0.1))
-    assert not queue.take(4).any()  # one block could run dry at once
-    queue.play(np.full(4, 0.2))
-    np.testing.assert_allclose(queue.take(6), [0.1] * 4 + [0.2] * 2, atol=1e-7)
-    np.testing.assert_allclose(queue.take(4), [0.2, 0.2, 0, 0], atol=1e-7)
+    speaker = Speaker(16000, 4, "a test")
+    speaker.play(np.full(4, 0.1))
+    assert not speaker.take(4).any()  # one block could run dry at once
+    speaker.play(np.full(4, 0.2))
+    np.testing.assert_allclose(speaker.take(6), [0.1] * 4 + [0.2] * 2, atol=1e-7)
+    np.testing.assert_allclose(speaker.take(4), [0.2, 0.2, 0, 0], atol=1e-7)
     for n in range(10):
-        queue.play(np.full(4, n))
-    np.testing.assert_allclose(queue.take(8), [4] * 4 + [5] * 4)  # what came too late is left out
+        speaker.play(np.full(4, n))
+    np.testing.assert_allclose(speaker.take(8), [4] * 4 + [5] * 4)  # what came too late is left out
 
 
 def test_messages_arrive_as_they_were_sent():

@@ -10,39 +10,8 @@ _LATENCY_BLOCKS = 2  # that are there before the first is played, so that a late
 _MOST_BLOCKS = 6  # more than this is too late to be played
 
 
-class SoundQueue:
-    """Samples between the control loop, which brings a block per step, and the sound card, which takes what it likes."""
-
-    def __init__(self, block_size: int) -> None:
-        self._block_size = block_size
-        self._samples: np.ndarray = np.zeros(0, np.float32)
-        self._is_playing = False
-        self._lock = threading.Lock()
-
-    def play(self, block: np.ndarray) -> None:
-        """What was heard in a step, (S,) in [-1, 1]."""
-        with self._lock:
-            self._samples = np.concatenate([self._samples, block])[-_MOST_BLOCKS * self._block_size :]
-            self._is_playing |= len(self._samples) >= _LATENCY_BLOCKS * self._block_size
-
-    def take(self, n: int) -> np.ndarray:
-        """The next n samples; silence where there are none."""
-        played = np.zeros(n, np.float32)
-        with self._lock:
-            if self._is_playing:
-                head, self._samples = self._samples[:n], self._samples[n:]
-                played[: len(head)] = head
-                self._is_playing = len(head) == n
-        return played
-
-    def clear(self) -> None:
-        """What has not been played yet is not played any more."""
-        with self._lock:
-            self._samples, self._is_playing = self._samples[:0], False
-
-
-class Speaker(SoundQueue):
-    """The default output of the sound card.
+class Speaker:
+    """The default output of the sound card: the control loop brings a block per step, and it takes what it likes.
 
     Args:
         sample_rate: [Hz].
@@ -54,7 +23,10 @@ class Speaker(SoundQueue):
     """
 
     def __init__(self, sample_rate: int, block_size: int, problem: str = "") -> None:
-        super().__init__(block_size)
+        self._block_size = block_size
+        self._samples: np.ndarray = np.zeros(0, np.float32)
+        self._is_playing = False
+        self._lock = threading.Lock()
         self._stream: Any = None
         self.problem = problem
         if problem:
@@ -73,6 +45,27 @@ class Speaker(SoundQueue):
         except Exception as error:  # whatever a sound card may say, work goes on without
             self.problem = f"no sound card ({str(error).splitlines()[0]})"
             self.close()
+
+    def play(self, block: np.ndarray) -> None:
+        """What was heard in a step, (S,) in [-1, 1]."""
+        with self._lock:
+            self._samples = np.concatenate([self._samples, block])[-_MOST_BLOCKS * self._block_size :]
+            self._is_playing |= len(self._samples) >= _LATENCY_BLOCKS * self._block_size
+
+    def take(self, n: int) -> np.ndarray:
+        """The next n samples, which are then played; silence where there are none."""
+        played = np.zeros(n, np.float32)
+        with self._lock:
+            if self._is_playing:
+                head, self._samples = self._samples[:n], self._samples[n:]
+                played[: len(head)] = head
+                self._is_playing = len(head) == n
+        return played
+
+    def clear(self) -> None:
+        """What has not been played yet is not played any more."""
+        with self._lock:
+            self._samples, self._is_playing = self._samples[:0], False
 
     def close(self) -> None:
         if self._stream is not None:
