@@ -130,14 +130,14 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
     def _is_success(self) -> bool:
         raise NotImplementedError
 
-    # Scripts for the current episode, to be made after `reset`
+    # Scripts that know more than a policy
 
     def scripted_expert(self) -> GraspExpert:
-        """An expert with privileged knowledge: `act()` gives an action (4,)."""
+        """An expert for the current episode, with privileged knowledge: `act()` gives an action (4,). Make it after `reset`."""
         return self._expert(self)
 
     def intervention_gate(self) -> InterventionGate:
-        """The expert beside a policy: `wants_control(policy_action)` and `act()`."""
+        """The expert beside a policy in this episode: `wants_control(policy_action)` and `act()`. Make it after `reset`."""
         return InterventionGate(self, self._expert(self, CORRECTING_EXPERT))
 
     def blind_baselines(self) -> dict[str, BlindGrasp]:
