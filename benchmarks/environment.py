@@ -88,7 +88,7 @@ def parts_of_a_step(task: str) -> dict[str, Callable[[], object]]:
     env = gym.make(f"gym_playbyear/{task}").unwrapped
     env.reset(seed=0)
     hold = np.repeat(env.data.ctrl[None].copy(), env._controller.n_substeps, axis=0)
-    camera, sensors = env._front_camera(), env._rollout_sensors[0]
+    camera, sensors = env._cameras["front"], env._rollout_sensors[0]
     from gym_playbyear.arena import pair_forces
 
     forces, speed = pair_forces(sensors, len(env.pairs)), np.zeros(len(sensors))
@@ -96,7 +96,7 @@ def parts_of_a_step(task: str) -> dict[str, Callable[[], object]]:
         "physics": lambda: env._advance(hold),
         "picture": lambda: camera.render(env.data, "front"),
         "sound": lambda: env._sound.step(forces, speed),
-        "inverse kinematics": lambda: env._controller.command(np.zeros(4), env.eef_position, 0.05),
+        "inverse kinematics": lambda: env._controller.command(np.zeros(4), env.eef_position),
     }
 
 
