@@ -40,6 +40,14 @@ def list_files(root: Path, pattern: str) -> list[Path]:
     return sorted(found)
 
 
+def entries_below(folder: Path) -> Iterator[Path]:
+    """Everything in a folder, without going through links."""
+    for entry in sorted(folder.iterdir()):
+        yield entry
+        if entry.is_dir() and not entry.is_symlink():
+            yield from entries_below(entry)
+
+
 def fits(name: PurePath, *patterns: str) -> bool:
     """Whether a name, as a whole, matches one of some patterns, part by part."""
     return any(len(name.parts) == len(PurePath(pattern).parts) and name.match(pattern) for pattern in patterns)

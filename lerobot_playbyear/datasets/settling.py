@@ -40,7 +40,7 @@ _SMALL_DATA_BYTES = 8 * 2**20  # a data file below this is continued
 _SMALL_TABLE_BYTES = 2 * 2**20  # a table of episodes below this is continued
 
 
-def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndarray]) -> list[Path]:
+def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndarray]) -> None:
     """Makes of one episode's files what the dataset in `root` shall hold, in its staging folder.
 
     LeRobot's files are left as they are, but for films, which are moved: after a failure this can be called again.
@@ -49,9 +49,6 @@ def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndar
         root: The dataset's folder.
         episode: The episode, written and closed by LeRobot.
         waveforms: Its sound, (n_frames, S) per microphone.
-
-    Returns:
-        The files to publish, relative to the staging folder, in the order in which they may be moved one by one.
     """
     source, folder, meta = episode.folder, root / STAGING, episode.dataset.meta
     for part in ("data", "meta"):
@@ -65,34 +62,24 @@ def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndar
     last = _last_row(root)
     sound = {key: sound_stats(waveform) for key, waveform in waveforms.items()}
     row = with_sound_stats(pq.read_table(source / row_file), sound)
-    row, data_file = _settle_data(root, episode, info, row, last, waveforms)
-    row_file = _settle_row(root, folder, row, row_file, last)
-    tables = [name for name in _new_files(episode, "meta") if len(name.parts) == 2 and name != INFO]
-    for name in tables:
-        shutil.copyfile(source / name, folder / name)
+    row = _settle_data(root, episode, info, row, last, waveforms)
+    _settle_row(root, folder, row, row_file, last)
+    for name in _new_files(episode, "meta"):
+        if len(name.parts) == 2 and name != INFO:
+            shutil.copyfile(source / name, folder / name)
     if meta.stats is not None and sound:
         known = {key: stats for key, stats in (read_stats(root) or {}).items() if key in sound}
         write_dataset_stats({**meta.stats, **add_stats(known, [sound], sound)}, folder)
-    return [data_file, *_settle_films(episode, folder), *tables, row_file, INFO]
+    for name in _new_files(episode, "videos"):  # those that an earlier try moved are there already
+        if not is_intact(source / name):
+            seal(source / name)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(source / name, folder / name)
 
 
 def _new_files(episode: Staging, part: str) -> list[Path]:
-    names = (path.relative_to(episode.folder) for path in _files(episode.folder / part))
-    return [name for name in names if name not in episode.before]
-
-
-def _files(folder: Path) -> list[Path]:
-    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
-
-
-def _settle_films(episode: Staging, folder: Path) -> list[Path]:
-    """Seals the films and moves them; those that an earlier try moved are there already. Returns all their names."""
-    for name in _new_files(episode, "videos"):
-        if not is_intact(episode.folder / name):
-            seal(episode.folder / name)
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        os.replace(episode.folder / name, folder / name)
-    return [path.relative_to(folder) for path in _files(folder / "videos")]
+    paths = (path for path in sorted((episode.folder / part).rglob("*")) if path.is_file())
+    return [name for path in paths if (name := path.relative_to(episode.folder)) not in episode.before]
 
 
 def _last_row(root: Path) -> dict | None:
@@ -111,12 +98,8 @@ def _settle_data(
     row: pa.Table,
     last: dict | None,
     waveforms: Mapping[str, np.ndarray],
-) -> tuple[pa.Table, Path]:
-    """Writes the episode's frames as our files are written, behind those of the last small file.
-
-    Returns:
-        The episode's row, and the file's name.
-    """
+) -> pa.Table:
+    """Writes the episode's frames as our files are written, behind those of the last small file. Returns its row."""
     name = _data_file(info, row.to_pylist()[0])
     frames = _with_sound(pq.read_table(episode.folder / name), info, waveforms)
     target, tables = name, [frames]
@@ -131,7 +114,7 @@ def _settle_data(
         assert last is not None
         for key in ("data/chunk_index", "data/file_index"):
             row = row.set_column(row.column_names.index(key), key, pa.array([last[key]], row.schema.field(key).type))
-    return row, target
+    return row
 
 
 def _with_sound(frames: pa.Table, info: DatasetInfo, waveforms: Mapping[str, np.ndarray]) -> pa.Table:
@@ -147,7 +130,7 @@ def _with_sound(frames: pa.Table, info: DatasetInfo, waveforms: Mapping[str, np.
     return frames.select(schema.names).cast(schema)
 
 
-def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict | None) -> Path:
+def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict | None) -> None:
     """Puts the episode's row behind those of the last small table of episodes."""
     table = row
     if last is not None:
@@ -167,7 +150,6 @@ def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict
             except ParquetDamageError as error:
                 logger.warning("%s is not continued: %s.", root / last_name, error)
     write_rows(table, staging / name)
-    return name
 
 
 def write_rows(rows: pa.Table, path: Path) -> None:

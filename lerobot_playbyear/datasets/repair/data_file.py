@@ -10,33 +10,53 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.columns import column_to_numpy
-from lerobot_playbyear.datasets.parquet_files import (
-    ParquetDamageError,
-    open_checked,
-    open_parquet,
-    parsing,
-    read_row_groups,
-)
-from lerobot_playbyear.datasets.repair.rescued_file import RescuedFile
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
 
 INDEX_COLUMNS = ["episode_index", "frame_index", "index", "task_index", "timestamp"]
 
 
-@dataclass(frozen=True)
+@dataclass
 class DataFile:
     """A data file that can be read, at least in parts.
 
     Args:
         name: Relative to the dataset's folder.
-        source: What is read: the file, or what of it can be read with a new footer.
+        path: Where it is.
+        footer: What is taken for its footer; None: its own.
         is_whole: Whether the file can be taken over as it is.
         n_rows: How many rows can be read.
     """
 
     name: Path
-    source: Path | RescuedFile
-    is_whole: bool
-    n_rows: int
+    path: Path
+    footer: pq.FileMetaData | None = None
+    is_whole: bool = False
+    n_rows: int = 0
+
+    def parts(
+        self, problems: list[str], columns: list[str] | None = None
+    ) -> Iterator[tuple[pa.Table, dict[str, np.ndarray]]]:
+        """The rows that can be read, in parts of bounded size, and their index columns.
+
+        Where a number is missing, which rows these are is not known, and nothing of them is used.
+
+        Args:
+            problems: What is wrong with the others is added here.
+            columns: Which to read; None: all.
+
+        Raises:
+            OSError: They cannot be read now.
+        """
+        with open_checked(self.path, self.footer) as file:
+            for number, table in enumerate(read_row_groups(file, columns, self.path)):
+                try:
+                    if isinstance(table, ParquetDamageError):
+                        raise table
+                    index = {name: column_to_numpy(table.column(name)) for name in INDEX_COLUMNS}
+                except ValueError as error:
+                    problems.append(f"row group {number} is damaged: {error}")
+                else:
+                    yield table, index
 
     def read(self, spans: Iterable[tuple[int, int]]) -> Iterator[tuple[int, pa.Table]]:
         """Some of the rows that can be read, in parts of bounded size; spans in the file's order are read in one go.
@@ -54,7 +74,7 @@ class DataFile:
         part, first = None, 0  # the rows that were read last, and the number of the first of them
         for place, (start, length) in enumerate(spans):
             if part is None or start < first:
-                parts, first = self._parts(), 0
+                parts, first = self._tables(), 0
                 part = next(parts)
             at = start
             while at < start + length:
@@ -68,37 +88,12 @@ class DataFile:
     @property
     def schema(self) -> pa.Schema:
         """Of its columns."""
-        with open_source(self.source) as file:
+        with open_checked(self.path, self.footer) as file:
             return file.schema_arrow
 
-    @property
-    def path(self) -> Path:
-        """The file."""
-        return self.source if isinstance(self.source, Path) else self.source.path
-
-    def _parts(self) -> Iterator[pa.Table]:
+    def _tables(self) -> Iterator[pa.Table]:
         n_rows = 0
-        with open_source(self.source) as file:
-            for table in read_row_groups(file, path=self.path):
-                if not isinstance(table, ParquetDamageError) and not isinstance(
-                    read_indices(table), ParquetDamageError
-                ):
-                    n_rows += len(table)
-                    yield table
+        for table, _ in self.parts([]):
+            n_rows += len(table)
+            yield table
         raise OSError(errno.EIO, f"{self.n_rows} of its rows could be read before, and now {n_rows}", str(self.name))
-
-
-def read_indices(table: pa.Table) -> dict[str, np.ndarray] | ParquetDamageError:
-    """The index columns; where a number is missing, which rows these are is not known, and nothing of them is used."""
-    try:
-        return {name: column_to_numpy(table.column(name)) for name in INDEX_COLUMNS}
-    except ValueError as error:
-        return ParquetDamageError(str(error))
-
-
-def open_source(source: Path | RescuedFile) -> pq.ParquetFile:
-    """Opens a data file, or what of it can be read with a new footer. Raises as `open_checked`."""
-    if isinstance(source, Path):
-        return open_checked(source)
-    with parsing(source.path):
-        return open_parquet(source.open())

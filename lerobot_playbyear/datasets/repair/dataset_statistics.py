@@ -3,8 +3,6 @@
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,47 +12,44 @@ from lerobot.datasets.utils import STATS_PATH, DatasetInfo
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.files import read_listed
 from lerobot_playbyear.datasets.repair.episode_tables import Row
-from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing
+from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.statistics import Stats, add_stats, row_stats
 
 _TOLERANCE = 0.01  # between statistics that were added up episode by episode and all at once
 
 
-@dataclass(frozen=True)
-class OwnStats:
-    """The entries of `meta/stats.json` that are right.
+def read_own_stats(
+    report: RepairReport, features: Mapping[str, Any], is_begun: bool
+) -> dict[str, dict[str, np.ndarray] | None] | None:
+    """Reads `meta/stats.json`.
 
     Args:
-        entries: Per feature; None where the file is lost.
-        findings: What is wrong with the others, or the file.
-    """
+        report: Of the dataset; what is wrong is added.
+        features: The dataset's.
+        is_begun: Whether it has only been begun, and may have no statistics yet.
 
-    entries: Stats | None
-    findings: tuple[Finding, ...]
-
-
-def read_own_stats(root: Path, features: Mapping[str, Any]) -> OwnStats:
-    """Reads `meta/stats.json`.
+    Returns:
+        Its entry for each feature, or None for a wrong one; None where the file is lost.
 
     Raises:
         OSError: It cannot be read now.
     """
-    data = read_listed(root, STATS_PATH)
+    data = read_listed(report.root, STATS_PATH)
     if data is None:
-        return OwnStats(None, (Finding(Thing.STATISTICS, State.MISSING, f"{STATS_PATH} is missing"),))
+        report.findings += [] if is_begun else [f"{STATS_PATH} is missing"]
+        return None
     try:
         stats = cast_stats_to_numpy(json.loads(data))
-        wrong = [key for key, own in stats.items() if not _are_numbers(own)]
+        entries = {key: own if _are_numbers(own) else None for key, own in stats.items()}
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
-        return OwnStats(None, (Finding(Thing.STATISTICS, State.DAMAGED, f"{STATS_PATH} cannot be read: {error}"),))
-    problems = (
+        report.findings.append(f"{STATS_PATH} cannot be read: {error}")
+        return None
+    report.findings += [
         f"{STATS_PATH}: the entries of '{key}' are no numbers of shape {tuple(features.get(key, {}).get('shape', ()))}"
-        for key in wrong
-    )
-    return OwnStats(
-        {key: own for key, own in stats.items() if key not in wrong},
-        tuple(Finding(Thing.STATISTICS, State.DAMAGED, problem) for problem in problems),
-    )
+        for key, own in entries.items()
+        if own is None
+    ]
+    return entries
 
 
 def _are_numbers(own: Any) -> bool:
@@ -62,7 +57,10 @@ def _are_numbers(own: Any) -> bool:
 
 
 def settle_stats(
-    own: OwnStats, info: DatasetInfo, rows: Sequence[Row], rows_before: Sequence[Row]
+    own: Mapping[str, dict[str, np.ndarray] | None] | None,
+    info: DatasetInfo,
+    rows: Sequence[Row],
+    rows_before: Sequence[Row],
 ) -> tuple[Stats | None, list[str]]:
     """The statistics of the repaired dataset.
 
@@ -70,7 +68,7 @@ def settle_stats(
     the episodes, set by hand, stay too; the rest is added up anew.
 
     Args:
-        own: The dataset's.
+        own: The dataset's, as `read_own_stats` has them.
         info: What it says about itself.
         rows: The rows of the kept episodes, with their statistics.
         rows_before: All rows that there were.
@@ -80,7 +78,7 @@ def settle_stats(
     """
     microphones = audio_keys(info.features)
     made = add_stats(None, [row_stats(row) for row in rows], microphones)
-    if own.entries is None:
+    if own is None:
         return made, [f"{STATS_PATH}: made anew from the episodes; what it held that is not theirs is lost"]
     before: Stats = {}
     with contextlib.suppress(ValueError, TypeError, AttributeError, KeyError):  # of rows that may be damaged
@@ -88,7 +86,9 @@ def settle_stats(
     settled: Stats = dict(made)
     anew: list[str] = []
     by_hand: list[str] = []
-    for key, entry in own.entries.items():
+    for key, entry in own.items():
+        if entry is None:
+            continue
         if key not in made or _alike(entry.get("count"), made[key].get("count")):
             settled[key] = entry
             by_hand += [] if key in info.features else [f"'{key}'"]
@@ -98,13 +98,13 @@ def settle_stats(
         settled[key] = {**made[key], **kept}
         by_hand += [f"{name} of '{key}'" for name in kept]
         anew.append(key)
-    anew += [key for key in made if key not in own.entries]
+    anew += [key for key in made if own.get(key) is None]
     notes = []
     if anew:
         notes.append(f"{STATS_PATH}: made anew from the episodes: {', '.join(sorted(anew))}")
         if by_hand:
             notes.append(f"{STATS_PATH}: not those of the episodes, and as they were: {', '.join(by_hand)}")
-    return (settled if anew or own.findings else None), notes
+    return (settled if anew or None in own.values() else None), notes
 
 
 def _set_by_hand(own: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]) -> set[str]:

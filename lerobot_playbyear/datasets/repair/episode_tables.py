@@ -4,7 +4,6 @@ import contextlib
 import math
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ from lerobot.datasets.utils import EPISODES_DIR, DatasetInfo
 
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing, read_table
-from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing
 from lerobot_playbyear.datasets.repair.frames import Run
+from lerobot_playbyear.datasets.repair.report import RepairReport
 
 Row = Mapping[str, Any]
 """An episode's row in `meta/episodes`."""
@@ -25,45 +24,33 @@ PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
 _PARTIAL = "is partial"
 
 
-@dataclass(frozen=True)
-class EpisodeTables:
-    """The rows of all tables of episodes that can be read.
+def read_rows(report: RepairReport) -> list[Row]:
+    """The rows of all tables of episodes that can be read, in order.
 
-    Args:
-        rows: In order; more than one of an episode where tables contradict each other.
-        findings: What was found wrong.
-    """
-
-    rows: tuple[Row, ...]
-    findings: tuple[Finding, ...]
-
-
-def read_rows(root: Path) -> EpisodeTables:
-    """Reads all tables of episodes.
+    There is more than one of an episode where tables contradict each other. What is wrong is added to the report.
 
     Raises:
         OSError: A table cannot be read now.
     """
     rows: list[Row] = []
     named: set[int] = set()
-    findings: list[str] = []
-    for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
-        name = path.relative_to(root)
+    for path in list_files(report.root, f"{EPISODES_DIR}/*/*.parquet"):
+        name = path.relative_to(report.root)
         try:
             found = read_table(path).to_pylist()
         except ParquetDamageError as error:
-            findings.append(f"{name} cannot be read: {error}")
+            report.findings.append(f"{name} cannot be read: {error}")
             found = _readable_parts(path)
         for row in found:
             number = row.get("episode_index")
             if not isinstance(number, int):
-                findings.append(f"{name} has a row that names no episode")
+                report.findings.append(f"{name} has a row that names no episode")
                 continue
             if number in named:
-                findings.append(f"{name} names episode {number} a second time")
+                report.findings.append(f"{name} names episode {number} a second time")
             named.add(number)
             rows.append(row)
-    return EpisodeTables(tuple(rows), tuple(Finding(Thing.TABLE, State.DAMAGED, said) for said in findings))
+    return rows
 
 
 def _readable_parts(path: Path) -> list[dict[str, Any]]:

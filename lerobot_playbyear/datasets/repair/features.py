@@ -12,41 +12,38 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing
-from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError, Finding, State, Thing
+from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport
 
 
-def settle_features(
-    root: Path, info: DatasetInfo, features: dict[str, dict] | None
-) -> tuple[DatasetInfo, tuple[Finding, ...]]:
+def settle_features(report: RepairReport, info: DatasetInfo, features: dict[str, dict] | None) -> DatasetInfo:
     """Holds the features against what the data files hold. Where these differ, the caller's may be right.
 
     Args:
-        root: The dataset's folder.
+        report: Of the dataset; what is wrong is added.
         info: What the dataset says about itself.
         features: The features as the caller knows them; None if it does not.
 
     Returns:
-        The same, with the features of the data files, and what was found wrong.
+        The same, with the features of the data files.
 
     Raises:
         DatasetDamagedError: The files hold other columns than the features say, and nobody knows better.
         OSError: A file cannot be read now.
     """
     known = {**features, **DEFAULT_FEATURES} if features else None
-    schemas = [schema for path in list_files(root, "data/*/*.parquet") if (schema := own_schema(path)) is not None]
+    paths = list_files(report.root, "data/*/*.parquet")
+    schemas = [schema for path in paths if (schema := own_schema(path)) is not None]
     reasons = [_disagreement(schema, info.features) for schema in schemas]
-    findings: list[Finding] = []
     if (reasons and all(reasons)) or (not reasons and _disagreement(None, info.features)):
         if known is None or any(_disagreement(schema, known) for schema in schemas):
             raise DatasetDamagedError(
-                f"{root / 'meta/info.json'} and the data files disagree: {(reasons or ['its features'])[0]}. Put the "
+                f"{report.root / 'meta/info.json'} and the data files disagree: {(reasons or ['its features'])[0]}. Put the "
                 "file back from a copy, or repair with --like=<folder of a dataset recorded with the same settings>."
             )
         what = reasons[0] if reasons else "it names a feature that LeRobot does not know"
-        said = f"meta/info.json: {what}; the features are now those of this recording"
-        findings.append(Finding(Thing.FEATURE, State.DAMAGED, said))
+        report.findings.append(f"meta/info.json: {what}; the features are now those of this recording")
         info = replace(info, features=deepcopy(known))
-    return info, tuple(findings)
+    return info
 
 
 def check_columns(found: pa.Schema, wanted: pa.Schema) -> str | None:

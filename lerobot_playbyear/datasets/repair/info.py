@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import re
-from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.confines import is_template
 from lerobot_playbyear.datasets.files import is_listed, list_files, read_listed
-from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError, Finding, State, Thing
+from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport
 
 _TOLERANCE = 0.01  # of rates
 _MOST_FPS = 1_000_000  # timestamps that are closer are none
@@ -31,77 +30,77 @@ _KEPT: dict[str, type] = {"robot_type": str, "splits": dict, "tools": list}  # w
 
 
 def read_info(
-    root: Path, fps: int | None, features: dict[str, dict] | None
-) -> tuple[DatasetInfo, dict[str, Any], tuple[Finding, ...]]:
+    report: RepairReport, fps: int | None, features: dict[str, dict] | None
+) -> tuple[DatasetInfo, dict[str, Any]]:
     """Reads `meta/info.json`, or makes it from what the caller knows.
 
     Args:
-        root: The dataset's folder.
+        report: Of the dataset; what is wrong is added.
         fps: Its frames per second, if the caller knows them.
         features: Its features, if the caller knows them.
 
     Returns:
-        What it says, made good as far as it is proven; all fields that it has, also those of other tools, which LeRobot's
-        reader leaves out; and what was found wrong.
+        What it says, made good as far as it is proven; and all fields that it has, also those of other tools, which
+        LeRobot's reader leaves out.
 
     Raises:
         DatasetDamagedError: It is unreadable and the caller does not know the features, or it is of another version.
         OSError: It cannot be read now.
     """
+    root = report.root
     data = read_listed(root, INFO_PATH)
     if data is None:
-        return _new_info(root, {}, State.MISSING, "is missing", fps, features)
+        return _new_info(report, {}, "is missing", fps, features)
     fields: dict[str, Any] = {}
     try:
         raw = json.loads(data)
         fields = raw if isinstance(raw, dict) else {}
         info = _known(_checked(fields))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        return _new_info(root, fields, State.DAMAGED, f"is damaged ({error})", fps, features)
-    findings = list(_check_version(root, info))
+        return _new_info(report, fields, f"is damaged ({error})", fps, features)
+    _check_version(report, info)
     for name, wanted in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
         own = getattr(info, name)
         is_used = name == "data_path" or any(feature["dtype"] == "video" for feature in info.features.values())
         if not is_used or own == wanted or _leads_somewhere(root, own):
             continue
-        state, said = State.DAMAGED, f"{INFO_PATH}: {name} was {own!r}, where nothing is"
-        if not _leads_somewhere(root, wanted):
-            state, said = State.UNDECIDED, f"{said}, nor at {wanted!r}. Put the files, or the right path, there"
-        findings.append(Finding(Thing.INFO, state, said))
+        said = f"{INFO_PATH}: {name} was {own!r}, where nothing is"
+        if _leads_somewhere(root, wanted):
+            report.findings.append(said)
+        else:
+            report.undecided.append(f"{said}, nor at {wanted!r}. Put the files, or the right path, there")
         info = dataclasses.replace(info, **{name: wanted})
-    return info, fields, tuple(findings)
+    return info, fields
 
 
-def check_rates(info: DatasetInfo, frame_seconds: float | None) -> tuple[Finding, ...]:
+def check_rates(report: RepairReport, info: DatasetInfo, frame_seconds: float | None) -> float:
     """Holds the frame rate against the frames' timestamps, and the sample rates against the sound.
 
     Args:
+        report: Of the dataset; what is wrong is added.
         info: What the dataset says about itself.
         frame_seconds: The time between two frames, as the data have it; None where there are not two frames.
+
+    Returns:
+        The frames per second: as the dataset says where its frames' timestamps agree with it, otherwise theirs.
     """
-    findings: list[str] = []
-    fps = frame_rate(info, frame_seconds)
-    if fps != info.fps:
-        findings.append(
-            f"fps is {info.fps}, but the frames' timestamps are {fps:g} per second. Write {fps:g} there if they are right"
+    fps: float = info.fps
+    rate = 1 / frame_seconds if frame_seconds and frame_seconds > 0 else 0
+    if 0 < rate < _MOST_FPS and abs(info.fps / rate - 1) > _TOLERANCE:
+        fps = round(rate) or rate
+        report.undecided.append(
+            f"{INFO_PATH}: fps is {info.fps}, but the frames' timestamps are {fps:g} per second. Write {fps:g} there if "
+            "they are right"
         )
     for key in audio_keys(info.features):
         feature = info.features[key]
-        rate = (feature.get("info") or {}).get("sample_rate")
-        if rate is not None and len(feature["shape"]) == 1 and rate != feature["shape"][0] * fps:
-            findings.append(
-                f"the sample rate of '{key}' is {rate!r}, but {feature['shape'][0]} samples per frame at {fps:g} frames "
-                f"per second are {feature['shape'][0] * fps:g} Hz. Write there what it was recorded at"
+        heard = (feature.get("info") or {}).get("sample_rate")
+        if heard is not None and len(feature["shape"]) == 1 and heard != feature["shape"][0] * fps:
+            report.undecided.append(
+                f"{INFO_PATH}: the sample rate of '{key}' is {heard!r}, but {feature['shape'][0]} samples per frame at "
+                f"{fps:g} frames per second are {feature['shape'][0] * fps:g} Hz. Write there what it was recorded at"
             )
-    return tuple(Finding(Thing.INFO, State.UNDECIDED, f"{INFO_PATH}: {said}") for said in findings)
-
-
-def frame_rate(info: DatasetInfo, frame_seconds: float | None) -> float:
-    """The frames per second: as the dataset says where its frames' timestamps agree with it, otherwise theirs."""
-    rate = 1 / frame_seconds if frame_seconds and frame_seconds > 0 else 0
-    if not 0 < rate < _MOST_FPS or abs(info.fps / rate - 1) <= _TOLERANCE:
-        return info.fps
-    return round(rate) or rate
+    return fps
 
 
 def _known(raw: dict[str, Any]) -> DatasetInfo:
@@ -138,7 +137,8 @@ def _checked(raw: dict[str, Any]) -> dict[str, Any]:
     return raw
 
 
-def _check_version(root: Path, info: DatasetInfo) -> Iterator[Finding]:
+def _check_version(report: RepairReport, info: DatasetInfo) -> None:
+    root = report.root
     version = re.fullmatch(r"v(\d+)\.(\d+)(\..*)?", info.codebase_version)
     if version and version[1] == "3":
         return
@@ -158,17 +158,16 @@ def _check_version(root: Path, info: DatasetInfo) -> Iterator[Finding]:
             f"{root} was written by a newer LeRobot (format {info.codebase_version}); wanted {CODEBASE_VERSION}. "
             "Update lerobot."
         )
-    yield Finding(
-        Thing.INFO,
-        State.UNDECIDED,
+    report.undecided.append(
         f"{INFO_PATH}: codebase_version is {info.codebase_version!r}, which LeRobot does not open; the files are named as "
-        f"in {CODEBASE_VERSION}. Write that there if it is the dataset's format",
+        f"in {CODEBASE_VERSION}. Write that there if it is the dataset's format"
     )
 
 
 def _new_info(
-    root: Path, old: dict[str, Any], state: State, reason: str, fps: int | None, features: dict[str, dict] | None
-) -> tuple[DatasetInfo, dict[str, Any], tuple[Finding, ...]]:
+    report: RepairReport, old: dict[str, Any], reason: str, fps: int | None, features: dict[str, dict] | None
+) -> tuple[DatasetInfo, dict[str, Any]]:
+    root = report.root
     if not list_files(root, "data/*/*.parquet"):
         raise DatasetDamagedError(f"{root} holds no LeRobotDataset: {INFO_PATH} {reason}, and there is no data.")
     if fps is None or features is None:
@@ -186,8 +185,8 @@ def _new_info(
         if old
         else "robot_type, splits, and what else it held besides them, is lost"
     )
-    said = f"{INFO_PATH} {reason}: made anew from the settings of this recording; {rest}"
-    return info, old, (Finding(Thing.INFO, state, said),)
+    report.findings.append(f"{INFO_PATH} {reason}: made anew from the settings of this recording; {rest}")
+    return info, old
 
 
 def _leads_somewhere(root: Path, template: str | None) -> bool:

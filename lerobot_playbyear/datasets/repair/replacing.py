@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 
 from lerobot_playbyear.datasets.journal import SCRATCH, flush
-from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError
+from lerobot_playbyear.datasets.repair.report import DatasetDamagedError
 
 _BEGUN = SCRATCH / ".repairing"
 _FINISHED = SCRATCH / ".repaired.json"

@@ -10,16 +10,21 @@ from lerobot.datasets.utils import DatasetInfo
 from lerobot_playbyear.datasets.repair.camera import TOLERANCE, Camera, numbers
 from lerobot_playbyear.datasets.repair.episode_tables import Row, video_places
 from lerobot_playbyear.datasets.repair.episodes import Episode
-from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing, name_episodes
+from lerobot_playbyear.datasets.repair.report import RepairReport, name_episodes
 
 
 def check_videos(
-    root: Path, info: DatasetInfo, fps: float, episodes: Sequence[Episode], rows: Mapping[int, Row], thorough: bool
-) -> tuple[tuple[Episode, ...], tuple[Finding, ...]]:
+    report: RepairReport,
+    info: DatasetInfo,
+    fps: float,
+    episodes: Sequence[Episode],
+    rows: Mapping[int, Row],
+    thorough: bool,
+) -> Sequence[Episode]:
     """Finds out which episodes have lost their pictures, and where those are of episodes without a row.
 
     Args:
-        root: The dataset's folder.
+        report: Of the dataset; what is wrong is added.
         info: What it says about itself.
         fps: Its frames per second, as the frames' timestamps have them.
         episodes: All there are.
@@ -28,31 +33,27 @@ def check_videos(
 
     Returns:
         The episodes: those without pictures are not whole, and rows that are lost are begun with the videos' places.
-        And what was found wrong.
 
     Raises:
         OSError: A video cannot be read now.
     """
-    findings: list[Finding] = []
     for key, feature in info.features.items():
         if feature["dtype"] == "video":
-            camera = Camera(root, info, key, fps, thorough)
+            camera = Camera(report.root, info, key, fps, thorough)
             known = [
-                episode.row if episode.is_whole else video_places(rows.get(episode.number, {}), info)
-                for episode in episodes
+                episode.row if episode.run else video_places(rows.get(episode.number, {}), info) for episode in episodes
             ]
-            episodes, own = _check_camera(camera, episodes, known, info.chunks_size)
-            findings += own
-    return tuple(episodes), tuple(findings)
+            episodes = _check_camera(report, camera, episodes, known, info.chunks_size)
+    return episodes
 
 
 def _check_camera(
-    camera: Camera, episodes: Sequence[Episode], known: Sequence[Row], chunks_size: int
-) -> tuple[list[Episode], list[Finding]]:
+    report: RepairReport, camera: Camera, episodes: Sequence[Episode], known: Sequence[Row], chunks_size: int
+) -> list[Episode]:
     """As `check_videos`, for one camera. `known`: of each episode what is said of where its pictures are."""
     places: Mapping[int, Row] = {}
     unclaimed: list[Path] = []
-    if any(episode.is_whole and not camera.has_place(row) for episode, row in zip(episodes, known, strict=True)):
+    if any(episode.run and not camera.has_place(row) for episode, row in zip(episodes, known, strict=True)):
         places = _find_places(camera, episodes, known, chunks_size)
         unclaimed = _unclaimed(camera, [*known, *places.values()])
         places = {} if unclaimed else places  # pictures of an episode that is gone may lie between them
@@ -69,11 +70,16 @@ def _check_camera(
             checked.append(episode)
         else:
             lost[problem].append(episode.number)
-            checked.append(episode.lost(State.MISSING, f"its video of '{camera.key}' is lost: {problem}"))
-    findings = [
-        Finding(Thing.VIDEO, State.DAMAGED, f"{problem}: {name_episodes(own)}") for problem, own in lost.items()
-    ]
-    return checked, [*findings, *_unplaced(camera, unplaced)]
+            checked.append(Episode(episode.number, reason=f"its video of '{camera.key}' is lost: {problem}"))
+    report.findings += [f"{problem}: {name_episodes(own)}" for problem, own in lost.items()]
+    if unplaced:
+        names = ", ".join(map(str, sorted({name for files in unplaced.values() for name in files})))
+        report.undecided.append(
+            f"meta/episodes does not say, or not rightly, where the pictures of '{camera.key}' of "
+            f"{name_episodes(unplaced)} are: they may be in {names}. Put the table, or videos that are missing, back from "
+            "a copy. To give these episodes up, take these files away, with whatever else is in them"
+        )
+    return checked
 
 
 def _problem(camera: Camera, row: Row, length: int) -> str | None:
@@ -146,15 +152,3 @@ def _unclaimed(camera: Camera, known: Iterable[Row]) -> list[Path]:
             start, end = camera.span(row)
             n_claimed[camera.name(row)] += round((end - start) * camera.fps)
     return [name for name in camera.names if len(camera.times(name)) > n_claimed[name]]
-
-
-def _unplaced(camera: Camera, unplaced: Mapping[int, Collection[Path]]) -> list[Finding]:
-    if not unplaced:
-        return []
-    names = ", ".join(map(str, sorted({name for files in unplaced.values() for name in files})))
-    said = (
-        f"meta/episodes does not say, or not rightly, where the pictures of '{camera.key}' of {name_episodes(unplaced)} "
-        f"are: they may be in {names}. Put the table, or videos that are missing, back from a copy. To give these "
-        "episodes up, take these files away, with whatever else is in them"
-    )
-    return [Finding(Thing.VIDEO, State.UNDECIDED, said)]
