@@ -16,7 +16,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_feature import audio_feature
-from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.columns import column_to_numpy, numpy_to_column
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
     open_checked,
@@ -26,7 +26,7 @@ from lerobot_playbyear.datasets.parquet_files import (
 )
 from lerobot_playbyear.datasets.settling import write_rows
 from lerobot_playbyear.datasets.spooled_sound import EpisodesSound
-from lerobot_playbyear.datasets.statistics import Stats, add_stats, read_stats, write_stats
+from lerobot_playbyear.datasets.statistics import Stats, add_stats, read_stats, with_sound_stats, write_stats
 
 
 def write_with_sound(root: Path, target: Path, sound: EpisodesSound) -> None:
@@ -107,10 +107,7 @@ def _with_columns(table: pa.Table, schema: pa.Schema, sound: EpisodesSound, meta
     parts = [sound.blocks(int(episodes[a]), int(frames[a]), int(frames[a]) + b - a) for a, b in spans]
     blocks = np.concatenate(parts) if parts else np.zeros((0, sound.samples_per_frame, len(sound.keys)), np.int16)
     for i, key in enumerate(sound.keys):
-        kind = schema.field(key).type
-        samples = pa.array(np.ascontiguousarray(blocks[..., i]).reshape(-1))
-        column = pa.FixedSizeListArray.from_arrays(samples, kind.list_size).cast(kind)
-        table = table.append_column(pa.field(key, kind), column)
+        table = table.append_column(key, numpy_to_column(blocks[..., i], schema.field(key).type))
     return table.replace_schema_metadata(metadata)
 
 
@@ -123,10 +120,6 @@ def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
 
 
 def _write_rows(source: Path, target: Path, stats: list[Stats]) -> None:
-    table = read_named_table(source)
-    episodes = table.column("episode_index").to_pylist()
-    for key in stats[0]:
-        for name in stats[0][key]:
-            values = pa.array([stats[episode][key][name].tolist() for episode in episodes])
-            table = table.append_column(f"stats/{key}/{name}", values)
-    write_rows(table.replace_schema_metadata(None), target)
+    rows = read_named_table(source)
+    own = [stats[episode] for episode in rows.column("episode_index").to_pylist()]
+    write_rows(with_sound_stats(rows, own).replace_schema_metadata(None), target)

@@ -1,5 +1,6 @@
 """The columns of a LeRobotDataset as arrays, and the files that hold them; without LeRobot, which takes seconds to import."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,20 @@ def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
     if len(column) == 0 or len(flat) % len(column):
         raise ValueError(f"{len(flat)} values in {len(column)} rows: the rows differ in length, or some are missing")
     return flat.reshape(len(column), -1)
+
+
+def numpy_to_column(values: np.ndarray, kind: pa.DataType) -> pa.Array:
+    """Numbers (N,) or (N, values per row) as a column of some type, as a feature of this shape has it."""
+    column = pa.array(np.ascontiguousarray(values).reshape(-1))
+    if pa.types.is_fixed_size_list(kind):
+        column = pa.FixedSizeListArray.from_arrays(column, kind.list_size)
+    return column.cast(kind)
+
+
+def with_values(table: pa.Table, name: str, values: Sequence | np.ndarray) -> pa.Table:
+    """A table with other values in one of its columns, which keeps its place and its type."""
+    field = table.schema.field(name)
+    return table.set_column(table.column_names.index(name), field, pa.array(values, field.type))
 
 
 def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:

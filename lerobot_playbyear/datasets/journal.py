@@ -105,6 +105,14 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
+def flush_all(folder: Path) -> None:
+    """As `flush`, of a folder and all that is in it but links."""
+    for path in folder.rglob("*"):
+        if not path.is_symlink():
+            flush(path)
+    flush(folder)
+
+
 def _staged_files(root: Path) -> list[Path]:
     """The files to move, relative to the dataset's folder, so that nothing comes before what it refers to.
 

@@ -19,6 +19,7 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import write_info
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DatasetInfo
 
+from lerobot_playbyear.datasets.columns import numpy_to_column, with_values
 from lerobot_playbyear.datasets.journal import STAGING
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
@@ -28,7 +29,7 @@ from lerobot_playbyear.datasets.parquet_files import (
     read_table,
     write_tables,
 )
-from lerobot_playbyear.datasets.staging import Staging
+from lerobot_playbyear.datasets.staging import Staging, last_episode
 from lerobot_playbyear.datasets.statistics import add_stats, read_stats, sound_stats, with_sound_stats
 from lerobot_playbyear.datasets.statistics import write_stats as write_dataset_stats
 from lerobot_playbyear.datasets.video_seal import is_intact, seal
@@ -59,9 +60,10 @@ def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndar
         meta.info, features={key: meta.features.get(key, feature) for key, feature in episode.features.items()}
     )
     write_info(info, folder)
-    last = _last_row(root)
+    tables = sorted(root.glob("meta/episodes/*/*.parquet"))
+    last = last_episode(tables[-1]).to_pylist()[0] if tables else None
     sound = {key: sound_stats(waveform) for key, waveform in waveforms.items()}
-    row = with_sound_stats(pq.read_table(source / row_file), sound)
+    row = with_sound_stats(pq.read_table(source / row_file), [sound])
     row = _settle_data(root, episode, info, row, last, waveforms)
     _settle_row(root, folder, row, row_file, last)
     for name in _new_files(episode, "meta"):
@@ -80,15 +82,6 @@ def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndar
 def _new_files(episode: Staging, part: str) -> list[Path]:
     paths = (path for path in sorted((episode.folder / part).rglob("*")) if path.is_file())
     return [name for path in paths if (name := path.relative_to(episode.folder)) not in episode.before]
-
-
-def _last_row(root: Path) -> dict | None:
-    """The last episode of a dataset, without its statistics."""
-    paths = sorted(root.glob("meta/episodes/*/*.parquet"))
-    if not paths:
-        return None
-    columns = [name for name in pq.read_schema(paths[-1]).names if not name.startswith("stats/")]
-    return pq.read_table(paths[-1], columns=columns).slice(pq.read_metadata(paths[-1]).num_rows - 1).to_pylist()[0]
 
 
 def _settle_data(
@@ -113,7 +106,7 @@ def _settle_data(
     if target != name:
         assert last is not None
         for key in ("data/chunk_index", "data/file_index"):
-            row = row.set_column(row.column_names.index(key), key, pa.array([last[key]], row.schema.field(key).type))
+            row = with_values(row, key, [last[key]])
     return row
 
 
@@ -121,12 +114,7 @@ def _with_sound(frames: pa.Table, info: DatasetInfo, waveforms: Mapping[str, np.
     """An episode's frames with its microphones' columns, all in the order of the features."""
     schema = get_hf_features_from_features(info.features).arrow_schema
     for key, waveform in waveforms.items():
-        kind = schema.field(key).type
-        values = pa.array(waveform.reshape(-1))
-        column = (
-            pa.FixedSizeListArray.from_arrays(values, kind.list_size) if pa.types.is_fixed_size_list(kind) else values
-        )
-        frames = frames.append_column(key, column.cast(kind))
+        frames = frames.append_column(key, numpy_to_column(waveform, schema.field(key).type))
     return frames.select(schema.names).cast(schema)
 
 
@@ -144,8 +132,7 @@ def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict
             try:
                 rows = read_table(root / last_name).replace_schema_metadata(None)
                 for key in keys:
-                    value = pa.array([last[key]], row.schema.field(key).type)
-                    row = row.set_column(row.column_names.index(key), key, value)
+                    row = with_values(row, key, [last[key]])
                 table, name = pa.concat_tables([rows, row]).combine_chunks(), last_name
             except ParquetDamageError as error:
                 logger.warning("%s is not continued: %s.", root / last_name, error)

@@ -14,13 +14,10 @@ from lerobot.datasets.utils import DatasetInfo
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.confines import file_inside, open_picture
-from lerobot_playbyear.datasets.repair.camera import video_file
+from lerobot_playbyear.datasets.repair.camera import TOLERANCE, video_file
 from lerobot_playbyear.datasets.repair.episode_tables import Row
 from lerobot_playbyear.datasets.statistics import Stats, channel_stats, numeric_stats, repeated_stats
 from lerobot_playbyear.datasets.video_pictures import video_pictures
-
-_TOLERANCE = 1e-4  # seconds, LeRobot's own
-
 
 Frames = Callable[[], Iterable[pa.Table]]
 """Gives an episode's frames in parts, from the first whenever it is called."""
@@ -83,7 +80,7 @@ def _pictures(root: Path, frames: Frames, key: str, feature: dict, length: int) 
 def _video_pictures(root: Path, info: DatasetInfo, key: str, row: Row, length: int) -> Iterator[np.ndarray]:
     path = file_inside(root, video_file(info, key, row))
     times = [row[f"videos/{key}/from_timestamp"] + index / info.fps for index in sample_indices(length)]
-    return video_pictures(path, times, _TOLERANCE, "pyav")
+    return video_pictures(path, times, TOLERANCE, "pyav")
 
 
 def _downsampled(pictures: Callable[[], Iterable[np.ndarray]]) -> Iterator[np.ndarray]:
