@@ -6,9 +6,8 @@ from pathlib import Path
 import pandas as pd
 from lerobot.datasets.utils import DatasetInfo
 
-from lerobot_playbyear.datasets.repair.data_file import DataFile
 from lerobot_playbyear.datasets.repair.episodes import Episode
-from lerobot_playbyear.datasets.repair.frames import Run
+from lerobot_playbyear.datasets.repair.frames import DataFile, Run
 from lerobot_playbyear.datasets.repair.plan import make_plan
 from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.repair.survey import Survey

@@ -19,8 +19,8 @@ from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
+    from lerobot_playbyear.datasets.attached_sound import EpisodesSound
     from lerobot_playbyear.datasets.long_dataset import LongDataset
-    from lerobot_playbyear.datasets.spooled_sound import EpisodesSound
 
 
 class AttachError(ValueError):

@@ -175,6 +175,14 @@ def to_pcm_s16(waveform: np.ndarray) -> np.ndarray:
     return np.clip(scaled, -_PCM_S16_FULL_SCALE, _PCM_S16_FULL_SCALE - 1).astype(np.int16)
 
 
+def pcm_channels(waveform: np.ndarray) -> np.ndarray:
+    """Sound (n,) or (n, channels) as (n, channels) int16 PCM. Raises as `to_pcm_s16`, also where the shape is another."""
+    samples = to_pcm_s16(waveform)
+    if samples.ndim not in (1, 2):
+        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
+    return samples[:, None] if samples.ndim == 1 else samples
+
+
 def write_wav(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
     """Write sound as a 16-bit WAV file.
 
@@ -189,13 +197,11 @@ def write_wav(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
     Raises:
         ValueError: If the samples are neither, or the shape is another.
     """
-    samples = to_pcm_s16(waveform)
-    if samples.ndim not in (1, 2):
-        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
+    samples = pcm_channels(waveform)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with wave.open(str(path), "wb") as file:
-        file.setnchannels(1 if samples.ndim == 1 else samples.shape[1])
+        file.setnchannels(samples.shape[1])
         file.setsampwidth(2)
         file.setframerate(sample_rate)
         file.writeframes(np.ascontiguousarray(samples).astype("<i2").tobytes())

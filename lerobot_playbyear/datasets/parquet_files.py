@@ -150,18 +150,26 @@ def read_row_groups(
     for index in range(file.num_row_groups):
         try:
             with parsing(path):
-                if _is_large(file, index, columns):  # it is read to its end first: of a damaged one nothing is given
+                is_large = _row_group_bytes(file, index, columns) > 2 * PIECE_BYTES
+                if is_large:  # it is read to its end first: of a damaged one nothing is given
                     for _ in row_group_parts(file, index, columns):
                         pass
-                    parts = row_group_parts(file, index, columns)
                 else:
                     table = file.read_row_group(index, columns=columns, use_threads=False)
                     table.validate(full=True)
-                    parts = iter([table])
         except ParquetDamageError as error:
             yield error
-        else:
-            yield from _as_before(parts, path)
+            continue
+        if not is_large:
+            yield table
+            continue
+        try:
+            with parsing(path):
+                yield from row_group_parts(file, index, columns)
+        except ParquetDamageError as error:
+            raise OSError(
+                errno.EIO, f"what could be read before cannot be read now ({error})", path and str(path)
+            ) from error
 
 
 def row_group_parts(file: pq.ParquetFile, index: int, columns: list[str] | None = None) -> Iterator[pa.Table]:
@@ -172,21 +180,6 @@ def row_group_parts(file: pq.ParquetFile, index: int, columns: list[str] | None 
         table = pa.Table.from_batches([batch])
         table.validate(full=True)
         yield table
-
-
-def _as_before(parts: Iterator[pa.Table], path: Path | None) -> Iterator[pa.Table]:
-    """Parts that could be read a moment ago."""
-    try:
-        with parsing(path):
-            yield from parts
-    except ParquetDamageError as error:
-        raise OSError(
-            errno.EIO, f"what could be read before cannot be read now ({error})", path and str(path)
-        ) from error
-
-
-def _is_large(file: pq.ParquetFile, index: int, columns: list[str] | None) -> bool:
-    return _row_group_bytes(file, index, columns) > 2 * PIECE_BYTES
 
 
 def _row_group_bytes(file: pq.ParquetFile, index: int, columns: list[str] | None) -> int:

@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
-from lerobot.datasets.io_utils import write_info
+from lerobot.datasets.io_utils import load_stats, write_info
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DatasetInfo
 
 from lerobot_playbyear.datasets.columns import numpy_to_column, with_values
@@ -30,7 +30,7 @@ from lerobot_playbyear.datasets.parquet_files import (
     write_tables,
 )
 from lerobot_playbyear.datasets.staging import Staging, last_episode
-from lerobot_playbyear.datasets.statistics import add_stats, read_stats, sound_stats, with_sound_stats
+from lerobot_playbyear.datasets.statistics import add_stats, sound_stats, with_sound_stats
 from lerobot_playbyear.datasets.statistics import write_stats as write_dataset_stats
 from lerobot_playbyear.datasets.video_seal import is_intact, seal
 
@@ -70,7 +70,7 @@ def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndar
         if len(name.parts) == 2 and name != INFO:
             shutil.copyfile(source / name, folder / name)
     if meta.stats is not None and sound:
-        known = {key: stats for key, stats in (read_stats(root) or {}).items() if key in sound}
+        known = {key: stats for key, stats in (load_stats(root) or {}).items() if key in sound}
         write_dataset_stats({**meta.stats, **add_stats(known, [sound], sound)}, folder)
     for name in _new_files(episode, "videos"):  # those that an earlier try moved are there already
         if not is_intact(source / name):

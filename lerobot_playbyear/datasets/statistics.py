@@ -22,7 +22,6 @@ from lerobot.datasets.compute_stats import (
     compute_episode_stats,
     get_feature_stats,
 )
-from lerobot.datasets.io_utils import cast_stats_to_numpy
 from lerobot.datasets.utils import STATS_PATH, serialize_dict
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
@@ -131,16 +130,6 @@ def add_stats(total: Stats | None, episodes: Iterable[Stats], microphones: Itera
             if name != "count" and (value == value.flat[0]).all():
                 summed[key][name] = np.full(value.shape, _rounded(float(value.flat[0])))
     return summed
-
-
-def read_stats(root: Path) -> Stats | None:
-    """A dataset's statistics; None where there are none.
-
-    Raises:
-        ValueError: The file is damaged.
-    """
-    path = root / STATS_PATH
-    return cast_stats_to_numpy(json.loads(path.read_text())) if path.exists() else None
 
 
 def write_stats(stats: Stats, root: Path) -> None:

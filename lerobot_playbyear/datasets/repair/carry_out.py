@@ -22,11 +22,10 @@ from lerobot.datasets.utils import (
 from lerobot_playbyear.datasets.columns import column_to_numpy, with_values
 from lerobot_playbyear.datasets.files import list_files, take_over
 from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES, ParquetDamageError, open_checked, write_tables
-from lerobot_playbyear.datasets.repair.data_file import DataFile
-from lerobot_playbyear.datasets.repair.dataset_statistics import settle_stats
-from lerobot_playbyear.datasets.repair.episode_statistics import Frames, episode_stats
 from lerobot_playbyear.datasets.repair.episode_tables import Row
+from lerobot_playbyear.datasets.repair.frames import DataFile
 from lerobot_playbyear.datasets.repair.plan import Kept, Plan
+from lerobot_playbyear.datasets.repair.statistics import Frames, episode_stats, settle_stats
 from lerobot_playbyear.datasets.repair.taking_over import take_over_rest
 from lerobot_playbyear.datasets.settling import write_rows
 from lerobot_playbyear.datasets.statistics import write_stats
@@ -121,9 +120,7 @@ def _read(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[Kept, pa.Table
     Raises:
         OSError: They cannot be read now, or are others than they were.
     """
-    before, offset = -1, 0
-    for place, rows in file.read((kept.run.start, kept.run.length) for kept in episodes):
-        offset = 0 if place != before else offset
+    for place, offset, rows in file.read((kept.run.start, kept.run.length) for kept in episodes):
         kept, numbers = episodes[place], offset + np.arange(len(rows))
         is_same = (column_to_numpy(rows.column("frame_index")) == kept.run.first_frame + numbers) & (
             column_to_numpy(rows.column("episode_index")) == kept.run.episode
@@ -134,7 +131,6 @@ def _read(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[Kept, pa.Table
             )
         rows = with_values(rows, "episode_index", np.full(len(rows), kept.number))
         yield kept, with_values(rows, "index", kept.first_index + numbers)
-        before, offset = place, offset + len(rows)
 
 
 def _frames(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[Kept, Frames]]:

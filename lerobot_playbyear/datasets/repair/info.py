@@ -116,8 +116,9 @@ def _checked(raw: dict[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: It is not there.
     """
-    for name in ("fps", "total_episodes", "total_frames", "chunks_size"):
-        if not isinstance(raw.get(name), int):
+    wanted: dict[str, type] = dict.fromkeys(("fps", "total_episodes", "total_frames", "chunks_size"), int)
+    for name, kind in {**wanted, "data_path": str, "codebase_version": str}.items():
+        if not isinstance(raw.get(name), kind):
             raise ValueError(f"{name} is {raw.get(name)!r}")
     features = raw.get("features")
     if not isinstance(features, dict):
@@ -131,9 +132,6 @@ def _checked(raw: dict[str, Any]) -> dict[str, Any]:
             raise ValueError(f"the feature '{key}' has no dtype and shape")
         if not all(isinstance(size, int) for size in shape):
             raise ValueError(f"the feature '{key}' has shape {shape}")
-    for name in ("data_path", "codebase_version"):
-        if not isinstance(raw.get(name), str):
-            raise ValueError(f"{name} is {raw.get(name)!r}")
     return raw
 
 

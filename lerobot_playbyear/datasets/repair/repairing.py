@@ -121,14 +121,12 @@ def _confirm(first: "RepairReport", second: "RepairReport") -> None:
 
 @contextlib.contextmanager
 def _lock(root: Path) -> Iterator[DatasetLock | None]:
-    if not root.is_dir():
-        yield None
-        return
     try:
-        lock = DatasetLock(root)
+        lock = DatasetLock(root) if root.is_dir() else None
     except DatasetLockedError as error:
         raise DatasetDamagedError(str(error)) from None
     try:
         yield lock
     finally:
-        lock.release()
+        if lock is not None:
+            lock.release()

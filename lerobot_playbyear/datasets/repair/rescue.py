@@ -16,13 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.files import naming
-from lerobot_playbyear.datasets.parquet_files import (
-    ParquetDamageError,
-    leaf_columns,
-    open_checked,
-    parsing,
-    writer_options,
-)
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, leaf_columns, open_checked, parsing
 from lerobot_playbyear.datasets.repair import thrift
 from lerobot_playbyear.datasets.repair.thrift import Elements, Struct, ThriftError
 
@@ -65,32 +59,26 @@ def rescue(path: Path, schema: pa.Schema) -> pq.FileMetaData | None:
     groups = _row_groups(pages, values_per_row)
     if not groups:
         return None
-    for options in (
-        {"compression": "snappy", "use_dictionary": True},
-        writer_options(schema),
-    ):  # LeRobot's, and our own
-        footer = _empty_footer(schema, options)
-        columns = [chunk.value(3) for chunk in footer.value(4).values[0].value(1).values]
-        footer[3] = (thrift.I64, sum(n_rows for n_rows, _ in groups))
-        row_groups = [_row_group(columns, n_rows, chunks) for n_rows, chunks in groups]
-        footer[4] = (thrift.LIST, Elements(thrift.STRUCT, row_groups))
-        encoded = thrift.write_struct(footer)
-        end = encoded + len(encoded).to_bytes(4, "little") + _MAGIC
-        try:
-            with parsing(path):
-                metadata = pq.read_metadata(io.BytesIO(_MAGIC + end))
-                open_checked(path, metadata).close()
-        except ParquetDamageError as error:
-            logger.debug("%s: the footer that was made for it is not accepted: %s", path, error)
-        else:
-            return metadata
-    return None
+    footer = _empty_footer(schema)
+    columns = [chunk.value(3) for chunk in footer.value(4).values[0].value(1).values]
+    footer[3] = (thrift.I64, sum(n_rows for n_rows, _ in groups))
+    row_groups = [_row_group(columns, n_rows, chunks) for n_rows, chunks in groups]
+    footer[4] = (thrift.LIST, Elements(thrift.STRUCT, row_groups))
+    encoded = thrift.write_struct(footer)
+    try:
+        with parsing(path):
+            metadata = pq.read_metadata(io.BytesIO(_MAGIC + encoded + len(encoded).to_bytes(4, "little") + _MAGIC))
+            open_checked(path, metadata).close()
+    except ParquetDamageError as error:
+        logger.debug("%s: the footer that was made for it is not accepted: %s", path, error)
+        return None
+    return metadata
 
 
-def _empty_footer(schema: pa.Schema, options: dict) -> Struct:
-    """The footer of a file with one row group, in which no row is."""
+def _empty_footer(schema: pa.Schema) -> Struct:
+    """The footer of a file with one row group, in which no row is: LeRobot's and our own describe the columns alike."""
     buffer = io.BytesIO()
-    pq.write_table(schema.empty_table(), buffer, **options)
+    pq.write_table(schema.empty_table(), buffer, compression="snappy")
     data = buffer.getvalue()
     return thrift.read_struct(data[-8 - int.from_bytes(data[-8:-4], "little") :])[0]
 
@@ -105,21 +93,19 @@ def _pages(file: BinaryIO) -> list[_Page]:
             page = _page(at, *thrift.read_struct(file.read(_MAX_HEADER_BYTES)))
         except (ThriftError, AttributeError, TypeError):
             break
-        if page is None or page.start + page.stored > size:
+        if page.start + page.stored > size:
             break
         pages.append(page)
         at = page.start + page.stored
     return pages
 
 
-def _page(start: int, header: Struct, header_bytes: int) -> _Page | None:
-    kind, inflated, stored = header.value(1), header.value(2), header.value(3)
+def _page(start: int, header: Struct, header_bytes: int) -> _Page:
+    kind = header.value(1)
     details = header.value({_DATA_PAGE: 5, _DICTIONARY_PAGE: 7, _DATA_PAGE_V2: 8}.get(kind, -1))
-    if not isinstance(details, Struct) or not isinstance(inflated, int) or not isinstance(stored, int) or stored < 0:
-        return None
-    n_values = details.value(1)
-    if not isinstance(n_values, int) or n_values < 0:
-        return None
+    inflated, stored, n_values = header.value(2), header.value(3), details.value(1)
+    if not all(isinstance(number, int) and number >= 0 for number in (inflated, stored, n_values)):
+        raise ThriftError("it is no page")
     return _Page(start, header_bytes + stored, header_bytes + inflated, kind == _DICTIONARY_PAGE, n_values)
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from lerobot.datasets.utils import DatasetInfo
 
-from lerobot_playbyear.datasets.repair.dataset_statistics import read_own_stats
 from lerobot_playbyear.datasets.repair.episode_tables import Row, read_rows
 from lerobot_playbyear.datasets.repair.episodes import (
     Episode,
@@ -21,6 +20,7 @@ from lerobot_playbyear.datasets.repair.features import settle_features
 from lerobot_playbyear.datasets.repair.frames import read_frames
 from lerobot_playbyear.datasets.repair.info import check_rates, read_info
 from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport
+from lerobot_playbyear.datasets.repair.statistics import read_own_stats
 from lerobot_playbyear.datasets.repair.tasks import Tasks, settle_tasks
 from lerobot_playbyear.datasets.repair.videos import check_videos
 

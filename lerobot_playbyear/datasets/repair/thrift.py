@@ -41,7 +41,7 @@ def read_struct(data: bytes) -> tuple[Struct, int]:
     stream = io.BytesIO(data)
     try:
         return _read_value(STRUCT, stream, 0), stream.tell()
-    except IndexError as error:
+    except (IndexError, OverflowError) as error:
         raise ThriftError("the structure is cut off") from error
 
 
@@ -78,12 +78,13 @@ def _read_value(kind: int, stream: io.BytesIO, depth: int) -> Any:
         return stream.read(1)[0]
     if kind == BINARY:
         size = _read_varint(stream)
-        _check_size(size, stream)
-        return stream.read(size)
+        value = stream.read(size)
+        if len(value) < size:
+            raise ThriftError("a value is longer than the file")
+        return value
     if kind == LIST:
         head = stream.read(1)[0]
         size = head >> 4 if head >> 4 != 15 else _read_varint(stream)
-        _check_size(size, stream)
         return Elements(head & 15, [_read_value(head & 15, stream, depth + 1) for _ in range(size)])
     if kind == STRUCT:
         return _read_struct(stream, depth)
@@ -104,11 +105,6 @@ def _write_value(kind: int, value: Any) -> bytes:
     if kind == STRUCT:
         return write_struct(value)
     raise ThriftError(f"type {kind} does not occur in parquet")
-
-
-def _check_size(size: int, stream: io.BytesIO) -> None:
-    if size > len(stream.getbuffer()) - stream.tell():
-        raise ThriftError("a value is longer than the file")
 
 
 def _read_integer(stream: io.BytesIO) -> int:
