@@ -29,7 +29,7 @@ def lost(number: int) -> Episode:
 
 def survey(*episodes: Episode, tables_are_right: bool = True, splits: dict[str, str] | None = None) -> Survey:
     info = DatasetInfo("v3.0", 20, {}, len(episodes), LENGTH * len(episodes), splits=splits or {})
-    tasks = Tasks(pd.DataFrame({"task_index": [0]}, index=["Listen."]), True, False)
+    tasks = Tasks(pd.DataFrame({"task_index": [0]}, index=["Listen."]), note=None)
     rows = [episode.row for episode in episodes]
     return Survey(RepairReport(NOWHERE), info, {}, rows, tables_are_right, episodes, tasks, {})
 

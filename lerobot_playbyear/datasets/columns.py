@@ -48,7 +48,9 @@ def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
     return starts, [*starts[1:], len(episode_index)]
 
 
-def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: str | None = None) -> None:
+def check_dataset_files(
+    repo_id: str, root: str | Path | None = None, revision: str | None = None
+) -> list[pq.FileMetaData]:
     """Refuse a local dataset that is empty or was cut off while it was written, or that no one should trust.
 
     Where no local dataset is, what the Hub's says about itself is fetched and checked; the rest LeRobot fetches later.
@@ -57,6 +59,9 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
         repo_id: The dataset's name.
         root: Its folder; None means LeRobot's own place for `repo_id`.
         revision: Of the dataset on the Hub, as LeRobot takes it.
+
+    Returns:
+        What its data files say of themselves; nothing where no local dataset is.
 
     Raises:
         ValueError: Naming the file that is damaged, the folder without data, or what leads out of the folder or claims
@@ -69,7 +74,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
 
         meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
         check_info(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
-        return
+        return []
     footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
     for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, "meta/episodes/*/*.parquet")]:
         try:
@@ -83,6 +88,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
     if not footers["data"]:
         raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
     check_info(folder, footers["data"], sum(footer.num_rows for footer in footers["meta"]))
+    return footers["data"]
 
 
 def _is_list(kind: pa.DataType) -> bool:

@@ -43,12 +43,7 @@ def publish(root: Path) -> None:
     for folder in sorted({staging / parent for name in names for parent in name.parents}):
         flush(folder)
     flush(staging.parent)
-    journal = root / JOURNAL
-    partial = journal.with_suffix(".partial")
-    partial.touch()
-    flush(partial)
-    os.replace(partial, journal)
-    flush(journal.parent)
+    write_at_once(root / JOURNAL, "")
     flush(root)
     finish_journal(root)
 
@@ -103,6 +98,15 @@ def flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def write_at_once(path: Path, text: str) -> None:
+    """Writes a file that is there as a whole, on the disk itself, or not at all."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(text)
+    flush(partial)
+    os.replace(partial, path)
+    flush(path.parent)
 
 
 def flush_all(folder: Path) -> None:

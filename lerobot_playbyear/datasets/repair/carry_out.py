@@ -22,7 +22,7 @@ from lerobot.datasets.utils import (
 from lerobot_playbyear.datasets.columns import column_to_numpy, with_values
 from lerobot_playbyear.datasets.files import list_files, take_over
 from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES, ParquetDamageError, open_checked, write_tables
-from lerobot_playbyear.datasets.repair.episode_tables import Row
+from lerobot_playbyear.datasets.repair.episodes import Row
 from lerobot_playbyear.datasets.repair.frames import DataFile
 from lerobot_playbyear.datasets.repair.plan import Kept, Plan
 from lerobot_playbyear.datasets.repair.statistics import Frames, episode_stats, settle_stats
@@ -62,12 +62,11 @@ def write_copy(root: Path, target: Path, plan: Plan) -> list[str]:
         take_over(root / STATS_PATH, target / STATS_PATH)
     else:
         write_stats(stats, target)
-    if survey.tasks.is_own:
+    if survey.tasks.note is None:
         take_over(root / DEFAULT_TASKS_PATH, target / DEFAULT_TASKS_PATH)
     else:
         write_tasks(survey.tasks.table, target)
-        lost = "; what it held that no episode says is lost" if survey.tasks.was_lost else ""
-        notes.append(f"{DEFAULT_TASKS_PATH}: made anew from the episodes{lost}")
+        notes.append(survey.tasks.note)
     if plan.tables_stay:
         for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
             take_over(path, target / path.relative_to(root))

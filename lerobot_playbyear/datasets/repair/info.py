@@ -55,7 +55,7 @@ def read_info(
     try:
         raw = json.loads(data)
         fields = raw if isinstance(raw, dict) else {}
-        info = _known(_checked(fields))
+        info = _checked(fields)
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         return _new_info(report, fields, f"is damaged ({error})", fps, features)
     _check_version(report, info)
@@ -103,18 +103,11 @@ def check_rates(report: RepairReport, info: DatasetInfo, frame_seconds: float | 
     return fps
 
 
-def _known(raw: dict[str, Any]) -> DatasetInfo:
-    """As `DatasetInfo.from_dict`, without its warning that other fields are lost: here they are not."""
-    return DatasetInfo(
-        **{field.name: raw[field.name] for field in dataclasses.fields(DatasetInfo) if field.name in raw}
-    )
-
-
-def _checked(raw: dict[str, Any]) -> dict[str, Any]:
-    """What LeRobot relies on without looking.
+def _checked(raw: dict[str, Any]) -> DatasetInfo:
+    """As `DatasetInfo.from_dict`, without its warning that other fields are lost: here they are not.
 
     Raises:
-        ValueError: It is not there.
+        ValueError: What LeRobot relies on without looking is not there.
     """
     wanted: dict[str, type] = dict.fromkeys(("fps", "total_episodes", "total_frames", "chunks_size"), int)
     for name, kind in {**wanted, "data_path": str, "codebase_version": str}.items():
@@ -132,7 +125,9 @@ def _checked(raw: dict[str, Any]) -> dict[str, Any]:
             raise ValueError(f"the feature '{key}' has no dtype and shape")
         if not all(isinstance(size, int) for size in shape):
             raise ValueError(f"the feature '{key}' has shape {shape}")
-    return raw
+    return DatasetInfo(
+        **{field.name: raw[field.name] for field in dataclasses.fields(DatasetInfo) if field.name in raw}
+    )
 
 
 def _check_version(report: RepairReport, info: DatasetInfo) -> None:

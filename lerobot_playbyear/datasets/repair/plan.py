@@ -8,7 +8,7 @@ from typing import Any
 
 from lerobot.datasets.utils import INFO_PATH, DatasetInfo
 
-from lerobot_playbyear.datasets.repair.episode_tables import Row
+from lerobot_playbyear.datasets.repair.episodes import Row
 from lerobot_playbyear.datasets.repair.frames import Run
 from lerobot_playbyear.datasets.repair.survey import Survey
 

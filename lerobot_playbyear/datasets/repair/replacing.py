@@ -13,7 +13,7 @@ import shutil
 from pathlib import Path
 
 from lerobot_playbyear.datasets.files import entries_below
-from lerobot_playbyear.datasets.journal import SCRATCH, flush, flush_all
+from lerobot_playbyear.datasets.journal import SCRATCH, flush, flush_all, write_at_once
 from lerobot_playbyear.datasets.repair.report import DatasetDamagedError
 
 _BEGUN = SCRATCH / ".repairing"
@@ -61,14 +61,10 @@ def replace(root: Path, copy: Path, source: str) -> Path:
         raise OSError(
             f"{root} was changed while it was repaired: wait until nothing writes to it. Nothing was changed."
         )
-    original = _unused(real)
+    names = (real.with_name(f"{real.name}.damaged{f'-{number}' if number else ''}") for number in itertools.count())
+    original = next(name for name in names if not os.path.lexists(name))
     flush_all(copy)
-    mark = copy / _FINISHED
-    partial = mark.with_suffix(".partial")
-    partial.write_text(json.dumps({"source": source, "original": original.name}))
-    flush(partial)
-    os.replace(partial, mark)
-    flush(mark.parent)
+    write_at_once(copy / _FINISHED, json.dumps({"source": source, "original": original.name}))
     os.rename(real, original)
     try:
         os.rename(copy, real)
@@ -151,9 +147,3 @@ def _remove_marks(folder: Path) -> None:
         (folder / _BEGUN).unlink(missing_ok=True)
         (folder / _FINISHED).unlink(missing_ok=True)
         (folder / SCRATCH).rmdir()
-
-
-def _unused(real: Path) -> Path:
-    """A name beside the dataset for what it was before."""
-    names = (real.with_name(f"{real.name}.damaged{f'-{number}' if number else ''}") for number in itertools.count())
-    return next(name for name in names if not os.path.lexists(name))

@@ -23,7 +23,7 @@ from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.confines import file_inside, open_picture
 from lerobot_playbyear.datasets.files import read_listed
-from lerobot_playbyear.datasets.repair.episode_tables import Row
+from lerobot_playbyear.datasets.repair.episodes import Row
 from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.repair.videos import TOLERANCE, video_file
 from lerobot_playbyear.datasets.statistics import (

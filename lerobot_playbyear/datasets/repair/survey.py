@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from lerobot.datasets.utils import DatasetInfo
 
-from lerobot_playbyear.datasets.repair.episode_tables import Row, read_rows
 from lerobot_playbyear.datasets.repair.episodes import (
     Episode,
+    Row,
     check_counts,
     match_episodes,
+    read_rows,
     with_lost,
     without_impossible_numbers,
 )

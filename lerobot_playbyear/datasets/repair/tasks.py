@@ -10,8 +10,7 @@ from lerobot.datasets.utils import DEFAULT_TASKS_PATH
 
 from lerobot_playbyear.datasets.files import read_listed
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, parsing
-from lerobot_playbyear.datasets.repair.episode_tables import Row
-from lerobot_playbyear.datasets.repair.episodes import Episode
+from lerobot_playbyear.datasets.repair.episodes import Episode, Row
 from lerobot_playbyear.datasets.repair.frames import Run
 from lerobot_playbyear.datasets.repair.report import RepairReport, name_episodes
 
@@ -22,13 +21,11 @@ class Tasks:
 
     Args:
         table: As LeRobot keeps them: a task's number in `task_index`, its text as the index.
-        is_own: Whether it is the dataset's own, which stays as it is.
-        was_lost: Whether there was none that could be read.
+        note: What is said of it where it is made anew; None: it is the dataset's own, which stays as it is.
     """
 
     table: pd.DataFrame
-    is_own: bool
-    was_lost: bool
+    note: str | None
 
 
 def settle_tasks(report: RepairReport, episodes: Sequence[Episode], rows: Mapping[int, Row]) -> Tasks:
@@ -48,7 +45,7 @@ def settle_tasks(report: RepairReport, episodes: Sequence[Episode], rows: Mappin
     runs = {episode.number: episode.run for episode in episodes if episode.run}
     data = read_listed(report.root, DEFAULT_TASKS_PATH)
     if data is None and not runs:  # it has only been begun
-        return Tasks(pd.DataFrame({"task_index": []}, index=pd.Index([], name="task")), True, True)
+        return Tasks(pd.DataFrame({"task_index": []}, index=pd.Index([], name="task")), None)
     said = _texts(runs, rows)
     table = None
     if data is None:
@@ -84,8 +81,9 @@ def settle_tasks(report: RepairReport, episodes: Sequence[Episode], rows: Mappin
                 "place, or correct the frames' task_index"
             )
     if table is not None and known == table_has:
-        return Tasks(table, True, False)
-    return Tasks(_table(table, known), False, table is None)
+        return Tasks(table, None)
+    lost = "; what it held that no episode says is lost" if table is None else ""
+    return Tasks(_table(table, known), f"{DEFAULT_TASKS_PATH}: made anew from the episodes{lost}")
 
 
 def unknown_task(number: int) -> str:

@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -120,10 +120,6 @@ def _has_memory() -> bool:
         return False
 
 
-def main(paths: Sequence[str]) -> None:
-    for path in paths:
-        print(json.dumps(_decode(path)), flush=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    for argument in sys.argv[1:]:
+        print(json.dumps(_decode(argument)), flush=True)

@@ -11,8 +11,7 @@ import numpy as np
 from lerobot.datasets.utils import DatasetInfo
 
 from lerobot_playbyear.datasets.files import is_listed, list_files, naming
-from lerobot_playbyear.datasets.repair.episode_tables import PLACE, Row, video_places
-from lerobot_playbyear.datasets.repair.episodes import Episode
+from lerobot_playbyear.datasets.repair.episodes import PLACE, Episode, Row, video_places
 from lerobot_playbyear.datasets.repair.report import RepairReport, name_episodes
 from lerobot_playbyear.datasets.repair.video_times import picture_times
 from lerobot_playbyear.datasets.video_seal import is_intact
