@@ -17,7 +17,7 @@ from PIL import Image, UnidentifiedImageError
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
-from lerobot_playbyear.datasets.repair.features import check_columns, own_schema
+from lerobot_playbyear.datasets.repair.info import check_columns, own_schema
 from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.repair.rescue import rescue
 

@@ -3,6 +3,7 @@
 That something cannot be read now is nothing to report but an OSError, which ends the survey: nothing can be planned on it.
 """
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,15 +87,13 @@ class RepairReport:
 
 def name_episodes(numbers: Iterable[int]) -> str:
     """`episode 3`, or `episodes 3, 5 to 9 and 12`."""
-    spans: list[list[int]] = []
-    for number in sorted(numbers):
-        if spans and number == spans[-1][1] + 1:
-            spans[-1][1] = number
-        else:
-            spans.append([number, number])
-    parts = [str(first) if first == last else f"{first} to {last}" for first, last in spans]
+    ordered = sorted(numbers)
+    parts: list[str] = []
+    for _, group in itertools.groupby(enumerate(ordered), key=lambda pair: pair[1] - pair[0]):
+        span = [number for _, number in group]
+        parts.append(str(span[0]) if len(span) == 1 else f"{span[0]} to {span[-1]}")
     listed = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-    return f"episode{'s' if len(spans) > 1 or spans[0][0] != spans[0][1] else ''} {listed}"
+    return f"episode{'s' if len(ordered) > 1 else ''} {listed}"
 
 
 def _items(lines: list[str]) -> list[str]:

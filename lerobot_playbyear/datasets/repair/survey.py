@@ -17,9 +17,8 @@ from lerobot_playbyear.datasets.repair.episodes import (
     with_lost,
     without_impossible_numbers,
 )
-from lerobot_playbyear.datasets.repair.features import settle_features
 from lerobot_playbyear.datasets.repair.frames import read_frames
-from lerobot_playbyear.datasets.repair.info import check_rates, read_info
+from lerobot_playbyear.datasets.repair.info import check_rates, read_info, settle_features
 from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport
 from lerobot_playbyear.datasets.repair.statistics import read_own_stats
 from lerobot_playbyear.datasets.repair.tasks import Tasks, settle_tasks

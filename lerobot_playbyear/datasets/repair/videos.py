@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from lerobot.datasets.utils import DatasetInfo
@@ -18,6 +19,14 @@ from lerobot_playbyear.datasets.video_seal import is_intact
 
 TOLERANCE = 1e-4  # seconds, LeRobot's own
 _BOX_HEADER = 8
+
+
+class Place(NamedTuple):
+    """Where pictures are: in which file, and from when to when in it [s]."""
+
+    name: Path
+    start: float
+    end: float
 
 
 class Camera:
@@ -45,21 +54,16 @@ class Camera:
         self._sealed: set[Path] = set()
         self._times: dict[Path, np.ndarray] = {}
 
-    def has_place(self, row: Row) -> bool:
-        """Whether a row says where the episode's pictures are."""
-        return f"videos/{self.key}/file_index" in row
+    def place(self, row: Row) -> Place | None:
+        """Where an episode's row says that its pictures are; None where it does not."""
+        if f"videos/{self.key}/file_index" not in row:
+            return None
+        start, end = (float(row[f"videos/{self.key}/{edge}_timestamp"]) for edge in ("from", "to"))
+        return Place(video_file(self._info, self.key, row), start, end)
 
-    def name(self, row: Row) -> Path:
-        """The file in which an episode's row says that its pictures are."""
-        return video_file(self._info, self.key, row)
-
-    def span(self, row: Row) -> tuple[float, float]:
-        """From when to when in that file [s]."""
-        return float(row[f"videos/{self.key}/from_timestamp"]), float(row[f"videos/{self.key}/to_timestamp"])
-
-    def place(self, name: Path, start: float, length: int) -> Row:
-        """The part of a row that says where so many pictures are."""
-        values = (*(numbers(name) or (0, 0)), start, start + length / self.fps)
+    def row(self, place: Place) -> Row:
+        """The part of a row that says where pictures are."""
+        values = (*(numbers(place.name) or (0, 0)), place.start, place.end)
         return {f"videos/{self.key}/{what}": value for what, value in zip(PLACE, values, strict=True)}
 
     def problem(self, name: Path) -> str | None:
@@ -174,30 +178,32 @@ def check_videos(
         if feature["dtype"] == "video":
             camera = Camera(report.root, info, key, fps, thorough)
             known = [
-                episode.row if episode.run else video_places(rows.get(episode.number, {}), info) for episode in episodes
+                camera.place(episode.row if episode.run else video_places(rows.get(episode.number, {}), info))
+                for episode in episodes
             ]
             episodes = _check_camera(report, camera, episodes, known, info.chunks_size)
     return episodes
 
 
 def _check_camera(
-    report: RepairReport, camera: Camera, episodes: Sequence[Episode], known: Sequence[Row], chunks_size: int
+    report: RepairReport, camera: Camera, episodes: Sequence[Episode], known: Sequence[Place | None], chunks_size: int
 ) -> list[Episode]:
-    """As `check_videos`, for one camera. `known`: of each episode what is said of where its pictures are."""
-    places: Mapping[int, Row] = {}
+    """As `check_videos`, for one camera. `known`: where the pictures of each episode are said to be."""
+    found: dict[int, Place] = {}
     unclaimed: list[Path] = []
-    if any(episode.run and not camera.has_place(row) for episode, row in zip(episodes, known, strict=True)):
-        places = _find_places(camera, episodes, known, chunks_size)
-        unclaimed = _unclaimed(camera, [*known, *places.values()])
-        places = {} if unclaimed else places  # pictures of an episode that is gone may lie between them
+    if any(episode.run and place is None for episode, place in zip(episodes, known, strict=True)):
+        found = _find_places(camera, episodes, known, chunks_size)
+        unclaimed = _unclaimed(camera, [*known, *found.values()])
+        found = {} if unclaimed else found  # pictures of an episode that is gone may lie between them
     checked: list[Episode] = []
     lost: dict[str, list[int]] = defaultdict(list)
     unplaced: dict[int, Collection[Path]] = {}
-    for episode, row in zip(episodes, known, strict=True):
-        place = places.get(episode.number, row)
+    for episode, said in zip(episodes, known, strict=True):
+        place = found.get(episode.number, said)
         problem = _problem(camera, place, episode.run.length) if episode.run else None
         if not problem or episode.run is None:
-            checked.append(replace(episode, row={**episode.row, **places.get(episode.number, {})}))
+            own = camera.row(found[episode.number]) if episode.number in found else {}
+            checked.append(replace(episode, row={**episode.row, **own}))
         elif files := _may_be_in(camera, place, episode.run.length, unclaimed):
             unplaced[episode.number] = files
             checked.append(episode)
@@ -215,73 +221,65 @@ def _check_camera(
     return checked
 
 
-def _problem(camera: Camera, row: Row, length: int) -> str | None:
-    if not camera.has_place(row):
+def _problem(camera: Camera, place: Place | None, length: int) -> str | None:
+    if place is None:
         return f"no video of '{camera.key}' has its pictures"
-    name = camera.name(row)
-    if problem := camera.problem(name):
-        return f"{name} {problem}"
-    if camera.shows(name, camera.span(row)[0], length):
+    if problem := camera.problem(place.name):
+        return f"{place.name} {problem}"
+    if camera.shows(place.name, place.start, length):
         return None
-    return f"{name} {camera.problem(name) or 'lacks some of the pictures'}"
+    return f"{place.name} {camera.problem(place.name) or 'lacks some of the pictures'}"
 
 
-def _may_be_in(camera: Camera, row: Row, length: int, unclaimed: Collection[Path]) -> Collection[Path]:
+def _may_be_in(camera: Camera, place: Place | None, length: int, unclaimed: Collection[Path]) -> Collection[Path]:
     """The files that may have an episode's pictures after all: its row does not say where they are, or says two things."""
-    if not camera.has_place(row):
+    if place is None:
         return unclaimed
-    name, (start, end) = camera.name(row), camera.span(row)
-    is_wrong = abs((end - start) * camera.fps - length) > 1
-    return [name] if is_wrong and not camera.problem(name) else []
+    is_wrong = abs((place.end - place.start) * camera.fps - length) > 1
+    return [place.name] if is_wrong and not camera.problem(place.name) else []
 
 
 def _find_places(
-    camera: Camera, episodes: Sequence[Episode], known: Sequence[Row], chunks_size: int
-) -> Mapping[int, Row]:
+    camera: Camera, episodes: Sequence[Episode], known: Sequence[Place | None], chunks_size: int
+) -> dict[int, Place]:
     """Finds the pictures of episodes without a row: LeRobot puts one episode behind the other until a file is full.
 
     So an episode's place follows from that of the one before it, if this is known: nothing may be lost between them.
     """
-    claimed = [(camera.name(row), *camera.span(row)) for row in known if camera.has_place(row)]
-    found: dict[int, Row] = {}
-    before: tuple[Path, float] | None = None  # where the episode before ends
-    for episode, row in zip(episodes, known, strict=True):
-        if camera.has_place(row):
-            before = camera.name(row), camera.span(row)[1]
+    found: dict[int, Place] = {}
+    last: Place | None = None  # of the episode before
+    for episode, place in zip(episodes, known, strict=True):
+        before, last = last, place
+        if place or episode.run is None or (before is None and episode.number != 0):
             continue
-        may_follow = episode.run is not None and (before is not None or episode.number == 0)
-        candidates = _next_places(camera, before, chunks_size) if may_follow else []
-        before = None
-        for name, start in candidates:
-            length = episode.run.length if episode.run else 0
-            end = start + length / camera.fps
+        for name, start in _next_places(camera, before, chunks_size):
+            own = Place(name, start, start + episode.run.length / camera.fps)
             is_free = not any(
-                name == other and start < stop - TOLERANCE and first < end - TOLERANCE for other, first, stop in claimed
+                name == other.name and start < other.end - TOLERANCE and other.start < own.end - TOLERANCE
+                for other in known
+                if other
             )
-            if is_free and camera.shows(name, start, length, certainly=True):
-                found[episode.number] = camera.place(name, start, length)
-                before = name, end
+            if is_free and camera.shows(name, start, episode.run.length, certainly=True):
+                found[episode.number] = last = own
     return found
 
 
-def _next_places(camera: Camera, before: tuple[Path, float] | None, chunks_size: int) -> list[tuple[Path, float]]:
+def _next_places(camera: Camera, before: Place | None, chunks_size: int) -> list[tuple[Path, float]]:
     """Where an episode can begin: in the file of the one before, or in the next where that is full; the first in the first."""
     wanted = (0, 0)
     if before is not None:
-        name, end = before
-        times = camera.times(name)
-        if len(times) == 0 or times[-1] > end - TOLERANCE:
-            return [(name, end)]
-        chunk, file = numbers(name) or (0, -1)
+        times = camera.times(before.name)
+        if len(times) == 0 or times[-1] > before.end - TOLERANCE:
+            return [(before.name, before.end)]
+        chunk, file = numbers(before.name) or (0, -1)
         wanted = (chunk, file + 1) if file + 1 < chunks_size else (chunk + 1, 0)
     return [(other, 0.0) for other in camera.names if numbers(other) == wanted]
 
 
-def _unclaimed(camera: Camera, known: Iterable[Row]) -> list[Path]:
+def _unclaimed(camera: Camera, known: Iterable[Place | None]) -> list[Path]:
     """The files that are whole and have more pictures than is known of where episodes are."""
     n_claimed: dict[Path, int] = defaultdict(int)
-    for row in known:
-        if camera.has_place(row):
-            start, end = camera.span(row)
-            n_claimed[camera.name(row)] += round((end - start) * camera.fps)
+    for place in known:
+        if place:
+            n_claimed[place.name] += round((place.end - place.start) * camera.fps)
     return [name for name in camera.names if len(camera.times(name)) > n_claimed[name]]
