@@ -1,6 +1,6 @@
 """Repairing datasets on disk: those that a killed recording left half-written, and those that were damaged later.
 
-A survey reads a dataset once and says how each thing was found; a plan follows from it without a look at the disk; and
+A survey reads a dataset once and says what is wrong with it; a plan follows from it without a look at the disk; and
 what is planned is carried out in a copy, which then takes the dataset's place.
 """
 

@@ -24,9 +24,9 @@ class Elements:
 class Struct(dict[int, tuple[int, Any]]):
     """Fields by their number: type and value."""
 
-    def value(self, field: int, default: Any = None) -> Any:
-        """The value of a field, or `default` where it is absent."""
-        return self[field][1] if field in self else default
+    def value(self, field: int) -> Any:
+        """The value of a field; None where it is absent."""
+        return self[field][1] if field in self else None
 
 
 def read_struct(data: bytes) -> tuple[Struct, int]:
