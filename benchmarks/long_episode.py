@@ -1,4 +1,4 @@
-"""One very long episode, assembled instead of recorded: the files of a LeRobotDataset v3.0 as LeRobot lays them out.
+"""Hours of recordings, assembled instead of recorded: the files of a LeRobotDataset v3.0 as LeRobot lays them out.
 
 A minute of each camera is encoded and its packets are repeated; the sound is noise with knocks, different throughout.
 """
@@ -39,18 +39,35 @@ def make(folder: Path, minutes: float) -> None:
     """
     n_frames = round(minutes * 60 * FPS)
     heard, silent = folder / "heard", folder / "silent"
-    _write_tables(heard, n_frames, _write_wav(folder / "sound" / "0.wav", n_frames))
-    _write_tables(silent, n_frames, None)
-    for number, camera in enumerate(CAMERAS):
+    make_episodes(heard, 1, n_frames, folder / "sound" / "0.wav")
+    _write_tables(silent, 1, n_frames, None)
+    for camera in CAMERAS:
         video = DEFAULT_VIDEO_PATH.format(video_key=camera, **_PLACE)
-        _write_video(heard / video, n_frames, number)
         (silent / video).parent.mkdir(parents=True)
         (silent / video).hardlink_to(heard / video)
-    for root in (heard, silent):
-        dataset = LeRobotDataset(f"benchmark/{root.name}", root=root, video_backend="pyav")
-        assert dataset.num_frames == n_frames
-        assert dataset[n_frames - 2][CAMERAS[1]].shape == (3, HEIGHT, WIDTH)
+    _check(silent, n_frames)
     (folder / "minutes").write_text(str(minutes))
+
+
+def make_episodes(root: Path, n_episodes: int, n_frames: int, wav: Path) -> None:
+    """Makes a dataset of equally long episodes.
+
+    Args:
+        root: Its folder.
+        n_episodes: How many.
+        n_frames: Of each.
+        wav: Where all of its sound is put as well.
+    """
+    _write_tables(root, n_episodes, n_frames, _write_wav(wav, n_episodes * n_frames))
+    for number, camera in enumerate(CAMERAS):
+        _write_video(root / DEFAULT_VIDEO_PATH.format(video_key=camera, **_PLACE), n_episodes * n_frames, number)
+    _check(root, n_episodes * n_frames)
+
+
+def _check(root: Path, n_frames: int) -> None:
+    dataset = LeRobotDataset(f"benchmark/{root.name}", root=root, video_backend="pyav")
+    assert dataset.num_frames == n_frames
+    assert dataset[n_frames - 2][CAMERAS[1]].shape == (3, HEIGHT, WIDTH)
 
 
 def _write_wav(path: Path, n_frames: int) -> np.ndarray:
@@ -89,8 +106,10 @@ def _write_video(path: Path, n_frames: int, seed: int) -> None:
     minute.unlink()
 
 
-def _write_tables(root: Path, n_frames: int, sound: np.ndarray | None) -> None:
-    """The data file, in one row group as LeRobot writes an episode, and everything in `meta`."""
+def _write_tables(root: Path, n_episodes: int, length: int, sound: np.ndarray | None) -> None:
+    """The data file, a row group for each episode as LeRobot writes it, and everything in `meta`."""
+    n_frames = n_episodes * length
+    frame_index = np.tile(np.arange(length), n_episodes)
     n_microphones = 0 if sound is None else len(MICROPHONES)
     features = dataset_features((HEIGHT, WIDTH), SAMPLE_RATE, FPS, n_microphones, "video", len(CAMERAS))
     meta = LeRobotDatasetMetadata.create(REPO_ID, FPS, features, root=root)
@@ -98,9 +117,9 @@ def _write_tables(root: Path, n_frames: int, sound: np.ndarray | None) -> None:
     columns: dict[str, np.ndarray] = {
         "observation.state": np.cumsum(rng.normal(0, 0.01, (n_frames, 7)), axis=0).astype(np.float32),
         "action": rng.uniform(-1, 1, (n_frames, 4)).astype(np.float32),
-        "timestamp": (np.arange(n_frames) / FPS).astype(np.float32),
-        "frame_index": np.arange(n_frames),
-        "episode_index": np.zeros(n_frames, np.int64),
+        "timestamp": (frame_index / FPS).astype(np.float32),
+        "frame_index": frame_index,
+        "episode_index": np.arange(n_episodes).repeat(length),
         "index": np.arange(n_frames),
         "task_index": np.zeros(n_frames, np.int64),
     }
@@ -115,17 +134,23 @@ def _write_tables(root: Path, n_frames: int, sound: np.ndarray | None) -> None:
         arrays.append(array.cast(field.type))
     path = root / DEFAULT_DATA_PATH.format(**_PLACE)
     path.parent.mkdir(parents=True)
-    pq.write_table(pa.Table.from_arrays(arrays, schema=schema), path, compression="snappy", use_dictionary=True)
+    table = pa.Table.from_arrays(arrays, schema=schema)
+    pq.write_table(table, path, row_group_size=length, compression="snappy", use_dictionary=True)
     del arrays
     stats = numeric_stats(columns, meta.features)
     picture_stats = {name: np.full((3, 1, 1), value) for name, value in _PICTURE_STATS.items()}
     stats |= {key: {**picture_stats, "count": np.array([100])} for key in CAMERAS}
-    places = {
+    files = {
         **{f"data/{name}": value for name, value in _PLACE.items()},
         **{f"videos/{key}/{name}": value for key, (name, value) in itertools.product(CAMERAS, _PLACE.items())},
-        **{f"videos/{key}/from_timestamp": 0.0 for key in CAMERAS},
-        **{f"videos/{key}/to_timestamp": n_frames / FPS for key in CAMERAS},
     }
     meta.save_episode_tasks([TASK])
-    meta.save_episode(0, n_frames, [TASK], stats, places)
+    for episode in range(n_episodes):
+        begin, end = episode * length / FPS, (episode + 1) * length / FPS
+        times = {
+            f"videos/{key}/{edge}": t
+            for key in CAMERAS
+            for edge, t in (("from_timestamp", begin), ("to_timestamp", end))
+        }
+        meta.save_episode(episode, length, [TASK], stats, {**files, **times})
     meta.finalize()

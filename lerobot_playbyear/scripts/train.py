@@ -5,7 +5,7 @@ other's), and trains through LeRobot's own update. The dataset is read once and 
 
     playbyear-train --preset=cpu --dataset.repo_id=me/demos --dataset.root=outputs/demos \\
         --output_dir=outputs/train
-    accelerate launch --num_processes=2 $(which playbyear-train) ...   # several processes
+    accelerate launch --multi_gpu --num_processes=2 $(which playbyear-train) ...
     playbyear-train --resume=true --steps=6000 \\
         --config_path=outputs/train/checkpoints/last/pretrained_model/train_config.json
 
