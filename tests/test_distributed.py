@@ -179,11 +179,6 @@ def test_corrections_in_two_processes_teach_what_they_teach_in_one(tmp_path):
     base, losses = base_folder(), {}
     for n_processes in (2, 1):
         folder = tmp_path / str(n_processes)
-        data = [
-            f"--{name}.{key}"
-            for name in ("demos", "interventions")
-            for key in ("repo_id=tests/demos", f"root={base / 'demos'}")
-        ]
         options = (
             f"--policy.path={base / 'policy'}",
             *WITHOUT_CHANCE,
@@ -204,11 +199,6 @@ def test_runs_that_cannot_be_shared_are_refused(tmp_path):
     from dagger_factory import base_folder
 
     base = base_folder()
-    data = [
-        f"--{name}.{key}"
-        for name in ("demos", "interventions")
-        for key in ("repo_id=tests/demos", f"root={base / 'demos'}")
-    ]
     options = (
         f"--policy.path={base / 'policy'}",
         "--episodes=0",

@@ -49,8 +49,10 @@ def compile_networks(policy: nn.Module) -> None:
     if not isinstance(policy, PlaybyearPolicy):
         raise ValueError("--compile=true is for --policy.type=playbyear: leave it out.")
     network = policy.model
-    parts = [encoder.network for encoder in network.modules() if isinstance(encoder, VisionEncoder)]
-    parts += [*(network.hearing.values() if policy.config.use_audio else []), network.fusion, network.memory_head.head]
+    parts: list[nn.Module] = [network.fusion, network.memory_head.head]
+    parts += [encoder.network for encoder in network.modules() if isinstance(encoder, VisionEncoder)]
+    if policy.config.use_audio:
+        parts += network.hearing.values()
     for part in parts:
         part.compile()
 
