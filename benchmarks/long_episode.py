@@ -5,6 +5,7 @@ A minute of each camera is encoded and its packets are repeated; the sound is no
 
 import itertools
 import wave
+from collections.abc import Callable
 from pathlib import Path
 
 import av
@@ -39,7 +40,7 @@ def make(folder: Path, minutes: float) -> None:
     """
     n_frames = round(minutes * 60 * FPS)
     heard, silent = folder / "heard", folder / "silent"
-    make_episodes(heard, 1, n_frames, folder / "sound" / "0.wav")
+    make_episodes(heard, 1, n_frames, folder / "sound" / "0.wav", noise_std=2, crf=32)
     _write_tables(silent, 1, n_frames, None)
     for camera in CAMERAS:
         video = DEFAULT_VIDEO_PATH.format(video_key=camera, **_PLACE)
@@ -49,7 +50,7 @@ def make(folder: Path, minutes: float) -> None:
     (folder / "minutes").write_text(str(minutes))
 
 
-def make_episodes(root: Path, n_episodes: int, n_frames: int, wav: Path) -> None:
+def make_episodes(root: Path, n_episodes: int, n_frames: int, wav: Path, noise_std: float = 12, crf: int = 24) -> None:
     """Makes a dataset of equally long episodes.
 
     Args:
@@ -57,10 +58,15 @@ def make_episodes(root: Path, n_episodes: int, n_frames: int, wav: Path) -> None
         n_episodes: How many.
         n_frames: Of each.
         wav: Where all of its sound is put as well.
+        noise_std: Of the cameras' noise [levels]; with the defaults a picture takes 20 kB.
+        crf: x264's quality; 0 loses nothing.
     """
     _write_tables(root, n_episodes, n_frames, _write_wav(wav, n_episodes * n_frames))
     for number, camera in enumerate(CAMERAS):
-        _write_video(root / DEFAULT_VIDEO_PATH.format(video_key=camera, **_PLACE), n_episodes * n_frames, number)
+        video = root / DEFAULT_VIDEO_PATH.format(video_key=camera, **_PLACE)
+        _write_video(
+            video, n_episodes * n_frames, pictures(HEIGHT, WIDTH, np.random.default_rng(number), noise_std), crf
+        )
     _check(root, n_episodes * n_frames)
 
 
@@ -90,15 +96,14 @@ def _write_wav(path: Path, n_frames: int) -> np.ndarray:
     return whole.reshape(n_frames, _BLOCK, len(MICROPHONES))
 
 
-def _write_video(path: Path, n_frames: int, seed: int) -> None:
+def _write_video(path: Path, n_frames: int, picture: Callable[[int], np.ndarray], crf: int) -> None:
     minute = path.with_name("minute.mp4")
     path.parent.mkdir(parents=True, exist_ok=True)
     n_encoded = min(60 * FPS, n_frames)
-    picture = pictures(HEIGHT, WIDTH, np.random.default_rng(seed))
     with av.open(str(minute), "w") as container:
         stream = container.add_stream("libx264", rate=FPS)
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        stream.options = {"preset": "veryfast", "crf": "32", "g": str(FPS)}
+        stream.options = {"preset": "veryfast", "crf": str(crf), "g": str(FPS)}
         for i in range(n_encoded):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(i), "rgb24")))
         container.mux(stream.encode(None))

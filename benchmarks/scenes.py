@@ -29,12 +29,13 @@ def dataset_features(
     }
 
 
-def pictures(height: int, width: int, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
-    """A scene of smooth shapes that moves, with a camera's noise, as pictures compress about like a camera's."""
+def pictures(height: int, width: int, rng: np.random.Generator, noise_std: float = 2) -> Callable[[int], np.ndarray]:
+    """A scene of smooth shapes that moves, with a camera's noise [levels], as pictures compress about like a camera's."""
     y, x = np.mgrid[0:height, 0:width] / width
     scene = np.stack([127 + 90 * np.sin(a * x + b * y) for a, b in ((9, 4), (3, 11), (14, 2))], axis=-1)
-    noise = [rng.normal(0, 2, scene.shape) for _ in range(4)]
-    rolled = [np.clip(np.roll(scene, 3 * i, axis=1) + noise[i % 4], 0, 255).astype(np.uint8) for i in range(40)]
+    noise = [rng.normal(0, noise_std, scene.shape) for _ in range(4)]
+    moved = [np.roll(scene, 3 * i, axis=1) + np.roll(noise[i % 4], 17 * (i // 4), axis=0) for i in range(40)]
+    rolled = [np.clip(picture, 0, 255).astype(np.uint8) for picture in moved]
     return lambda i: rolled[i % 40]
 
 
