@@ -3,11 +3,11 @@
     python benchmarks/gpu.py                              # on a machine with an NVIDIA card
     python benchmarks/gpu.py --device=cpu --demos=2 --rounds=1 --evaluations=2 --options="--steps=3 --batch_size=2 ..."
 
-Records demonstrations, trains with `playbyear-train --preset=gpu`, evaluates, and corrects for some rounds. Then it makes
-updates in this process: operations are counted by torch's FlopCounterMode and divided by the time of an update; beside it stands the
-largest product of matrices that the card reaches in the same number format. Parts of an update are timed one by one, with the
-card waited for in between, so that they add up to more than an update takes. Five updates run with
-`torch.cuda.set_sync_debug_mode("error")`: a line that waits for the card fails there.
+Records demonstrations, trains with `playbyear-train --preset=gpu`, evaluates, and corrects for some rounds. Then it
+makes updates in this process: operations are counted by torch's FlopCounterMode and divided by the time of an update;
+beside it stands the largest product of matrices that the card reaches in the same number format. Parts of an update
+are timed one by one, with the card waited for in between, so that they add up to more than an update takes. Five
+updates run with `torch.cuda.set_sync_debug_mode("error")`: a line that waits for the card fails there.
 """
 
 import json
