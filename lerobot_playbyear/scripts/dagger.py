@@ -31,6 +31,7 @@ Training
   --batch_size=24              runs of windows per update, half of them demonstrations
   --learning_rate=null         the largest of each round; else the policy's own
   --seed=1000                  of training, and of the first evaluation episode
+  --store=auto                 where demonstrations are kept: memory, disk, or what suits
 
 What comes out
   --output_dir=outputs/dagger  folder of checkpoints, figures and options
