@@ -77,6 +77,7 @@ class EpisodeStore:
         place: str = "memory",
         image_size: int | None = None,
         cache: Path | None = None,
+        sample_rates: Mapping[str, int] | None = None,
     ) -> "EpisodeStore":
         """Read a dataset, local or from the Hub; the episodes it was opened with.
 
@@ -90,13 +91,16 @@ class EpisodeStore:
             place: "memory", or "disk" for files that are mapped into memory, which the next run finds again.
             image_size: Keep pictures no larger than this, shrunk as the policy `playbyear` does [pixels].
             cache: Folder of the files; None takes one beside LeRobot's cache.
+            sample_rates: Keep these microphones at these rates, resampled where they were recorded at others [Hz].
 
         Raises:
             ValueError: If a key is missing or cannot be kept, sound breaks the contract, a value is NaN or infinite,
                 there are no frames, or the disk has no room.
             MemoryError: If the tensors do not fit into the memory.
         """
-        columns, starts, ends = read_dataset(dataset, keys, device, video_backend, progress, place, image_size, cache)
+        columns, starts, ends = read_dataset(
+            dataset, keys, device, video_backend, progress, place, image_size, cache, sample_rates
+        )
         tasks, device = list(dataset.meta.tasks.index), columns["index"].device
         return cls(columns, starts, ends, dataset.fps, tasks, device, image_size)
 

@@ -7,7 +7,7 @@ import torch
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from torch import Tensor
 
-from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.mixture import Windowed
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -26,7 +26,7 @@ class Figures:
     """
 
     def __init__(
-        self, batch_size: int, store: EpisodeStore, step: int = 0, accelerator: "Accelerator | None" = None
+        self, batch_size: int, store: Windowed, step: int = 0, accelerator: "Accelerator | None" = None
     ) -> None:
         meters = {
             "loss": AverageMeter("loss", ":.3f"),

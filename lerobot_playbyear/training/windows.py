@@ -8,7 +8,9 @@ from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_playbyear.datasets import EpisodeStore, audio_keys
+from lerobot_playbyear.datasets import audio_keys
+from lerobot_playbyear.datasets.mixture import Windowed
+from lerobot_playbyear.datasets.resampling import sample_rate_in
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 
@@ -20,11 +22,12 @@ class PolicyWindows:
 
     Args:
         policy: The policy's configuration, complete with its features.
-        meta: The dataset's metadata.
+        meta: The dataset's metadata; of sound at the rate at which it is to be cut out.
         rename_map: The dataset's names of observations, with what the policy calls them.
 
     Attributes:
         image_size: Height and width at which the policy looks at pictures [pixels]; None: as they are recorded.
+        sample_rates: Of every microphone of `meta` that says it [Hz].
         n_windows: Windows per item that lie in a run of frames, K.
         action_deltas: Where the actions of an item lie, in frames from its last or, of a chunk, its first one; empty for a
             policy that learns single actions.
@@ -42,6 +45,8 @@ class PolicyWindows:
             timestamps = resolve_delta_timestamps(policy, meta) or {}
             self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
         self.image_size = policy.image_size if isinstance(policy, PlaybyearConfig) else None
+        rates = {key: sample_rate_in(meta.features[key]) for key in audio_keys(meta.features)}
+        self.sample_rates = {key: int(rate) for key, rate in rates.items() if rate is not None}
         self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
         self.action_deltas: list[int] = self._deltas.get(ACTION, [])
 
@@ -50,7 +55,7 @@ class PolicyWindows:
         """The features that a store has to hold; None means all that it can."""
         return None if self._as_lerobot else list(self._deltas)
 
-    def batch(self, store: EpisodeStore, last_frames: Tensor) -> dict[str, Any]:
+    def batch(self, store: Windowed, last_frames: Tensor) -> dict[str, Any]:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""
         return store.windows(last_frames, self._deltas, as_lerobot=self._as_lerobot)
 
