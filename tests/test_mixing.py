@@ -209,7 +209,7 @@ def names_of(key, names):
         ),
         (changed(lambda f: f[MICROPHONE].update(info={"sample_rate": "fast"})), 20, "sample_rate 'fast'"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_datasets_that_do_not_go_together_are_refused(datasets, features, fps, message):
     main = copy.copy(datasets[0].meta)
@@ -220,7 +220,7 @@ def test_datasets_that_do_not_go_together_are_refused(datasets, features, fps, m
     other.info.features, other.info.fps = features, fps
     with pytest.raises(ValueError, match=message) as error:
         learned_meta(options_of(1.0), main, other)
-    assert "tests/strange" in str(error.value) or MICROPHONE in str(error.value)
+    assert "'tests/strange'" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -309,12 +309,37 @@ def test_a_policy_is_tuned_with_sound_of_another_rate(trained, datasets, tmp_pat
     assert tuned["sample_rate"] == 16000
 
 
+def test_another_policy_learns_from_several_too(datasets, tmp_path):
+    act = ("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=32")
+    small = ("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.chunk_size=5", "--policy.n_action_steps=5")
+    scratch = ("--policy.pretrained_backbone_weights=null", "--steps=1", "--batch_size=8", "--num_workers=0")
+    alike = (
+        datasets[0],
+        make_dataset(tmp_path / "alike", (9,), sample_rate=48000, image_size=16, repo_id="tests/other"),
+    )
+    run(train, *act, *small, *scratch, *data(alike), f"--output_dir={tmp_path / 'out'}")
+    assert (tmp_path / "out/checkpoints/000001").is_dir()
+    with pytest.raises(InputError, match=rf"'{CAMERA}' is pictures of 3 x 24 x 24 .*3 x 16 x 16.*equally large"):
+        run(train, *act, *small, *scratch, *data(datasets), f"--output_dir={tmp_path / 'other'}")
+
+
+def test_a_dataset_without_statistics_is_refused(datasets):
+    metas = [copy.copy(dataset.meta) for dataset in datasets]
+    for stats in (
+        None,
+        {key: value for key, value in metas[1].stats.items() if key != "action"},
+        {"action": {"mean": 0}},
+    ):
+        metas[1].stats = stats
+        with pytest.raises(ValueError, match=r"'tests/other' .* has no statistics of .*'action'.*recompute_stats"):
+            learned_meta(options_of(1.0), *metas)
+
+
 @pytest.mark.parametrize(
     ("mix", "message"),
     [
         ("[{repo_id: tests/main, weight: 0}]", "weight of 'tests/main' must be above 0 and finite, got 0"),
         ("[{repo_id: tests/main, weight: .inf}]", "weight of 'tests/main' must be above 0 and finite, got inf"),
-        ("[{repo_id: tests/gone, root: NOWHERE}]", "tests/gone|NOWHERE"),
         ("[{repo_id: tests/cut, root: CUT}]", "truncated"),
     ],
 )
@@ -323,12 +348,17 @@ def test_a_bad_mix_is_refused_before_any_work(datasets, tmp_path, mix, message):
     shutil.copytree(datasets[0].root, cut)
     path = next(cut.glob("data/*/*.parquet"))
     path.write_bytes(path.read_bytes()[:-50])
-    mix = mix.replace("CUT", str(cut)).replace("NOWHERE", str(tmp_path / "NOWHERE"))
     with pytest.raises(InputError, match=message):
-        run(train, *TINY, *data(datasets)[:2], f"--mix={mix}", f"--output_dir={tmp_path / 'out'}")
+        run(
+            train,
+            *TINY,
+            *data(datasets)[:2],
+            f"--mix={mix.replace('CUT', str(cut))}",
+            f"--output_dir={tmp_path / 'out'}",
+        )
     assert not (tmp_path / "out").exists()
 
 
 def test_streaming_is_refused_with_what_to_do(datasets, tmp_path):
-    with pytest.raises(InputError, match="--dataset.streaming does not work in playbyear-train: give --store=disk"):
+    with pytest.raises(InputError, match=r"--dataset.streaming does not work in playbyear-train: give --store=disk"):
         run(train, *TINY, *data(datasets)[:2], "--dataset.streaming=true", f"--output_dir={tmp_path / 'out'}")

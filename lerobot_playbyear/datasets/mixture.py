@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.rows import sent_to
 
 type Windowed = EpisodeStore | StoreMixture
 """What batches are cut out of."""
@@ -88,5 +89,5 @@ def _in_order(parts: list[Any], places: list[Tensor], device: torch.device) -> A
     n = sum(map(len, places))
     whole = parts[0].new_empty((n, *parts[0].shape[1:]), device=device)
     for part, place in zip(parts, places, strict=True):
-        whole[place.to(device)] = part.to(device)
+        whole.index_copy_(0, sent_to(device, place), part.to(device))
     return whole

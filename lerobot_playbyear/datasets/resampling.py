@@ -63,7 +63,7 @@ def resampled_pieces(
     Raises:
         ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values.
     """
-    old_rate = dataset.meta.features[key]["info"]["sample_rate"]
+    old_rate = int(dataset.meta.features[key]["info"]["sample_rate"])
     n_samples = samples_per_frame(sample_rate, dataset.fps, key)
     n_rows = max(_SAMPLES_AT_ONCE // n_samples, 1)
     divisor = math.gcd(old_rate, sample_rate)

@@ -21,6 +21,7 @@ from lerobot_playbyear.training.reach import action_names
 from lerobot_playbyear.training.windows import dataset_names
 
 _CAMERA_DTYPES = ("image", "video")
+_STATISTICS = {"min", "max", "mean", "std", "count"}
 
 
 def open_mix(cfg: PlaybyearTrainConfig) -> list[LeRobotDataset]:
@@ -65,8 +66,8 @@ def learned_meta(
     if not others and all(features[key] is main.features[key] for key in features):
         return main
     for meta in (main, *others):
-        for key in used:
-            if key in rates and (rate := sample_rate_in(meta.features[key])) not in (None, rates[key]):
+        for key, rate in _sound_of(meta, used).items():
+            if rate != rates.get(key, rate):
                 logging.info(f"{_name(meta)}: '{key}' is resampled from {rate} to {rates[key]} Hz")
     meta = copy.copy(main)
     meta.info = copy.copy(main.info)
@@ -115,6 +116,15 @@ def _used(policy: PreTrainedConfig, features: Mapping[str, Any], rename_map: Map
     return [key for key in (*names, ACTION) if key in features]  # what is missing, `check_dataset_suits` says
 
 
+def _sound_of(meta: LeRobotDatasetMetadata, used: Sequence[str]) -> dict[str, int]:
+    """The rate of each microphone that is used and says one [Hz]."""
+    saying = {key: meta.features[key] for key in audio_keys(used) if sample_rate_in(meta.features[key]) is not None}
+    try:
+        return check_audio_features(saying, meta.fps)
+    except ValueError as error:
+        raise ValueError(f"{_name(meta)}: {error}") from error
+
+
 def _common_statistics(
     metas: Sequence[LeRobotDatasetMetadata], use_imagenet_stats: bool, used: Sequence[str]
 ) -> dict[str, Any]:
@@ -123,7 +133,7 @@ def _common_statistics(
     if use_imagenet_stats:
         keys = [key for key in keys if key not in metas[0].camera_keys]
     for meta in metas:
-        missing = [key for key in keys if key not in (meta.stats or {})]
+        missing = [key for key in keys if not set((meta.stats or {}).get(key, ())) >= _STATISTICS]
         if missing:
             raise ValueError(
                 f"{_name(meta)} has no statistics of {missing}: write them with lerobot-edit-dataset "
@@ -155,21 +165,21 @@ class _Pair:
                 f"{sorted(others)}. Leave it out, or train without them (--policy.use_audio=false, "
                 "--policy.use_vision=false; lerobot-edit-dataset removes a feature)."
             )
-        heard = {key: others[key] for key in audio_keys(self._used) if sample_rate_in(others[key]) is not None}
-        check_audio_features(heard, self._other.fps)
         for key in self._used:
             self._check_feature(key, mains[key], others[key])
 
     def _check_feature(self, key: str, mine: Mapping[str, Any], its: Mapping[str, Any]) -> None:
         main, other = _name(self._main), _name(self._other)
-        forms = [self._form(key, feature) for feature in (mine, its)]
+        forms = [self._form(feature) for feature in (mine, its)]
         if forms[0] != forms[1]:
-            sizes = " at the size at which the policy looks at them" if self._image_size is not None else ""
-            advice = (
-                f"Their pictures have to be equal{sizes}: give a smaller --policy.image_size, or leave it out."
-                if mine["dtype"] in _CAMERA_DTYPES and its["dtype"] in _CAMERA_DTYPES
-                else "They have to be equal: leave it out, or convert the column."
-            )
+            advice = "They have to be equal: leave it out, or convert the column."
+            if mine["dtype"] in _CAMERA_DTYPES and its["dtype"] in _CAMERA_DTYPES:
+                advice = "Pictures have to be equally large: leave it out, or resize them."
+                if self._image_size is not None:
+                    advice = (
+                        "They have to be equal at the size at which the policy looks at them: give a smaller "
+                        "--policy.image_size, or leave it out."
+                    )
             raise ValueError(f"--mix: '{key}' is {forms[1]} in {other}, and {forms[0]} in {main}. {advice}")
         names = [action_names(feature) for feature in (mine, its)]
         if mine["dtype"] not in _CAMERA_DTYPES and None not in names and names[0] != names[1]:
@@ -178,8 +188,8 @@ class _Pair:
                 "same: leave it out."
             )
 
-    def _form(self, key: str, feature: Mapping[str, Any]) -> str:
-        """What rows of a feature have to have in common to lie in one batch."""
+    def _form(self, feature: Mapping[str, Any]) -> str:
+        """In words, what rows of a feature have to have in common to lie in one batch."""
         shape, dtype = tuple(feature["shape"]), feature["dtype"]
         if dtype in _CAMERA_DTYPES:
             channels, height, width = kept_shape(shape, self._image_size)

@@ -46,7 +46,7 @@ class PolicyWindows:
             self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
         self.image_size = policy.image_size if isinstance(policy, PlaybyearConfig) else None
         rates = {key: sample_rate_in(meta.features[key]) for key in audio_keys(meta.features)}
-        self.sample_rates = {key: int(rate) for key, rate in rates.items() if rate is not None}
+        self.sample_rates = {key: rate for key, rate in rates.items() if rate is not None}
         self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
         self.action_deltas: list[int] = self._deltas.get(ACTION, [])
 
