@@ -36,8 +36,9 @@ def shrink(pictures: np.ndarray, image_size: int) -> np.ndarray:
         (n, C, h, w) uint8, `pictures` themselves where they are no larger. They differ from what the policy makes of the
         recorded ones by rounding, one level of 255.
     """
-    size = shrunk_size(*pictures.shape[-2:], image_size)
-    if size == pictures.shape[-2:]:
+    height, width = pictures.shape[-2:]
+    size = shrunk_size(height, width, image_size)
+    if size == (height, width):
         return pictures
     values = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 2, 3, 1))).permute(0, 3, 1, 2)
     return functional.interpolate(values, size, mode="bilinear", align_corners=False, antialias=True).numpy()

@@ -27,7 +27,6 @@ class PolicyWindows:
 
     Attributes:
         image_size: Height and width at which the policy looks at pictures [pixels]; None: as they are recorded.
-        sample_rates: Of every microphone of `meta` that says it [Hz].
         n_windows: Windows per item that lie in a run of frames, K.
         action_deltas: Where the actions of an item lie, in frames from its last or, of a chunk, its first one; empty for a
             policy that learns single actions.
@@ -36,6 +35,7 @@ class PolicyWindows:
     def __init__(
         self, policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
     ) -> None:
+        self._meta = meta
         self._as_lerobot = not isinstance(policy, PlaybyearConfig)
         if isinstance(policy, PlaybyearConfig):
             names = dataset_names(policy, rename_map)
@@ -45,8 +45,6 @@ class PolicyWindows:
             timestamps = resolve_delta_timestamps(policy, meta) or {}
             self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
         self.image_size = policy.image_size if isinstance(policy, PlaybyearConfig) else None
-        rates = {key: sample_rate_in(meta.features[key]) for key in audio_keys(meta.features)}
-        self.sample_rates = {key: rate for key, rate in rates.items() if rate is not None}
         self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
         self.action_deltas: list[int] = self._deltas.get(ACTION, [])
 
@@ -54,6 +52,12 @@ class PolicyWindows:
     def keys(self) -> list[str] | None:
         """The features that a store has to hold; None means all that it can."""
         return None if self._as_lerobot else list(self._deltas)
+
+    @property
+    def sample_rates(self) -> dict[str, int]:
+        """The rate at which each microphone is cut out [Hz]; of those alone whose feature says it."""
+        rates = {key: sample_rate_in(self._meta.features[key]) for key in audio_keys(self._meta.features)}
+        return {key: rate for key, rate in rates.items() if rate is not None}
 
     def batch(self, store: Windowed, last_frames: Tensor) -> dict[str, Any]:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""
