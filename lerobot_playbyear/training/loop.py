@@ -74,11 +74,12 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         parts = make_training_parts(cfg, meta, accelerator=accelerator)
         if cfg.seed is not None and accelerator.num_processes > 1:
             set_seed(cfg.seed + accelerator.process_index)  # each its own noise
-        windows = PolicyWindows(parts.policy.config, meta, cfg.rename_map)
+        config = accelerator.unwrap_model(parts.policy).config
+        windows = PolicyWindows(config, meta, cfg.rename_map)
         stores = [read_store(each, windows, cfg) for each in datasets]
         validation_store = None if held_out is None or cfg.eval_steps <= 0 else read_store(held_out, windows, cfg)
 
-    reach = Reach(parts.policy.config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
+    reach = Reach(config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
     for each, part in zip(datasets, stores, strict=True):
         reach.warn(part.column(ACTION), f"the dataset '{each.repo_id}'")
     store = stores[0] if len(stores) == 1 else StoreMixture(stores)
