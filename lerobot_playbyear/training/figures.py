@@ -29,11 +29,11 @@ class Figures:
         self, batch_size: int, store: Windowed, step: int = 0, accelerator: "Accelerator | None" = None
     ) -> None:
         meters = {
-            "loss": AverageMeter("loss", ":.3f"),
+            "loss": AverageMeter("loss", ":.3f", reduction="mean"),
             "grad_norm": AverageMeter("grdn", ":.3f"),
             "lr": AverageMeter("lr", ":0.1e"),
-            "update_s": AverageMeter("updt_s", ":.3f"),
-            "dataloading_s": AverageMeter("data_s", ":.3f"),
+            "update_s": AverageMeter("updt_s", ":.3f", reduction="max"),
+            "dataloading_s": AverageMeter("data_s", ":.3f", reduction="max"),
         }
         if torch.cuda.is_available():
             meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
