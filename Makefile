@@ -28,8 +28,7 @@ lint: install  ## Style and types
 	$(BIN)/mypy
 
 test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, default 2)
-	./tools/browser.sh
-	./tools/screen.sh
+	./tools/test_programs.sh
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile
 
 test-slow: install  ## The tests that take minutes, side by side like the others

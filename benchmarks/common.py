@@ -1,9 +1,11 @@
 """What the benchmarks share: turns of measuring, helpers in processes of their own, the table, and the file of figures."""
 
 import argparse
+import contextlib
 import json
 import os
 import platform
+import re
 import statistics
 import subprocess
 import sys
@@ -12,6 +14,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
+
+import psutil
 
 BENCH = Path("outputs/bench.json")
 _LESS_IS_BETTER = ("ms", "s", "MiB")
@@ -52,14 +56,23 @@ class Row:
         return self.theirs / self.ours if self.unit in _LESS_IS_BETTER else self.ours / self.theirs
 
 
-def parser_for(doc: str | None) -> argparse.ArgumentParser:
-    """A command line that prints the module's docstring as help."""
+def parser_for(doc: str | None, turns: int | None = None) -> argparse.ArgumentParser:
+    """A command line that prints the module's docstring as help, with the number of turns where one is given."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=BENCH, help="JSON file that the figures are merged into")
+    if turns is not None:
+        parser.add_argument("--turns", type=int, default=turns)
     return parser
 
 
-def in_turns(works: Mapping[str, Callable[[], object]], n_turns: int, warm_up: int = 1) -> dict[str, list[float]]:
+def seconds_of(work: Callable[[], object]) -> float:
+    """How long a call takes."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def in_turns[K](works: Mapping[K, Callable[[], object]], n_turns: int, warm_up: int = 1) -> dict[K, list[float]]:
     """Times several pieces of work in turns, so that whatever else the machine does hits all of them.
 
     Args:
@@ -70,17 +83,16 @@ def in_turns(works: Mapping[str, Callable[[], object]], n_turns: int, warm_up: i
     Returns:
         The seconds of every call.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in works}
+    seconds: dict[K, list[float]] = {name: [] for name in works}
     for turn in range(warm_up + n_turns):
         for name, work in works.items():
-            start = time.perf_counter()
-            work()
+            took = seconds_of(work)
             if turn >= warm_up:
-                seconds[name].append(time.perf_counter() - start)
+                seconds[name].append(took)
     return seconds
 
 
-def medians(seconds: Mapping[str, Sequence[float]]) -> dict[str, float]:
+def medians[K](seconds: Mapping[K, Sequence[float]]) -> dict[K, float]:
     """The median of every list."""
     return {name: statistics.median(values) for name, values in seconds.items()}
 
@@ -105,21 +117,16 @@ class Helper:
 
     def ask(self, question: str = "") -> None:
         """Lets it begin."""
-        assert self._process.stdin is not None
-        try:
+        with contextlib.suppress(BrokenPipeError):  # `answer` tells why
             self._process.stdin.write(question + "\n")
             self._process.stdin.flush()
-        except BrokenPipeError:
-            self._fail()
 
     def answer(self) -> float:
         """Waits for its number."""
-        assert self._process.stdout is not None
         for line in self._process.stdout:
             if line.startswith("answer "):
                 return float(line.split()[1])
-        self._fail()
-        raise AssertionError
+        raise RuntimeError(f"A helper did not run:\n{self._process.stderr.read()[-2000:]}")
 
     def measure(self, question: str = "") -> float:
         """Asks and waits."""
@@ -128,13 +135,8 @@ class Helper:
 
     def close(self) -> None:
         """Ends it."""
-        assert self._process.stdin is not None
         self._process.stdin.close()
         self._process.wait(timeout=60)
-
-    def _fail(self) -> None:
-        assert self._process.stderr is not None
-        raise RuntimeError(f"A helper did not run:\n{self._process.stderr.read()[-2000:]}")
 
 
 def serve(work: Callable[[str], float]) -> None:
@@ -145,20 +147,14 @@ def serve(work: Callable[[str], float]) -> None:
 
 def machine() -> dict[str, object]:
     """What ran, and whether it ran alone."""
-    model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [
-            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
-        ]
-        model = names[0] if names else model
-    installed = {name: metadata.version(name) for name in _VERSIONS}
+    model = re.search(r"^model name\s*: (.*)", info.read_text(), re.MULTILINE) if info.is_file() else None
     return {
-        "processor": model,
+        "processor": model[1] if model else platform.processor() or platform.machine(),
         "cores": os.cpu_count(),
         "threads": os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())),
         "python": platform.python_version(),
-        **installed,
+        **{name: metadata.version(name) for name in _VERSIONS},
         "load_before": round(os.getloadavg()[0], 2),
     }
 
@@ -173,11 +169,28 @@ def report(section: str, rows: Sequence[Row], output: Path, started: dict[str, o
         started: `machine()` from before the work.
     """
     print("\n".join(markdown(rows)), flush=True)
-    figures = json.loads(output.read_text()) if output.is_file() else {}
     entries = [{**asdict(row), "times_better": row.times_better} for row in rows]
-    figures[section] = {"machine": started, "rows": entries}
+    merge({section: {"machine": started, "rows": entries}}, output)
+
+
+def run(section: str, parser: argparse.ArgumentParser, measure: Callable[[argparse.Namespace], Sequence[Row]]) -> None:
+    """What a benchmark does: measures with the options of the command line, and reports."""
+    args, started = parser.parse_args(), machine()
+    report(section, measure(args), args.output, started)
+
+
+def merge(sections: dict[str, object], output: Path) -> None:
+    """Puts sections into the file of figures; the others stay."""
+    figures = json.loads(output.read_text()) if output.is_file() else {}
     output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(figures, indent=1) + "\n")
+    output.write_text(json.dumps({**figures, **sections}, indent=1) + "\n")
+
+
+def occupied(*processes: psutil.Process) -> tuple[int, int]:
+    """Bytes of memory of processes, and those of them that are no files, which the system cannot take back."""
+    memories = [process.memory_info() for process in processes]
+    total = sum(memory.rss for memory in memories)
+    return total, total - sum(getattr(memory, "shared", 0) for memory in memories)
 
 
 def rows_of(section: Mapping[str, object]) -> list[Row]:

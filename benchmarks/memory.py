@@ -12,22 +12,21 @@ The episode is made once and kept in `--folder`. What is repaired is what a kill
 end, and no table of episodes. The Hub is the one of the tests, on loopback, and throws large files away.
 """
 
-import argparse
 import json
 import os
 import resource
 import shutil
+import statistics
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import psutil
-from common import BENCH, machine
+from common import machine, merge, occupied, parser_for
 
 GIB = 2**30
 _EVERY_S = 0.1
@@ -47,6 +46,7 @@ class Result:
         seconds: How long it took.
         cpu_seconds: How long processors worked for it, which tells more on a busy machine.
         failure: Why it failed; empty where it did not.
+        load: The mean of what the machine did meanwhile, the command included.
     """
 
     command: str
@@ -56,6 +56,7 @@ class Result:
     seconds: float
     cpu_seconds: float
     failure: str
+    load: float = 0.0
 
 
 def measure(name: str, command: list[str], minutes: float, limit: int, environment: dict[str, str]) -> Result:
@@ -70,49 +71,40 @@ def measure(name: str, command: list[str], minutes: float, limit: int, environme
             env={**os.environ, **environment},
             preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (limit, limit)),
         )
-        peak = own = 0
+        watched = psutil.Process(process.pid)
+        sizes, loads = [(0, 0)], [os.getloadavg()[0]]
         while process.poll() is None and time.perf_counter() - started < _KILLED_S:
-            now, now_own = _occupied(process.pid)
-            peak, own = max(peak, now), max(own, now_own)
+            with suppress(psutil.Error):  # one of them has just ended
+                sizes.append(occupied(watched, *watched.children(recursive=True)))
+            loads.append(os.getloadavg()[0])
             time.sleep(_EVERY_S)
         process.kill()
         status = process.wait()
-    lines = log.read_text().strip().splitlines()
-    last = lines[-1][:200] if lines else ""
-    failure = "" if status == 0 else f"status {status}: {last}"
-    if not failure and peak > limit:
-        failure = "more than the limit"
-    seconds = time.perf_counter() - started
-    cpu_seconds = round(_cpu_seconds() - cpu_before)
-    return Result(name, minutes, round(peak / GIB, 2), round(own / GIB, 2), round(seconds), cpu_seconds, failure)
+    peak, own = (max(column) for column in zip(*sizes, strict=True))
+    failure = "more than the limit" if peak > limit else ""
+    if status:
+        last = (log.read_text().strip().splitlines() or [""])[-1]
+        failure = f"status {status}: {last[:200]}"
+    return Result(
+        command=name,
+        minutes=minutes,
+        peak_gib=round(peak / GIB, 2),
+        own_gib=round(own / GIB, 2),
+        seconds=round(time.perf_counter() - started),
+        cpu_seconds=round(_cpu_seconds() - cpu_before),
+        failure=failure,
+        load=round(statistics.fmean(loads), 1),
+    )
 
 
 def _cpu_seconds() -> float:
     """Of all children that have ended."""
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return usage.ru_utime + usage.ru_stime
-
-
-def _occupied(pid: int) -> tuple[int, int]:
-    """Bytes of a process and its children, and those of them that are no files."""
-    total = own = 0
-    try:
-        processes = [psutil.Process(pid), *psutil.Process(pid).children(recursive=True)]
-    except psutil.NoSuchProcess:
-        return 0, 0
-    for process in processes:
-        try:
-            memory = process.memory_info()
-        except psutil.Error:
-            continue
-        total += memory.rss
-        own += memory.rss - getattr(memory, "shared", 0)
-    return total, own
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def inspect(folder: Path) -> list[str]:
-    root = folder / "episode" / "heard"
-    return _module("inspect", "--dataset.repo_id=benchmark/heard", f"--dataset.root={root}", "--json")
+    return _module("inspect", *_named("dataset", "benchmark/heard", folder / "episode" / "heard"), "--json")
 
 
 def page(folder: Path) -> list[str]:
@@ -121,34 +113,27 @@ def page(folder: Path) -> list[str]:
 
 def repair(folder: Path) -> list[str]:
     """Of a copy that shares the videos and lacks what a killed recording lacks."""
-    root = folder / "killed"
+    heard, root = folder / "episode" / "heard", folder / "killed"
     shutil.rmtree(root, ignore_errors=True)
-    shutil.copytree(folder / "episode" / "heard", root, copy_function=os.link)
+    shutil.copytree(heard, root, copy_function=os.link)
     shutil.rmtree(root / "meta" / "episodes")
     (data,) = root.glob("data/*/*.parquet")
-    size = data.stat().st_size
-    whole = data.with_suffix(".whole")
-    data.rename(whole)
-    shutil.copyfile(whole, data)
-    whole.unlink()
-    os.truncate(data, size - 8)
+    data.unlink()
+    shutil.copyfile(heard / data.relative_to(root), data)
+    os.truncate(data, data.stat().st_size - 8)
     return _module("repair", f"--root={root}")
 
 
 def attach(folder: Path) -> list[str]:
     shutil.rmtree(folder / "attached", ignore_errors=True)
-    places = {"dataset": ("silent", folder / "episode" / "silent"), "output": ("attached", folder / "attached")}
-    options = [
-        option
-        for key, (name, root) in places.items()
-        for option in (f"--{key}.repo_id=benchmark/{name}", f"--{key}.root={root}")
-    ]
+    silent = _named("dataset", "benchmark/silent", folder / "episode" / "silent")
+    attached = _named("output", "benchmark/attached", folder / "attached")
     files = f"--files={folder}/episode/sound/{{episode}}.wav"
-    return _module("attach_audio", *options, files, "--microphone=left,right")
+    return _module("attach_audio", *silent, *attached, files, "--microphone=left,right")
 
 
 def push(folder: Path) -> list[str]:
-    return _module("push", "--dataset.repo_id=tester/heard", f"--dataset.root={folder / 'episode' / 'heard'}")
+    return _module("push", *_named("dataset", "tester/heard", folder / "episode" / "heard"))
 
 
 COMMANDS: dict[str, Callable[[Path], list[str]]] = {
@@ -158,6 +143,10 @@ COMMANDS: dict[str, Callable[[Path], list[str]]] = {
     "playbyear-push": push,
     "playbyear-inspect --html": page,
 }
+
+
+def _named(kind: str, repo_id: str, root: Path) -> list[str]:
+    return [f"--{kind}.repo_id={repo_id}", f"--{kind}.root={root}"]
 
 
 def _module(name: str, *options: str) -> list[str]:
@@ -178,15 +167,6 @@ def hub() -> Iterator[dict[str, str]]:
         def verify(self, request: "hub_server._Handler") -> hub_server.Answer:
             return hub_server.Answer({})
 
-        def large_files(self, request: "hub_server._Handler", name: str) -> hub_server.Answer:
-            answer = super().large_files(request, name)
-            for entry in answer.content["objects"]:
-                entry.get("actions", {}).pop("verify", None)
-            return answer
-
-    hub_server._ROUTES[:] = [
-        (methods, pattern, getattr(Forgetful, method.__name__)) for methods, pattern, method in hub_server._ROUTES
-    ]
     with Forgetful() as server:
         yield server.environment()
 
@@ -204,40 +184,16 @@ def run(folder: Path, minutes: float, limit: int, only: list[str] | None, output
     results = []
     with hub() as environment:
         for name, prepare in COMMANDS.items():
-            if only is not None and not any(word in (prepare.__name__, name) for word in only):
+            if only is not None and prepare.__name__ not in only:
                 continue
             home = folder / "home"
             shutil.rmtree(home, ignore_errors=True)
-            command = prepare(folder)
-            with _load() as load:
-                started = machine()
-                result = measure(name, command, minutes, limit, {**environment, "HF_HOME": str(home)})
-            results.append(result)
-            _keep(result, {**started, "load_meanwhile": load()}, output)
-            print("\n".join(table([result])[2:]), flush=True)
+            command, started = prepare(folder), machine()
+            results.append(measure(name, command, minutes, limit, {**environment, "HF_HOME": str(home)}))
+            kept = json.loads(output.read_text()).get("memory", {}) if output.is_file() else {}
+            merge({"memory": {**kept, name: {"machine": started, **asdict(results[-1])}}}, output)
+            print(table(results)[-1], flush=True)
     return results
-
-
-@contextmanager
-def _load() -> Iterator[Callable[[], float]]:
-    """The mean of what the machine did meanwhile, the command included."""
-    done = threading.Event()
-    loads: list[float] = []
-
-    def look() -> None:
-        while not done.wait(10):
-            loads.append(os.getloadavg()[0])
-
-    threading.Thread(target=look, daemon=True).start()
-    yield lambda: round(sum(loads) / max(len(loads), 1), 1)
-    done.set()
-
-
-def _keep(result: Result, started: dict[str, object], output: Path) -> None:
-    figures = json.loads(output.read_text()) if output.is_file() else {}
-    figures.setdefault("memory", {})[result.command] = {"machine": started, **asdict(result)}
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(figures, indent=1) + "\n")
 
 
 def table(results: list[Result]) -> list[str]:
@@ -256,8 +212,7 @@ def table(results: list[Result]) -> list[str]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=BENCH, help="JSON file that the figures are merged into")
+    parser = parser_for(__doc__)
     parser.add_argument("--folder", type=Path, default=Path("outputs/memory"), help="for the episode and the copies")
     parser.add_argument("--minutes", type=float, default=120, help="of the episode")
     parser.add_argument("--limit", type=float, default=4, help="[GiB]")

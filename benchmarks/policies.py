@@ -2,7 +2,7 @@
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -26,6 +26,14 @@ def make_policy(n_cameras: int = 1, n_microphones: int = 1, **options) -> Playby
     return PlaybyearPolicy(config)
 
 
+def bare_resnet(n_frames: int, image_size: int) -> tuple[nn.Module, Tensor]:
+    """The vision encoder's ResNet alone, and frames that are already as it reads them."""
+    policy = make_policy(use_audio=False)
+    encoder = policy.model.vision[CAMERA.removeprefix("observation.").replace(".", "_")]
+    frames = torch.rand(n_frames, 9, image_size, image_size).contiguous(memory_format=torch.channels_last)
+    return encoder.network, frames
+
+
 def random_runs(config: PlaybyearConfig, n: int) -> dict[str, Tensor]:
     """A training batch of n runs of noise, as `EpisodeStore` gives it: bytes and 16-bit sound."""
     batch = {STATE: torch.randn(n, config.n_run_frames, 7)}
@@ -39,11 +47,11 @@ def random_runs(config: PlaybyearConfig, n: int) -> dict[str, Tensor]:
 
 def random_observations(config: PlaybyearConfig, n: int, n_episodes: int = 1) -> list[dict[str, Tensor]]:
     """Observations of n control steps in several episodes at once, noise, as LeRobot hands them to `select_action`."""
-    shapes = dict.fromkeys(config.camera_keys, (3, PIXELS, PIXELS))
-    quiet = {key: 0.02 * torch.randn(n, n_episodes, SAMPLES) for key in config.audio_keys}
     return [
-        {key: torch.rand(n_episodes, *shape) for key, shape in shapes.items()}
-        | {key: sound[step] for key, sound in quiet.items()}
-        | {STATE: torch.randn(n_episodes, 7)}
-        for step in range(n)
+        {
+            **{key: torch.rand(n_episodes, 3, PIXELS, PIXELS) for key in config.camera_keys},
+            **{key: 0.02 * torch.randn(n_episodes, SAMPLES) for key in config.audio_keys},
+            STATE: torch.randn(n_episodes, 7),
+        }
+        for _ in range(n)
     ]

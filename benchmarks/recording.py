@@ -14,16 +14,17 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import datasets
 import numpy as np
-from common import Row, in_turns, machine, medians, parser_for, report
+from common import Row, in_turns, machine, medians, parser_for, report, seconds_of
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
-from scenes import dataset_features, frames
+from scenes import CAMERAS, dataset_features, frames
 
 from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -33,30 +34,23 @@ N_EPISODES = 3
 _ROOM_RATE = 48000  # Hz
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """A robot's sensors."""
 
     name: str
     fps: int
-    height: int
-    width: int
-    microphones: int
-    dtype: str
+    features: dict[str, dict[str, Any]]
     streaming: bool = False
-    sample_rate: int = 48000
-
-    @property
-    def features(self) -> dict[str, dict]:
-        return dataset_features((self.height, self.width), self.sample_rate, self.fps, self.microphones, self.dtype)
 
 
-SIMULATION = Case("84 px pictures, one 16 kHz microphone", 20, 84, 84, 1, "image", sample_rate=16000)
+_ROBOT = ((480, 640), 48000, 30, 2)  # pixels, Hz, Hz, microphones
+_FILMED = dataset_features(*_ROBOT, "video")
+SIMULATION = Case("84 px pictures, one 16 kHz microphone", 20, dataset_features((84, 84), 16000, 20))
 PACED = (
-    Case("20 Hz, 84x84 pictures, one microphone", 20, 84, 84, 1, "image"),
-    Case("30 Hz, 640x480 pictures, two microphones", 30, 480, 640, 2, "image"),
-    Case("30 Hz, 640x480 video, two microphones", 30, 480, 640, 2, "video"),
-    Case("30 Hz, 640x480 video as it comes in, two microphones", 30, 480, 640, 2, "video", streaming=True),
+    Case("20 Hz, 84x84 pictures, one microphone", 20, dataset_features((84, 84), 48000, 20)),
+    Case("30 Hz, 640x480 pictures, two microphones", 30, dataset_features(*_ROBOT)),
+    Case("30 Hz, 640x480 video, two microphones", 30, _FILMED),
+    Case("30 Hz, 640x480 video as it comes in, two microphones", 30, _FILMED, streaming=True),
 )
 
 
@@ -74,7 +68,7 @@ def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
 
     def compress() -> None:
         for frame in episode:
-            Image.fromarray(frame["observation.images.front"]).save(io.BytesIO(), format="PNG", compress_level=1)
+            Image.fromarray(frame[CAMERAS[0]]).save(io.BytesIO(), format="PNG", compress_level=1)
 
     with DurableWriter("benchmark/ours", folder / "ours", fps, features) as ours:
         works = {"ours": lambda: write(ours), "stock": lambda: write(stock), "limit": compress}
@@ -98,21 +92,17 @@ def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
 
 def measure_paced(case: Case, root: Path) -> None:
     waits, saves = [], []
-    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if case.dtype == "video" else None
+    is_filmed = case.features[CAMERAS[0]]["dtype"] == "video"
+    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if is_filmed else None
     with DurableWriter(
         "benchmark/recording", root, case.fps, case.features, streaming_encoding=case.streaming, rgb_encoder=encoder
     ) as writer:
         for episode in range(N_EPISODES):
             begun = time.perf_counter()
             for i, frame in enumerate(frames(case.features, SECONDS * case.fps, episode)):
-                due = begun + i / case.fps
-                time.sleep(max(0.0, due - time.perf_counter()))
-                started = time.perf_counter()
-                writer.add_frame(frame)
-                waits.append(time.perf_counter() - started)
-            started = time.perf_counter()
-            writer.save_episode()
-            saves.append(time.perf_counter() - started)
+                time.sleep(max(0.0, begun + i / case.fps - time.perf_counter()))
+                waits.append(seconds_of(partial(writer.add_frame, frame)))
+            saves.append(seconds_of(writer.save_episode))
     late = sum(wait > 1 / case.fps for wait in waits)
     print(
         f"{case.name}: {len(waits)} frames, {late} late; longest wait {1e3 * max(waits):.1f} ms "
@@ -122,13 +112,15 @@ def measure_paced(case: Case, root: Path) -> None:
 
 
 def measure_room(folder: Path) -> None:
-    own = {"observation.audio.gripper": audio_feature(_ROOM_RATE, 20)}
-    own["action"] = {"dtype": "float32", "shape": (4,), "names": None}
-    rng = np.random.default_rng(0)
+    n, rng = _ROOM_RATE // 20, np.random.default_rng(0)
+    own = {
+        "observation.audio.gripper": audio_feature(_ROOM_RATE, 20),
+        "action": {"dtype": "float32", "shape": (4,), "names": None},
+    }
     sounds: dict[str, Callable[[], np.ndarray]] = {
-        "noise at full scale": lambda: rng.integers(-32768, 32768, _ROOM_RATE // 20),
-        "a quiet room (noise of 100 of 32,768)": lambda: rng.normal(0, 100, _ROOM_RATE // 20),
-        "silence": lambda: np.zeros(_ROOM_RATE // 20),
+        "noise at full scale": lambda: rng.integers(-32768, 32768, n),
+        "a quiet room (noise of 100 of 32,768)": lambda: rng.normal(0, 100, n),
+        "silence": lambda: np.zeros(n),
     }
     for number, (name, sound) in enumerate(sounds.items()):
         root = folder / str(number)
@@ -151,10 +143,9 @@ def measure_room(folder: Path) -> None:
 def main() -> None:
     os.environ.setdefault("SVT_LOG", "1")
     datasets.disable_progress_bars()
-    parser = parser_for(__doc__)
+    parser = parser_for(__doc__, turns=5)
     parser.add_argument("--paced", action="store_true", help="at the rate of the robot instead; takes 5 minutes")
     parser.add_argument("--frames", type=int, default=200, help="of an episode")
-    parser.add_argument("--turns", type=int, default=5)
     args = parser.parse_args()
     started = machine()
     with tempfile.TemporaryDirectory() as folder:

@@ -6,11 +6,12 @@ Not part of `make bench`: stores of up to 1,000 episodes are made of noise in me
 Medians of a few turns.
 """
 
+import argparse
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
-from common import Row, in_turns, machine, medians, parser_for, report
+from common import Row, in_turns, medians, parser_for, run
 from policies import PIXELS, SAMPLES, make_policy, random_observations, random_runs
 
 from lerobot_playbyear.datasets import EpisodeStore
@@ -69,29 +70,26 @@ def update_work(n_sensors: int) -> Callable[[], object]:
     return update
 
 
-def main() -> None:
-    parser = parser_for(__doc__)
-    parser.add_argument("--turns", type=int, default=5)
-    args = parser.parse_args()
-    started, rows = machine(), []
+def measure(args: argparse.Namespace) -> list[Row]:
+    rows = []
     small = {"image_size": 48, "vision_width": 16}
     for n in EPISODES:
         seconds = medians(in_turns({"windows": windows_work(n)}, args.turns))["windows"]
         rows.append(Row(f"windows from a store of {n} episodes", 20 * _BATCH / seconds, "windows/s"))
-    steps = medians(in_turns({str(n): step_work(n, **small) for n in ENVIRONMENTS}, 5 * args.turns, warm_up=3))
+    steps = medians(in_turns({n: step_work(n, **small) for n in ENVIRONMENTS}, 5 * args.turns, warm_up=3))
     rows += [
-        Row(f"control step of {n} environments in one batch, preset `cpu`'s network", 1e3 * steps[str(n)], "ms")
+        Row(f"control step of {n} environments in one batch, preset `cpu`'s network", 1e3 * steps[n], "ms")
         for n in ENVIRONMENTS
     ]
     sensors = {n: step_work(1, n_cameras=n, n_microphones=n, **small) for n in SENSORS}
-    latency = medians(in_turns({str(n): work for n, work in sensors.items()}, 5 * args.turns, warm_up=3))
-    updates = medians(in_turns({str(n): update_work(n) for n in SENSORS}, args.turns))
+    latency = medians(in_turns(sensors, 5 * args.turns, warm_up=3))
+    updates = medians(in_turns({n: update_work(n) for n in SENSORS}, args.turns))
     for n in SENSORS:
-        rows.append(Row(f"control step, {n} cameras and {n} microphones, the same", 1e3 * latency[str(n)], "ms"))
-        rate = 4 * 8 / updates[str(n)]
+        rows.append(Row(f"control step, {n} cameras and {n} microphones, the same", 1e3 * latency[n], "ms"))
+        rate = 4 * 8 / updates[n]
         rows.append(Row(f"training, 84 px, width 16, {n} cameras and {n} microphones", rate, "windows/s"))
-    report("scaling", rows, args.output, started)
+    return rows
 
 
 if __name__ == "__main__":
-    main()
+    run("scaling", parser_for(__doc__, turns=5), measure)

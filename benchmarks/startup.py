@@ -7,6 +7,7 @@ the first folder or file that it was given; the process ends there. All are proc
 first turn, which fills the disk's cache, does not count.
 """
 
+import argparse
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from common import Row, in_turns, machine, medians, parser_for, report
+from common import Row, in_turns, medians, parser_for, run
 
 _LEROBOT = "lerobot-train --help"
 _LIGHT = ("inspect", "repair", "attach_audio", "push")
@@ -83,30 +84,27 @@ def works(folder: Path) -> dict[str, Callable[[], None]]:
 
 def rows(seconds: dict[str, float]) -> list[Row]:
     """The table's: all beside LeRobot's own."""
-    theirs = seconds[_LEROBOT]
-    wanted = {}
-    for name in seconds.keys() - {_LEROBOT}:
+    theirs, table = seconds[_LEROBOT], []
+    for name, ours in seconds.items():
+        if name == _LEROBOT:
+            continue
         if "first work" not in name:
-            wanted[name] = "under 2 s", seconds[name] < 2
+            wanted, holds = "under 2 s", ours < 2
         elif name.split(",")[0].removeprefix("playbyear-").replace("-", "_") in _LIGHT:
-            wanted[name] = "under 5 s", seconds[name] < 5
+            wanted, holds = "under 5 s", ours < 5
         else:
-            wanted[name] = "no slower", seconds[name] <= theirs
-    return [
-        Row(name, seconds[name], "s", _LEROBOT, theirs, "", None, *wanted[name]) for name in seconds if name in wanted
-    ]
+            wanted, holds = "no slower", ours <= theirs
+        table.append(Row(name, ours, "s", _LEROBOT, theirs, wanted=wanted, holds=holds))
+    return table
 
 
-def main() -> None:
-    parser = parser_for(__doc__)
-    parser.add_argument("--n_turns", type=int, default=3)
-    args = parser.parse_args()
-    started = machine()
+def measure(args: argparse.Namespace) -> list[Row]:
     with TemporaryDirectory() as folder:
         make_inputs(Path(folder))
-        seconds = medians(in_turns(works(Path(folder)), args.n_turns))
-    report("startup", rows(seconds), args.output, started)
+        return rows(medians(in_turns(works(Path(folder)), args.n_turns)))
 
 
 if __name__ == "__main__":
-    main()
+    parser = parser_for(__doc__)
+    parser.add_argument("--n_turns", type=int, default=3)
+    run("startup", parser, measure)

@@ -8,23 +8,20 @@ process, drawing the panel and showing both. Medians of wall time, and processor
 
 import argparse
 import os
-import statistics
 import time
 from collections.abc import Callable
+
+from common import in_turns, medians
 
 os.environ.setdefault("MUJOCO_GL", "egl")
 
 
 def measured(work: Callable[[], object], n: int) -> tuple[float, float]:
     """Median wall time and mean processor time [ms] of a piece of work."""
-    walls = []
     work()
     before = time.process_time()
-    for _ in range(n):
-        start = time.perf_counter()
-        work()
-        walls.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(walls), 1e3 * (time.process_time() - before) / n
+    wall = medians(in_turns({"work": work}, n, warm_up=0))["work"]
+    return 1e3 * wall, 1e3 * (time.process_time() - before) / n
 
 
 def main() -> None:

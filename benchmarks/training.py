@@ -7,12 +7,14 @@ A whole update counts: augmentation, spectrograms, network, gradients, clipping 
 is the time that the ResNet's forward and backward pass alone take for the frames that an update encodes. Noise as data.
 """
 
+import argparse
+import os
+import statistics
 import sys
-import time
 from collections.abc import Callable
 
 import torch
-from common import Helper, Row, in_turns, machine, medians, parser_for, report, serve
+from common import Helper, Row, in_turns, medians, parser_for, run, seconds_of, serve
 from reference import Reference, random_windows
 from torch import nn
 
@@ -40,14 +42,8 @@ def serve_reference() -> None:
     model = Reference().train()
     images, sound, state, action = random_windows(REFERENCE_WINDOWS)
     update = update_of(model, lambda: (model(images, sound, state) - action).square().mean())
-
-    def timed(_: str) -> float:
-        start = time.perf_counter()
-        update()
-        return time.perf_counter() - start
-
-    timed("")
-    serve(timed)
+    update()
+    serve(lambda _: seconds_of(update))
 
 
 def our_update(n_supervised_steps: int, image_size: int, amp: bool = False) -> Callable[[], None]:
@@ -64,31 +60,23 @@ def our_update(n_supervised_steps: int, image_size: int, amp: bool = False) -> C
     return update_of(policy, loss)
 
 
-def bare_resnet(n_frames: int, image_size: int) -> Callable[[], None]:
-    """Forward and backward pass of the vision encoder's ResNet alone, on frames that are already as it reads them."""
-    from policies import CAMERA, make_policy
+def bare_passes(n_frames: int, image_size: int) -> Callable[[], None]:
+    """Forward and backward pass of the vision encoder's ResNet alone."""
+    from policies import bare_resnet
 
-    network = make_policy(use_audio=False).train().model.vision[CAMERA.removeprefix("observation.").replace(".", "_")]
-    frames = torch.rand(n_frames, 9, image_size, image_size).contiguous(memory_format=torch.channels_last)
+    network, frames = bare_resnet(n_frames, image_size)
+    network.train()
 
     def passes() -> None:
-        network.network(frames).square().mean().backward()
+        network(frames).square().mean().backward()
         network.zero_grad()
 
     return passes
 
 
-def main() -> None:
-    parser = parser_for(__doc__)
-    parser.add_argument("--turns", type=int, default=4)
-    parser.add_argument("--image_size", type=int, default=224)
-    parser.add_argument("--reference", action="store_true", help="be the process of the published scheme")
-    args = parser.parse_args()
-    if args.reference:
-        serve_reference()
-        return
-    started = machine()
-    helper = Helper(sys.executable, __file__, "--reference")
+def measure(args: argparse.Namespace) -> list[Row]:
+    code = "from training import serve_reference; serve_reference()"
+    helper = Helper(sys.executable, "-c", code, PYTHONPATH=os.pathsep.join(sys.path))
     from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
     from lerobot_playbyear.training.heap import keep_freed_memory
 
@@ -96,27 +84,26 @@ def main() -> None:
     config = PlaybyearConfig(device="cpu")
     default = config.n_supervised_steps
     wanted_times = {default: WANTED_AT_DEFAULT, 32: WANTED_AT_32}
-    frames = {k: n * (k + config.n_memory_steps - 1) for k, n in RUNS.items()}
+    variants = [(k, False) for k in RUNS] + [
+        (k, True) for k in wanted_times
+    ]  # windows per run, and whether in bfloat16
+    works: dict[object, Callable[[], object]] = {(k, amp): our_update(k, args.image_size, amp) for k, amp in variants}
+    for k in wanted_times:
+        works["bare", k] = bare_passes(RUNS[k] * (k + config.n_memory_steps - 1), args.image_size)
     theirs: list[float] = []
-    works: dict[str, Callable[[], object]] = {f"K={k}": our_update(k, args.image_size) for k in RUNS}
-    works |= {f"bfloat16 {k}": our_update(k, args.image_size, amp=True) for k in wanted_times}
-    works |= {f"bare {k}": bare_resnet(frames[k], args.image_size) for k in wanted_times}
     works["reference"] = lambda: theirs.append(helper.measure())
     seconds = medians(in_turns(works, args.turns))
-    seconds["reference"] = medians({"reference": theirs[1:]})["reference"]
     helper.close()
 
-    reference = REFERENCE_WINDOWS / seconds["reference"]
-    size, rows = f"{args.image_size} px", []
-    named = [(k, f"K={k}", " (default)" if k == default else "", f"bare {k}") for k in RUNS]
-    named += [(k, f"bfloat16 {k}", ", bfloat16 (`--policy.use_amp=true`)", "") for k in wanted_times]
-    for k, name, note, limit in named:
+    reference, rows = REFERENCE_WINDOWS / statistics.median(theirs[1:]), []
+    for k, amp in variants:
+        note = ", bfloat16 (`--policy.use_amp=true`)" if amp else " (default)" if k == default else ""
         windows, wanted = RUNS[k] * k, wanted_times.get(k)
-        ours = windows / seconds[name]
-        bare = windows / seconds[limit] if limit in seconds else None
+        ours = windows / seconds[k, amp]
+        bare = windows / seconds["bare", k] if wanted and not amp else None
         rows.append(
             Row(
-                f"training, {size}, K = {k}{note}",
+                f"training, {args.image_size} px, K = {k}{note}",
                 ours,
                 "windows/s",
                 "ten frames per window (K = 1), float32",
@@ -127,7 +114,7 @@ def main() -> None:
                 ours >= wanted * reference if wanted else None,
             )
         )
-    overhead = seconds[f"K={default}"] / seconds[f"bare {default}"]
+    overhead = seconds[default, False] / seconds["bare", default]
     rows.append(
         Row(
             "a whole update over its convolutions' time",
@@ -139,8 +126,10 @@ def main() -> None:
             holds=overhead <= OVERHEAD_WANTED,
         )
     )
-    report("training", rows, args.output, started)
+    return rows
 
 
 if __name__ == "__main__":
-    main()
+    parser = parser_for(__doc__, turns=4)
+    parser.add_argument("--image_size", type=int, default=224)
+    run("training", parser, measure)

@@ -12,13 +12,15 @@ store, above what it has when the dataset is open.
 import argparse
 import multiprocessing
 import tempfile
-import threading
+import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Row, in_turns, machine, medians, parser_for, report
+import psutil
+from common import Row, in_turns, medians, occupied, parser_for, run
 from lerobot.datasets import LeRobotDataset
 from scenes import dataset_features, frames
 from torch import Tensor
@@ -34,7 +36,7 @@ _BATCH = 32  # windows
 
 def record(root: Path, args: argparse.Namespace) -> None:
     """Writes a dataset with one camera and one microphone."""
-    features = dataset_features(args.image_size, args.sample_rate, args.fps)
+    features = dataset_features((args.image_size, args.image_size), args.sample_rate, args.fps)
     with DurableWriter(args.repo_id, root, args.fps, features) as writer:
         for episode in range(args.episodes):
             for frame in frames(features, args.frames, seed=episode):
@@ -42,32 +44,19 @@ def record(root: Path, args: argparse.Namespace) -> None:
             writer.save_episode()
 
 
-class PeakMemory:
-    """The most memory of its own that this process has while the block runs [bytes]; Linux.
+def with_peak[T](work: Callable[[], T]) -> tuple[T, int]:
+    """What a piece of work returns, and the most memory of its own that this process needs for it [bytes]; Linux.
 
     Pages of files that are mapped into memory do not count: the system takes them back when it needs them.
     """
-
-    def __enter__(self) -> "PeakMemory":
-        self._before = self.peak = _own_memory()
-        self._done = threading.Event()
-        self._watch = threading.Thread(target=self._look)
-        self._watch.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._done.set()
-        self._watch.join()
-        self.peak = max(self.peak, _own_memory()) - self._before
-
-    def _look(self) -> None:
-        while not self._done.wait(0.002):
-            self.peak = max(self.peak, _own_memory())
-
-
-def _own_memory() -> int:
-    status = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * next(int(line.split()[1]) for line in status if line.startswith("RssAnon"))
+    process = psutil.Process()
+    sizes = [occupied(process)[1]]
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(work)
+        while not done.done():
+            time.sleep(0.002)
+            sizes.append(occupied(process)[1])
+    return done.result(), max(sizes) - sizes[0]
 
 
 def drawing(make_batch: Callable[[list[int]], Any], n_frames: int, n_batches: int) -> Callable[[], None]:
@@ -81,10 +70,20 @@ def drawing(make_batch: Callable[[list[int]], Any], n_frames: int, n_batches: in
     return draw
 
 
-def measure(root: Path, args: argparse.Namespace) -> list[Row]:
+def measure(args: argparse.Namespace) -> list[Row]:
+    with tempfile.TemporaryDirectory() as folder:
+        if args.root is not None:
+            return measure_reading(args.root, args)
+        root = Path(folder) / "dataset"
+        # in another process, whose memory does not count
+        with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as pool:
+            pool.submit(record, root, args).result()
+        return measure_reading(root, args)
+
+
+def measure_reading(root: Path, args: argparse.Namespace) -> list[Row]:
     opened = LeRobotDataset(args.repo_id, root, video_backend="pyav")
-    with PeakMemory() as memory:
-        store = EpisodeStore.from_dataset(opened, device="cpu")
+    store, peak = with_peak(lambda: EpisodeStore.from_dataset(opened, device="cpu"))
 
     policy = PlaybyearConfig(sample_rate=args.sample_rate, device="cpu")
     keys = [key for key in store.keys if key.startswith("observation.") or key == "action"]
@@ -98,7 +97,7 @@ def measure(root: Path, args: argparse.Namespace) -> list[Row]:
     n_bytes = sum(value.nbytes for value in batch.values() if isinstance(value, Tensor))
     source, target = np.random.default_rng(0).integers(0, 256, (2, 64 * n_bytes), np.uint8)
 
-    n_batches = {"same": 4, "compact": 100, "copy": 1, "stock": 1}
+    n_batches = {"same": 4, "compact": 100, "copy": 64, "stock": 1}
     works: dict[str, Callable[[], object]] = {
         "stock": drawing(lambda i: default_collate([stock[j] for j in i]), len(stock), n_batches["stock"]),
         "same": drawing(lambda i: store.windows(i, full, as_lerobot=True), len(stock), n_batches["same"]),
@@ -107,38 +106,34 @@ def measure(root: Path, args: argparse.Namespace) -> list[Row]:
     }
     seconds = medians(in_turns(works, args.turns))
     rates = {name: n * _BATCH / seconds[name] for name, n in n_batches.items()}
-    rates["copy"] = 64 * _BATCH / seconds["copy"]
     what = f"dataset windows, {args.window} frames, "
-    wanted, times = f"at least {WANTED_TIMES} times", rates["compact"] / rates["stock"]
-    name, limit = "stock LeRobotDataset", "copying as many bytes"
-    ratio = memory.peak / store.nbytes
+    beside = {"beside": "stock LeRobotDataset", "theirs": rates["stock"]}
     return [
         Row(
             what + "as training uses them",
             rates["compact"],
             "windows/s",
-            name,
-            rates["stock"],
-            limit,
-            rates["copy"],
-            wanted,
-            times >= WANTED_TIMES,
+            **beside,
+            limit_is="copying as many bytes",
+            limit=rates["copy"],
+            wanted=f"at least {WANTED_TIMES} times",
+            holds=rates["compact"] >= WANTED_TIMES * rates["stock"],
         ),
-        Row(what + "LeRobot's very tensors", rates["same"], "windows/s", name, rates["stock"]),
+        Row(what + "LeRobot's very tensors", rates["same"], "windows/s", **beside),
         Row(
             f"peak memory of reading {store.n_episodes} episodes",
-            memory.peak / 2**20,
+            peak / 2**20,
             "MiB",
             limit_is="their raw bytes",
             limit=store.nbytes / 2**20,
             wanted=f"at most {WANTED_MEMORY} times the raw bytes",
-            holds=ratio <= WANTED_MEMORY,
+            holds=peak <= WANTED_MEMORY * store.nbytes,
         ),
     ]
 
 
-def main() -> None:
-    parser = parser_for(__doc__)
+if __name__ == "__main__":
+    parser = parser_for(__doc__, turns=5)
     parser.add_argument("--root", type=Path, help="folder of an existing dataset; one is recorded without it")
     parser.add_argument("--repo_id", default="benchmark/windows", help="name of that dataset")
     parser.add_argument("--image_size", type=int, default=84, help="pixels")
@@ -147,19 +142,4 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--frames", type=int, default=100, help="per episode")
     parser.add_argument("--window", type=int, default=49, help="frames: 2 s of sound before a window of 10")
-    parser.add_argument("--turns", type=int, default=5)
-    args = parser.parse_args()
-    started = machine()
-    with tempfile.TemporaryDirectory() as folder:
-        root = args.root or Path(folder) / "dataset"
-        if args.root is None:  # in another process, whose memory does not count
-            recording = multiprocessing.get_context("fork").Process(target=record, args=(root, args))
-            recording.start()
-            recording.join()
-            if recording.exitcode:
-                raise RuntimeError(f"The dataset could not be recorded (exit code {recording.exitcode}).")
-        report("windows", measure(root, args), args.output, started)
-
-
-if __name__ == "__main__":
-    main()
+    run("windows", parser, measure)

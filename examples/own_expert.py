@@ -10,6 +10,7 @@ import argparse
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -20,6 +21,11 @@ from lerobot.envs import EnvConfig
 from lerobot_playbyear.dagger import Expert, ExpertConfig
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.scripts import dagger, train
+
+
+def push(velocity: float) -> np.ndarray:
+    """The action that pushes the way the car rolls."""
+    return np.array([1.0 if velocity >= 0 else -1.0], np.float32)
 
 
 class Momentum(Expert):
@@ -37,7 +43,7 @@ class Momentum(Expert):
         return self.n_left > 0
 
     def act(self) -> np.ndarray:
-        return np.array([1.0 if self.velocity >= 0 else -1.0], np.float32)
+        return push(self.velocity)
 
 
 @ExpertConfig.register_subclass("momentum")
@@ -71,14 +77,7 @@ class Car(Continuous_MountainCarEnv):
 
     def scripted_expert(self):
         """For the demonstrations: the same idea, from the state itself."""
-        expert = Momentum()
-
-        class Demonstrator:
-            def act(_):  # noqa: N805
-                expert.velocity = self.state[1]
-                return expert.act()
-
-        return Demonstrator()
+        return SimpleNamespace(act=lambda: push(self.state[1]))
 
 
 gym.register("OwnCar-v0", Car, max_episode_steps=200)
@@ -87,6 +86,8 @@ gym.register("OwnCar-v0", Car, max_episode_steps=200)
 @EnvConfig.register_subclass("own_car")
 @dataclass
 class CarConfig(EnvConfig):
+    package_name, gym_id, gym_kwargs = "gymnasium", "OwnCar-v0", {}  # LeRobot has properties
+
     task: str | None = "OwnCar-v0"
     fps: int = 30
     features: dict[str, PolicyFeature] = field(
@@ -96,18 +97,6 @@ class CarConfig(EnvConfig):
         }
     )
     features_map: dict[str, str] = field(default_factory=lambda: {"action": "action", "agent_pos": "observation.state"})
-
-    @property
-    def package_name(self) -> str:
-        return "gymnasium"
-
-    @property
-    def gym_id(self) -> str:
-        return str(self.task)
-
-    @property
-    def gym_kwargs(self) -> dict:
-        return {}
 
 
 def main() -> None:

@@ -11,10 +11,9 @@ All three are evaluated on the same 50 seeds: in the task's own time, and in tha
 try. Resumes where it was interrupted.
 """
 
-import argparse
 import json
-import time
 from dataclasses import asdict, dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +23,18 @@ from experiments.protocol import (
     EVALUATION_SEEDS,
     RESULTS,
     RUNS,
-    TASKS,
+    command_line,
     library_versions,
+    load,
+    options_of,
     record,
-    run,
+    save,
     shown,
-    tool,
 )
-from experiments.training import Job, evaluate, train
+from experiments.training import Job, clocked, evaluate, train
 
 STUDY = "corrections"
-SEEDS = range(EVALUATION_SEEDS.start, EVALUATION_SEEDS.start + 50)
+SEEDS = EVALUATION_SEEDS[:50]
 N_EPISODES = 25
 EVERY = 10  # kept attempts between evaluations
 BATCH_SIZE = 12
@@ -81,26 +81,23 @@ class Corrected:
         return self.condition, self.n_demonstrations, self.steps
 
 
-def load_corrections(task: str) -> list[Corrected]:
-    """The saved results of a task: those of one kind follow each other, in the order of their training seeds."""
-    paths = (RESULTS / STUDY).glob(f"{task}-*.json")
-    results = [Corrected(**json.loads(path.read_text())) for path in paths]
-    return sorted(results, key=lambda result: (result.condition != "full", result.kind, result.training_seed))
+def load_corrections(task: str) -> dict[tuple[str, int, int], list[Corrected]]:
+    """The saved results of a task by their kind, those of one kind in the order of their training seeds."""
+    results = [Corrected(**load(path)) for path in (RESULTS / STUDY).glob(f"{task}-*.json")]
+    results.sort(key=lambda result: (result.condition != "full", result.kind, result.training_seed))
+    return {kind: list(alike) for kind, alike in groupby(results, lambda result: result.kind)}
 
 
 def correct(job: Job) -> Corrected:
     """Runs all three parts, or what is missing of them."""
     assert job.dataset is not None
-    demonstrations, threads = job.dataset, job.threads
     train_command, _ = train(job)
     folder = RUNS / "dagger" / job.name
     dagger = [
-        tool("playbyear-dagger"),
+        "playbyear-dagger",
         f"--policy.path={job.checkpoint}",
-        f"--demos.repo_id=experiments/{demonstrations.name}",
-        f"--demos.root={demonstrations}",
-        f"--interventions.repo_id=experiments/corrections-{job.name}",
-        f"--interventions.root={RUNS / 'datasets' / f'corrections-{job.name}'}",
+        *options_of(job.dataset, "demos"),
+        *options_of(RUNS / "datasets" / f"corrections-{job.name}", "interventions"),
         "--env.type=playbyear",
         f"--env.task={job.task}",
         f"--env.episode_length={ATTEMPT_STEPS[job.task]}",
@@ -112,59 +109,39 @@ def correct(job: Job) -> Corrected:
         f"--output_dir={folder}",
         "--resume=true",
     ]
-    spent = _clocked(dagger, folder, threads)
+    minutes = {"dagger": clocked(dagger, folder, job.threads)}
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     updates = max(line["step"] for line in lines)
     rounds = [line for line in lines if line["kind"] == "round" and "n_updates" in line]
     parts = {name for line in rounds for name in line if name.endswith("_s")}
-    attempts = [
-        {key: line[key] for key in ("seed", "outcome", "intervention_share")}
-        for line in lines
-        if line["kind"] == "attempt"
-    ]
-    commands = [train_command, shown(dagger)]
-    milestones = {line["round"]: line["step"] for line in rounds if line["round"] % EVERY == 0 or line is rounds[-1]}
-    first = _evaluations(job, commands, "0", job.checkpoint, is_end=True)
-    evaluations = [{"kept": 0, "updates": 0, **first}]
-    for kept, step in milestones.items():
-        checkpoint = folder / "checkpoints" / f"{step:06}" / "pretrained_model"
-        success = _evaluations(job, commands, str(kept), checkpoint, is_end=kept == max(milestones))
-        evaluations.append({"kept": kept, "updates": step, **success})
+    attempts = [line for line in lines if line["kind"] == "attempt"]
 
-    control_job = replace(job, steps=updates, variant=f"control-of-{job.steps}steps")
-    go_on = [
-        tool("playbyear-train"),
-        f"--policy.path={job.checkpoint}",
-        f"--dataset.repo_id=experiments/{demonstrations.name}",
-        f"--dataset.root={demonstrations}",
-        f"--output_dir={RUNS / 'train' / control_job.name}",
-        f"--steps={updates}",
-        f"--save_freq={updates}",
-        "--env_eval_freq=0",
-        f"--batch_size={BATCH_SIZE}",
-        "--policy.push_to_hub=false",
-        f"--seed={job.training_seed}",
-        "--wandb.enable=false",
-    ]
-    clock = RUNS / "train" / control_job.name
-    control_spent = _minutes(clock) if control_job.checkpoint.exists() else _clocked(go_on, clock, threads)
-    commands.append(shown(go_on))
-    control = _evaluations(control_job, commands, "control", control_job.checkpoint, is_end=True)
+    commands = [train_command, shown(dagger)]
+    policies = {0: (0, job.checkpoint)}
+    for line in rounds:
+        if line["round"] % EVERY == 0 or line is rounds[-1]:
+            policies[line["round"]] = line["step"], folder / "checkpoints" / f"{line['step']:06}" / "pretrained_model"
+    evaluations = []
+    for kept, (step, checkpoint) in policies.items():
+        rates = _evaluations(job, commands, str(kept), checkpoint, is_end=kept in (0, max(policies)))
+        evaluations.append({"kept": kept, "updates": step, **rates})
+
+    start = (f"--policy.path={job.checkpoint}", "--policy.push_to_hub=false", f"--batch_size={BATCH_SIZE}")
+    variant = f"control-of-{job.steps}steps"
+    control_job = replace(job, steps=updates, variant=variant, start=(*start, f"--save_freq={updates}"))
+    control_command, minutes["control"] = train(control_job)
+    commands.append(control_command)
     return Corrected(
-        task=job.task,
-        training_seed=job.training_seed,
-        n_demonstrations=job.n_demonstrations,
-        steps=job.steps,
+        **job.learned,
         first_seed=SEEDS.start,
         n_episodes=len(SEEDS),
         evaluations=evaluations,
-        attempts=attempts,
+        attempts=[{key: line[key] for key in ("seed", "outcome", "intervention_share")} for line in attempts],
         updates=updates,
-        control=control,
-        minutes={"dagger": round(spent, 1), "control": round(control_spent, 1)},
+        control=_evaluations(control_job, commands, "control", control_job.checkpoint, is_end=True),
+        minutes={name: round(spent, 1) for name, spent in minutes.items()},
         seconds={name: round(sum(line.get(name, 0.0) for line in rounds), 1) for name in sorted(parts)},
         commands=commands,
-        condition=job.condition,
     )
 
 
@@ -180,37 +157,13 @@ def _evaluations(job: Job, commands: list[str], name: str, checkpoint: Path, is_
     return rates
 
 
-def _clocked(command: list[str], folder: Path, threads: int) -> float:
-    """Runs a command that can go on where it stopped; returns the minutes that it took in all."""
-    spent = _minutes(folder)
-    clock = _clock(folder)
-    clock.parent.mkdir(parents=True, exist_ok=True)
-    start = time.monotonic()
-    run(command, RUNS / "logs" / f"{Path(command[0]).name}-{folder.name}.log", threads)
-    spent += (time.monotonic() - start) / 60
-    clock.write_text(str(spent))
-    return spent
-
-
-def _clock(folder: Path) -> Path:
-    return folder.with_name(folder.name + ".minutes")
-
-
-def _minutes(folder: Path) -> float:
-    """What was spent on it so far."""
-    return float(_clock(folder).read_text()) if _clock(folder).exists() else 0.0
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=TASKS, default=TASKS[0])
-    parser.add_argument("--seeds", nargs="+", type=int, default=[1], help="of training")
+    parser = command_line(__doc__, "task", "seeds", "threads")
+    parser.set_defaults(seeds=[1])
     parser.add_argument("--n_demonstrations", type=int, default=5)
     parser.add_argument("--steps", type=int, default=1000, help="updates of the policy that is corrected")
     parser.add_argument("--condition", choices=CONDITIONS, default="full", help="senses of the policy")
-    parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
-    record(options.task, options.n_demonstrations)
     demonstrations = RUNS / "datasets" / f"{options.task}-{options.n_demonstrations}"
     record(options.task, options.n_demonstrations, demonstrations)
     for seed in options.seeds:
@@ -220,10 +173,8 @@ def main() -> None:
             dataset=demonstrations,
         )
         if not job.result_path.exists():
-            result = correct(job)
-            job.result_path.parent.mkdir(parents=True, exist_ok=True)
-            job.result_path.write_text(json.dumps(asdict(result)) + "\n")
-        result = Corrected(**json.loads(job.result_path.read_text()))
+            save(job.result_path, asdict(correct(job)))
+        result = Corrected(**load(job.result_path))
         first, last = result.evaluations[0], result.evaluations[-1]
         print(
             f"{result.task}, {result.condition}, seed {seed}: "

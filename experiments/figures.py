@@ -1,7 +1,5 @@
 """The results as pictures: `python -m experiments.figures --output=docs/media`."""
 
-import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,15 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 
 from experiments.corrections import load_corrections
-from experiments.protocol import RESULTS, TASKS, load_results, wilson_interval
+from experiments.protocol import (
+    TASKS,
+    blind_path,
+    command_line,
+    load,
+    load_demonstrations,
+    load_results,
+    wilson_interval,
+)
 
 COLOURS = {"full": "#1f6f8b", "deaf": "#c8553d", "blind": "#777777"}
 NOISES = {
@@ -34,103 +40,100 @@ def band(axes: Axes, points: dict[float, list[bool]], label: str, colour: str) -
 
 
 def blind_line(axes: Axes, task: str) -> None:
-    path = RESULTS / "ablations" / f"{task}-blind.json"
-    if path.exists():
-        rates = json.loads(path.read_text())["success"]
+    if blind_path(task).exists():
+        rates = load(blind_path(task))["success"]
         best = max(rate for name, rate in rates.items() if name != "expert")
         axes.axhline(100 * best, color=COLOURS["blind"], linestyle="--", label="best blind script")
 
 
-def demonstrations(output: Path) -> None:
+def demonstrations(task: str, output: Path) -> None:
     """Success of the full and the deaf policy over the number of demonstrations."""
-    for task in TASKS:
-        few = load_results(f"demonstrations/{task}-*.json")
-        if not few:
-            continue
-        seed = few[0].training_seed
-        results = few + [r for r in load_results(f"ablations/{task}-*demos-*.json") if r.training_seed == seed]
-        figure, axes = plt.subplots(figsize=(6, 3.6))
-        for condition in ("full", "deaf"):
-            points = {r.n_demonstrations: r.successes for r in results if r.condition == condition}
-            band(axes, points, condition, COLOURS[condition])
-        blind_line(axes, task)
-        axes.set_xscale("log")
-        ticks = sorted({r.n_demonstrations for r in results})
-        axes.set_xticks(ticks, [str(tick) for tick in ticks])
-        axes.minorticks_off()
-        finish(figure, axes, "demonstrations", output / f"demonstrations-{task}.png")
+    results = load_demonstrations(task)
+    if not results:
+        return
+    axes = new_axes()
+    for condition in ("full", "deaf"):
+        points = {r.n_demonstrations: r.successes for r in results if r.condition == condition}
+        band(axes, points, condition, COLOURS[condition])
+    blind_line(axes, task)
+    axes.set_xscale("log")
+    ticks = sorted({r.n_demonstrations for r in results})
+    axes.set_xticks(ticks, [str(tick) for tick in ticks])
+    axes.minorticks_off()
+    finish(axes, "demonstrations", output / f"demonstrations-{task}.png")
 
 
-def noise(output: Path) -> None:
+def noise(task: str, output: Path) -> None:
     """Success of the full policies over the background's level, with the training noise of two recipes."""
-    for task in TASKS:
-        curves: dict[str, dict[float, list[bool]]] = {}
-        for study in NOISES:
-            for result in load_results(f"{study}/{task}-*.json"):
-                level = float(result.environment["noise_level"])
-                curves.setdefault(study, {}).setdefault(level, []).extend(result.successes)
-        if not curves:
-            continue
-        figure, axes = plt.subplots(figsize=(6, 3.6))
-        for study, by_level in curves.items():
-            label, colour = NOISES[study]
-            most = max(map(len, by_level.values()))  # a level that fewer policies were tried at would be another curve
-            band(axes, {level: tried for level, tried in by_level.items() if len(tried) == most}, label, colour)
-        blind_line(axes, task)
-        axes.set_xscale("log", base=2)
-        levels = sorted({level for by_level in curves.values() for level in by_level})
-        axes.set_xticks(levels, [f"{level:g}" for level in levels])
-        finish(figure, axes, "background noise (1: as in training)", output / f"noise-{task}.png")
+    curves: dict[str, dict[float, list[bool]]] = {}
+    for study in NOISES:
+        for result in load_results(f"{study}/{task}-*.json"):
+            level = float(result.environment["noise_level"])
+            curves.setdefault(study, {}).setdefault(level, []).extend(result.successes)
+    if not curves:
+        return
+    axes = new_axes()
+    for study, by_level in curves.items():
+        label, colour = NOISES[study]
+        most = max(map(len, by_level.values()))  # a level that fewer policies were tried at would be another curve
+        band(axes, {level: tried for level, tried in by_level.items() if len(tried) == most}, label, colour)
+    blind_line(axes, task)
+    axes.set_xscale("log", base=2)
+    levels = sorted({level for by_level in curves.values() for level in by_level})
+    axes.set_xticks(levels, [f"{level:g}" for level in levels])
+    finish(axes, "background noise (1: as in training)", output / f"noise-{task}.png")
 
 
-def corrections(output: Path) -> None:
+def corrections(task: str, output: Path) -> None:
     """Success over the attempts that were corrected, with the control beside it: each training seed, and their mean."""
-    for task in TASKS:
-        results = load_corrections(task)
-        if not results:
-            continue
-        figure, axes = plt.subplots(figsize=(6, 3.6))
-        kinds = list(dict.fromkeys(result.kind for result in results))
-        for colour, kind in zip(KINDS, kinds, strict=False):
-            alike = [result for result in results if result.kind == kind]
-            curves = [{point["kept"]: point["success"] for point in result.evaluations} for result in alike]
-            controls = [result.control["success"] for result in alike]
-            for curve in curves:
-                axes.plot(list(curve), list(curve.values()), color=colour, linewidth=0.8, alpha=0.5)
-            kept = sorted(set.intersection(*(set(curve) for curve in curves)))
-            means = [sum(curve[k] for curve in curves) / len(curves) for k in kept]
-            condition, n_demonstrations, steps = kind
-            seeds = f"{len(alike)} training seed{'s' * (len(alike) > 1)}"
-            label = f"{condition}: {n_demonstrations} demonstrations, {steps:,} updates ({seeds})"
-            axes.plot(kept, means, marker="o", color=colour, label=label)
-            axes.plot([kept[-1]] * len(controls), controls, marker="x", color=colour, linestyle="", alpha=0.5)
-            axes.plot(kept[-1], sum(controls) / len(controls), marker="X", markersize=9, color=colour)
-        axes.plot([], [], marker="X", color="black", linestyle="", label="as many updates on the demonstrations")
-        path = output / f"corrections-{task}.png"
-        finish(figure, axes, "attempts with corrections", path, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    kinds = load_corrections(task)
+    if not kinds:
+        return
+    axes = new_axes()
+    for colour, (kind, results) in zip(KINDS, kinds.items(), strict=False):
+        curves = [{point["kept"]: point["success"] for point in result.evaluations} for result in results]
+        controls = [result.control["success"] for result in results]
+        for curve in curves:
+            axes.plot(list(curve), list(curve.values()), color=colour, linewidth=0.8, alpha=0.5)
+        kept = sorted(set.intersection(*map(set, curves)))
+        means = [sum(curve[k] for curve in curves) / len(curves) for k in kept]
+        condition, n_demonstrations, steps = kind
+        seeds = f"{len(results)} training seed{'s' * (len(results) > 1)}"
+        label = f"{condition}: {n_demonstrations} demonstrations, {steps:,} updates ({seeds})"
+        axes.plot(kept, means, marker="o", color=colour, label=label)
+        axes.plot([kept[-1]] * len(controls), controls, marker="x", color=colour, linestyle="", alpha=0.5)
+        axes.plot(kept[-1], sum(controls) / len(controls), marker="X", markersize=9, color=colour)
+    axes.plot([], [], marker="X", color="black", linestyle="", label="as many updates on the demonstrations")
+    path = output / f"corrections-{task}.png"
+    finish(axes, "attempts with corrections", path, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
-def finish(figure, axes: Axes, label: str, path: Path, **legend: Any) -> None:
-    """Axes, legend, file."""
-    axes.set_xlabel(label)
-    axes.set_ylabel("success [%]")
-    axes.set_ylim(0, 100)
+def new_axes() -> Axes:
+    """Of a new figure, success from 0 to 100 %."""
+    _, axes = plt.subplots(figsize=(6, 3.6))
+    axes.set(ylabel="success [%]", ylim=(0, 100))
     axes.grid(alpha=0.25)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.spines[["top", "right"]].set_visible(False)
+    return axes
+
+
+def finish(axes: Axes, label: str, path: Path, **legend: Any) -> None:
+    """Label, legend, file."""
+    axes.set_xlabel(label)
     axes.legend(frameon=False, **legend)
+    figure = axes.get_figure(root=True)
+    assert figure is not None
     figure.savefig(path, dpi=110, bbox_inches="tight")
     plt.close(figure)
     print(path)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=Path("docs/media"))
-    output = parser.parse_args().output
+    output = command_line(__doc__, "output").parse_args().output
     output.mkdir(parents=True, exist_ok=True)
     for draw in (demonstrations, noise, corrections):
-        draw(output)
+        for task in TASKS:
+            draw(task, output)
 
 
 if __name__ == "__main__":

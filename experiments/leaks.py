@@ -8,7 +8,6 @@ frames in contact from the twin's same frames; its area under the curve on held-
 Rows are sensors, columns what the network is shown.
 """
 
-import argparse
 import json
 from dataclasses import replace
 
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from experiments.protocol import RESULTS
+from experiments.protocol import RESULTS, command_line, save
 from gym_playbyear.experts import ExpertConfig, GraspExpert
 from gym_playbyear.proprioception import NO_SENSOR_NOISE, SensorNoise
 from lerobot_playbyear.episodes.episode import Observation
@@ -56,19 +55,18 @@ def twin_sweeps(sensors: SensorNoise, seeds: range) -> tuple[np.ndarray, np.ndar
     env = gym.make(f"gym_playbyear:gym_playbyear/{TASK}", image_size=8, sound="none", disable_env_checker=True)
     task = env.unwrapped
     task.variant = replace(task.variant, sensors=sensors)
-    windows, touched, of_seed = [], [], []
+    windows, labels = [], []
     for seed in seeds:
         states, contacts = _sweep(env, seed, None)
         without, _ = _sweep(env, seed, (_ASIDE, float(task.cube_position[1])))
-        for t in (t for t in contacts if _HISTORY <= t + 1 <= len(without)):
-            for episode, label in ((states, True), (without, False)):
-                window = np.stack(episode[t + 1 - _HISTORY : t + 1])
-                window[:, :3] -= window[-1, :3]
-                windows.append(window)
-                touched.append(label)
-                of_seed.append(seed)
+        for end in (t + 1 for t in contacts if _HISTORY <= t + 1 <= len(without)):
+            windows += [states[end - _HISTORY : end], without[end - _HISTORY : end]]
+            labels += [(True, seed), (False, seed)]
     env.close()
-    return np.stack(windows), np.array(touched), np.array(of_seed)
+    touched, of_seed = map(np.array, zip(*labels, strict=True))
+    stacked = np.array(windows)
+    stacked[..., :3] -= stacked[:, -1:, :3]
+    return stacked, touched, of_seed
 
 
 def _sweep(env: gym.Env, seed: int, cube: tuple[float, float] | None) -> tuple[list[np.ndarray], list[int]]:
@@ -82,10 +80,8 @@ def _sweep(env: gym.Env, seed: int, cube: tuple[float, float] | None) -> tuple[l
 
 
 def area_under_curve(scores: np.ndarray, positive: np.ndarray) -> float:
-    """The probability that a positive scores above a negative (Mann and Whitney, 1947)."""
-    ranks = np.argsort(np.argsort(scores)) + 1
-    n = int(positive.sum())
-    return float((ranks[positive].sum() - n * (n + 1) / 2) / (n * (len(scores) - n)))
+    """The probability that a positive scores above a negative."""
+    return float(np.mean(scores[positive][:, None] > scores[~positive]))
 
 
 def contact_auc(windows: np.ndarray, touched: np.ndarray, held_out: np.ndarray, dims: list[int]) -> float:
@@ -115,7 +111,7 @@ def contact_auc(windows: np.ndarray, touched: np.ndarray, held_out: np.ndarray, 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--n_episodes", type=int, default=200)
     n_episodes = parser.parse_args().n_episodes
     report = {}
@@ -126,9 +122,7 @@ def main() -> None:
             part: round(contact_auc(windows, touched, held_out, list(dims)), 3) for part, dims in _PARTS.items()
         }
         print(name, f"{touched.sum()} of {len(touched)} frames in contact", json.dumps(report[name]), flush=True)
-    output = RESULTS / "leaks.json"
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps(report, indent=1) + "\n")
+    save(RESULTS / "leaks.json", report, indent=1)
 
 
 if __name__ == "__main__":

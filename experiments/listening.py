@@ -12,8 +12,8 @@ A reaction is a stop of the sweep within 10 steps: three actions in a row whose 
 figures do not depend on whether the episode would have succeeded.
 """
 
-import argparse
 import json
+import statistics
 from pathlib import Path
 
 import gymnasium as gym
@@ -21,23 +21,30 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from experiments.ablations import STUDY
-from experiments.protocol import DONOR_SEEDS, EVALUATION_SEEDS, N_DEMONSTRATIONS, RESULTS, STEPS, TRAINING_SEEDS
+from experiments.protocol import DONOR_SEEDS, EVALUATION_SEEDS, RESULTS, command_line, save
 from experiments.sound_probe import REACTION_STEPS, Donor, SoundProbe, Trial, make_donors
 from experiments.training import Job
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.episodes.policy_actor import load_policy_actor
+from lerobot_playbyear.episodes.policy_actor import PolicyActor, load_policy_actor
 
 TASK = "OccludedGrasp-v0"
+ENV = PlaybyearEnvConfig(task=TASK)
 MODES = ("false", "control", "muted")
 
 
-def listen(policy_path: Path, mode: str, env: gym.Env, seeds: range, donors: list[Donor]) -> list[Trial]:
+def actor_of(checkpoint: Path) -> PolicyActor:
+    """A trained policy, ready to act in the task."""
+    register_third_party_plugins()
+    policy_cfg = PreTrainedConfig.from_pretrained(checkpoint)
+    policy_cfg.pretrained_path = checkpoint
+    return load_policy_actor(policy_cfg, ENV)
+
+
+def listen(checkpoint: Path, mode: str, env: gym.Env, seeds: range, donors: list[Donor]) -> list[Trial]:
     """What a policy does when its sound is swapped, one trial per seed."""
-    policy_cfg = PreTrainedConfig.from_pretrained(policy_path)
-    policy_cfg.pretrained_path = policy_path
-    actor = load_policy_actor(policy_cfg, PlaybyearEnvConfig(task=TASK))
+    actor = actor_of(checkpoint)
     probe = SoundProbe(env, mode, donors)
     trials = []
     for seed in seeds:
@@ -49,38 +56,32 @@ def listen(policy_path: Path, mode: str, env: gym.Env, seeds: range, donors: lis
 def summary(trials: list[Trial]) -> dict[str, float | int | None]:
     """The trials in which the moment came, as counts."""
     swapped = [trial for trial in trials if trial.swapped_at is not None]
-    delays = sorted(trial.reacted_after for trial in swapped if trial.reacted_after is not None)
+    delays = [trial.reacted_after for trial in swapped if trial.reacted_after is not None]
     return {
         "n_episodes": len(trials),
         "n_trials": len(swapped),
         "n_reacted": sum(delay <= REACTION_STEPS for delay in delays),
         "n_closed_there": sum(trial.closed_there for trial in swapped),
-        "median_steps_to_stop": delays[len(delays) // 2] if delays else None,
+        "median_steps_to_stop": statistics.median_high(delays) if delays else None,
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", nargs="+", type=int, default=TRAINING_SEEDS, help="of the policies' training")
+    parser = command_line(__doc__, "seeds")
     parser.add_argument("--policy", type=Path, help="another policy's folder instead of the ablations'")
     parser.add_argument("--n_episodes", type=int, default=len(EVALUATION_SEEDS))
     parser.add_argument("--first_seed", type=int, default=EVALUATION_SEEDS.start)
     options = parser.parse_args()
-    register_third_party_plugins()
 
-    env = env_spec(PlaybyearEnvConfig(task=TASK)).make()
+    env = env_spec(ENV).make()
     donors = make_donors(env, DONOR_SEEDS)
     episodes = range(options.first_seed, options.first_seed + options.n_episodes)
-    policies = {"policy": options.policy} if options.policy else {}
-    for seed in () if options.policy else options.seeds:
-        policies[f"seed{seed}"] = Job(STUDY, TASK, "full", seed, N_DEMONSTRATIONS, STEPS[TASK]).checkpoint
-    for name, path in policies.items():
+    policies = {f"seed{seed}": Job(STUDY, TASK, "full", seed).checkpoint for seed in options.seeds}
+    for name, path in ({"policy": options.policy} if options.policy else policies).items():
         report = {mode: summary(listen(path, mode, env, episodes, donors)) for mode in MODES}
         print(name, json.dumps(report), flush=True)
         if not options.policy:
-            output = RESULTS / "listening" / f"{TASK}-{name}.json"
-            output.parent.mkdir(parents=True, exist_ok=True)
-            output.write_text(json.dumps({"first_seed": episodes.start, **report}, indent=1) + "\n")
+            save(RESULTS / "listening" / f"{TASK}-{name}.json", {"first_seed": episodes.start, **report}, indent=1)
     env.close()
 
 

@@ -4,14 +4,16 @@ Three ranges of environment seeds never meet: demonstrations are recorded from t
 second, and the third is for the figures that are reported and for nothing else.
 """
 
+import argparse
 import json
 import math
 import os
 import subprocess
 import sys
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 TASKS = ("OccludedGrasp-v0", "OccludedPickPlace-v0")
 DEMONSTRATION_SEED = 0  # recording counts up from here, below 1000
@@ -21,7 +23,7 @@ TRAINING_SEEDS = (1, 2, 3)
 N_DEMONSTRATIONS = 50
 ATTEMPT_STEPS = {"OccludedGrasp-v0": 220, "OccludedPickPlace-v0": 300}  # enough to search a second time
 RUN_LENGTHS = (1, 8, 16)  # windows per run
-STEPS = {"OccludedGrasp-v0": 3000, "OccludedPickPlace-v0": 3000}
+STEPS = 3000
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
     "full": (),
@@ -30,8 +32,24 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
     "memoryless": ("--policy.use_memory=false",),
 }
 
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "task": {"choices": TASKS, "default": TASKS[0]},
+    "seeds": {"nargs": "+", "type": int, "default": TRAINING_SEEDS, "help": "of the policies' training"},
+    "jobs": {"type": int, "default": 1, "help": "policies that are trained side by side"},
+    "threads": {"type": int, "default": 1, "help": "per policy"},
+    "output": {"type": Path, "default": Path("docs/media")},
+}
+
 RESULTS = Path(__file__).parent / "results"
 RUNS = Path(os.environ.get("PLAYBYEAR_RUNS", "outputs/experiments"))
+
+
+def command_line(doc: str | None, *options: str) -> argparse.ArgumentParser:
+    """A command line that prints the module's docstring as help, with some of the options that the studies share."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for option in options:
+        parser.add_argument(f"--{option}", **_OPTIONS[option])
+    return parser
 
 
 @dataclass
@@ -67,21 +85,35 @@ class Result:
     def rate(self) -> float:
         return sum(self.successes) / len(self.successes)
 
-    def save(self, path: Path) -> None:
-        """Writes the result as JSON, all of it or nothing."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps(asdict(self)) + "\n")
-        partial.replace(path)
 
-    @classmethod
-    def load(cls, path: Path) -> "Result":
-        return cls(**json.loads(path.read_text()))
+def save(path: Path, content: Any, indent: int | None = None) -> None:
+    """Writes JSON, all of it or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(content, indent=indent) + "\n")
+    partial.replace(path)
+
+
+def load(path: Path) -> Any:
+    """What a JSON file holds."""
+    return json.loads(path.read_text())
 
 
 def load_results(pattern: str) -> list[Result]:
     """The saved results whose file below `RESULTS` matches a glob pattern, in the order of their names."""
-    return [Result.load(path) for path in sorted(RESULTS.glob(pattern))]
+    return [Result(**load(path)) for path in sorted(RESULTS.glob(pattern))]
+
+
+def load_demonstrations(task: str) -> list[Result]:
+    """The results over the number of demonstrations, with those that the ablations have for the same training seed."""
+    few = load_results(f"demonstrations/{task}-*.json")
+    seeds = {result.training_seed for result in few}
+    return few + [r for r in load_results(f"ablations/{task}-*demos-*.json") if r.training_seed in seeds]
+
+
+def blind_path(task: str) -> Path:
+    """The file of what scripts reach that feel nothing, and of the expert."""
+    return RESULTS / "ablations" / f"{task}-blind.json"
 
 
 def wilson_interval(n_successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
@@ -96,37 +128,41 @@ def library_versions() -> dict[str, str]:
     return {name: version(name) for name in ("lerobot", "torch", "mujoco")}
 
 
-def tool(name: str) -> str:
-    """A command that is installed beside this Python."""
-    return str(Path(sys.executable).with_name(name))
-
-
-def run(command: list[str], log: Path, threads: int) -> None:
-    """Runs a command, its output in a file.
+def run(command: list[str], name: str, threads: int) -> None:
+    """Runs a command that is installed beside this Python, its output in a log of this name.
 
     Raises:
         RuntimeError: It failed; the message ends with its last lines.
     """
+    log = RUNS / "logs" / f"{name}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
+    environment = {"MUJOCO_GL": "egl", **os.environ, "OMP_NUM_THREADS": str(threads)}
+    program = str(Path(sys.executable).with_name(command[0]))
     with log.open("a") as file:
-        code = subprocess.run(command, stdout=file, stderr=subprocess.STDOUT, env=environment, check=False).returncode
-    if code:
+        done = subprocess.run(
+            [program, *command[1:]], stdout=file, stderr=subprocess.STDOUT, env=environment, check=False
+        )
+    if done.returncode:
         tail = "\n".join(log.read_text(errors="replace").replace("\r", "\n").splitlines()[-15:])
-        raise RuntimeError(f"{shown(command)} ended with {code}; {log} ends with\n{tail}")
+        raise RuntimeError(f"{shown(command)} ended with {done.returncode}; {log} ends with\n{tail}")
 
 
 def shown(command: list[str]) -> str:
     """A command as a person would type it: without the folders of this machine."""
-    return " ".join([Path(command[0]).name, *(arg.replace(f"{RUNS}/", "outputs/experiments/") for arg in command[1:])])
+    return " ".join(command).replace(f"{RUNS}/", "outputs/experiments/")
 
 
 def dataset_root(task: str) -> Path:
     return RUNS / "datasets" / task
 
 
-def record(task: str, n_episodes: int, root: Path | None = None) -> str:
-    """Records demonstrations, or as many as are missing; returns the command.
+def options_of(dataset: Path, kind: str = "dataset") -> list[str]:
+    """The options that name a dataset."""
+    return [f"--{kind}.repo_id=experiments/{dataset.name}", f"--{kind}.root={dataset}"]
+
+
+def record(task: str, n_episodes: int, root: Path | None = None) -> None:
+    """Records demonstrations, or as many as are missing.
 
     Args:
         task: What the expert does.
@@ -135,14 +171,12 @@ def record(task: str, n_episodes: int, root: Path | None = None) -> str:
     """
     root = root or dataset_root(task)
     command = [
-        tool("playbyear-record"),
+        "playbyear-record",
         "--env.type=playbyear",
         f"--env.task={task}",
-        f"--dataset.repo_id=experiments/{root.name}",
-        f"--dataset.root={root}",
+        *options_of(root),
         f"--dataset.num_episodes={n_episodes}",
         f"--seed={DEMONSTRATION_SEED}",
         "--resume=true",
     ]
-    run(command, RUNS / "logs" / f"record-{root.name}.log", threads=1)
-    return shown(command)
+    run(command, f"record-{root.name}", threads=1)

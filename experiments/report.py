@@ -1,9 +1,8 @@
 """The results as tables in Markdown: `python -m experiments.report`."""
 
-import json
 from collections import defaultdict
 
-from experiments.corrections import Corrected, load_corrections
+from experiments.corrections import load_corrections
 from experiments.protocol import (
     ATTEMPT_STEPS,
     CONDITIONS,
@@ -11,40 +10,52 @@ from experiments.protocol import (
     RUN_LENGTHS,
     TASKS,
     Result,
+    blind_path,
+    load,
+    load_demonstrations,
     load_results,
     wilson_interval,
 )
 
 
+def table(head: str, rows: list[str], title: str = "") -> list[str]:
+    """A table, with a heading or without; nothing where there are no rows."""
+    if not rows:
+        return []
+    heading = [f"### {title}", ""] if title else []
+    return [*heading, head, "|---" * (head.count("|") - 1) + "|", *rows, ""]
+
+
+def interval(n_successes: int, n: int) -> str:
+    low, high = wilson_interval(n_successes, n)
+    return f"({100 * low:.0f} to {100 * high:.0f})"
+
+
 def percent(results: list[Result]) -> str:
     """Rate over all episodes of some policies, with its 95 % interval, and the rate of each policy."""
     successes = [success for result in results for success in result.successes]
-    low, high = wilson_interval(sum(successes), len(successes))
+    n_successes, n = sum(successes), len(successes)
     each = ", ".join(f"{100 * result.rate:.0f}" for result in results)
-    return f"**{100 * sum(successes) / len(successes):.0f} %** ({100 * low:.0f} to {100 * high:.0f}) | {each}"
+    return f"**{100 * n_successes / n:.0f} %** {interval(n_successes, n)} | {each}"
 
 
 def ablation_table(task: str) -> list[str]:
-    lines = [
-        f"### {task}",
-        "",
-        "| policy | success (95 % interval) | training seeds | minutes of training |",
-        "|---|---|---|---|",
-    ]
+    rows = []
     for condition in CONDITIONS:
         results = load_results(f"ablations/{task}-{condition}-*.json")
         if results:
             minutes = ", ".join(f"{result.minutes:.0f}" for result in results)
-            lines.append(f"| {condition} | {percent(results)} | {minutes} |")
-    blind = RESULTS / "ablations" / f"{task}-blind.json"
-    if blind.exists():
-        rates = json.loads(blind.read_text())["success"]
+            rows.append(f"| {condition} | {percent(results)} | {minutes} |")
+    if blind_path(task).exists():
+        blind = load(blind_path(task))
+        first, last = blind["seeds"]
+        n = last - first + 1
+        rates = blind["success"]
         expert = rates.pop("expert")
         name, best = max(rates.items(), key=lambda item: item[1])
-        low, high = wilson_interval(round(100 * best), 100)
-        lines.append(f"| best blind script (`{name}`) | **{best:.0%}** ({100 * low:.0f} to {100 * high:.0f}) | | |")
-        lines.append(f"| expert that feels contact | {expert:.0%} | | |")
-    return [*lines, ""]
+        rows.append(f"| best blind script (`{name}`) | **{best:.0%}** {interval(round(n * best), n)} | | |")
+        rows.append(f"| expert that feels contact | {expert:.0%} | | |")
+    return table("| policy | success (95 % interval) | training seeds | minutes of training |", rows, task)
 
 
 CURVES = {
@@ -58,60 +69,34 @@ def curve_table(study: str, task: str) -> list[str]:
     by_value: dict[str, list[Result]] = defaultdict(list)
     for result in load_results(f"{study}/{task}-*.json"):
         by_value[", ".join(result.environment.values())].append(result)
-    if not by_value:
-        return []
-    lines = [
-        f"### {task}: {CURVES[study]}",
-        "",
-        f"| {study.split('_')[0]} | success (95 % interval) | training seeds |",
-        "|---|---|---|",
-    ]
-    return [
-        *lines,
-        *(f"| {value} | {percent(results)} |" for value, results in sorted(by_value.items(), key=_order)),
-        "",
-    ]
+    rows = [f"| {value} | {percent(results)} |" for value, results in sorted(by_value.items(), key=_order)]
+    head = f"| {study.split('_')[0]} | success (95 % interval) | training seeds |"
+    return table(head, rows, f"{task}: {CURVES[study]}")
 
 
 def demonstration_table(task: str) -> list[str]:
-    results = load_results(f"demonstrations/{task}-*.json")
-    if not results:
-        return []
-    seed = results[0].training_seed
-    results += [r for r in load_results(f"ablations/{task}-*demos-*.json") if r.training_seed == seed]
-    lines = [f"### {task}: demonstrations", "", "| demonstrations | full | deaf |", "|---|---|---|"]
+    results, rows = load_demonstrations(task), []
     for n in sorted({result.n_demonstrations for result in results}):
-        row = {r.condition: f"{r.rate:.0%}" for r in results if r.n_demonstrations == n}
-        lines.append(f"| {n} | {row.get('full', '')} | {row.get('deaf', '')} |")
-    return [*lines, ""]
+        rates = {r.condition: f"{r.rate:.0%}" for r in results if r.n_demonstrations == n}
+        rows.append(f"| {n} | {rates.get('full', '')} | {rates.get('deaf', '')} |")
+    return table("| demonstrations | full | deaf |", rows, f"{task}: demonstrations")
 
 
 def listening_table() -> list[str]:
-    lines = [
-        "### Listening",
-        "",
-        "| policy | false contact | nothing swapped | muted contact | closed at the false contact |",
-    ]
-    lines.append("|---|---|---|---|---|")
-    paths = sorted((RESULTS / "listening").glob("*.json"))
-    for path in paths:
-        report = json.loads(path.read_text())
+    rows = []
+    for path in sorted((RESULTS / "listening").glob("*.json")):
+        report = load(path)
         cells = [f"{report[mode]['n_reacted']} of {report[mode]['n_trials']}" for mode in ("false", "control", "muted")]
         closed = f"{report['false']['n_closed_there']} of {report['false']['n_trials']}"
-        lines.append(f"| {path.stem} | {' | '.join(cells)} | {closed} |")
-    return [*lines, ""] if paths else []
+        rows.append(f"| {path.stem} | {' | '.join(cells)} | {closed} |")
+    head = "| policy | false contact | nothing swapped | muted contact | closed at the false contact |"
+    return table(head, rows, "Listening")
 
 
-def correction_table(task: str) -> list[str]:
+def correction_tables(task: str) -> list[str]:
     """What corrections are worth, in the time of the attempts and in the task's own, and where the time of a round goes."""
-    kinds: dict[tuple[str, int, int], list[Corrected]] = defaultdict(list)
-    for result in load_corrections(task):
-        kinds[result.kind].append(result)
-    if not kinds:
-        return []
-    lines = [f"### {task}: corrections", ""]
-    lines.append("| policy | demonstrations | updates | time | before | corrected | control | more updates | minutes |")
-    lines.append("|---|---|---|---|---|---|---|---|---|")
+    kinds = load_corrections(task)
+    rows = []
     for kind, results in kinds.items():
         policy = " | ".join(map(str, kind))
         updates = ", ".join(str(result.updates) for result in results)
@@ -120,16 +105,17 @@ def correction_table(task: str) -> list[str]:
             first, last = ([result.evaluations[n][key] for result in results] for n in (0, -1))
             rates = [first, last, [result.control[key] for result in results]]
             cells = " | ".join(_mean_of_seeds(values) for values in rates)
-            lines.append(f"| {policy} | {time} | {cells} | {updates} | {minutes} |")
+            rows.append(f"| {policy} | {time} | {cells} | {updates} | {minutes} |")
     names = sorted({name for results in kinds.values() for result in results for name in result.seconds} - {"total_s"})
-    lines += ["", f"| share of a round | {' | '.join(name.removesuffix('_s') for name in names)} | all of it |"]
-    lines.append("|---" * (len(names) + 2) + "|")
+    shares = []
     for (condition, _, steps), results in kinds.items():
         total = sum(result.seconds["total_s"] for result in results)
         spent = [sum(result.seconds.get(name, 0.0) for result in results) for name in names]
         cells = " | ".join(f"{value / total:.1%}" for value in spent)
-        lines.append(f"| {condition}, {steps} updates before | {cells} | {total:.0f} s |")
-    return [*lines, ""]
+        shares.append(f"| {condition}, {steps} updates before | {cells} | {total:.0f} s |")
+    head = "| policy | demonstrations | updates | time | before | corrected | control | more updates | minutes |"
+    share_head = f"| share of a round | {' | '.join(name.removesuffix('_s') for name in names)} | all of it |"
+    return table(head, rows, f"{task}: corrections") + table(share_head, shares)
 
 
 def _mean_of_seeds(rates: list[float]) -> str:
@@ -140,22 +126,16 @@ def _mean_of_seeds(rates: list[float]) -> str:
 
 def run_length_table(task: str) -> list[str]:
     """What windows that share encodings teach, beside windows that do not: as many of them, and what they took."""
-    lines = []
+    rows = []
     for length in RUN_LENGTHS:
         results = load_results(f"run_length/{task}-full-k{length}-*.json")
         if results:
             paths = (RESULTS / "run_length" / "held_out_loss").glob(f"{task}-full-k{length}-*.json")
-            losses = ", ".join(f"{json.loads(path.read_text()):.4f}" for path in sorted(paths))
+            losses = ", ".join(f"{load(path):.4f}" for path in sorted(paths))
             minutes = ", ".join(f"{result.minutes:.1f}" for result in results)
-            lines.append(f"| {length} | {percent(results)} | {losses} | {minutes} |")
-    if not lines:
-        return []
-    head = [
-        f"### {task}: windows per run, K",
-        "",
-        "| K | success (95 % interval) | training seeds | held-out loss | minutes |",
-    ]
-    return [*head, "|---|---|---|---|---|", *lines, ""]
+            rows.append(f"| {length} | {percent(results)} | {losses} | {minutes} |")
+    head = "| K | success (95 % interval) | training seeds | held-out loss | minutes |"
+    return table(head, rows, f"{task}: windows per run, K")
 
 
 def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
@@ -166,15 +146,12 @@ def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
 
 
 def main() -> None:
-    lines: list[str] = []
-    for task in TASKS:
-        lines += ablation_table(task)
-    lines += listening_table()
+    lines = [line for task in TASKS for line in ablation_table(task)] + listening_table()
     for task in TASKS:
         lines += demonstration_table(task)
-        lines += curve_table("noise", task) + curve_table("noise_white", task) + curve_table("materials", task)
-        lines += run_length_table(task)
-        lines += correction_table(task)
+        for study in CURVES:
+            lines += curve_table(study, task)
+        lines += run_length_table(task) + correction_tables(task)
     print("\n".join(lines))
 
 

@@ -7,8 +7,6 @@ stands the loss on demonstrations that no training saw, and the minutes. A small
 the figures compare, and say nothing about what a policy can reach.
 """
 
-import argparse
-import json
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -16,7 +14,17 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import make_pre_post_processors
 
-from experiments.protocol import RESULTS, RUN_LENGTHS, TASKS, TRAINING_SEEDS, Result, dataset_root, record
+from experiments.protocol import (
+    N_DEMONSTRATIONS,
+    RESULTS,
+    RUN_LENGTHS,
+    Result,
+    command_line,
+    dataset_root,
+    load,
+    record,
+    save,
+)
 from experiments.training import Job, train_and_evaluate
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -25,12 +33,12 @@ from lerobot_playbyear.training.windows import PolicyWindows
 STUDY = "run_length"
 N_WINDOWS = 64  # per update
 STEPS = 600
-N_DEMONSTRATIONS, N_RECORDED = 50, 100  # what is recorded beyond the demonstrations is held out
+N_RECORDED = 100  # what is recorded beyond the demonstrations is held out
 
 
 def job_of(task: str, run_length: int, seed: int) -> Job:
     options = (f"--policy.n_supervised_steps={run_length}", f"--batch_size={N_WINDOWS // run_length}")
-    return Job(STUDY, task, "full", seed, N_DEMONSTRATIONS, STEPS, options=options, variant=f"k{run_length}")
+    return Job(STUDY, task, "full", seed, steps=STEPS, options=options, variant=f"k{run_length}")
 
 
 @torch.no_grad()
@@ -55,17 +63,13 @@ def study(job: Job) -> tuple[Result, float]:
     result = train_and_evaluate(job)
     path = RESULTS / STUDY / "held_out_loss" / f"{job.name}.json"
     if not path.exists():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(held_out_loss(job)) + "\n")
-    return result, json.loads(path.read_text())
+        save(path, held_out_loss(job))
+    return result, load(path)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", choices=TASKS, default=TASKS[0])
+    parser = command_line(__doc__, "task", "seeds", "jobs")
     parser.add_argument("--run_lengths", nargs="+", type=int, default=RUN_LENGTHS)
-    parser.add_argument("--seeds", nargs="+", type=int, default=TRAINING_SEEDS, help="of training")
-    parser.add_argument("--jobs", type=int, default=1, help="policies that are trained side by side")
     options = parser.parse_args()
     record(options.task, N_RECORDED)
     jobs = [job_of(options.task, length, seed) for seed in options.seeds for length in options.run_lengths]

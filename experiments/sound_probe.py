@@ -1,6 +1,6 @@
 """An environment whose sound is swapped at one moment: another episode's contact where there is none, or the reverse."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -38,24 +38,14 @@ class Trial:
     """What happened after the swap.
 
     Attributes:
-        seed: Of the episode.
         swapped_at: Step after which the policy heard the swapped sound; None if the moment never came.
         reacted_after: Steps until the sweep stopped; None if it went on.
-        n_awaited: Steps that were there to react: fewer than `REACTION_STEPS` if the episode ended.
         closed_there: Whether it later closed the fingers where the false contact told it to.
     """
 
-    seed: int = -1
     swapped_at: int | None = None
     reacted_after: int | None = None
-    n_awaited: int = 0
     closed_there: bool = False
-
-
-@dataclass
-class _History:
-    actions: list[np.ndarray] = field(default_factory=list)
-    y: list[float] = field(default_factory=list)
 
 
 class SoundProbe(gym.Wrapper):
@@ -70,12 +60,9 @@ class SoundProbe(gym.Wrapper):
 
     def __init__(self, env: gym.Env, mode: str, donors: list[Donor]):
         super().__init__(env)
-        if mode not in ("false", "muted", "control"):
-            raise ValueError(f"mode={mode!r}: choose false, muted or control.")
         self._mode, self._donors = mode, donors
         self._task: Any = env.unwrapped
         self._reach = self._task.variant.arm.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
-        self.trial = Trial()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         if seed is None:
@@ -83,7 +70,9 @@ class SoundProbe(gym.Wrapper):
         self._rng = np.random.default_rng([seed, 1])
         self._donor = self._donors[self._rng.integers(len(self._donors))]
         self._wait = int(self._rng.integers(0, 6))
-        self.trial, self._past = Trial(seed=seed), _History()
+        self._swapped_at: int | None = None
+        self._actions: list[np.ndarray] = []
+        self._y: list[float] = []  # of the hand, after each of them
         if self._mode != "muted":
             lower, upper = self._task.variant.cube_y
             y = lower + (upper - lower) / 4 * float(self._rng.integers(1, 5)) - _FAR_END
@@ -92,29 +81,45 @@ class SoundProbe(gym.Wrapper):
 
     def step(self, action):
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._past.actions.append(np.array(action, dtype=float))
-        self._past.y.append(float(self._task.eef_position[1]))
-        trial = self.trial
-        if trial.swapped_at is None and self._is_moment():
-            trial.swapped_at = len(self._past.actions)
-        if trial.swapped_at is not None:
-            observation = self._swap(observation, len(self._past.actions) - trial.swapped_at)
-            self._judge()
-            truncated = truncated or self._is_over()
+        self._actions.append(np.array(action, dtype=float))
+        self._y.append(float(self._task.eef_position[1]))
+        if self._swapped_at is None and self._is_moment():
+            self._swapped_at = len(self._actions)
+        if self._swapped_at is not None:
+            n_after = len(self._actions) - self._swapped_at
+            observation = self._swap(observation, n_after)
+            truncated = truncated or n_after >= (
+                _GRASP_WINDOW if self._mode == "false" else REACTION_STEPS + _N_STOPPED
+            )
         return observation, reward, terminated, truncated, info
+
+    @property
+    def trial(self) -> Trial:
+        """Of the last episode."""
+        start = self._swapped_at
+        if start is None:
+            return Trial()
+        after = self._actions[start:]
+        limit = _STOPPED_SHARE * float(np.mean([action[1] for action in self._actions[start - _N_BEFORE : start]]))
+        slow = [action[1] < limit for action in after[: REACTION_STEPS + _N_STOPPED - 1]]
+        stops = (k + 1 for k in range(len(slow) - _N_STOPPED + 1) if all(slow[k : k + _N_STOPPED]))
+        there = self._y[start - 1] + self._reach
+        grasps = zip(after[:_GRASP_WINDOW], self._y[start:], strict=False)
+        closed_there = any(action[3] > 0 and abs(y - there) < CUBE_HALF_SIZE for action, y in grasps)
+        return Trial(start, next(stops, None), closed_there)
 
     def _is_moment(self) -> bool:
         touched = self._task.contact_forces["gripper-cube"] > 0
         if self._mode == "muted":
             return touched and self._is_sweeping()
-        way = float(self._task.cube_position[1]) - self._past.y[-1] - self._reach
+        way = float(self._task.cube_position[1]) - self._y[-1] - self._reach
         if touched or way < _FREE_WAY or not self._is_sweeping():
             return False
         self._wait -= 1
         return self._wait < 0
 
     def _is_sweeping(self) -> bool:
-        before = self._past.actions[-_N_BEFORE:]
+        before = self._actions[-_N_BEFORE:]
         low = self._task.eef_position[2] < TABLE_TOP + _SWEEP_HEIGHT
         return low and len(before) == _N_BEFORE and float(np.mean([a[1] for a in before])) > _SWEEPING
 
@@ -126,26 +131,6 @@ class SoundProbe(gym.Wrapper):
         else:
             return observation
         return {**observation, AUDIO_KEY: block.copy()}
-
-    def _judge(self) -> None:
-        trial, actions = self.trial, self._past.actions
-        start = trial.swapped_at
-        assert start is not None
-        after = [float(action[1]) for action in actions[start:]]
-        trial.n_awaited = min(len(after), REACTION_STEPS)
-        limit = _STOPPED_SHARE * float(np.mean([action[1] for action in actions[start - _N_BEFORE : start]]))
-        if trial.reacted_after is None:
-            slow = [y < limit for y in after[: REACTION_STEPS + _N_STOPPED - 1]]
-            stops = [k for k in range(len(slow) - _N_STOPPED + 1) if all(slow[k : k + _N_STOPPED])]
-            trial.reacted_after = stops[0] + 1 if stops else None
-        if len(after) <= _GRASP_WINDOW and after and actions[-1][3] > 0 and not trial.closed_there:
-            there = self._past.y[start - 1] + self._reach
-            trial.closed_there = abs(self._past.y[-1] - there) < CUBE_HALF_SIZE
-
-    def _is_over(self) -> bool:
-        assert self.trial.swapped_at is not None
-        n_after = len(self._past.actions) - self.trial.swapped_at
-        return n_after >= (_GRASP_WINDOW if self._mode == "false" else REACTION_STEPS + _N_STOPPED)
 
 
 def make_donors(env: gym.Env, seeds: range) -> list[Donor]:

@@ -1,21 +1,27 @@
 """Train and evaluate one policy with the commands that everybody has; what is there already is kept."""
 
-import json
 import shutil
 import time
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from experiments.protocol import (
     CONDITIONS,
     EVALUATION_SEEDS,
+    N_DEMONSTRATIONS,
     RESULTS,
     RUNS,
+    STEPS,
     Result,
     dataset_root,
+    load,
+    options_of,
     run,
+    save,
     shown,
-    tool,
 )
 
 
@@ -25,7 +31,8 @@ class Job:
 
     Attributes:
         study: Folder of its result.
-        options: Further options of `playbyear-train`.
+        start: The options of `playbyear-train` that say what a training begins with.
+        options: Further ones.
         variant: What the options do, for the names of files; empty without any.
         dataset: Folder of a dataset that holds the demonstrations and no more. None: the first ones of the task's own.
     """
@@ -34,13 +41,20 @@ class Job:
     task: str
     condition: str
     training_seed: int
-    n_demonstrations: int
-    steps: int
+    n_demonstrations: int = N_DEMONSTRATIONS
+    steps: int = STEPS
     threads: int = 1
     evaluation_seeds: range = EVALUATION_SEEDS
-    options: tuple[str, ...] = field(default=())
+    start: tuple[str, ...] = ("--preset=cpu", "--save_freq=500")
+    options: tuple[str, ...] = ()
     variant: str = ""
     dataset: Path | None = None
+
+    @property
+    def learned(self) -> dict[str, Any]:
+        """What its result says of the policy."""
+        names = ("task", "condition", "training_seed", "n_demonstrations", "steps")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def name(self) -> str:
@@ -58,25 +72,25 @@ class Job:
 
 def train_and_evaluate(job: Job) -> Result:
     """Trains, evaluates and saves the result; returns the saved one if there is one."""
-    if job.result_path.exists():
-        return Result.load(job.result_path)
-    train_command, minutes = train(job)
-    commands = [train_command]
-    successes = evaluate(job, commands)
-    result = Result(
-        task=job.task,
-        condition=job.condition,
-        training_seed=job.training_seed,
-        n_demonstrations=job.n_demonstrations,
-        steps=job.steps,
-        first_seed=job.evaluation_seeds.start,
-        successes=successes,
-        minutes=round(minutes, 1),
-        threads=job.threads,
-        commands=commands,
-    )
-    result.save(job.result_path)
-    return result
+    if not job.result_path.exists():
+        command, minutes = train(job)
+        commands = [command]
+        result = Result(
+            **job.learned,
+            first_seed=job.evaluation_seeds.start,
+            successes=evaluate(job, commands),
+            minutes=round(minutes, 1),
+            threads=job.threads,
+            commands=commands,
+        )
+        save(job.result_path, asdict(result))
+    return Result(**load(job.result_path))
+
+
+def side_by_side(jobs: Sequence[Job], n: int) -> Iterator[Result]:
+    """Trains and evaluates n policies at a time; the results come in the order of the jobs."""
+    with ThreadPoolExecutor(n) as pool:
+        yield from pool.map(train_and_evaluate, jobs)
 
 
 def train(job: Job) -> tuple[str, float]:
@@ -86,41 +100,50 @@ def train(job: Job) -> tuple[str, float]:
         The command, and the minutes that its training took in all.
     """
     folder = RUNS / "train" / job.name
+    episodes, named = str(list(range(job.n_demonstrations))), f"[0..{job.n_demonstrations - 1}]"
     command = [
-        tool("playbyear-train"),
-        "--preset=cpu",
-        *_demonstrations(job),
+        "playbyear-train",
+        *job.start,
+        *options_of(job.dataset or dataset_root(job.task)),
+        *([] if job.dataset else [f"--dataset.episodes={episodes}"]),
         f"--output_dir={folder}",
         f"--steps={job.steps}",
-        "--save_freq=500",
         "--env_eval_freq=0",
         f"--seed={job.training_seed}",
         "--wandb.enable=false",
         *CONDITIONS[job.condition],
         *job.options,
     ]
-    clock = folder.with_suffix(".minutes")
+    todo = command
+    last = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    if (folder / "checkpoints" / f"{job.steps:06}").exists():
+        todo = []
+    elif last.exists():
+        todo = ["playbyear-train", "--resume=true", f"--config_path={last}"]
+    elif folder.exists():  # interrupted before its first checkpoint
+        shutil.rmtree(folder)
+    return shown(command).replace(episodes, named), clocked(todo, folder, job.threads)
+
+
+def clocked(command: list[str], folder: Path, threads: int) -> float:
+    """Runs a command that can go on where it stopped, if there is one.
+
+    Args:
+        command: What is to run; empty if all of it is done.
+        folder: What it writes to; a file beside it keeps the time.
+        threads: For the command.
+
+    Returns:
+        The minutes that it took in all.
+    """
+    clock = folder.with_name(f"{folder.name}.minutes")
     spent = float(clock.read_text()) if clock.exists() else 0.0
-    if not (folder / "checkpoints" / str(job.steps).zfill(6)).exists():
-        last = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-        resume = [tool("playbyear-train"), "--resume=true", f"--config_path={last}"]
-        if folder.exists() and not last.exists():  # interrupted before its first checkpoint
-            shutil.rmtree(folder)
+    if command:
         start = time.monotonic()
-        run(resume if last.exists() else command, RUNS / "logs" / f"train-{job.name}.log", job.threads)
+        run(command, f"{command[0]}-{folder.name}", threads)
         spent += (time.monotonic() - start) / 60
         clock.write_text(str(spent))
-    return shown(command).replace(
-        json.dumps(list(range(job.n_demonstrations))), f"[0..{job.n_demonstrations - 1}]"
-    ), spent
-
-
-def _demonstrations(job: Job) -> list[str]:
-    folder = job.dataset or dataset_root(job.task)
-    options = [f"--dataset.repo_id=experiments/{folder.name}", f"--dataset.root={folder}"]
-    if job.dataset is None:
-        options.append(f"--dataset.episodes={json.dumps(list(range(job.n_demonstrations)))}")
-    return options
+    return spent
 
 
 def evaluate(
@@ -138,7 +161,7 @@ def evaluate(
     label = f"{name or job.study}-{job.name}"
     output = RUNS / "eval" / label
     command = [
-        tool("lerobot-eval"),
+        "lerobot-eval",
         f"--policy.path={checkpoint or job.checkpoint}",
         "--env.type=playbyear",
         f"--env.task={job.task}",
@@ -149,7 +172,7 @@ def evaluate(
         f"--output_dir={output}",
         *environment,
     ]
-    run(command, RUNS / "logs" / f"eval-{label}.log", job.threads)
+    run(command, f"eval-{label}", job.threads)
     commands.append(shown(command))
-    report = json.loads((output / "eval_info.json").read_text())
+    report = load(output / "eval_info.json")
     return [bool(success) for success in report["per_task"][0]["metrics"]["successes"]]

@@ -294,7 +294,7 @@ class _Handler(BaseHTTPRequestHandler):
                     return Answer({"error": "Invalid username or password."}, 401)
                 groups = {key: value for key, value in found.groupdict().items() if value is not None}
                 try:
-                    return method(self.server_hub, self, **groups)
+                    return getattr(self.server_hub, method.__name__)(self, **groups)
                 except HubAnswerError as error:
                     headers = {"X-Error-Code": error.code, "X-Error-Message": error.message}
                     return Answer({"error": error.message}, error.status, headers)

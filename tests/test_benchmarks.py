@@ -1,6 +1,7 @@
 """What the benchmarks compare with is what they say, and their figures and tables are put together rightly."""
 
 import json
+import subprocess
 import sys
 from pathlib import Path
 
@@ -140,3 +141,31 @@ def test_a_command_is_timed_up_to_the_first_of_its_files(tmp_path):
     table = rows(dict.fromkeys(timed, 3.0))
     assert len(table) == len(timed) - 1
     assert {row.what for row in table if row.holds} == {row.what for row in table if "first work" in row.what}
+
+
+@pytest.mark.slow
+def test_the_benchmark_for_gpus_runs_without_one(tmp_path):
+    """Every part of it, with two demonstrations and a network that learns nothing in three updates."""
+    options = (
+        "--steps=3 --batch_size=2 --policy.image_size=32 --policy.vision_width=8 --policy.n_supervised_steps=4 "
+        "--policy.hidden_size=64 --compile=false --save_freq=3"
+    )
+    small = ("--device=cpu", "--demos=2", "--rounds=1", "--evaluations=2", f"--options={options}")
+    output = tmp_path / "bench.json"
+    command = [sys.executable, str(BENCHMARKS / "gpu.py"), *small, f"--output={output}"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr[-3000:]
+    rows = {row["what"]: row for row in json.loads(output.read_text())["gpu"]["rows"]}
+    operations = rows["operations of an update over its time"]
+    assert 0 < operations["ours"] < operations["limit"]
+    assert rows["a round of HG-DAgger"]["ours"] > 0
+    assert 0 <= rows["success on 2 episodes"]["ours"] <= 100
+
+
+def test_the_benchmark_for_gpus_says_that_there_is_none(monkeypatch):
+    import gpu
+
+    monkeypatch.setattr(sys, "argv", ["gpu.py"])
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(SystemExit, match="no NVIDIA GPU here; --device=cpu"):
+        gpu.main()

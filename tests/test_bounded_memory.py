@@ -19,7 +19,7 @@ from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frame
 from test_attach_audio import config as attach_config
 from test_attach_audio import silent_dataset, write_sounds
 
-from lerobot_playbyear.datasets import EpisodeStore, audio_feature, opening, parquet_files, resample, spooled_sound
+from lerobot_playbyear.datasets import EpisodeStore, attached_sound, audio_feature, opening, parquet_files, resample
 from lerobot_playbyear.datasets.attach import attach_audio
 from lerobot_playbyear.datasets.audio_files import Resampled
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -70,13 +70,13 @@ def peak_of_process(work: Callable[[], object]) -> int:
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Pieces of 16 kB, so that a short episode has many."""
-    for module in (parquet_files, spooled_sound, carry_out):
+    for module in (parquet_files, attached_sound, carry_out):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**14)
 
 
 @pytest.fixture
 def megabyte_pieces(monkeypatch):
-    for module in (parquet_files, spooled_sound, carry_out):
+    for module in (parquet_files, attached_sound, carry_out):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**20)
 
 
@@ -219,7 +219,7 @@ def test_attaching_in_pieces_gives_the_same_dataset_and_holds_no_file(tmp_path, 
     silent_dataset(tmp_path / "silent")
     files = write_sounds(tmp_path / "sound")
     in_pieces = attach_audio(attach_config(tmp_path / "silent", tmp_path / "pieces", files))
-    for module in (parquet_files, spooled_sound):
+    for module in (parquet_files, attached_sound):
         module.PIECE_BYTES = 2**26  # put back by the fixture
     at_once = attach_audio(attach_config(tmp_path / "silent", tmp_path / "once", files))
     tables = [pq.read_table(root / "data") for root in (in_pieces, at_once)]

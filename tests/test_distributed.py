@@ -1,10 +1,12 @@
 """Several processes learn what one with all their data learns."""
 
+import json
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -73,54 +75,138 @@ def test_two_processes_normalise_and_weigh_like_one_with_all_items(tmp_path):
     torch.testing.assert_close(of_images, one["images.grad"], rtol=1e-4, atol=1e-6)
 
 
-def losses_of(command: list[str], folder: Path, batch_size: int, dataset: Path) -> tuple[list[float], Path]:
-    """The loss of every step of a training, and its last checkpoint."""
-    program = str(Path(sys.executable).with_name("lerobot-train"))
-    options = [
-        "--policy.type=playbyear",
-        "--policy.device=cpu",
-        "--policy.push_to_hub=false",
-        "--policy.image_size=32",
-        "--policy.vision_width=8",
-        "--policy.audio_window_s=0.9",
-        "--policy.n_memory_steps=3",
-        "--policy.n_supervised_steps=4",
-        "--policy.hidden_size=64",
-        *(f"--policy.augmentation_{name}=0" for name in ("crop", "brightness", "hue", "degrees", "translate", "scale")),
-        "--dataset.repo_id=tests/noise",
-        f"--dataset.root={dataset}",
-        f"--output_dir={folder}",
-        f"--batch_size={batch_size}",
-        "--num_workers=0",
-        "--steps=6",
-        "--save_freq=6",
-        "--log_freq=1",
-        "--seed=3",
-        "--wandb.enable=false",
-    ]
-    result = subprocess.run(
-        [*command, program, *options],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
+AUGMENTATIONS = ("crop", "brightness", "hue", "degrees", "translate", "scale")
+WITHOUT_CHANCE = tuple(f"--policy.augmentation_{name}=0" for name in AUGMENTATIONS)
+"""Augmentation is drawn per process; without it two processes see what one does."""
+
+TINY = (
+    "--policy.type=playbyear",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+    "--policy.image_size=32",
+    "--policy.vision_width=8",
+    "--policy.audio_window_s=0.9",
+    "--policy.n_memory_steps=3",
+    "--policy.n_supervised_steps=4",
+    "--policy.hidden_size=64",
+    *WITHOUT_CHANCE,
+    "--num_workers=0",
+    "--log_freq=1",
+    "--seed=3",
+)
+
+
+def launch(n_processes: int, program: str, *options: object) -> str:
+    """Runs a program in several processes through the real launcher, one thread each; what it printed."""
+    folder = Path(sys.executable).parent
+    command = [str(folder / program), *map(str, options)]
+    if n_processes > 1:
+        processes = ("--multi_gpu", f"--num_processes={n_processes}", "--num_machines=1", "--main_process_port=0")
+        command = [
+            str(folder / "accelerate"),
+            "launch",
+            *processes,
+            "--mixed_precision=no",
+            "--dynamo_backend=no",
+            *command,
+        ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     output = result.stdout + result.stderr
     assert result.returncode == 0, output[-4000:]
-    losses = [float(found) for found in re.findall(r"loss:([\d.]+)", output)]
-    return losses, folder / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
+    return output
+
+
+def figures(folder: Path, kind: str) -> list[dict[str, Any]]:
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [line for line in lines if line["kind"] == kind]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    root = tmp_path_factory.mktemp("data") / "noise"
+    make_dataset(root, (30, 30), image_size=48)
+    return root
 
 
 @pytest.mark.slow
-def test_accelerate_in_two_processes_learns_what_one_with_twice_the_batch_learns(tmp_path):
-    dataset = tmp_path / "dataset"
-    make_dataset(dataset, (30, 30), image_size=16)
-    accelerate = str(Path(sys.executable).with_name("accelerate"))
-    launch = [accelerate, "launch", "--multi_gpu", "--num_processes=2", "--num_machines=1", "--mixed_precision=no"]
-    together, their_weights = losses_of([*launch, "--dynamo_backend=no"], tmp_path / "two", 4, dataset)
-    alone, weights = losses_of([sys.executable], tmp_path / "one", 8, dataset)
-    assert len(alone) == len(together) == 6
-    assert together == pytest.approx(alone, abs=2e-3)  # three decimals are printed
-    ours, theirs = load_file(weights), load_file(their_weights)
-    for key in (key for key in ours if key.endswith(("mean", "variance", "running_var"))):
-        torch.testing.assert_close(theirs[key], ours[key], rtol=1e-2, atol=1e-3)
+def test_lerobots_training_in_two_processes_learns_what_one_with_twice_the_batch_learns(tmp_path, dataset):
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={dataset}", "--steps=6", "--save_freq=6")
+    losses, weights = [], []
+    for n_processes in (2, 1):
+        folder = tmp_path / str(n_processes)
+        options = (*TINY, *data, f"--output_dir={folder}", f"--batch_size={8 // n_processes}")
+        output = launch(n_processes, "lerobot-train", *options)
+        losses.append([float(found) for found in re.findall(r"loss:([\d.]+)", output)])
+        weights.append(load_file(folder / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"))
+    assert len(losses[0]) == len(losses[1]) == 6
+    assert losses[0] == pytest.approx(losses[1], abs=2e-3)  # three decimals are printed
+    for key in (key for key in weights[0] if key.endswith(("mean", "variance", "running_var"))):
+        torch.testing.assert_close(weights[0][key], weights[1][key], rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_training_in_two_processes_learns_what_one_with_twice_the_batch_learns(tmp_path, dataset):
+    """Over 20 updates, from a store on the disk that one of the two makes, with one checkpoint and one line per update."""
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={dataset}", "--dataset.eval_split=0.5", "--eval_steps=10")
+    losses = {}
+    for n_processes in (2, 1):
+        folder, cache = tmp_path / str(n_processes), tmp_path / f"cache{n_processes}"
+        store = ("--store=disk", f"--store.cache={cache}")
+        options = (*TINY, *data, *store, "--steps=20", "--save_freq=10", f"--batch_size={8 // n_processes}")
+        launch(n_processes, "playbyear-train", *options, f"--output_dir={folder}")
+        losses[n_processes] = [line["loss"] for line in figures(folder, "train")]
+        assert [line["step"] for line in figures(folder, "train")] == list(range(1, 21))
+        assert [line["step"] for line in figures(folder, "validation")] == [10, 20]
+        assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == ["000010", "000020", "last"]
+        assert len([path for path in cache.iterdir() if path.is_dir()]) == 2
+    assert losses[2] == pytest.approx(losses[1], rel=2e-3)
+    last = tmp_path / "2" / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    launch(2, "playbyear-train", "--resume=true", f"--config_path={last}", "--steps=22")
+    assert figures(tmp_path / "2", "train")[-1]["step"] == 22
+
+
+def demonstrations_as_corrections(base: Path) -> list[str]:
+    place = ("repo_id=tests/demos", f"root={base / 'demos'}")
+    return [f"--{name}.{option}" for name in ("demos", "interventions") for option in place]
+
+
+@pytest.mark.slow
+def test_corrections_in_two_processes_teach_what_they_teach_in_one(tmp_path):
+    """The batch is shared out, so that both have the same number of runs."""
+    from dagger_factory import base_folder
+
+    base, losses = base_folder(), {}
+    for n_processes in (2, 1):
+        folder = tmp_path / str(n_processes)
+        options = (
+            f"--policy.path={base / 'policy'}",
+            *WITHOUT_CHANCE,
+            "--episodes=0",
+            "--updates=20",
+            "--batch_size=4",
+        )
+        rest = ("--updates_per_episode=5", "--eval_every=0", f"--output_dir={folder}")
+        launch(n_processes, "playbyear-dagger", *demonstrations_as_corrections(base), *options, *rest)
+        losses[n_processes] = [(line["loss"], line["loss_demonstrations"]) for line in figures(folder, "round")]
+        assert len(losses[n_processes]) == 4
+    for two, one in zip(losses[2], losses[1], strict=True):
+        assert two == pytest.approx(one, rel=1e-2)
+
+
+@pytest.mark.slow
+def test_runs_that_cannot_be_shared_are_refused(tmp_path):
+    from dagger_factory import base_folder
+
+    base = base_folder()
+    options = (
+        f"--policy.path={base / 'policy'}",
+        "--episodes=0",
+        "--updates=4",
+        "--batch_size=6",
+        f"--output_dir={tmp_path / 'out'}",
+    )
+    with pytest.raises(AssertionError, match="6 runs per update cannot be shared by 4 processes: give a multiple of 4"):
+        launch(
+            4, "playbyear-dagger", *demonstrations_as_corrections(base), *options, f"--output_dir={tmp_path / 'out'}"
+        )

@@ -15,6 +15,7 @@ from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.files import is_listed, list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing, read_table
 from lerobot_playbyear.datasets.repair import check_dataset, repair_dataset, repairing
+from lerobot_playbyear.datasets.repair.rescue import rescue
 from lerobot_playbyear.datasets.repair.video_times import picture_times
 from lerobot_playbyear.inspection.damage import find_damage
 from lerobot_playbyear.scripts import repair as repair_command
@@ -97,6 +98,12 @@ def test_a_lack_of_memory_is_no_damage_and_a_misread_size_is(tmp_path):
         raise MemoryError
     with pytest.raises(ParquetDamageError, match="failed"), parsing(path):
         pa.allocate_buffer(2**60)
+
+
+def test_bytes_that_nest_without_end_are_no_pages(tmp_path):
+    path = tmp_path / "file.parquet"
+    path.write_bytes(b"PAR1" + b"\x19" * 60_000)  # a list with a list with a list
+    assert rescue(path, pa.schema([("index", pa.int64())])) is None
 
 
 @pytest.mark.skipif(os.name == "nt", reason="a shell script stands for the decoder's process")

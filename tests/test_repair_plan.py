@@ -6,13 +6,10 @@ from pathlib import Path
 import pandas as pd
 from lerobot.datasets.utils import DatasetInfo
 
-from lerobot_playbyear.datasets.repair.data_file import DataFile
-from lerobot_playbyear.datasets.repair.dataset_statistics import OwnStats
 from lerobot_playbyear.datasets.repair.episodes import Episode
-from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing
-from lerobot_playbyear.datasets.repair.frames import Run
+from lerobot_playbyear.datasets.repair.frames import DataFile, Run
 from lerobot_playbyear.datasets.repair.plan import make_plan
-from lerobot_playbyear.datasets.repair.report import describe
+from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.repair.survey import Survey
 from lerobot_playbyear.datasets.repair.tasks import Tasks
 
@@ -23,17 +20,18 @@ NOWHERE = Path("nowhere")
 def whole(number: int, **changes) -> Episode:
     file = DataFile(Path("data/chunk-000/file-000.parquet"), NOWHERE, is_whole=True, n_rows=4 * LENGTH)
     run = Run(file, number * LENGTH, LENGTH, number, 0, number * LENGTH, True, (0,))
-    return Episode(number, State.FINE, replace(run, **changes), {"episode_index": number, "length": LENGTH})
+    return Episode(number, replace(run, **changes), {"episode_index": number, "length": LENGTH})
 
 
 def lost(number: int) -> Episode:
-    return Episode(number, State.MISSING, reason="its frames are lost")
+    return Episode(number, reason="its frames are lost")
 
 
-def survey(*episodes: Episode, findings: tuple[Finding, ...] = (), splits: dict[str, str] | None = None) -> Survey:
+def survey(*episodes: Episode, tables_are_right: bool = True, splits: dict[str, str] | None = None) -> Survey:
     info = DatasetInfo("v3.0", 20, {}, len(episodes), LENGTH * len(episodes), splits=splits or {})
-    tasks = Tasks(pd.DataFrame({"task_index": [0]}, index=["Listen."]), True, False, ())
-    return Survey(info, {}, tuple(episode.row for episode in episodes), episodes, tasks, OwnStats({}, ()), findings)
+    tasks = Tasks(pd.DataFrame({"task_index": [0]}, index=["Listen."]), note=None)
+    rows = [episode.row for episode in episodes]
+    return Survey(RepairReport(NOWHERE), info, {}, rows, tables_are_right, episodes, tasks, {})
 
 
 def test_of_a_sound_dataset_everything_stays():
@@ -42,9 +40,9 @@ def test_of_a_sound_dataset_everything_stays():
         (number, LENGTH * number, True) for number in range(4)
     ]
     assert plan.tables_stay
-    assert not plan.dropped
+    assert not plan.survey.report.dropped
     assert not plan.notes
-    assert describe(NOWHERE, plan).is_sound
+    assert plan.survey.report.is_sound
 
 
 def test_episodes_after_a_lost_one_move_up_and_the_counts_and_splits_with_them():
@@ -55,7 +53,8 @@ def test_episodes_after_a_lost_one_move_up_and_the_counts_and_splits_with_them()
         (3, 2, 10),
     ]
     assert [kept.frames_stay for kept in plan.kept] == [True, False, False]
-    assert plan.dropped == {1: "its frames are lost"}
+    assert plan.survey.report.dropped == {1: "its frames are lost"}
+    assert plan.survey.report.kept == {0: 0, 2: 1, 3: 2}
     assert (plan.info.total_episodes, plan.info.total_frames) == (3, 15)
     assert plan.info.splits == {"train": "0:2", "val": "2:3"}
     assert len(plan.notes) == 2
@@ -65,29 +64,19 @@ def test_episodes_after_a_lost_one_move_up_and_the_counts_and_splits_with_them()
 def test_a_row_that_is_lost_or_a_table_that_is_damaged_has_the_tables_made_anew():
     without_row = replace(whole(1), row={})
     assert not make_plan(survey(whole(0), without_row)).tables_stay
-    damage = Finding(Thing.TABLE, State.DAMAGED, "a table cannot be read")
-    assert not make_plan(survey(whole(0), findings=(damage,))).tables_stay
-    assert make_plan(survey(whole(0), findings=(replace(damage, thing=Thing.STATISTICS),))).tables_stay
+    assert not make_plan(survey(whole(0), tables_are_right=False)).tables_stay
+    assert make_plan(survey(whole(0))).tables_stay
 
 
 def test_frames_that_are_not_numbered_one_after_the_other_are_numbered_anew():
     plan = make_plan(survey(whole(0), whole(1, is_numbered=False)))
     assert [kept.frames_stay for kept in plan.kept] == [True, False]
-    assert not plan.dropped
+    assert not plan.survey.report.dropped
 
 
 def test_a_report_tells_what_is_proven_from_what_is_not():
-    states = {state: Finding(Thing.INFO, state, state.name.lower()) for state in State}
-    report = describe(NOWHERE, make_plan(survey(whole(0), findings=tuple(states.values()))))
-    assert report.findings == ["damaged", "missing"]
-    assert (report.undecided, report.odd) == (["undecided"], ["odd"])
-    only = {
-        state: describe(NOWHERE, make_plan(survey(whole(0), findings=(finding,)))) for state, finding in states.items()
-    }
-    assert [only[state].is_sound for state in (State.DAMAGED, State.MISSING, State.UNDECIDED, State.ODD)] == [
-        False,
-        False,
-        False,
-        True,
-    ]
-    assert "odd" in str(only[State.ODD])
+    assert not RepairReport(NOWHERE, findings=["It is damaged."]).is_sound
+    assert not RepairReport(NOWHERE, undecided=["It may be."]).is_sound
+    odd = RepairReport(NOWHERE, odd=["It is odd."])
+    assert odd.is_sound
+    assert "It is odd." in str(odd)

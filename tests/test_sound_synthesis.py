@@ -266,6 +266,12 @@ def test_unusable_options_are_refused(changes, message):
         ContactSound(PAIRS, **(options | changes))
 
 
+def test_every_mode_of_a_material_has_a_frequency_a_decay_and_a_gain():
+    for material in MATERIALS.values():
+        assert len(material.frequencies) == len(material.decays) == len(material.gains) > 0
+        assert min(*material.frequencies, *material.decays) > 0
+
+
 def test_unknown_material_is_refused():
     with pytest.raises(ValueError, match=r"'jelly'.*cube"):
         ContactPair("gripper-jelly", ("gripper", "jelly"), ("gripper", "jelly"))

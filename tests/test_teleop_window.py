@@ -99,12 +99,12 @@ class Person(gym.Wrapper):
                 self.screen.let_go(name)
             if self.n in (first, after):
                 is_held = self.n == first
-                wait_for(lambda name=name, is_held=is_held: (name.lower() in self.window.keys.down) is is_held)
+                wait_for(lambda name=name, is_held=is_held: (name.lower() in self.window.keys._held) is is_held)
         return result
 
     @property
     def window(self):
-        return self.expert._desk.window
+        return self.expert.window
 
 
 class Remembering(PolicyActor):
@@ -268,7 +268,7 @@ def test_escape_ends_the_session(screen):
     expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
     screen.focus(screen.window(_TITLE))
     screen.press("s", "Escape")  # before an attempt has begun
-    wait_for(lambda: "escape" in expert._desk.window.keys._pressed_since)
+    wait_for(lambda: "escape" in expert.window.keys._pressed_since)
     with pytest.raises(PersonLeftError):
         play(env, Nobody(), seed=1, expert=expert)
     expert.close()
@@ -279,9 +279,9 @@ def test_a_key_that_is_held_is_let_go_when_the_window_loses_the_keyboard(screen)
     windows = [Window(f"{_TITLE}: {name}") for name in ("first", "second")]
     screen.focus(screen.window("first"))
     screen.hold("space")
-    wait_for(lambda: "space" in windows[0].keys.down)
+    wait_for(lambda: "space" in windows[0].keys._held)
     screen.focus(screen.window("second"))
-    wait_for(lambda: "space" not in windows[0].keys.down)
+    wait_for(lambda: "space" not in windows[0].keys._held)
     assert not windows[0].keys.has_focus
     screen.let_go("space")
     for window in windows:

@@ -1,5 +1,6 @@
 """A person as expert, without a screen: what keys and LeRobot's teleoperators mean, and what becomes of it."""
 
+import copy
 import io
 import json
 from dataclasses import dataclass
@@ -29,15 +30,15 @@ from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig
 from lerobot_playbyear.teleoperation.actions import CLOSE, DELTAS, OPEN, STAY, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
 from lerobot_playbyear.teleoperation.controls import Controls
-from lerobot_playbyear.teleoperation.expert import Desk, PersonLeftError, TeleopExpert
+from lerobot_playbyear.teleoperation.expert import PersonLeftError, TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig, WindowKeys
 from lerobot_playbyear.teleoperation.levels import FLOOR_DB, as_float, level_db
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.panel import FRAME, SIZE, draw
-from lerobot_playbyear.teleoperation.speaker import SoundQueue
+from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.status import Control, Status
 from lerobot_playbyear.teleoperation.window import Window
-from lerobot_playbyear.teleoperation.wire import receive, send
+from lerobot_playbyear.teleoperation.wire import Newest, receive, send
 
 ARM = Box(-1.0, 1.0, (4,), np.float32)
 HAND = {"dtype": "float32", "shape": (4,), "names": {**dict(zip(DELTAS, range(3), strict=True)), "gripper": 3}}
@@ -141,7 +142,7 @@ def test_the_gripper_is_told_what_the_arm_carries_out():
     for _ in range(400):
         close, was_closed = bool(rng.random() < 0.5), gripper.is_closed
         told = gripper.wish(close)
-        controller.command(np.array([0, 0, 0, 1.0 if told else -1.0]), controller.target, 0.05)
+        controller.command(np.array([0, 0, 0, 1.0 if told else -1.0]), controller.target)
         gripper.follow(told)
         assert controller._closed == gripper.is_closed == told
         n_changes, n_ignored = n_changes + (told != was_closed), n_ignored + (told != close)
@@ -194,15 +195,15 @@ def test_levels_are_those_of_full_scale():
 
 
 def test_sound_plays_on_without_gaps_until_nothing_is_left():
-    queue = SoundQueue(block_size=4)
-    queue.put(np.full(4, 0.1))
-    assert not queue.take(4).any()  # one block could run dry at once
-    queue.put(np.full(4, 0.2))
-    np.testing.assert_allclose(queue.take(6), [0.1] * 4 + [0.2] * 2, atol=1e-7)
-    np.testing.assert_allclose(queue.take(4), [0.2, 0.2, 0, 0], atol=1e-7)
+    speaker = Speaker(16000, 4, "a test")
+    speaker.play(np.full(4, 0.1))
+    assert not speaker.take(4).any()  # one block could run dry at once
+    speaker.play(np.full(4, 0.2))
+    np.testing.assert_allclose(speaker.take(6), [0.1] * 4 + [0.2] * 2, atol=1e-7)
+    np.testing.assert_allclose(speaker.take(4), [0.2, 0.2, 0, 0], atol=1e-7)
     for n in range(10):
-        queue.put(np.full(4, n))
-    np.testing.assert_allclose(queue.take(8), [4] * 4 + [5] * 4)  # what came too late is left out
+        speaker.play(np.full(4, n))
+    np.testing.assert_allclose(speaker.take(8), [4] * 4 + [5] * 4)  # what came too late is left out
 
 
 def test_messages_arrive_as_they_were_sent():
@@ -211,20 +212,31 @@ def test_messages_arrive_as_they_were_sent():
         Control.PERSON, "Grasp", 2, 3, 9, 20.0, 19.5, "open", 0.5, {"gripper": [-30.5]}, "", [("P", "pause")]
     )
     stream = io.BytesIO()
-    send(stream, {"status": status.to_json()}, picture)
+    send(stream, (status, picture))
     send(stream, {"key": "space", "is_pressed": True})
     stream.seek(0)
-    message, received = receive(stream)
-    np.testing.assert_array_equal(received, picture)
-    assert Status.from_json(message["status"]) == status
-    assert receive(stream) == ({"key": "space", "is_pressed": True}, None)
+    received, shown = receive(stream)
+    np.testing.assert_array_equal(shown, picture)
+    assert received == status
+    assert receive(stream) == {"key": "space", "is_pressed": True}
     assert receive(stream) is None
 
 
 def test_a_message_that_was_cut_off_is_none():
     stream = io.BytesIO()
-    send(stream, {"key": "space"}, np.zeros((2, 2, 3), np.uint8))
-    assert receive(io.BytesIO(stream.getvalue()[:-1])) is None
+    send(stream, (Status(), np.zeros((2, 2, 3), np.uint8)))
+    for length in range(len(stream.getvalue())):
+        assert receive(io.BytesIO(stream.getvalue()[:length])) is None
+
+
+def test_only_the_newest_is_shown_and_a_picture_until_there_is_another():
+    picture, newest = np.zeros((2, 2, 3), np.uint8), Newest()
+    newest.put(Status(step=1), picture)
+    newest.put(Status(step=2), None)
+    assert newest.take() == (Status(step=2), picture)
+    assert newest.take() is None
+    newest.put(Status(step=3), None)
+    assert newest.take() == (Status(step=3), None)
 
 
 # Keys and events
@@ -350,7 +362,7 @@ class Screenless:
         self.n_pauses = 0
 
     def show(self, status, picture=None):
-        self.shown.append((Status.from_json(status.to_json()), picture))
+        self.shown.append((copy.deepcopy(status), picture))
         if picture is None:
             self.n_pauses += status.control is Control.PAUSED
             on_pause = self.script.get("paused")
@@ -385,8 +397,9 @@ def play(script, teleop=None, begins_paused=False, demonstrates=False, horizon=3
         teleop.connect()
     mapping = ActionMapping(teleop.action_features, env.action_space, "x,y,z", 0.3)
     clock = Clock()
-    desk = Desk(window, teleop, mapping, Gripper(40), Pace(20, clock, clock.sleep), None, [])
-    expert = TeleopExpert(desk, begins_paused, demonstrates)
+    speaker = Speaker(16000, 800, "a test")
+    pace = Pace(20, clock, clock.sleep)
+    expert = TeleopExpert(window, teleop, mapping, Gripper(40), pace, speaker, [], begins_paused, demonstrates)
     try:
         return play_episode(env, Nobody(), seed=3, expert=expert), window
     finally:
@@ -485,7 +498,8 @@ def test_what_was_pressed_before_an_attempt_is_not_meant_for_it():
     teleop.connect()
     clock = Clock()
     mapping = ActionMapping(teleop.action_features, env.action_space, "x,y,z", 0.3)
-    expert = TeleopExpert(Desk(window, teleop, mapping, Gripper(40), Pace(20, clock, clock.sleep), None, []), False)
+    pace, speaker = Pace(20, clock, clock.sleep), Speaker(16000, 800, "a test")
+    expert = TeleopExpert(window, teleop, mapping, Gripper(40), pace, speaker, [], begins_paused=False)
     press(window.keys, "s", "g", "p", "right", "space")
     attempt = play_episode(env, Nobody(), seed=3, expert=expert)
     assert (attempt.verdict, len(attempt), attempt.intervention_share) == (None, 8, 0)

@@ -3,6 +3,7 @@
 import json
 import sys
 
+import numpy as np
 import pytest
 import torch
 from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
@@ -20,9 +21,10 @@ from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts import train as train_script
 from lerobot_playbyear.training import loop
+from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.loop import frame_weights
-from lerobot_playbyear.training.presets import PRESETS, apply_preset
+from lerobot_playbyear.training.presets import PRESETS, RECIPES, apply_preset, preset_options
 from lerobot_playbyear.training.windows import PolicyWindows
 
 train = parser.wrap()(loop.train)
@@ -166,7 +168,7 @@ def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(
 
     tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (tuned["image_size"], tuned["vision_width"]) == (32, 8)
-    assert tuned["n_supervised_steps"] == int(PRESETS["cpu"].training["policy.n_supervised_steps"])
+    assert tuned["n_supervised_steps"] == int(preset_options("cpu")["policy.n_supervised_steps"])
 
 
 def test_its_batches_give_the_loss_of_lerobots(trained, root):
@@ -271,8 +273,8 @@ def test_a_truncated_dataset_and_an_existing_output_are_refused(command, tmp_pat
 
 
 def test_the_command_says_in_one_line_what_is_wrong(command):
-    with pytest.raises(SystemExit, match=r"^error: --preset=gpu is not known. The presets are: cpu .*; paper "):
-        command(train_script.main, "--preset=gpu", "--dataset.repo_id=tests/noise")
+    with pytest.raises(SystemExit, match=r"^error: --preset=tpu is not known. The presets are: cpu .*; paper "):
+        command(train_script.main, "--preset=tpu", "--dataset.repo_id=tests/noise")
 
 
 def test_moments_that_matter_weigh_more():
@@ -301,7 +303,7 @@ def test_a_preset_leaves_checkpoints_and_the_hub_alone():
     shared = apply_preset(["--preset=cpu", "--policy.repo_id=me/policy"])
 
     assert not any(arg.startswith(("--policy.type", "--policy.vision_width")) for arg in tuned)
-    assert f"--batch_size={PRESETS['cpu'].training['batch_size']}" in tuned
+    assert f"--batch_size={preset_options('cpu')['batch_size']}" in tuned
     assert resumed == ["--preset=cpu", "--resume=true"]
     assert "--policy.push_to_hub=false" not in shared
     with pytest.raises(ValueError, match=r"is for --policy.type=playbyear, not for act"):
@@ -326,4 +328,40 @@ def test_presets_are_options_that_exist(name, command, monkeypatch, root):
         command(train_script.main, f"--preset={name}", *data(root))
 
     assert seen[0].policy.type == "playbyear"
-    assert seen[0].steps == int(PRESETS[name].training["steps"])
+    assert seen[0].steps == int(preset_options(name)["steps"])
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_a_configuration_file_as_well(name, command, monkeypatch, root):
+    seen = []
+    monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
+    for options in ((f"--preset={name}", "--policy.use_amp=false"), (f"--config_path={RECIPES / name}.json",)):
+        with pytest.raises(ZeroDivisionError):
+            command(train_script.main, *options, *data(root))
+    by_name, by_file = seen
+    assert by_name.preset == name
+    by_name.preset = None
+    assert by_name == by_file
+
+
+@pytest.mark.parametrize("given", [["--store=disk"], ["--store", "disk"], ["--store.place=disk"]])
+def test_where_frames_are_kept_has_a_short_name(given):
+    assert with_long_store([*given, "--steps=3"]) == ["--store.place=disk", "--steps=3"]
+    assert with_long_store(["--store=store.yaml"]) == ["--store=store.yaml"]
+
+
+def test_a_run_from_the_disk_resumes_from_there_and_sees_shrunk_pictures(tmp_path, command):
+    make_dataset(tmp_path / "data", (12, 17), image_size=48)
+    options = (*TINY, *data(tmp_path / "data"), "--store=disk", f"--store.cache={tmp_path / 'cache'}")
+    command(train_script.main, *options, "--steps=2", f"--output_dir={tmp_path / 'out'}")
+    (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.is_dir())
+    assert np.load(folder / "0.npy", mmap_mode="r").shape == (29, 3, 32, 32)
+    last = tmp_path / "out" / "checkpoints" / "last"
+    command(train_script.main, "--resume=true", f"--config_path={config_of(last)}", "--steps=3")
+    assert step_of(last.resolve()) == 3
+    assert [path for path in (tmp_path / "cache").iterdir() if path.is_dir()] == [folder]
+
+
+def test_a_place_that_does_not_exist_is_named(command, root, tmp_path):
+    with pytest.raises(SystemExit, match="--store=tape is not known: wanted one of memory, disk, auto"):
+        command(train_script.main, *TINY, *data(root), "--store=tape", f"--output_dir={tmp_path / 'out'}")

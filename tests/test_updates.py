@@ -192,11 +192,16 @@ def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(
     cfg, resumed = make()
     resumed.policy.load_state_dict(load_file(folder / "pretrained_model" / "model.safetensors"))
     prefer_channels_last(resumed.policy, resumed.optimizer.optimizer)
+    fuse(resumed.optimizer.optimizer)
     resumed.step, _, _ = load_training_state(folder, resumed.optimizer.optimizer, resumed.scheduler)
     again = batches(resumed)
     for _ in range(3):
         next(again)
     assert learn(resumed, again, 2) == pytest.approx(further, rel=1e-4)
+    assert all(group["fused"] for group in resumed.optimizer.param_groups)
+    _, unfused = make()  # as another machine, or lerobot-train, resumes it
+    load_training_state(folder, unfused.optimizer.optimizer, unfused.scheduler)
+    assert not any(group["fused"] for group in unfused.optimizer.param_groups)
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch compiles for a CPU with g++, which is not here")

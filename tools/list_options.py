@@ -48,25 +48,17 @@ def list_options() -> dict[str, Any]:
 
 
 def _options_of(config: type) -> dict[str, Any]:
-    opened = sorted(_choices(config))
-    groups = {"config_path", *(field.name for field in dataclasses.fields(config))} - set(opened)
+    hints = typing.get_type_hints(config)
+    names = {field.name for field in dataclasses.fields(config)}
+    opened = {name for name in names if any(map(_is_choice, (hints[name], *typing.get_args(hints[name]))))}
+    groups = {"config_path", *names} - opened  # what the latter hold depends on a type
     options = {
         option.removeprefix("--"): _kind(action.type)
         for action in ArgumentParser(config).parser._actions
         for option in action.option_strings
         if option.removeprefix("--").partition(".")[0] in groups
     }
-    return {"options": dict(sorted(options.items())), "open": opened, "required": _required(config)}
-
-
-def _choices(config: type) -> list[str]:
-    """The fields whose options depend on a type."""
-    hints = typing.get_type_hints(config)
-    return [
-        field.name
-        for field in dataclasses.fields(config)
-        if any(_is_choice(part) for part in (hints[field.name], *typing.get_args(hints[field.name])))
-    ]
+    return {"options": dict(sorted(options.items())), "open": sorted(opened), "required": _required(config)}
 
 
 def _required(config: type, prefix: str = "") -> list[str]:

@@ -12,11 +12,10 @@ import numpy as np
 
 N_JOINTS = 7
 PHYSICS_TIMESTEP = 0.002  # s
+ACTION_SCALE = 0.05  # m of displacement per unit of action and step (the authors' code)
 
-# Distance from the hand's frame to the point between the fingertips (Franka's own tool centre point), and to the tips' ends.
-_TCP_OFFSET = 0.1034  # m
-_FINGERTIP_END = 0.112  # m
-TIP_BELOW_TCP = _FINGERTIP_END - _TCP_OFFSET  # m: the fingers reach this much below the controlled point
+# Distance from the hand's frame to the point between the fingertips (Franka's own tool centre point).
+_TCP_OFFSET = 0.1034  # m; the tips end at 0.112
 FINGER_THICKNESS = 0.01  # m, along the opening
 FINGER_WIDTH = 0.02  # m
 FINGER_FRICTION = 0.3  # bare steel: the rough cube tips over a pushing finger instead of jamming against it
@@ -55,70 +54,41 @@ class ArmConfig:
     max_lead: float = 0.06
 
 
-# name, position, quaternion (w x y z), joint range, mass, centre of mass, full inertia, capsule (from, to, radius) or None
 _R = 2**-0.5
-_LINKS = (
+_LINKS = (  # of each: name, position, quaternion (w x y z), joint range; mass, its centre, full inertia; capsule's ends, radius
     (
-        ("link1", (0, 0, 0.333), (1, 0, 0, 0), (-2.8973, 2.8973), 4.970684, (0.003875, 0.002081, -0.04762)),
-        (0.70337, 0.70661, 0.0091170, -0.00013900, 0.0067720, 0.019169),
+        ("link1", (0, 0, 0.333), (1, 0, 0, 0), (-2.8973, 2.8973)),
+        (4.970684, (0.003875, 0.002081, -0.04762), (0.70337, 0.70661, 0.0091170, -0.00013900, 0.0067720, 0.019169)),
         ((0, 0, -0.20), (0, 0, -0.02), 0.06),
     ),
     (
-        ("link2", (0, 0, 0), (_R, -_R, 0, 0), (-1.7628, 1.7628), 0.646926, (-0.003141, -0.02872, 0.003495)),
-        (0.0079620, 0.028110, 0.025995, -0.003925, 0.010254, 0.000704),
+        ("link2", (0, 0, 0), (_R, -_R, 0, 0), (-1.7628, 1.7628)),
+        (0.646926, (-0.003141, -0.02872, 0.003495), (0.0079620, 0.028110, 0.025995, -0.003925, 0.010254, 0.000704)),
         ((0, 0, -0.06), (0, 0, 0.06), 0.06),
     ),
     (
-        (
-            "link3",
-            (0, -0.316, 0),
-            (_R, _R, 0, 0),
-            (-2.8973, 2.8973),
-            3.228604,
-            (0.027518, 0.039252, -0.066502),
-        ),
-        (0.037242, 0.036155, 0.010830, -0.004761, -0.011396, -0.012805),
+        ("link3", (0, -0.316, 0), (_R, _R, 0, 0), (-2.8973, 2.8973)),
+        (3.228604, (0.027518, 0.039252, -0.066502), (0.037242, 0.036155, 0.010830, -0.004761, -0.011396, -0.012805)),
         ((0, 0, -0.25), (0, 0, -0.05), 0.055),
     ),
     (
-        (
-            "link4",
-            (0.0825, 0, 0),
-            (_R, _R, 0, 0),
-            (-3.0718, -0.0698),
-            3.587895,
-            (-0.05317, 0.104419, 0.027454),
-        ),
-        (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641),
+        ("link4", (0.0825, 0, 0), (_R, _R, 0, 0), (-3.0718, -0.0698)),
+        (3.587895, (-0.05317, 0.104419, 0.027454), (0.025853, 0.019552, 0.028323, 0.007796, -0.001332, 0.008641)),
         ((0, 0, -0.05), (0, 0, 0.05), 0.055),
     ),
     (
-        (
-            "link5",
-            (-0.0825, 0.384, 0),
-            (_R, -_R, 0, 0),
-            (-2.8973, 2.8973),
-            1.225946,
-            (-0.011953, 0.041065, -0.038437),
-        ),
-        (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229),
+        ("link5", (-0.0825, 0.384, 0), (_R, -_R, 0, 0), (-2.8973, 2.8973)),
+        (1.225946, (-0.011953, 0.041065, -0.038437), (0.035549, 0.029474, 0.008627, -0.002117, -0.004037, 0.000229)),
         ((0, 0.02, -0.28), (0, 0.03, -0.06), 0.05),
     ),
     (
-        ("link6", (0, 0, 0), (_R, _R, 0, 0), (-0.0175, 3.7525), 1.666555, (0.060149, -0.014117, -0.010517)),
-        (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341),
+        ("link6", (0, 0, 0), (_R, _R, 0, 0), (-0.0175, 3.7525)),
+        (1.666555, (0.060149, -0.014117, -0.010517), (0.001964, 0.004354, 0.005433, 0.000109, -0.001158, 0.000341)),
         ((0, 0, -0.03), (0.06, 0, 0.0), 0.05),
     ),
     (
-        (
-            "link7",
-            (0.088, 0, 0),
-            (_R, _R, 0, 0),
-            (-2.8973, 2.8973),
-            0.735522,
-            (0.010517, -0.004252, 0.061597),
-        ),
-        (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741),
+        ("link7", (0.088, 0, 0), (_R, _R, 0, 0), (-2.8973, 2.8973)),
+        (0.735522, (0.010517, -0.004252, 0.061597), (0.012516, 0.010027, 0.004815, -0.000428, -0.001196, -0.000741)),
         ((0, 0, 0.0), (0, 0, 0.08), 0.045),
     ),
 )
@@ -151,7 +121,7 @@ def _hand_xml(max_opening: float) -> str:
 def arm_body_xml(config: ArmConfig) -> str:
     """MJCF of the arm's body tree: base, seven links, hand, two fingers. Its nine joints come first in the model."""
     body = ""
-    for (name, pos, quat, limits, mass, com), inertia, (start, end, radius) in _LINKS:
+    for (name, pos, quat, limits), (mass, com, inertia), (start, end, radius) in _LINKS:
         body += f"""
       <body name="{name}" pos="{_vector(pos)}" quat="{_vector(quat)}" gravcomp="1">
         <inertial pos="{_vector(com)}" mass="{mass}" fullinertia="{_vector(inertia)}"/>
@@ -179,7 +149,7 @@ def arm_actuator_xml(config: ArmConfig) -> str:
 
 
 ARM_DEFAULT_XML = (
-    """<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>"""
+    '<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>'
 )
 
 
@@ -194,7 +164,6 @@ class CartesianController:
         self.config = config
         self.n_substeps = round(1 / (control_hz * PHYSICS_TIMESTEP))
         self._cooldown_steps = round(config.gripper_cooldown * control_hz)
-        self._finger_step = _FINGER_SPEED * PHYSICS_TIMESTEP
         xml = f"""<mujoco><compiler angle="radian"/><default>{ARM_DEFAULT_XML}</default>
             <worldbody>{arm_body_xml(config)}</worldbody></mujoco>"""
         self._model = mujoco.MjModel.from_xml_string(xml)
@@ -204,40 +173,34 @@ class CartesianController:
         self._lower = self._model.jnt_range[:N_JOINTS, 0] + 0.02
         self._upper = self._model.jnt_range[:N_JOINTS, 1] - 0.02
         self._orientation = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # hand pointing down, fingers open along y
-        self._workspace = np.array(config.workspace)
-        self.joints: np.ndarray = HOME_JOINTS.copy()
-        self.target: np.ndarray = np.zeros(3)
-        self.finger_target = config.max_opening / 2
-        self._closed = False
-        self._steps_since_change = self._cooldown_steps
+        self.reset(np.zeros(3))
 
     def reset(self, position: np.ndarray) -> np.ndarray:
         """Places the commanded point at `position` (3,) [m, world], fingers open. Returns the nine joint positions."""
-        self.joints = HOME_JOINTS.copy()
-        self.target = np.asarray(position, dtype=float).copy()
+        self.joints: np.ndarray = HOME_JOINTS.copy()
+        self.target: np.ndarray = np.asarray(position, dtype=float).copy()
         self._solve(iterations=100)
         self.finger_target = self.config.max_opening / 2
         self._closed = False
         self._steps_since_change = self._cooldown_steps
         return np.concatenate([self.joints, [self.finger_target] * 2])
 
-    def command(self, action: np.ndarray, measured: np.ndarray, scale: float) -> np.ndarray:
+    def command(self, action: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """One control step.
 
         Args:
-            action: (4,) in [-1, 1]: displacement in units of `scale`, gripper (> 0 closes).
+            action: (4,) in [-1, 1]: displacement in units of `ACTION_SCALE`, gripper (> 0 closes).
             measured: (3,) the tool centre point as it is [m, world].
-            scale: metres per unit of action.
 
         Returns:
             (n_substeps, 8) servo targets at physics rate: seven joints [rad], finger position [m].
         """
-        target = self.target + scale * np.asarray(action[:3], dtype=float)
+        target = self.target + ACTION_SCALE * np.asarray(action[:3], dtype=float)
         lead = target - measured
         distance = float(np.linalg.norm(lead))
         if distance > self.config.max_lead:
             target = measured + lead * (self.config.max_lead / distance)
-        self.target = np.clip(target, self._workspace[0], self._workspace[1])
+        self.target = np.clip(target, *self.config.workspace)
         before = self.joints.copy()
         self._solve(iterations=2)
         self._update_gripper(action[3] > 0)
@@ -246,7 +209,7 @@ class CartesianController:
         controls = np.empty((self.n_substeps, N_JOINTS + 1))
         controls[:, :N_JOINTS] = before + ramp * (self.joints - before)
         goal = 0.0 if self._closed else self.config.max_opening / 2
-        travel = self._finger_step * np.arange(1, self.n_substeps + 1)
+        travel = _FINGER_SPEED * PHYSICS_TIMESTEP * np.arange(1, self.n_substeps + 1)
         sign = np.sign(goal - self.finger_target)
         fingers = self.finger_target + sign * np.minimum(travel, abs(goal - self.finger_target))
         controls[:, N_JOINTS] = fingers

@@ -12,6 +12,9 @@ from mujoco import rollout
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, contact_pairs, pair_forces
 from gym_playbyear.arm import N_JOINTS, PHYSICS_TIMESTEP, CartesianController
+from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp
+from gym_playbyear.experts import CORRECTING_EXPERT, GraspExpert
+from gym_playbyear.gates import InterventionGate
 from gym_playbyear.materials import CUBE_MATERIALS
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
@@ -19,7 +22,6 @@ from gym_playbyear.rendering import SceneRenderer, Window
 from gym_playbyear.scene import model_xml
 from gym_playbyear.sound import ContactPair, ContactSound
 
-ACTION_SCALE = 0.05  # m of displacement per unit of action and step (the authors' code)
 CONTROL_HZ = 20
 SOUND_MODES = ("waveform", "contact_force", "none")
 _SETTLE_STEPS = 10
@@ -33,7 +35,8 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
     A copy (`copy.deepcopy`, `pickle`), of the environment alone or together with an expert or a gate, goes on as the original
     would and independently of it; what it renders with it opens itself, when it first draws.
 
-    Subclasses define `VARIANTS`, `task`, `task_description`, `_scene_xml`, `_scene_bodies`, `_place` and `_is_success`.
+    Subclasses define `VARIANTS`, `task`, `task_description`, `_expert`, `_blind`, `_scene_xml`, `_scene_bodies`, `_place` and
+    `_is_success`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 (Gymnasium declares it so)
@@ -43,6 +46,8 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
     VARIANTS: ClassVar[dict[str, Any]]
     task: str
     task_description: str
+    _expert: type[GraspExpert]
+    _blind: type[BlindGrasp]
     _scene_bodies: tuple[str, ...]
     _start_position: tuple[float, float, float] = (-0.12, 0.0, 0.98)  # m, before each episode's own offset
     _start_spread = 0.02  # m
@@ -68,11 +73,9 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         if image_size < 8:
             raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
         self.variant = self.VARIANTS[variant]
-        self.control_hz = CONTROL_HZ
         self._max_episode_steps = int(horizon or self.variant.horizon)
         self.render_mode, self._render_size = render_mode, render_size
         self._image_size, self._sound_mode = image_size, sound
-        self._sample_rate = sample_rate
 
         self.pairs = contact_pairs(self._scene_bodies)
         self.model = mujoco.MjModel.from_xml_string(
@@ -92,13 +95,10 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             )
         self._tcp = self.model.site("tcp").id
         self._cube = self.model.body("cube").id
-        self._base = np.array(self.variant.arm.base)
-        self._state_size = mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-        self._rollout_state = np.empty((1, self._controller.n_substeps, self._state_size))
+        self._state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
+        self._rollout_state = np.empty((1, self._controller.n_substeps, len(self._state)))
         self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
-        self._state = np.empty(self._state_size)
-        self._camera: SceneRenderer | None = None
-        self._people_camera: SceneRenderer | None = None
+        self._cameras: dict[str, SceneRenderer] = {}  # those that have drawn
         self._window: Window | None = None
         self._is_closed = False
         self._expert_rng: np.random.Generator | None = None  # None before the first episode
@@ -130,26 +130,25 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
     def _is_success(self) -> bool:
         raise NotImplementedError
 
-    def scripted_expert(self):
+    # Scripts that know more than a policy
+
+    def scripted_expert(self) -> GraspExpert:
         """An expert for the current episode, with privileged knowledge: `act()` gives an action (4,). Make it after `reset`."""
-        raise NotImplementedError
+        return self._expert(self)
 
-    def intervention_gate(self):
+    def intervention_gate(self) -> InterventionGate:
         """The expert beside a policy in this episode: `wants_control(policy_action)` and `act()`. Make it after `reset`."""
-        raise NotImplementedError
+        return InterventionGate(self, self._expert(self, CORRECTING_EXPERT))
 
-    def blind_baselines(self) -> dict[str, Any]:
+    def blind_baselines(self) -> dict[str, BlindGrasp]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""
-        raise NotImplementedError
+        return {strategy: self._blind(self, strategy) for strategy in BLIND_STRATEGIES}
 
     # Gymnasium's interface
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         self.begin_episode(seed=seed, options=options)
-        observation = self._observe(self._rollout_sensors[0])
-        if self.render_mode == "human":
-            self.render()
-        return observation, {"is_success": False}
+        return self._observe(), {"is_success": False}
 
     def begin_episode(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """`reset` without the observation, for scripts that go on with `advance`: nothing is rendered, no OpenGL is needed."""
@@ -174,11 +173,8 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         self._first_cube_position, self._was_carried = self.cube_position, False
 
     def step(self, action):
-        reward, terminated, truncated, info = self.advance(action)
-        observation = self._observe(self._rollout_sensors[0])
-        if self.render_mode == "human":
-            self.render()
-        return observation, reward, terminated, truncated, info
+        outcome = self.advance(action)
+        return self._observe(), *outcome
 
     def advance(self, action) -> tuple[float, bool, bool, dict[str, Any]]:
         """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise."""
@@ -186,7 +182,7 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
-        controls = self._controller.command(np.clip(action, -1, 1), self.eef_position, ACTION_SCALE)
+        controls = self._controller.command(np.clip(action, -1, 1), self.eef_position)
         self._advance(controls)
         self._n_steps += 1
         success = self._is_success()
@@ -204,34 +200,26 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             return None
         if self.render_mode != "rgb_array":
             return None
-        if self._people_camera is None:
-            self._people_camera = SceneRenderer(self.model, self._render_size, self._render_size)
-        return self._people_camera.render(self.data, "people")
+        return self._picture("people", self._render_size)
 
     def close(self):
         """Closes window and OpenGL. Only `reset` opens them again, as in Gymnasium's own environments; until then `step` and
         `render` raise ClosedEnvironmentError."""
         self._is_closed = True
-        for resource in (self._camera, self._people_camera, self._window):
+        for resource in (*self._cameras.values(), self._window):
             if resource is not None:
                 resource.close()
-        self._camera = self._people_camera = self._window = None
+        self._cameras, self._window = {}, None
 
     def __getstate__(self) -> dict[str, Any]:
         # What is open belongs to this process and to this object: a copy opens its own.
-        return {**self.__dict__, "_camera": None, "_people_camera": None, "_window": None}
+        return {**self.__dict__, "_cameras": {}, "_window": None}
 
     def _check_is_running(self, call: str) -> None:
         if self._is_closed:
             raise ClosedEnvironmentError(f"{call}() was called on a closed environment: call reset() to open it again.")
         if self._expert_rng is None:
             raise ResetNeeded(f"{call}() was called before the first episode: call reset() first.")
-
-    def cube_pixels(self) -> int:
-        """How many pixels of the policy's camera show the cube (segmentation rendering)."""
-        self._check_is_running("cube_pixels")
-        geom = self.model.geom("cube").id
-        return int((self._front_camera().segmentation(self.data, "front") == geom).sum())
 
     # One control step
 
@@ -257,9 +245,11 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
         distance = np.linalg.norm((self.cube_position - self._first_cube_position)[:2])
         return not self._was_carried and bool(distance > self.variant.max_shove)
 
-    def _observe(self, sensors: np.ndarray) -> dict[str, Any]:
+    def _observe(self) -> dict[str, Any]:
+        """The observation after a control step; a person who watches sees it, too."""
+        sensors = self._rollout_sensors[0]
         observation: dict[str, Any] = {
-            "pixels": {"front": self._front_camera().render(self.data, "front")},
+            "pixels": {"front": self._picture("front", self._image_size)},
             "agent_pos": self._sensors.measure(self._true_proprioception(), self.np_random),
         }
         if self._sound is not None:
@@ -271,24 +261,32 @@ class PlayByEarEnv(PrivilegedState, gym.Env):
             silent = self.cube_position[2] > _LIFTED_SILENCE_HEIGHT
             force = np.zeros(6) if silent else sensors[:, -6:].mean(axis=0)
             observation["contact_force"] = force.astype(np.float32)
+        if self.render_mode == "human":
+            self.render()
         return observation
 
     def _true_proprioception(self) -> np.ndarray:
         fingers = slice(N_JOINTS, N_JOINTS + 2)
-        return np.concatenate([self.eef_position - self._base, self.data.qpos[fingers], self.data.qvel[fingers]])
+        return np.concatenate(
+            [self.eef_position - self.variant.arm.base, self.data.qpos[fingers], self.data.qvel[fingers]]
+        )
 
-    def _front_camera(self) -> SceneRenderer:
-        if self._camera is None:
-            self._camera = SceneRenderer(self.model, self._image_size, self._image_size)
-        return self._camera
+    def _picture(self, camera: str, size: int) -> np.ndarray:
+        """(size, size, 3) uint8."""
+        if camera not in self._cameras:
+            self._cameras[camera] = SceneRenderer(self.model, size)
+        return self._cameras[camera].render(self.data, camera)
 
-    def _place_cube(self, position: np.ndarray, yaw: float) -> None:
+    def _place_cube(self, options: dict[str, Any]) -> float:
+        """Where it is drawn to be, or `options` want it. Returns its y [m]."""
+        x, y = (self.np_random.uniform(*limits) for limits in (self.variant.cube_x, self.variant.cube_y))
+        yaw = self.np_random.uniform(-self.variant.cube_yaw, self.variant.cube_yaw)
+        x, y = options.get("cube_position", (x, y))
+        yaw = options.get("cube_yaw", yaw)
         address = self.model.joint("cube").qposadr[0]
-        self.data.qpos[address : address + 3] = position
+        self.data.qpos[address : address + 3] = (x, y, TABLE_TOP + CUBE_HALF_SIZE)
         self.data.qpos[address + 3 : address + 7] = (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
-
-    def _place_body(self, name: str, position: np.ndarray) -> None:
-        self.model.body(name).pos[:] = position
+        return float(y)
 
 
 def _check_option(name: str, value, allowed: tuple) -> None:

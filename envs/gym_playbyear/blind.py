@@ -30,11 +30,11 @@ class BlindGrasp(GraspExpert):
     def __init__(self, env, strategy: str):
         self.strategy = strategy
         self.n_attempts = 0
-        self._n_closing = 0
         super().__init__(env)
 
     def _begin(self) -> None:
         super()._begin()
+        self._n_closing = 0  # steps
         lower, upper = self.env.hidden_range
         match self.strategy:
             case "middle":
@@ -58,30 +58,15 @@ class BlindGrasp(GraspExpert):
 
     def _grasp(self):
         self._n_closing += 1
-        if self._holds_nothing():
-            self._n_closing = 0
+        if self._fingers_met():
             self._begin()
         elif self._n_closing > _CLOSING_STEPS:
-            self._n_closing = 0
             self.phase = "lift"
         return np.zeros(3), True
 
     def _dropped(self) -> bool:
-        return self._holds_nothing()
-
-    def _holds_nothing(self) -> bool:
-        return bool(self.env.finger_positions.sum() < CUBE_HALF_SIZE)
+        return self._fingers_met()
 
 
 class BlindPickPlace(BlindGrasp, PickPlaceExpert):
     """Pick and place without any sense of contact."""
-
-
-def blind_grasps(env) -> dict[str, BlindGrasp]:
-    """The blind baselines of Occluded Grasp, by name."""
-    return {strategy: BlindGrasp(env, strategy) for strategy in BLIND_STRATEGIES}
-
-
-def blind_pick_places(env) -> dict[str, BlindGrasp]:
-    """The blind baselines of Occluded Pick and Place, by name."""
-    return {strategy: BlindPickPlace(env, strategy) for strategy in BLIND_STRATEGIES}

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP
-from gym_playbyear.arm import FINGER_THICKNESS
-from gym_playbyear.base import ACTION_SCALE
+from gym_playbyear.arm import ACTION_SCALE, FINGER_THICKNESS
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,6 @@ class GraspExpert:
         self.env = env
         self.config = config or ExpertConfig()
         self.rng: np.random.Generator = env.expert_rng
-        self.phase = "approach"
         self.contact_y = np.nan  # where the hand was when it felt the cube
         self.lift_drift: np.ndarray = np.zeros(2)
         self._wait = 0
@@ -78,7 +76,9 @@ class GraspExpert:
         opening = self.env.variant.arm.max_opening
         self.reach = opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE  # from the hand's centre to the cube's, in contact
         self.x = float(np.mean(self.env.variant.cube_x))
-        self.sweep_start, self.sweep_end = self._sweep_range()
+        lower, upper = self.env.hidden_range
+        self.sweep_start = lower - self.reach - (config.margin + rng.uniform(0, 0.02))
+        self.sweep_end = upper - self.reach + 0.02
         self.sweep_step = rng.uniform(*config.sweep_step)
         self.rise_step = rng.uniform(*config.rise_step)
         self.phase = "approach"
@@ -90,14 +90,13 @@ class GraspExpert:
         self._wait = 0
         self.contact_y = float(self.env.eef_position[1]) + self.config.back_off
 
-    def _sweep_range(self) -> tuple[float, float]:
-        lower, upper = self.env.hidden_range
-        margin = self.config.margin + self.rng.uniform(0, 0.02)
-        return lower - self.reach - margin, upper - self.reach + 0.02
-
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
-        displacement, close = getattr(self, f"_{self.phase}")()
+        if self.phase in ("lift", "carry") and self._dropped():
+            self._begin()
+            displacement, close = np.zeros(3), False
+        else:
+            displacement, close = getattr(self, f"_{self.phase}")()
         noise = self.rng.uniform(-self.config.noise, self.config.noise, 3)
         move = (displacement + noise) / ACTION_SCALE
         return np.append(np.clip(move, -1, 1), 1.0 if close else -1.0).astype(np.float32)
@@ -106,18 +105,13 @@ class GraspExpert:
 
     def _retreat(self):
         goal = np.array([*self.env.eef_position[:2], TABLE_TOP + self.config.travel_height])
-        if self._near(goal, 0.02):
-            self.phase = "approach"
-        return self._towards(goal), False
+        return self._go(goal, 0.02, "approach")
 
     def _approach(self):
-        goal = np.array([self.x, self.sweep_start, TABLE_TOP + self.config.travel_height])
-        if self._near(goal, 0.02):
-            self.phase = "lower"
-        return self._towards(goal), False
+        return self._go(self._on_line(self.sweep_start, self.config.travel_height), 0.02, "lower")
 
     def _lower(self):
-        goal = np.array([self.x, self.sweep_start, TABLE_TOP + self.config.sweep_height])
+        goal = self._on_line(self.sweep_start, self.config.sweep_height)
         if self._near(goal, self.config.tolerance):
             self.phase = "sweep"
             self._wait = int(self.rng.integers(*self.config.pause))
@@ -134,76 +128,79 @@ class GraspExpert:
             self._begin()
         if self._wait == 0 and self.rng.random() < self.config.pause_probability:
             self._wait = int(self.rng.integers(*self.config.pause, endpoint=True))
-        step = 0.0
-        if self._wait > 0:
-            self._wait -= 1
-        else:
-            step = self.sweep_step
-        hold = np.array([self.x, eef[1], TABLE_TOP + self.config.sweep_height])
+        step = self.sweep_step if self._has_waited() else 0.0
+        hold = self._on_line(eef[1], self.config.sweep_height)
         return self._towards(hold) + np.array([0, step, 0]), False
 
     def _feels_contact(self) -> bool:
         return self.env.contact_forces["gripper-cube"] > self.config.contact_force
 
     def _dwell(self):
-        hold = np.array([self.x, self.contact_y - self.config.back_off, TABLE_TOP + self.config.sweep_height])
-        if self._wait > 0:
-            self._wait -= 1
-        else:
+        if self._has_waited():
             self.phase = "rise"
-        return self._towards(hold), False
+        return self._towards(self._on_line(self.contact_y - self.config.back_off, self.config.sweep_height)), False
 
     def _rise(self):
-        goal = np.array([self.x, self.contact_y - self.config.back_off, TABLE_TOP + self.config.clear_height])
+        goal = self._on_line(self.contact_y - self.config.back_off, self.config.clear_height)
         if self.env.eef_position[2] > goal[2] - self.config.tolerance:
             self.phase = "hover"
             self._wait = int(self.rng.integers(*self.config.hover, endpoint=True))
         return self._towards(goal, self.rise_step), False
 
     def _hover(self):
-        goal = np.array([self.x, self.contact_y - self.config.back_off, TABLE_TOP + self.config.clear_height])
-        if self._wait > 0:
-            self._wait -= 1
-        else:
+        if self._has_waited():
             self.phase = "hop"
-        return self._towards(goal), False
+        return self._towards(self._on_line(self.contact_y - self.config.back_off, self.config.clear_height)), False
 
     def _hop(self):
-        goal = np.array([self.x, self._grasp_y(), TABLE_TOP + self.config.clear_height])
-        if self._near(goal, self.config.tolerance):
-            self.phase = "descend"
-        return self._towards(goal), False
+        return self._go(self._on_line(self._grasp_y(), self.config.clear_height), self.config.tolerance, "descend")
 
     def _grasp_y(self) -> float:
         return float(self.env.cube_position[1])
 
     def _descend(self):
-        goal = np.array([self.x, self._grasp_y(), TABLE_TOP + self.config.sweep_height])
+        goal = self._on_line(self._grasp_y(), self.config.sweep_height)
         if abs(self.env.eef_position[2] - goal[2]) < self.config.tolerance:
             self.phase = "grasp"
         return self._towards(goal, self.config.descent_step), False
 
     def _grasp(self):
-        opening = self.env.finger_positions.sum()
-        hold = np.array([self.x, self.env.eef_position[1], TABLE_TOP + self.config.sweep_height])
-        squeezed = self.env.contact_forces["gripper-cube"] > self.config.squeeze_force
-        if squeezed:
+        hold = self._on_line(self.env.eef_position[1], self.config.sweep_height)
+        if self.env.contact_forces["gripper-cube"] > self.config.squeeze_force:
             self.phase = "lift"
             self.lift_drift = self.rng.uniform(-0.25, 0.25, 2) * ACTION_SCALE * 0.3
-        elif opening < CUBE_HALF_SIZE:
+        elif self._fingers_met():
             self._begin()
         return self._towards(hold) * np.array([1, 0, 1]), True
 
+    def _fingers_met(self) -> bool:
+        """Whether they hold nothing."""
+        return bool(self.env.finger_positions.sum() < CUBE_HALF_SIZE)
+
     def _lift(self):
-        if self._dropped():
-            self._begin()
-            return np.zeros(3), False
         return np.array([*self.lift_drift, self.rise_step]), True
 
     def _dropped(self) -> bool:
         return bool(np.linalg.norm(self.env.cube_position - self.env.eef_position) > 0.1)
 
     # Motion
+
+    def _go(self, goal: np.ndarray, tolerance: float, next_phase: str) -> tuple[np.ndarray, bool]:
+        """With open fingers to a point (3,) [m, world frame]; that near to it, the next phase begins."""
+        if self._near(goal, tolerance):
+            self.phase = next_phase
+        return self._towards(goal), False
+
+    def _has_waited(self) -> bool:
+        """Whether the pause is over; if not, this is one step of it."""
+        if self._wait == 0:
+            return True
+        self._wait -= 1
+        return False
+
+    def _on_line(self, y: float, height: float) -> np.ndarray:
+        """A point on the line of the sweep, so high above the table (3,) [m, world frame]."""
+        return np.array([self.x, y, TABLE_TOP + height])
 
     def _near(self, goal: np.ndarray, tolerance: float) -> bool:
         return bool(np.linalg.norm(goal - self.env.eef_position) < tolerance + self.config.noise)
@@ -222,17 +219,11 @@ class PickPlaceExpert(GraspExpert):
     release_height = 0.075
 
     def _lift(self):
-        if self._dropped():
-            self._begin()
-            return np.zeros(3), False
         if self.env.eef_position[2] > TABLE_TOP + self.carry_height - 0.01:
             self.phase = "carry"
         return np.array([0, 0, self.rise_step]), True
 
     def _carry(self):
-        if self._dropped():
-            self._begin()
-            return np.zeros(3), False
         goal = self.env.bin_position + np.array([0, 0, self.carry_height])
         if np.abs(goal - self.env.eef_position)[:2].max() < 0.006:
             self.phase = "release"

@@ -14,7 +14,7 @@ from collections import deque
 import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP
-from gym_playbyear.base import ACTION_SCALE
+from gym_playbyear.arm import ACTION_SCALE
 from gym_playbyear.experts import GraspExpert
 from gym_playbyear.gate_config import GateConfig
 

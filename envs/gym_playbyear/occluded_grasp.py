@@ -1,18 +1,14 @@
 """Occluded Grasp with Visual Indicator (paper, section "Simulated Domain and Tasks")."""
 
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml
-from gym_playbyear.arm import ArmConfig
+from gym_playbyear.arena import TABLE_TOP, box_xml
 from gym_playbyear.base import PlayByEarEnv
-from gym_playbyear.blind import blind_grasps
-from gym_playbyear.experts import CORRECTING_EXPERT, GraspExpert
-from gym_playbyear.gates import InterventionGate
-from gym_playbyear.proprioception import NO_SENSOR_NOISE
-from gym_playbyear.variant import Variant
+from gym_playbyear.blind import BlindGrasp
+from gym_playbyear.experts import GraspExpert
+from gym_playbyear.variant import PAPER, Variant
 
 WALL_HALF_SIZE = (0.02, 0.40, 0.30)  # m
 WALL_CENTRE = (0.20, 0.0, 0.775)  # m: its top is 0.275 m above the table
@@ -72,27 +68,11 @@ class OccludedGraspEnv(PlayByEarEnv):
 
     task = "OccludedGrasp-v0"
     task_description = "Find the cube behind the wall by touch and sound, grasp it and lift it."
+    _expert, _blind = GraspExpert, BlindGrasp
     _scene_bodies = ("table", "wall")
     VARIANTS: ClassVar[dict[str, Variant]] = {
-        "default": Variant(
-            cube_x=(0.0, 0.0),
-            cube_y=(-0.28, 0.28),
-            cube_yaw=np.pi / 12,
-            cube_density=2000,
-            cube_friction=0.4,
-            max_shove=0.03,
-            horizon=102,
-        ),
-        "paper": Variant(
-            cube_x=(0.0, 0.0),
-            cube_y=(-0.17, 0.17),
-            cube_yaw=np.pi,
-            cube_density=2000,
-            cube_friction=5,
-            horizon=250,
-            arm=replace(ArmConfig(), max_opening=0.08, gripper_cooldown=0.0),
-            sensors=NO_SENSOR_NOISE,
-        ),
+        "default": Variant(cube_x=(0.0, 0.0), cube_y=(-0.28, 0.28), cube_density=2000, horizon=102),
+        "paper": Variant(cube_x=(0.0, 0.0), cube_y=(-0.17, 0.17), cube_density=2000, horizon=250, **PAPER),
     }
 
     def _scene_xml(self) -> str:
@@ -103,14 +83,10 @@ class OccludedGraspEnv(PlayByEarEnv):
         return wall + indicator
 
     def _place(self, options: dict[str, Any]) -> None:
-        x = self.np_random.uniform(*self.variant.cube_x)
-        y = self.np_random.uniform(*self.variant.cube_y)
-        yaw = self.np_random.uniform(-self.variant.cube_yaw, self.variant.cube_yaw)
-        x, y = options.get("cube_position", (x, y))
-        self._place_cube(np.array([x, y, TABLE_TOP + CUBE_HALF_SIZE]), options.get("cube_yaw", yaw))
+        y = self._place_cube(options)
         lower, upper = self.variant.cube_y
         self.quarter = int(np.clip(4 * (y - lower) / (upper - lower), 0, 3))
-        self._place_body("indicator", np.array([INDICATOR_X, np.mean(self.hidden_range), INDICATOR_Z]))
+        self.model.body("indicator").pos[:] = (INDICATOR_X, np.mean(self.hidden_range), INDICATOR_Z)
 
     def _is_success(self) -> bool:
         return bool(self.cube_position[2] > TABLE_TOP + LIFT_HEIGHT)
@@ -121,12 +97,3 @@ class OccludedGraspEnv(PlayByEarEnv):
         lower, upper = self.variant.cube_y
         width = (upper - lower) / 4
         return lower + self.quarter * width, lower + (self.quarter + 1) * width
-
-    def scripted_expert(self) -> GraspExpert:
-        return GraspExpert(self)
-
-    def intervention_gate(self) -> InterventionGate:
-        return InterventionGate(self, GraspExpert(self, CORRECTING_EXPERT))
-
-    def blind_baselines(self) -> dict[str, Any]:
-        return blind_grasps(self)

@@ -1,18 +1,14 @@
 """Occluded Pick and Place (paper, section "Simulated Domain and Tasks")."""
 
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP, box_xml, tray_xml
-from gym_playbyear.arm import ArmConfig
+from gym_playbyear.arena import TABLE_TOP, box_xml, tray_xml
 from gym_playbyear.base import PlayByEarEnv
-from gym_playbyear.blind import blind_pick_places
-from gym_playbyear.experts import CORRECTING_EXPERT, PickPlaceExpert
-from gym_playbyear.gates import InterventionGate
-from gym_playbyear.proprioception import NO_SENSOR_NOISE
-from gym_playbyear.variant import Variant
+from gym_playbyear.blind import BlindPickPlace
+from gym_playbyear.experts import PickPlaceExpert
+from gym_playbyear.variant import PAPER, Variant
 
 WALL_HALF_SIZE = (0.02, 0.20, 0.18)  # m
 WALL_CENTRE = (0.10, 0.20, 0.80)  # m
@@ -75,27 +71,11 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
 
     task = "OccludedPickPlace-v0"
     task_description = "Find the cube behind the wall by touch and sound, grasp it and put it into the tray."
+    _expert, _blind = PickPlaceExpert, BlindPickPlace
     _scene_bodies = ("table", "wall", "bin")
     VARIANTS: ClassVar[dict[str, Variant]] = {
-        "default": Variant(
-            cube_x=(-0.001, 0.001),
-            cube_y=(0.11, 0.31),
-            cube_yaw=np.pi / 12,
-            cube_density=3000,
-            cube_friction=0.4,
-            max_shove=0.03,
-            horizon=220,
-        ),
-        "paper": Variant(
-            cube_x=(-0.001, 0.001),
-            cube_y=(0.15, 0.179),
-            cube_yaw=np.pi,
-            cube_density=3000,
-            cube_friction=5,
-            horizon=400,
-            arm=replace(ArmConfig(), max_opening=0.08, gripper_cooldown=0.0),
-            sensors=NO_SENSOR_NOISE,
-        ),
+        "default": Variant(cube_x=(-0.001, 0.001), cube_y=(0.11, 0.31), cube_density=3000, horizon=220),
+        "paper": Variant(cube_x=(-0.001, 0.001), cube_y=(0.15, 0.179), cube_density=3000, horizon=400, **PAPER),
     }
 
     def _scene_xml(self) -> str:
@@ -104,14 +84,10 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
         )
 
     def _place(self, options: dict[str, Any]) -> None:
-        x = self.np_random.uniform(*self.variant.cube_x)
-        y = self.np_random.uniform(*self.variant.cube_y)
-        yaw = self.np_random.uniform(-self.variant.cube_yaw, self.variant.cube_yaw)
+        self._place_cube(options)
         bin_position = (0.0, BIN_Y - self.np_random.uniform(0, BIN_Y_RANGE))
-        x, y = options.get("cube_position", (x, y))
-        self._place_cube(np.array([x, y, TABLE_TOP + CUBE_HALF_SIZE]), options.get("cube_yaw", yaw))
         self.bin_position = np.array([*options.get("bin_position", bin_position), TABLE_TOP])
-        self._place_body("bin", self.bin_position)
+        self.model.body("bin").pos[:] = self.bin_position
 
     def _is_success(self) -> bool:
         offset = np.abs(self.cube_position - self.bin_position)
@@ -122,12 +98,3 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
     def hidden_range(self) -> tuple[float, float]:
         """Where along y the cube may be, as far as the camera tells [m]."""
         return self.variant.cube_y
-
-    def scripted_expert(self) -> PickPlaceExpert:
-        return PickPlaceExpert(self)
-
-    def intervention_gate(self) -> InterventionGate:
-        return InterventionGate(self, PickPlaceExpert(self, CORRECTING_EXPERT))
-
-    def blind_baselines(self) -> dict[str, Any]:
-        return blind_pick_places(self)

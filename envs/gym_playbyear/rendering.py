@@ -22,10 +22,10 @@ class SceneRenderer:
     waking other threads for a picture this small takes longer than drawing it, and ten times as long on a busy machine.
     """
 
-    def __init__(self, model: mujoco.MjModel, height: int, width: int):
+    def __init__(self, model: mujoco.MjModel, size: int):
         os.environ.setdefault("LP_NUM_THREADS", "0")
         try:
-            self._renderer = mujoco.Renderer(model, height=height, width=width)
+            self._renderer = mujoco.Renderer(model, height=size, width=size)
         except Exception as error:
             raise GLUnavailableError(
                 f"No OpenGL context could be made for rendering (MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}): {error}. "
@@ -37,18 +37,9 @@ class SceneRenderer:
         self._option.sitegroup[:] = 0
 
     def render(self, data: mujoco.MjData, camera: str) -> np.ndarray:
-        """The camera's picture, (height, width, 3) uint8."""
+        """The camera's picture, (size, size, 3) uint8."""
         self._renderer.update_scene(data, camera=camera, scene_option=self._option)
         return self._renderer.render()
-
-    def segmentation(self, data: mujoco.MjData, camera: str) -> np.ndarray:
-        """Which geom each pixel shows, (height, width) int32; -1 for none."""
-        self._renderer.enable_segmentation_rendering()
-        try:
-            self._renderer.update_scene(data, camera=camera, scene_option=self._option)
-            return self._renderer.render()[..., 0]
-        finally:
-            self._renderer.disable_segmentation_rendering()
 
     def close(self) -> None:
         self._renderer.close()

@@ -1,11 +1,12 @@
 """The numbers of a task that decide whether it can be solved without hearing."""
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.proprioception import SensorNoise
+from gym_playbyear.proprioception import NO_SENSOR_NOISE, SensorNoise
 
 
 @dataclass(frozen=True)
@@ -19,10 +20,20 @@ class Variant:
 
     cube_x: tuple[float, float]
     cube_y: tuple[float, float]
-    cube_yaw: float
     cube_density: float
-    cube_friction: float
     horizon: int
-    max_shove: float = np.inf
+    cube_yaw: float = np.pi / 12
+    cube_friction: float = 0.4
+    max_shove: float = 0.03
     arm: ArmConfig = field(default_factory=ArmConfig)
     sensors: SensorNoise = field(default_factory=SensorNoise)
+
+
+PAPER: dict[str, Any] = {
+    "cube_yaw": np.pi,
+    "cube_friction": 5,
+    "max_shove": np.inf,
+    "arm": ArmConfig(max_opening=0.08, gripper_cooldown=0.0),
+    "sensors": NO_SENSOR_NOISE,
+}
+"""What the paper's tasks have in common, and ours have not."""

@@ -13,6 +13,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
+from gym_playbyear import TASKS
 from gym_playbyear.materials import CUBE_MATERIALS
 from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
@@ -138,41 +139,23 @@ class PlaybyearEnvConfig(EnvConfig):
         return PolicyProcessorPipeline(steps=[PcmToFloatProcessorStep()]), PolicyProcessorPipeline(steps=[])
 
     def _check(self) -> None:
-        tasks = known_tasks()
-        _check_choice("task", self.task, tasks)
-        _check_choice("sound", self.sound, SOUND_MODES)
-        _check_choice("variant", self.variant, VARIANTS)
-        _check_choice("cube_material", self.cube_material, CUBE_MATERIALS)
+        known = {"task": TASKS, "sound": SOUND_MODES, "variant": VARIANTS, "cube_material": CUBE_MATERIALS}
+        for name, choices in known.items():
+            if getattr(self, name) not in choices:
+                raise self._error(name, f"choose one of {', '.join(choices)}")
         if self.fps != CONTROL_HZ:
-            raise _error("fps", self.fps, f"the tasks are controlled at {CONTROL_HZ} Hz, give {CONTROL_HZ}")
+            raise self._error("fps", f"the tasks are controlled at {CONTROL_HZ} Hz, give {CONTROL_HZ}")
         if self.sample_rate <= 0 or self.sample_rate % self.fps:
-            raise _error(
+            raise self._error(
                 "sample_rate",
-                self.sample_rate,
                 f"each of the {self.fps} frames per second must hold the same number of samples; "
                 f"give a multiple of {self.fps}, such as 16000 or 48000",
             )
         if self.sound == "waveform" and (not self.microphones or len(set(self.microphones)) < len(self.microphones)):
-            raise _error("microphones", self.microphones, "give at least one name and each only once")
+            raise self._error("microphones", "give at least one name and each only once")
         if self.visualization_width != self.visualization_height:
-            raise _error(
-                "visualization_width", self.visualization_width, "the picture is square: give both sides the same"
-            )
+            raise self._error("visualization_width", "the picture is square: give both sides the same")
 
-
-def known_tasks() -> tuple[str, ...]:
-    """The ids that `gym_playbyear` registers, without the namespace."""
-    import gym_playbyear  # noqa: F401  (registers the tasks)
-
-    prefix = "gym_playbyear/"
-    return tuple(sorted(key.removeprefix(prefix) for key in gym.registry if key.startswith(prefix)))
-
-
-def _check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise _error(name, value, f"choose one of {', '.join(choices)}")
-
-
-def _error(name: str, value: object, what_to_do: str) -> DecodingError:
-    # Not a ValueError: draccus hides a ValueError of __post_init__ behind a traceback, and prints this as one line.
-    return DecodingError(("env", name), f"{value!r} does not work: {what_to_do}.")
+    def _error(self, name: str, what_to_do: str) -> DecodingError:
+        # Not a ValueError: draccus hides a ValueError of __post_init__ behind a traceback, and prints this as one line.
+        return DecodingError(("env", name), f"{getattr(self, name)!r} does not work: {what_to_do}.")

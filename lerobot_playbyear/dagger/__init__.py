@@ -1,10 +1,15 @@
 """HG-DAgger: an expert corrects a policy while it works, and the policy learns from the corrections."""
 
+from typing import TYPE_CHECKING
+
+from lerobot_playbyear import lazy_names
 from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.dagger.run import run_dagger
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.dagger.run import run_dagger
 
 __all__ = [
     "DaggerConfig",
@@ -16,3 +21,5 @@ __all__ = [
     "Verdict",
     "run_dagger",
 ]
+
+__getattr__ = lazy_names(__name__, {"run": ("run_dagger",)})

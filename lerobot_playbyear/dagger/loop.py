@@ -154,7 +154,14 @@ class Loop:
         state.attempts += 1
         setattr(state, outcome, getattr(state, outcome) + 1)
         state.next_seed = episode.seed + 1
-        self.report.attempt(episode, outcome, spent.spent)
+        figures = {
+            "seed": episode.seed,
+            "outcome": outcome,
+            "success": episode.success,
+            "n_frames": len(episode),
+            "intervention_share": round(episode.intervention_share, 4),
+        }
+        self.report.write("attempt", figures | _rounded(spent))
         self.folder.commit(state)
 
     # Learning
@@ -208,8 +215,7 @@ class Loop:
             if is_due(state.round, cfg.eval_every) or is_due(state.round, cfg.save_every):
                 state.milestones.append(name)
         total = time.perf_counter() - start
-        spent = {f"{name}_s": round(value, 4) for name, value in seconds.spent.items()}
-        self.report.write("round", {**losses, **spent, "total_s": round(total, 4)})
+        self.report.write("round", {**losses, **_rounded(seconds), "total_s": round(total, 4)})
         self.folder.commit(state)
         self.folder.clean(state)
 
@@ -237,3 +243,7 @@ def outcome_of(episode: Episode) -> str:
     if not episode.success:
         return "failed"
     return "kept" if episode.intervention_share > 0 else "unneeded"
+
+
+def _rounded(seconds: Seconds) -> dict[str, float]:
+    return {f"{name}_s": round(value, 4) for name, value in seconds.spent.items()}

@@ -3,8 +3,8 @@
 import logging
 from typing import Any
 
+from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
-from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.report import Progress
 
@@ -13,25 +13,23 @@ class Report(Progress):
     """One line of progress for a person, one line of JSON per attempt, round and evaluation.
 
     Args:
+        cfg: The options; they say whether the bar counts attempts or updates.
+        training: The same, for W&B.
         folder: Where the lines go.
-        state: The run's counters; they are read, never changed.
-        training: Options, for W&B.
-        total: Attempts, or updates, that the bar counts to.
-        unit: Which of both.
+        state: The run's counters, which are only read, and its name in W&B, which is gone on with or noted.
     """
 
-    def __init__(
-        self, folder: RunFolder, state: RunState, training: PlaybyearTrainConfig, total: int, unit: str
-    ) -> None:
-        done = (state.first_episodes or 0) + state.kept if unit == "episode" else state.step
-        super().__init__(training, state, total, done, unit, "HG-DAgger")
+    def __init__(self, cfg: DaggerConfig, training: PlaybyearTrainConfig, folder: RunFolder, state: RunState) -> None:
+        training.resume, training.wandb.run_id = state.wandb_run_id is not None, state.wandb_run_id
+        if cfg.is_online:
+            done = (state.first_episodes or 0) + state.kept
+            super().__init__(training, state, cfg.episodes, done, "episode", "HG-DAgger")
+        else:
+            super().__init__(training, state, cfg.updates, state.step, "update", "HG-DAgger")
+        training.resume = False  # checkpoints of a resumed run are those of one that was not
+        state.wandb_run_id = training.wandb.run_id = self._wandb.cfg.run_id if self._wandb else None
         self._folder, self._state = folder, state
         self.success = state.success
-
-    @property
-    def wandb_run_id(self) -> str | None:
-        """Of the run in W&B, None without."""
-        return self._wandb.cfg.run_id if self._wandb else None
 
     def doing(self, what: str) -> None:
         """What the run is at, behind the bar."""
@@ -40,20 +38,6 @@ class Report(Progress):
         needed = state.attempts - state.unneeded - state.discarded
         expert = f", expert needed in {needed / state.attempts:.0%} of {state.attempts}" if state.attempts else ""
         self.bar.set_postfix_str(f"{what}{expert}{success}")
-
-    def attempt(self, episode: Episode, outcome: str, seconds: dict[str, float]) -> None:
-        """An attempt has ended."""
-        self.write(
-            "attempt",
-            {
-                "seed": episode.seed,
-                "outcome": outcome,
-                "success": episode.success,
-                "n_frames": len(episode),
-                "intervention_share": round(episode.intervention_share, 4),
-                **{f"{name}_s": round(value, 4) for name, value in seconds.items()},
-            },
-        )
 
     def write_evaluation(self, info: dict[str, Any], **more: float) -> None:
         """What an evaluation gave."""

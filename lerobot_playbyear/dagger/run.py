@@ -151,7 +151,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     batches = BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed)
 
     folder.begin(cfg, state)
-    report = stack.enter_context(_make_report(cfg, folder, state, training))
+    report = stack.enter_context(Report(cfg, training, folder, state))
     scene = None
     if env is not None and cfg.env is not None and expert is not None:
         policy = parts.accelerator.unwrap_model(parts.policy)
@@ -177,15 +177,6 @@ def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, correcti
             f"The intervention dataset holds {corrections.n_episodes} attempts already, and --episodes={cfg.episodes} asks for "
             "no more: give a larger number, or --episodes=0 --updates=N to learn from what is there."
         )
-
-
-def _make_report(cfg: DaggerConfig, folder: RunFolder, state: RunState, training: PlaybyearTrainConfig) -> Report:
-    training.resume, training.wandb.run_id = state.wandb_run_id is not None, state.wandb_run_id
-    total, unit = (cfg.episodes, "episode") if cfg.is_online else (cfg.updates, "update")
-    report = Report(folder, state, training, total, unit)
-    state.wandb_run_id = training.wandb.run_id = report.wandb_run_id
-    training.resume = False  # checkpoints of a resumed run are those of one that was not
-    return report
 
 
 def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> None:

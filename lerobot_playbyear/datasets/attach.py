@@ -13,15 +13,15 @@ from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, list_files
-from lerobot_playbyear.datasets.journal import flush
+from lerobot_playbyear.datasets.journal import flush, flush_all
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
+    from lerobot_playbyear.datasets.attached_sound import EpisodesSound
     from lerobot_playbyear.datasets.long_dataset import LongDataset
-    from lerobot_playbyear.datasets.spooled_sound import EpisodesSound
 
 
 class AttachError(InputError):
@@ -107,8 +107,7 @@ def _write(root: Path, target: Path, sound: "EpisodesSound") -> None:
     try:
         unfinished.mkdir(parents=True)
         write_with_sound(root, unfinished, sound)
-        for path in [*unfinished.rglob("*"), unfinished]:
-            flush(path)
+        flush_all(unfinished)
         os.rename(unfinished, target)
         flush(target.absolute().parent)
     except ParquetDamageError as error:

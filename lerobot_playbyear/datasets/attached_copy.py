@@ -1,7 +1,6 @@
 """The copy of a dataset that gets sound: every file as it is, with a column more in its tables."""
 
 import itertools
-import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,13 +9,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from lerobot.datasets.feature_utils import get_hf_features_from_features
-from lerobot.datasets.io_utils import write_info
-from lerobot.datasets.utils import INFO_PATH, DatasetInfo
+from lerobot.datasets.io_utils import load_info, load_stats, write_info
+from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
+from lerobot_playbyear.datasets.attached_sound import EpisodesSound
 from lerobot_playbyear.datasets.audio_feature import audio_feature
-from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.columns import column_to_numpy, numpy_to_column
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
     open_checked,
@@ -25,8 +25,9 @@ from lerobot_playbyear.datasets.parquet_files import (
     write_tables,
 )
 from lerobot_playbyear.datasets.settling import write_rows
-from lerobot_playbyear.datasets.spooled_sound import EpisodesSound
-from lerobot_playbyear.datasets.statistics import Stats, add_stats, read_stats, write_stats
+from lerobot_playbyear.datasets.statistics import Stats, add_stats, with_sound_stats, write_stats
+
+_SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
 
 
 def write_with_sound(root: Path, target: Path, sound: EpisodesSound) -> None:
@@ -41,11 +42,13 @@ def write_with_sound(root: Path, target: Path, sound: EpisodesSound) -> None:
         ParquetDamageError: A table is damaged, or names other frames than there is sound for.
         OSError: Something cannot be read or written.
     """
-    info = DatasetInfo.from_dict(json.loads((root / INFO_PATH).read_text()))
+    info = load_info(root)
     info.features = _with_microphones(info.features, sound, info.fps)
     schema = get_hf_features_from_features(info.features).arrow_schema
     stats = [sound.stats(episode) for episode in range(len(sound.episodes))]
-    paths = sorted(path for path in root.rglob("*") if path.is_file() and not _is_scratch(path.relative_to(root)))
+    paths = sorted(
+        path for path in root.rglob("*") if path.is_file() and path.relative_to(root).parts[0] not in _SCRATCH
+    )
     for path in tqdm(paths, desc="Writing", unit="file"):
         name = path.relative_to(root)
         (target / name).parent.mkdir(parents=True, exist_ok=True)
@@ -55,22 +58,14 @@ def write_with_sound(root: Path, target: Path, sound: EpisodesSound) -> None:
             _write_rows(path, target / name, stats)
         elif name != Path(INFO_PATH):
             shutil.copyfile(path, target / name)
-    known = read_stats(root) or {}
+    known = load_stats(root) or {}
     write_stats({**known, **add_stats(None, stats, sound.keys)}, target)
     write_info(info, target)
 
 
-def _is_scratch(name: Path) -> bool:
-    return name.parts[0] in ("images", ".cache", ".git")
-
-
 def _with_microphones(features: dict[str, dict], sound: EpisodesSound, fps: int) -> dict[str, dict[str, Any]]:
     own = {key: feature for key, feature in features.items() if key not in DEFAULT_FEATURES}
-    return {
-        **own,
-        **{key: audio_feature(sound.sample_rate, fps) for key in sound.keys},
-        **{key: feature for key, feature in features.items() if key in DEFAULT_FEATURES},
-    }
+    return {**own, **{key: audio_feature(sound.sample_rate, fps) for key in sound.keys}, **features}
 
 
 def _write_data(source: Path, target: Path, schema: pa.Schema, sound: EpisodesSound) -> None:
@@ -78,15 +73,15 @@ def _write_data(source: Path, target: Path, schema: pa.Schema, sound: EpisodesSo
         metadata = file.schema_arrow.metadata or {}
         if b"huggingface" in metadata:
             metadata = {**metadata, **(schema.metadata or {})}
-        first = file.schema_arrow.empty_table()
+        target_schema = pa.schema([*file.schema_arrow, *(schema.field(key) for key in sound.keys)], metadata)
 
         def add(table: pa.Table) -> pa.Table:
             try:
-                return _with_columns(table, schema, sound, metadata)
+                return _with_columns(table, target_schema, sound)
             except ValueError as error:
                 raise ParquetDamageError(f"{source} is damaged: {error}.") from error
 
-        write_tables(target, map(add, _tables(file, source, sound.rows_at_once)), add(first).schema)
+        write_tables(target, map(add, _tables(file, source, sound.rows_at_once)), target_schema)
 
 
 def _tables(file: Any, source: Path, rows: int) -> Iterator[pa.Table]:
@@ -97,21 +92,18 @@ def _tables(file: Any, source: Path, rows: int) -> Iterator[pa.Table]:
             yield table.slice(start, rows)
 
 
-def _with_columns(table: pa.Table, schema: pa.Schema, sound: EpisodesSound, metadata: dict[bytes, bytes]) -> pa.Table:
+def _with_columns(table: pa.Table, schema: pa.Schema, sound: EpisodesSound) -> pa.Table:
     episodes = column_to_numpy(table.column("episode_index"))
     frames = column_to_numpy(table.column("frame_index"))
     edges = np.flatnonzero((np.diff(episodes) != 0) | (np.diff(frames) != 1)) + 1
-    spans = list(itertools.pairwise([0, *edges.tolist(), len(table)])) if len(table) else []
-    for first, stop in spans:
-        sound.check(int(episodes[first]), int(frames[first]), int(frames[stop - 1]))
-    parts = [sound.blocks(int(episodes[a]), int(frames[a]), int(frames[a]) + b - a) for a, b in spans]
-    blocks = np.concatenate(parts) if parts else np.zeros((0, sound.samples_per_frame, len(sound.keys)), np.int16)
+    parts = []
+    for first, stop in itertools.pairwise([0, *edges.tolist(), len(table)]):
+        start = int(frames[first])
+        parts.append(sound.blocks(int(episodes[first]), start, start + stop - first))
+    blocks = np.concatenate(parts)
     for i, key in enumerate(sound.keys):
-        kind = schema.field(key).type
-        samples = pa.array(np.ascontiguousarray(blocks[..., i]).reshape(-1))
-        column = pa.FixedSizeListArray.from_arrays(samples, kind.list_size).cast(kind)
-        table = table.append_column(pa.field(key, kind), column)
-    return table.replace_schema_metadata(metadata)
+        table = table.append_column(key, numpy_to_column(blocks[..., i], schema.field(key).type))
+    return table.replace_schema_metadata(schema.metadata)
 
 
 def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
@@ -123,10 +115,6 @@ def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
 
 
 def _write_rows(source: Path, target: Path, stats: list[Stats]) -> None:
-    table = read_named_table(source)
-    episodes = table.column("episode_index").to_pylist()
-    for key in stats[0]:
-        for name in stats[0][key]:
-            values = pa.array([stats[episode][key][name].tolist() for episode in episodes])
-            table = table.append_column(f"stats/{key}/{name}", values)
-    write_rows(table.replace_schema_metadata(None), target)
+    rows = read_named_table(source)
+    own = [stats[episode] for episode in rows.column("episode_index").to_pylist()]
+    write_rows(with_sound_stats(rows, own).replace_schema_metadata(None), target)

@@ -39,10 +39,11 @@ def samples_per_frame(sample_rate: int, fps: int, key: str = AUDIO_PREFIX + "<mi
         ValueError: If the frame rate does not divide the sample rate.
     """
     if sample_rate <= 0 or fps <= 0 or sample_rate % fps:
+        nearest = max(1, round(sample_rate / fps)) * fps if fps > 0 else sample_rate
         raise ValueError(
             f"'{key}': a frame must hold a whole number of samples, but sample_rate / fps = {sample_rate} / {fps} "
             f"is not a positive integer. Choose a sample rate that is a multiple of {fps} Hz, for example "
-            f"{_nearest_multiple(sample_rate, fps)} Hz, and resample the recording to it."
+            f"{nearest} Hz, and resample the recording to it."
         )
     return int(sample_rate // fps)
 
@@ -70,19 +71,12 @@ def audio_keys(features: Iterable[str]) -> list[str]:
     return [key for key in features if key.startswith(AUDIO_PREFIX)]
 
 
-def check_audio_features(
-    features: Mapping[str, Mapping[str, Any]],
-    fps: int,
-    sample_rate: int | None = None,
-    required: bool = False,
-) -> dict[str, int]:
+def check_audio_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> dict[str, int]:
     """Check every microphone of a dataset against the contract.
 
     Args:
         features: The dataset's features (`dataset.meta.features`).
         fps: The dataset's frames per second [Hz].
-        sample_rate: The sample rate wanted [Hz]; None accepts any.
-        required: Whether at least one microphone has to be there.
 
     Returns:
         The sample rate [Hz] of every audio key.
@@ -90,20 +84,7 @@ def check_audio_features(
     Raises:
         ValueError: Naming the key, the value seen, the value wanted, and what to do.
     """
-    keys = audio_keys(features)
-    if required and not keys:
-        raise ValueError(
-            f"The dataset has no audio: no key starts with '{AUDIO_PREFIX}' (keys seen: {sorted(features)}). Record "
-            "it with a microphone, or train with --policy.use_audio=false."
-        )
-    rates = {key: _check_one(key, features[key], fps) for key in keys}
-    for key, rate in rates.items():
-        if sample_rate is not None and rate != sample_rate:
-            raise ValueError(
-                f"'{key}' was recorded at {rate} Hz, but {sample_rate} Hz is wanted. Use a dataset recorded at "
-                f"{sample_rate} Hz, or configure the sample rate as {rate}."
-            )
-    return rates
+    return {key: _check_one(key, features[key], fps) for key in audio_keys(features)}
 
 
 def _check_one(key: str, feature: Mapping[str, Any], fps: int) -> int:
@@ -175,6 +156,14 @@ def to_pcm_s16(waveform: np.ndarray) -> np.ndarray:
     return np.clip(scaled, -_PCM_S16_FULL_SCALE, _PCM_S16_FULL_SCALE - 1).astype(np.int16)
 
 
+def pcm_channels(waveform: np.ndarray) -> np.ndarray:
+    """Sound (n,) or (n, channels) as (n, channels) int16 PCM. Raises as `to_pcm_s16`, also where the shape is another."""
+    samples = to_pcm_s16(waveform)
+    if samples.ndim not in (1, 2):
+        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
+    return samples[:, None] if samples.ndim == 1 else samples
+
+
 def write_wav(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
     """Write sound as a 16-bit WAV file.
 
@@ -189,18 +178,12 @@ def write_wav(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
     Raises:
         ValueError: If the samples are neither, or the shape is another.
     """
-    samples = to_pcm_s16(waveform)
-    if samples.ndim not in (1, 2):
-        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
+    samples = pcm_channels(waveform)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with wave.open(str(path), "wb") as file:
-        file.setnchannels(1 if samples.ndim == 1 else samples.shape[1])
+        file.setnchannels(samples.shape[1])
         file.setsampwidth(2)
         file.setframerate(sample_rate)
         file.writeframes(np.ascontiguousarray(samples).astype("<i2").tobytes())
     return path
-
-
-def _nearest_multiple(sample_rate: int, fps: int) -> int:
-    return max(1, round(sample_rate / fps)) * fps if fps > 0 else sample_rate

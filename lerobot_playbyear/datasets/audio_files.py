@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import av
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_feature import samples_per_frame, to_pcm_s16, write_wav
+from lerobot_playbyear.datasets.audio_feature import pcm_channels, samples_per_frame, to_pcm_s16, write_wav
 
 _GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
 _FLAC_BLOCK = 4096  # samples
@@ -101,10 +101,7 @@ def write_audio(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Pat
         return write_wav(path, waveform, sample_rate)
     if path.suffix.lower() != ".flac":
         raise AudioFileError(f"{path}: sound is written as .wav or .flac; choose such a name.")
-    samples = to_pcm_s16(waveform)
-    if samples.ndim not in (1, 2):
-        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
-    samples = samples.reshape(len(samples), -1)
+    samples = pcm_channels(waveform)
     path.parent.mkdir(parents=True, exist_ok=True)
     layout = "mono" if samples.shape[1] == 1 else "stereo" if samples.shape[1] == 2 else f"{samples.shape[1]}c"
     with av.open(str(path), "w", format="flac") as container:
@@ -138,19 +135,18 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
     floats = torch.from_numpy(waveform.astype(np.float32) / (32768 if is_pcm else 1))
     channels_first = floats.reshape(len(floats), -1).T  # (channels, n)
     if max(sample_rate, new_sample_rate) > _MOST_PHASES * math.gcd(sample_rate, new_sample_rate):
-        result = _resample_odd_rates(channels_first.numpy(), sample_rate, new_sample_rate).T
-        result = result.reshape(-1, *waveform.shape[1:])
-        return to_pcm_s16(result) if is_pcm else result.astype(waveform.dtype)
-    converted = torchaudio.functional.resample(
-        channels_first,
-        sample_rate,
-        new_sample_rate,
-        lowpass_filter_width=_FILTER_WIDTH,
-        rolloff=_ROLLOFF,
-        resampling_method="sinc_interp_kaiser",
-        beta=14.769656459379492,
-    )
-    result = converted.T.reshape(-1, *waveform.shape[1:]).numpy()
+        converted = _resample_odd_rates(channels_first.numpy(), sample_rate, new_sample_rate)
+    else:
+        converted = torchaudio.functional.resample(
+            channels_first,
+            sample_rate,
+            new_sample_rate,
+            lowpass_filter_width=_FILTER_WIDTH,
+            rolloff=_ROLLOFF,
+            resampling_method="sinc_interp_kaiser",
+            beta=14.769656459379492,
+        ).numpy()
+    result = converted.T.reshape(-1, *waveform.shape[1:])
     return to_pcm_s16(result) if is_pcm else result.astype(waveform.dtype)
 
 

@@ -1,5 +1,6 @@
 """The columns of a LeRobotDataset as arrays, and the files that hold them; without LeRobot, which takes seconds to import."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,20 @@ def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
     return flat.reshape(len(column), -1)
 
 
+def numpy_to_column(values: np.ndarray, kind: pa.DataType) -> pa.Array:
+    """Numbers (N,) or (N, values per row) as a column of some type, as a feature of this shape has it."""
+    column = pa.array(np.ascontiguousarray(values).reshape(-1))
+    if pa.types.is_fixed_size_list(kind):
+        column = pa.FixedSizeListArray.from_arrays(column, kind.list_size)
+    return column.cast(kind)
+
+
+def with_values(table: pa.Table, name: str, values: Sequence | np.ndarray) -> pa.Table:
+    """A table with other values in one of its columns, which keeps its place and its type."""
+    field = table.schema.field(name)
+    return table.set_column(table.column_names.index(name), field, pa.array(values, field.type))
+
+
 def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
     """First row, and row after the last, of every episode, from the episode of each row (N,)."""
     changes = np.flatnonzero(np.diff(episode_index)) + 1
@@ -33,7 +48,9 @@ def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
     return starts, [*starts[1:], len(episode_index)]
 
 
-def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: str | None = None) -> None:
+def check_dataset_files(
+    repo_id: str, root: str | Path | None = None, revision: str | None = None
+) -> list[pq.FileMetaData]:
     """Refuse a local dataset that is empty or was cut off while it was written, or that no one should trust.
 
     Where no local dataset is, what the Hub's says about itself is fetched and checked; the rest LeRobot fetches later.
@@ -42,6 +59,9 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
         repo_id: The dataset's name.
         root: Its folder; None means LeRobot's own place for `repo_id`.
         revision: Of the dataset on the Hub, as LeRobot takes it.
+
+    Returns:
+        What its data files say of themselves; nothing where no local dataset is.
 
     Raises:
         ValueError: Naming the file that is damaged, the folder without data, or what leads out of the folder or claims
@@ -54,7 +74,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
 
         meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
         check_info(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
-        return
+        return []
     footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
     for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, "meta/episodes/*/*.parquet")]:
         try:
@@ -68,6 +88,7 @@ def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: 
     if not footers["data"]:
         raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
     check_info(folder, footers["data"], sum(footer.num_rows for footer in footers["meta"]))
+    return footers["data"]
 
 
 def _is_list(kind: pa.DataType) -> bool:

@@ -10,14 +10,14 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import pyarrow.parquet as pq
 from PIL import Image
 
-from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH, fits
+from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH, entries_below, fits
 
 _FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")  # of pictures; others have readers that start programs
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
@@ -32,14 +32,6 @@ class OutsideError(ValueError):
 
 class ClaimError(ValueError):
     """A dataset claims to hold what its files do not."""
-
-
-def entries_below(folder: Path) -> Iterator[Path]:
-    """Everything in a folder, without going through links."""
-    for entry in sorted(folder.iterdir()):
-        yield entry
-        if entry.is_dir() and not entry.is_symlink():
-            yield from entries_below(entry)
 
 
 def check_links(root: Path) -> None:

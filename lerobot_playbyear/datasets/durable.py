@@ -35,8 +35,8 @@ class DurableWriter:
     """Appends episodes to a LeRobotDataset v3.0; each is on disk for good when `save_episode` returns.
 
     Protocol: LeRobot writes the episode, all but its sound, into a dataset inside the root's scratch folder and closes
-    its files; of these and the sound the files are made that the dataset shall hold; a journal that
-    names them is written (from here on the episode counts); they are moved into place one by one,
+    its files; of these and the sound the files are made that the dataset shall hold; a journal
+    is written (from here on the episode counts); they are moved into place one by one,
     `meta/info.json` last; the journal is removed. After a crash the next writer finishes the moves of a journal it
     finds and throws other staged files away. The dataset loads with plain LeRobot between any two of these steps.
     Files and folders are synchronised with the disk before they are referred to, so that this holds for a power cut.
@@ -222,7 +222,8 @@ class DurableWriter:
         if (self.root / JOURNAL).exists():
             finish_journal(self.root)
         elif self.num_episodes == episode.index:
-            publish(self.root, settle_episode(self.root, episode, episode.save()))
+            settle_episode(self.root, episode, episode.save())
+            publish(self.root)
         elif self.num_episodes != episode.index + 1:
             raise _another_count(self.root, self.num_episodes, episode.index)
 

@@ -7,9 +7,11 @@ The names are LeRobot's, spelled here as well because its own modules with them 
 """
 
 import contextlib
+import errno
 import fnmatch
 import glob
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
@@ -38,6 +40,26 @@ def list_files(root: Path, pattern: str) -> list[Path]:
     for part in Path(pattern).parts:
         found = [path / name for path in found for name in _names(path) if fnmatch.fnmatchcase(name, part)]
     return sorted(found)
+
+
+def entries_below(folder: Path) -> Iterator[Path]:
+    """Everything in a folder, without going through links."""
+    for entry in sorted(folder.iterdir()):
+        yield entry
+        if entry.is_dir() and not entry.is_symlink():
+            yield from entries_below(entry)
+
+
+def take_over(source: str | Path, target: str | Path) -> None:
+    """A second name for a file that nobody changes in place, or a copy where there can be none."""
+    source, target = Path(source), Path(target)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+        if source.stat().st_size != target.stat().st_size:
+            raise OSError(errno.EIO, "it could not be copied as a whole", str(source)) from None
 
 
 def fits(name: PurePath, *patterns: str) -> bool:

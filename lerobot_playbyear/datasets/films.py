@@ -1,8 +1,6 @@
 """The films of an episode that was encoded while it came in: their pictures are nowhere else."""
 
-import contextlib
 import os
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +9,7 @@ import av
 from lerobot.datasets.video_utils import StreamingVideoEncoder
 
 from lerobot_playbyear.datasets.episode_checks import IncompleteEpisodeError, LostFramesError, check_video
+from lerobot_playbyear.datasets.files import take_over
 
 
 class Film(NamedTuple):
@@ -60,7 +59,7 @@ class FinishedFilms:
         results = {}
         for key, film in self._films.items():
             path = Path(tempfile.mkdtemp(dir=self._folder)) / film.path.name
-            link(film.path, path)
+            take_over(film.path, path)
             results[key] = (path, film.stats)
         return results
 
@@ -69,11 +68,3 @@ class FinishedFilms:
 
     def close(self) -> None:
         """Nothing is open."""
-
-
-def link(source: Path | str, target: Path | str) -> None:
-    """Gives a file a second name, or where the disk cannot do that copies it."""
-    with contextlib.suppress(OSError):
-        os.link(source, target)
-        return
-    shutil.copyfile(source, target)

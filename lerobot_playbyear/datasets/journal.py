@@ -1,15 +1,14 @@
 """Moving finished files into a dataset so that neither a crash nor a power cut can lose or halve an episode.
 
 Everything of ours lives under LeRobot's scratch folder for frames, which `push_to_hub` leaves out. It may come with a
-dataset that a stranger made, so that nothing in it is believed: what a journal names stays inside the dataset, and no
-folder is followed that is a link.
+dataset that a stranger made, so that nothing in it is believed: a journal says no more than that it is there, what is
+moved stays inside the dataset, and no folder is followed that is a link.
 """
 
-import json
 import os
-import stat
-from collections.abc import Iterable
-from pathlib import Path, PurePosixPath
+from pathlib import Path
+
+from lerobot_playbyear.datasets.files import INFO_PATH, entries_below
 
 SCRATCH = Path("images")
 STAGING = SCRATCH / ".staging"
@@ -19,62 +18,55 @@ LOCK = SCRATCH / ".lock"
 JOURNAL = SCRATCH / ".journal.json"
 
 _PARTS = ("data", "meta", "videos")  # where an episode's files lie
-_MOST_BYTES = 2**20  # of a journal: several hundred times what an episode of a hundred cameras needs
 
 
 class JournalError(ValueError):
     """A journal, or the folder it is in, is none that was written here; nothing was changed."""
 
 
-def publish(root: Path, names: Iterable[Path]) -> None:
-    """Moves files from the staging folder to the same place in the dataset: all of them, or none.
+def publish(root: Path) -> None:
+    """Moves the files of the staging folder to the same place in the dataset: all of them, or none.
 
     From the moment the journal stands on the disk the moves count as made: whoever opens the dataset next finishes
     them with `finish_journal`. Everything is on the disk itself before it is referred to.
 
     Args:
         root: The dataset's folder.
-        names: The files, relative to the dataset's folder, in the order in which they are moved.
 
     Raises:
         JournalError: A file's place is not inside the dataset.
     """
-    names = list(names)
+    names = _staged_files(root)
     staging = root / STAGING
-    _check_moves(root, [name.as_posix() for name in names])
     for name in names:
         flush(staging / name)
     for folder in sorted({staging / parent for name in names for parent in name.parents}):
         flush(folder)
     flush(staging.parent)
-    journal = root / JOURNAL
-    partial = journal.with_suffix(".partial")
-    partial.write_text(json.dumps([name.as_posix() for name in names]))
-    flush(partial)
-    os.replace(partial, journal)
-    flush(journal.parent)
+    write_at_once(root / JOURNAL, "")
     flush(root)
     finish_journal(root)
 
 
 def finish_journal(root: Path) -> None:
-    """Makes the moves that a journal names, where there is one: the rest of them after a crash.
+    """Makes the moves that a journal stands for, where there is one: the rest of them after a crash.
 
     Raises:
-        JournalError: It is none of ours; nothing was moved.
+        JournalError: It, or what is to be moved, is none of ours; nothing was moved.
     """
     journal = root / JOURNAL
     if not os.path.lexists(journal):
         return
-    names = _read_names(journal)
-    _check_moves(root, names)
+    names = _staged_files(root)
+    if journal.is_symlink() or not journal.is_file():
+        remedy = f"If nothing is being recorded there, delete it and run `playbyear-repair --root={root}`"
+        raise _error(journal, "is no ordinary file", remedy)
     for name in names:
-        source, target = root / STAGING / name, root / name
-        if source.exists():
-            made = make_folders(target.parent)
-            os.replace(source, target)
-            for folder in {target.parent, *made}:
-                flush(folder)
+        target = root / name
+        made = make_folders(target.parent)
+        os.replace(root / STAGING / name, target)
+        for folder in {target.parent, *made}:
+            flush(folder)
     journal.unlink()
     flush(journal.parent)
 
@@ -108,51 +100,42 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def _read_names(journal: Path) -> list[str]:
-    """The entries of a journal, whatever they are."""
-    check_scratch(journal.parent.parent)
-    remedy = f"If nothing is being recorded there, delete it and run `playbyear-repair --root={journal.parent.parent}`"
-    details = journal.lstat()
-    if not stat.S_ISREG(details.st_mode):
-        raise _error(journal, "is no ordinary file", remedy)
-    if details.st_size > _MOST_BYTES:
-        raise _error(journal, f"has {details.st_size} bytes; wanted at most {_MOST_BYTES}", remedy)
-    try:
-        names = json.loads(journal.read_bytes())
-    except (ValueError, RecursionError) as error:
-        raise _error(journal, f"cannot be read: {error}", remedy) from error
-    if not isinstance(names, list):
-        raise _error(journal, f"holds {type(names).__name__}; wanted a list of files", remedy)
-    for name in names:
-        if not is_inside(name):
-            wanted = f"wanted files below {', '.join(part + '/' for part in _PARTS)}"
-            raise _error(journal, f"names {str(name)[:100]!r}; {wanted}", remedy)
-    return names
+def write_at_once(path: Path, text: str) -> None:
+    """Writes a file that is there as a whole, on the disk itself, or not at all."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(text)
+    flush(partial)
+    os.replace(partial, path)
+    flush(path.parent)
 
 
-def is_inside(name: object) -> bool:
-    """Whether a journal's entry is, letter by letter, a path below one of the folders of a dataset."""
-    if not isinstance(name, str) or any(not letter.isprintable() or letter in "\\:" for letter in name):
-        return False
-    path = PurePosixPath(name)
-    return path.as_posix() == name and ".." not in path.parts and len(path.parts) > 1 and path.parts[0] in _PARTS
+def flush_all(folder: Path) -> None:
+    """As `flush`, of a folder and all that is in it but links."""
+    for path in folder.rglob("*"):
+        if not path.is_symlink():
+            flush(path)
+    flush(folder)
 
 
-def _check_moves(root: Path, names: Iterable[str]) -> None:
-    """Whether files and the folders they come from and go to are the dataset's own.
+def _staged_files(root: Path) -> list[Path]:
+    """The files to move, relative to the dataset's folder, so that nothing comes before what it refers to.
+
+    That is: frames and films, the tables of `meta`, those of its episodes, and last `meta/info.json`.
 
     Raises:
-        JournalError: One of them is a link, or lies somewhere else.
+        JournalError: One of them, or a folder that they come from or go to, is a link.
     """
     check_scratch(root)
-    for name in names:
-        if not is_inside(name):
-            raise _error(root / STAGING / name, "leads out of the dataset", "Choose another folder for the dataset")
-        file = root / STAGING / name
-        folders = [parent for parent in PurePosixPath(name).parents if parent.name]
-        for path in (file, *(base / parent for parent in folders for base in (root / STAGING, root))):
-            if path.is_symlink():
+    staging = root / STAGING
+    names: list[Path] = []
+    for entry in entries_below(staging) if staging.is_dir() else ():
+        name = entry.relative_to(staging)
+        for path in (entry, root / name):
+            if path.is_symlink() and (path == entry or entry.is_dir()):
                 raise _error(path, "is a link; wanted one of the dataset's own", "Put what it leads to in its place")
+        if entry.is_file() and name.parts[0] in _PARTS:
+            names.append(name)
+    return sorted(names, key=lambda name: (name.parts[0] == "meta", name == Path(INFO_PATH), len(name.parts) > 2))
 
 
 def _error(path: Path, found: str, remedy: str) -> JournalError:

@@ -38,9 +38,7 @@ class DatasetLock:
             try:
                 (root / SCRATCH).mkdir(parents=True, exist_ok=True)
                 lock = self._take()
-            except FileNotFoundError:  # whoever let go removed the folder
-                continue
-            except FileExistsError:  # it was there, and is gone again
+            except (FileNotFoundError, FileExistsError):  # whoever let go removes the folder just now
                 if (root / SCRATCH).is_file():
                     raise
                 continue

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import datasets
 import pyarrow as pa
+import pyarrow.compute as pc
 from datasets.arrow_writer import ArrowWriter
 from datasets.table import table_cast
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.parquet_files import open_parquet, row_group_parts
 
 
@@ -46,7 +46,10 @@ class LongDataset:
                 with open_parquet(name) as file:
                     for group in range(file.num_row_groups):
                         for table in row_group_parts(file, group):
-                            wanted = table if episodes is None else _of(table, episodes)
+                            is_wanted = (
+                                None if episodes is None else pc.is_in(table["episode_index"], pa.array(episodes))
+                            )
+                            wanted = table if is_wanted is None else table.filter(is_wanted)
                             if len(wanted):
                                 writer.write_table(table_cast(wanted, features.arrow_schema))
             writer.finalize()
@@ -58,8 +61,3 @@ def scratch_folder() -> tempfile.TemporaryDirectory[str]:
     cache = Path(datasets.config.HF_DATASETS_CACHE)
     cache.mkdir(parents=True, exist_ok=True)
     return tempfile.TemporaryDirectory(dir=cache, prefix="playbyear-")
-
-
-def _of(table: pa.Table, episodes: list[int]) -> pa.Table:
-    found = column_to_numpy(table.column("episode_index"))
-    return table.filter(pa.array([number in episodes for number in found.tolist()]))

@@ -8,10 +8,8 @@ imported when the files have been looked at, so that damage is told at once.
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pyarrow.parquet as pq
-
 from lerobot_playbyear.datasets.columns import check_dataset_files
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -36,17 +34,12 @@ def open_dataset(
         ValueError: If a file of the dataset is truncated, or it is empty.
         Exception: Whatever LeRobot raises where there is none, or it cannot be read.
     """
-    check_dataset_files(repo_id, root)
+    footers = check_dataset_files(repo_id, root)
     from lerobot.datasets import LeRobotDataset
 
     from lerobot_playbyear.datasets.long_dataset import LongDataset
 
-    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
-    if (folder / INFO_PATH).is_file() and any(map(_is_long, folder.glob("data/*/*.parquet"))):
-        return LongDataset(repo_id, folder, episodes)
+    sizes = (file.row_group(i).total_byte_size for file in footers for i in range(file.num_row_groups))
+    if any(size > _LARGE_ROW_GROUP for size in sizes):
+        return LongDataset(repo_id, Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, episodes)
     return LeRobotDataset(repo_id, root=root, episodes=episodes, video_backend=video_backend)
-
-
-def _is_long(path: Path) -> bool:
-    file = pq.read_metadata(path)
-    return any(file.row_group(i).total_byte_size > _LARGE_ROW_GROUP for i in range(file.num_row_groups))

@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -70,48 +71,66 @@ def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> N
 def writer_options(schema: pa.Schema) -> dict:
     """Options of `pyarrow.parquet.ParquetWriter` for a data file."""
     leaves = [leaf for field in schema for leaf in leaf_columns(field.name, field.type)]
-    pcm = {path for path, kind, nested in leaves if nested and kind == pa.int16()}
-    counters = {path for path, kind, nested in leaves if not nested and kind == pa.int64()}  # most go up by one
-    pictures = {path for path, kind, _ in leaves if pa.types.is_binary(kind)}
+    pcm = {leaf.path for leaf in leaves if leaf.nested and leaf.kind == pa.int16()}
+    counters = {leaf.path for leaf in leaves if not leaf.nested and leaf.kind == pa.int64()}  # most go up by one
+    pictures = {leaf.path for leaf in leaves if pa.types.is_binary(leaf.kind)}
     deltas = pcm | counters
     return {
         "compression": "snappy",
-        "use_dictionary": [path for path, _, _ in leaves if path not in deltas | {"timestamp"}],
+        "use_dictionary": [leaf.path for leaf in leaves if leaf.path not in deltas | {"timestamp"}],
         "column_encoding": dict.fromkeys(deltas, "DELTA_BINARY_PACKED") or None,
         "write_page_checksum": True,
         # Readers skip row groups by these; for sound and pictures they would only take room.
-        "write_statistics": [path for path, _, nested in leaves if not nested and path not in pictures] or False,
+        "write_statistics": [leaf.path for leaf in leaves if not leaf.nested and leaf.path not in pictures] or False,
     }
 
 
-def leaf_columns(path: str, kind: pa.DataType) -> list[tuple[str, pa.DataType, bool]]:
-    """Parquet's columns below an Arrow column: path, type, and whether it lies in a list, in the file's order."""
+class Leaf(NamedTuple):
+    """A column of parquet: its path and type, whether it lies in a list, and its values in a row; 0 where that varies."""
+
+    path: str
+    kind: pa.DataType
+    nested: bool
+    values_per_row: int
+
+
+def leaf_columns(path: str, kind: pa.DataType) -> list[Leaf]:
+    """Parquet's columns below an Arrow column, in the file's order."""
     if isinstance(kind, pa.BaseExtensionType):
         return leaf_columns(path, kind.storage_type)
     if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
-        return [(name, leaf, True) for name, leaf, _ in leaf_columns(f"{path}.list.element", kind.value_type)]
+        size = kind.list_size if pa.types.is_fixed_size_list(kind) else 0
+        leaves = leaf_columns(f"{path}.list.element", kind.value_type)
+        return [Leaf(leaf.path, leaf.kind, True, size * leaf.values_per_row) for leaf in leaves]
     if pa.types.is_struct(kind):
         return [column for field in kind for column in leaf_columns(f"{path}.{field.name}", field.type)]
-    return [(path, kind, False)]
+    return [Leaf(path, kind, False, 1)]
 
 
-def open_checked(path: Path) -> pq.ParquetFile:
+def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.ParquetFile:
     """Opens a file for reading with its pages' checksums verified, where it has them.
+
+    Args:
+        path: The file.
+        footer: What is taken for its footer; None: its own.
 
     Raises:
         ParquetDamageError: It is not a complete parquet file.
         OSError: It cannot be read now; nor may later reads, see `parsing`.
     """
     with parsing(path):
-        with path.open("rb") as file:
-            if file.read(4) != b"PAR1":
-                raise ParquetDamageError("it does not begin as a parquet file does")
-        return open_parquet(path)
+        if footer is None:
+            with path.open("rb") as file:
+                if file.read(4) != b"PAR1":
+                    raise ParquetDamageError("it does not begin as a parquet file does")
+        return open_parquet(path, footer)
 
 
-def open_parquet(source: Path | pa.NativeFile) -> pq.ParquetFile:
-    """Opens a file for reading as it is needed, with its pages' checksums verified, where it has them."""
-    return pq.ParquetFile(source, page_checksum_verification=True, pre_buffer=False, buffer_size=_BUFFER_BYTES)
+def open_parquet(path: Path, footer: pq.FileMetaData | None = None) -> pq.ParquetFile:
+    """As `open_checked`, without a look at its beginning. Raises what pyarrow raises."""
+    return pq.ParquetFile(
+        path, metadata=footer, page_checksum_verification=True, pre_buffer=False, buffer_size=_BUFFER_BYTES
+    )
 
 
 def read_row_groups(
@@ -131,18 +150,26 @@ def read_row_groups(
     for index in range(file.num_row_groups):
         try:
             with parsing(path):
-                if _is_large(file, index, columns):  # it is read to its end first: of a damaged one nothing is given
+                is_large = _row_group_bytes(file, index, columns) > 2 * PIECE_BYTES
+                if is_large:  # it is read to its end first: of a damaged one nothing is given
                     for _ in row_group_parts(file, index, columns):
                         pass
-                    parts = row_group_parts(file, index, columns)
                 else:
                     table = file.read_row_group(index, columns=columns, use_threads=False)
                     table.validate(full=True)
-                    parts = iter([table])
         except ParquetDamageError as error:
             yield error
-        else:
-            yield from _as_before(parts, path)
+            continue
+        if not is_large:
+            yield table
+            continue
+        try:
+            with parsing(path):
+                yield from row_group_parts(file, index, columns)
+        except ParquetDamageError as error:
+            raise OSError(
+                errno.EIO, f"what could be read before cannot be read now ({error})", path and str(path)
+            ) from error
 
 
 def row_group_parts(file: pq.ParquetFile, index: int, columns: list[str] | None = None) -> Iterator[pa.Table]:
@@ -153,21 +180,6 @@ def row_group_parts(file: pq.ParquetFile, index: int, columns: list[str] | None 
         table = pa.Table.from_batches([batch])
         table.validate(full=True)
         yield table
-
-
-def _as_before(parts: Iterator[pa.Table], path: Path | None) -> Iterator[pa.Table]:
-    """Parts that could be read a moment ago."""
-    try:
-        with parsing(path):
-            yield from parts
-    except ParquetDamageError as error:
-        raise OSError(
-            errno.EIO, f"what could be read before cannot be read now ({error})", path and str(path)
-        ) from error
-
-
-def _is_large(file: pq.ParquetFile, index: int, columns: list[str] | None) -> bool:
-    return _row_group_bytes(file, index, columns) > 2 * PIECE_BYTES
 
 
 def _row_group_bytes(file: pq.ParquetFile, index: int, columns: list[str] | None) -> int:

@@ -16,9 +16,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
-from lerobot.datasets.io_utils import write_info
+from lerobot.datasets.io_utils import load_stats, write_info
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DatasetInfo
 
+from lerobot_playbyear.datasets.columns import numpy_to_column, with_values
 from lerobot_playbyear.datasets.journal import STAGING
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
@@ -28,8 +29,8 @@ from lerobot_playbyear.datasets.parquet_files import (
     read_table,
     write_tables,
 )
-from lerobot_playbyear.datasets.staging import Staging
-from lerobot_playbyear.datasets.statistics import add_stats, read_stats, sound_stats, with_sound_stats
+from lerobot_playbyear.datasets.staging import Staging, last_episode
+from lerobot_playbyear.datasets.statistics import add_stats, sound_stats, with_sound_stats
 from lerobot_playbyear.datasets.statistics import write_stats as write_dataset_stats
 from lerobot_playbyear.datasets.video_seal import is_intact, seal
 
@@ -40,7 +41,7 @@ _SMALL_DATA_BYTES = 8 * 2**20  # a data file below this is continued
 _SMALL_TABLE_BYTES = 2 * 2**20  # a table of episodes below this is continued
 
 
-def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndarray]) -> list[Path]:
+def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndarray]) -> None:
     """Makes of one episode's files what the dataset in `root` shall hold, in its staging folder.
 
     LeRobot's files are left as they are, but for films, which are moved: after a failure this can be called again.
@@ -49,9 +50,6 @@ def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndar
         root: The dataset's folder.
         episode: The episode, written and closed by LeRobot.
         waveforms: Its sound, (n_frames, S) per microphone.
-
-    Returns:
-        The files to publish, relative to the staging folder, in the order in which they may be moved one by one.
     """
     source, folder, meta = episode.folder, root / STAGING, episode.dataset.meta
     for part in ("data", "meta"):
@@ -62,46 +60,28 @@ def settle_episode(root: Path, episode: Staging, waveforms: Mapping[str, np.ndar
         meta.info, features={key: meta.features.get(key, feature) for key, feature in episode.features.items()}
     )
     write_info(info, folder)
-    last = _last_row(root)
+    tables = sorted(root.glob("meta/episodes/*/*.parquet"))
+    last = last_episode(tables[-1]).to_pylist()[0] if tables else None
     sound = {key: sound_stats(waveform) for key, waveform in waveforms.items()}
-    row = with_sound_stats(pq.read_table(source / row_file), sound)
-    row, data_file = _settle_data(root, episode, info, row, last, waveforms)
-    row_file = _settle_row(root, folder, row, row_file, last)
-    tables = [name for name in _new_files(episode, "meta") if len(name.parts) == 2 and name != INFO]
-    for name in tables:
-        shutil.copyfile(source / name, folder / name)
+    row = with_sound_stats(pq.read_table(source / row_file), [sound])
+    row = _settle_data(root, episode, info, row, last, waveforms)
+    _settle_row(root, folder, row, row_file, last)
+    for name in _new_files(episode, "meta"):
+        if len(name.parts) == 2 and name != INFO:
+            shutil.copyfile(source / name, folder / name)
     if meta.stats is not None and sound:
-        known = {key: stats for key, stats in (read_stats(root) or {}).items() if key in sound}
+        known = {key: stats for key, stats in (load_stats(root) or {}).items() if key in sound}
         write_dataset_stats({**meta.stats, **add_stats(known, [sound], sound)}, folder)
-    return [data_file, *_settle_films(episode, folder), *tables, row_file, INFO]
+    for name in _new_files(episode, "videos"):  # those that an earlier try moved are there already
+        if not is_intact(source / name):
+            seal(source / name)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(source / name, folder / name)
 
 
 def _new_files(episode: Staging, part: str) -> list[Path]:
-    names = (path.relative_to(episode.folder) for path in _files(episode.folder / part))
-    return [name for name in names if name not in episode.before]
-
-
-def _files(folder: Path) -> list[Path]:
-    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
-
-
-def _settle_films(episode: Staging, folder: Path) -> list[Path]:
-    """Seals the films and moves them; those that an earlier try moved are there already. Returns all their names."""
-    for name in _new_files(episode, "videos"):
-        if not is_intact(episode.folder / name):
-            seal(episode.folder / name)
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        os.replace(episode.folder / name, folder / name)
-    return [path.relative_to(folder) for path in _files(folder / "videos")]
-
-
-def _last_row(root: Path) -> dict | None:
-    """The last episode of a dataset, without its statistics."""
-    paths = sorted(root.glob("meta/episodes/*/*.parquet"))
-    if not paths:
-        return None
-    columns = [name for name in pq.read_schema(paths[-1]).names if not name.startswith("stats/")]
-    return pq.read_table(paths[-1], columns=columns).slice(pq.read_metadata(paths[-1]).num_rows - 1).to_pylist()[0]
+    paths = (path for path in sorted((episode.folder / part).rglob("*")) if path.is_file())
+    return [name for path in paths if (name := path.relative_to(episode.folder)) not in episode.before]
 
 
 def _settle_data(
@@ -111,12 +91,8 @@ def _settle_data(
     row: pa.Table,
     last: dict | None,
     waveforms: Mapping[str, np.ndarray],
-) -> tuple[pa.Table, Path]:
-    """Writes the episode's frames as our files are written, behind those of the last small file.
-
-    Returns:
-        The episode's row, and the file's name.
-    """
+) -> pa.Table:
+    """Writes the episode's frames as our files are written, behind those of the last small file. Returns its row."""
     name = _data_file(info, row.to_pylist()[0])
     frames = _with_sound(pq.read_table(episode.folder / name), info, waveforms)
     target, tables = name, [frames]
@@ -130,24 +106,19 @@ def _settle_data(
     if target != name:
         assert last is not None
         for key in ("data/chunk_index", "data/file_index"):
-            row = row.set_column(row.column_names.index(key), key, pa.array([last[key]], row.schema.field(key).type))
-    return row, target
+            row = with_values(row, key, [last[key]])
+    return row
 
 
 def _with_sound(frames: pa.Table, info: DatasetInfo, waveforms: Mapping[str, np.ndarray]) -> pa.Table:
     """An episode's frames with its microphones' columns, all in the order of the features."""
     schema = get_hf_features_from_features(info.features).arrow_schema
     for key, waveform in waveforms.items():
-        kind = schema.field(key).type
-        values = pa.array(waveform.reshape(-1))
-        column = (
-            pa.FixedSizeListArray.from_arrays(values, kind.list_size) if pa.types.is_fixed_size_list(kind) else values
-        )
-        frames = frames.append_column(key, column.cast(kind))
+        frames = frames.append_column(key, numpy_to_column(waveform, schema.field(key).type))
     return frames.select(schema.names).cast(schema)
 
 
-def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict | None) -> Path:
+def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict | None) -> None:
     """Puts the episode's row behind those of the last small table of episodes."""
     table = row
     if last is not None:
@@ -161,13 +132,11 @@ def _settle_row(root: Path, staging: Path, row: pa.Table, name: Path, last: dict
             try:
                 rows = read_table(root / last_name).replace_schema_metadata(None)
                 for key in keys:
-                    value = pa.array([last[key]], row.schema.field(key).type)
-                    row = row.set_column(row.column_names.index(key), key, value)
+                    row = with_values(row, key, [last[key]])
                 table, name = pa.concat_tables([rows, row]).combine_chunks(), last_name
             except ParquetDamageError as error:
                 logger.warning("%s is not continued: %s.", root / last_name, error)
     write_rows(table, staging / name)
-    return name
 
 
 def write_rows(rows: pa.Table, path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import datasets
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.dataset_writer import DatasetWriter
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -21,7 +22,8 @@ from torch import Tensor
 from lerobot_playbyear.compat import forget_unsaved_rows, set_streaming_encoder, streaming_encoder
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.episode_checks import check_pictures, check_videos
-from lerobot_playbyear.datasets.films import Film, FinishedFilms, finish_films, link
+from lerobot_playbyear.datasets.files import take_over
+from lerobot_playbyear.datasets.films import Film, FinishedFilms, finish_films
 from lerobot_playbyear.datasets.journal import EPISODE, PICTURES, SCRATCH, STAGING
 from lerobot_playbyear.datasets.writable import check_frame
 
@@ -137,7 +139,7 @@ class Staging:
         check_pictures(self.dataset, is_streaming)
         shutil.rmtree(self._pictures / SCRATCH, ignore_errors=True)  # of a try that was interrupted
         if (self.folder / SCRATCH).is_dir():
-            shutil.copytree(self.folder / SCRATCH, self._pictures / SCRATCH, copy_function=link)
+            shutil.copytree(self.folder / SCRATCH, self._pictures / SCRATCH, copy_function=take_over)
         if is_streaming:
             if not self._films:
                 self._films = finish_films(streaming_encoder(self._writer), self._pictures / "films", self.length)
@@ -150,7 +152,7 @@ class Staging:
         shutil.rmtree(self.folder)
         self._open()
         if (self._pictures / SCRATCH).is_dir():
-            shutil.copytree(self._pictures / SCRATCH, self.folder / SCRATCH, copy_function=link)
+            shutil.copytree(self._pictures / SCRATCH, self.folder / SCRATCH, copy_function=take_over)
         if self._films:
             set_streaming_encoder(self._writer, FinishedFilms(self._films, self.folder))
         assert self._frames is not None
@@ -183,7 +185,8 @@ class Staging:
                 shutil.copyfile(root / "meta" / name, self.folder / "meta" / name)
         for path in sorted(root.glob("meta/episodes/*/*.parquet"))[-1:]:
             table = path.relative_to(root)
-            _copy_last_episode(path, self.folder / table)
+            (self.folder / table).parent.mkdir(parents=True)
+            pq.write_table(last_episode(path), self.folder / table)
             self.before.add(table)
         for feature in info["features"].values():
             feature["shape"] = tuple(feature["shape"])
@@ -204,12 +207,11 @@ def remove_leftovers(root: Path) -> bool:
     return has_frames
 
 
-def _copy_last_episode(source: Path, target: Path) -> None:
-    """Copies the last row of an episode table without its statistics, which make up nearly all of it."""
-    names = [name for name in pq.read_schema(source).names if not name.startswith("stats/")]
-    table = pq.read_table(source, columns=names)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(table.slice(table.num_rows - 1), target)
+def last_episode(path: Path) -> pa.Table:
+    """The last row of a table of episodes without its statistics, which make up nearly all of it."""
+    names = [name for name in pq.read_schema(path).names if not name.startswith("stats/")]
+    table = pq.read_table(path, columns=names)
+    return table.slice(table.num_rows - 1)
 
 
 @contextlib.contextmanager

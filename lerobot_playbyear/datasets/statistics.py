@@ -9,7 +9,7 @@ repetition in a few bytes, and whoever reads it sees what LeRobot would have wri
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from lerobot.datasets.compute_stats import (
     compute_episode_stats,
     get_feature_stats,
 )
-from lerobot.datasets.io_utils import cast_stats_to_numpy
 from lerobot.datasets.utils import STATS_PATH, serialize_dict
 
 from lerobot_playbyear.datasets.audio_feature import audio_keys
@@ -104,12 +103,12 @@ def numeric_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Mapp
     return {**stats, **{key: sound_stats(columns[key].reshape(len(columns[key]), -1)) for key in microphones}}
 
 
-def with_sound_stats(row: pa.Table, sound: Mapping[str, Mapping[str, np.ndarray]]) -> pa.Table:
-    """One episode's row of `meta/episodes`, with the statistics of its microphones."""
-    for key, stats in sound.items():
-        for name, value in stats.items():
-            row = row.append_column(f"stats/{key}/{name}", pa.array([value.tolist()]))
-    return row
+def with_sound_stats(rows: pa.Table, sound: Sequence[Stats]) -> pa.Table:
+    """Rows of `meta/episodes`, with the statistics of each episode's microphones."""
+    for key in sound[0] if sound else ():
+        for name in sound[0][key]:
+            rows = rows.append_column(f"stats/{key}/{name}", pa.array([own[key][name].tolist() for own in sound]))
+    return rows
 
 
 def row_stats(row: Mapping[str, Any]) -> Stats:
@@ -133,19 +132,11 @@ def add_stats(total: Stats | None, episodes: Iterable[Stats], microphones: Itera
     return summed
 
 
-def read_stats(root: Path) -> Stats | None:
-    """A dataset's statistics; None where there are none.
-
-    Raises:
-        ValueError: The file is damaged.
-    """
-    path = root / STATS_PATH
-    return cast_stats_to_numpy(json.loads(path.read_text())) if path.exists() else None
-
-
 def write_stats(stats: Stats, root: Path) -> None:
     """Writes `meta/stats.json` as LeRobot does, but each feature on one line: vectors of thousands take less room."""
-    lines = [f"{json.dumps(key)}: {_dump(value)}" for key, value in serialize_dict(stats).items()]
+    lines = [
+        f"{json.dumps(key)}: {json.dumps(value, separators=(',', ':'))}" for key, value in serialize_dict(stats).items()
+    ]
     path = root / STATS_PATH
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
@@ -200,10 +191,6 @@ def _running_stats(pieces: Pieces) -> dict[str, float]:
 
 def _column(sound: np.ndarray) -> np.ndarray:
     return sound.astype(np.float64).reshape(-1, 1)
-
-
-def _dump(value: Any) -> str:
-    return json.dumps(value, separators=(",", ":"))
 
 
 def _rounded(value: float) -> float:

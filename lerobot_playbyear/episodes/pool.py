@@ -3,6 +3,7 @@
 This module imports neither LeRobot nor torch, so that a worker process starts in seconds.
 """
 
+import itertools
 import multiprocessing
 import os
 import signal
@@ -43,12 +44,7 @@ class RolloutPool:
         if num_workers:
             context = multiprocessing.get_context("spawn")
             self._lifeline, self._workers_end = context.Pipe()  # workers exit when our end is closed, or dies with us
-            self._executor = ProcessPoolExecutor(
-                num_workers,
-                mp_context=context,
-                initializer=_start_worker,
-                initargs=(spec, self._workers_end),
-            )
+            self._executor = ProcessPoolExecutor(num_workers, context, _start_worker, (spec, self._workers_end))
 
     def facts(self) -> EnvFacts:
         """What the environment looks like.
@@ -64,21 +60,16 @@ class RolloutPool:
         Raises:
             RolloutError: A worker died, or the environment has no expert.
         """
-        if self._executor is None:
+        executor = self._executor
+        if executor is None:
             for seed in seeds:
                 yield play(self._own_env(), Script(), seed)
             return
-        upcoming = iter(seeds)
-        pending: deque[Future] = deque()
-        while True:
-            while len(pending) < 2 * self._num_workers:
-                try:
-                    pending.append(self._executor.submit(_play_in_worker, next(upcoming)))
-                except StopIteration:
-                    break
-            if not pending:
-                return
+        futures = (executor.submit(_play_in_worker, seed) for seed in seeds)
+        pending = deque(itertools.islice(futures, 2 * self._num_workers))
+        while pending:
             yield self._result(pending.popleft())
+            pending.extend(itertools.islice(futures, 1))
 
     def close(self) -> None:
         """Ends the workers, without waiting for what they are doing."""
@@ -114,13 +105,12 @@ class RolloutPool:
 
 
 # What follows runs in a worker; the environment there is the worker's own and lives as long as it does.
-_worker_spec: EnvSpec | None = None
-_worker_env: gym.Env | None = None
+_own_pool: RolloutPool
 
 
 def _start_worker(spec: EnvSpec, lifeline: connection.Connection) -> None:
-    global _worker_spec
-    _worker_spec = spec
+    global _own_pool
+    _own_pool = RolloutPool(spec)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends the workers
     threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
 
@@ -130,17 +120,9 @@ def _exit_with_parent(lifeline: connection.Connection) -> None:
     os._exit(0)
 
 
-def _env_of_worker() -> gym.Env:
-    global _worker_env
-    if _worker_env is None:
-        assert _worker_spec is not None
-        _worker_env = _worker_spec.make()
-    return _worker_env
-
-
 def _facts_in_worker() -> EnvFacts:
-    return env_facts(_env_of_worker())
+    return _own_pool.facts()
 
 
 def _play_in_worker(seed: int) -> Episode:
-    return play(_env_of_worker(), Script(), seed)
+    return next(_own_pool.episodes([seed]))

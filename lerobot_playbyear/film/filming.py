@@ -11,7 +11,6 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Actor, play
-from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.episodes.script import Script
 from lerobot_playbyear.film.episode_film import write_episode_film
 
@@ -64,7 +63,12 @@ def film(cfg: VideoConfig) -> Path:
         raise ValueError(f"attempts={cfg.attempts}: give at least 1.")
     env = env_spec(cfg.env).make() if cfg.policy is None else _env_of_lerobot(cfg.env)
     try:
-        actor: Actor = Script(cfg.baseline) if cfg.policy is None else load_policy_actor(cfg.policy, cfg.env)
+        actor: Actor = Script(cfg.baseline)
+        if cfg.policy is not None:
+            # A third of the time in which the command starts, which a script can do without.
+            from lerobot_playbyear.episodes.policy_actor import load_policy_actor
+
+            actor = load_policy_actor(cfg.policy, cfg.env)
         for seed in range(cfg.seed, cfg.seed + cfg.attempts):
             episode = play(env, actor, seed, watch=env.render)
             if episode.success:

@@ -15,8 +15,9 @@ _VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build
 _AUDIO_CODECS = ("aac", "libmp3lame")
 _STRIP_HEIGHT = 120  # pixels
 _INSET_SHARE = 0.28  # of the picture's height
-_TOP_FREQUENCY = 8000  # Hz, upper edge of the strip
-_WINDOW_SECONDS = 0.032
+TOP_FREQUENCY = 8000  # Hz, upper edge of spectrograms
+WINDOW_S = 0.032  # of sound behind each of their columns
+_POWER_FLOOR = 1e-12
 _DYNAMIC_RANGE_DB = 70.0
 _DIMMED = 0.4  # brightness of what has not been heard yet
 _LOUDEST = 0.7  # of full scale
@@ -46,8 +47,25 @@ def episode_sound(blocks: np.ndarray) -> np.ndarray:
 
 def amplify(samples: np.ndarray) -> np.ndarray:
     """Makes the loudest sample 70 % of full scale, with a gain of at most 40 dB; int16 in, int16 out."""
-    peak = np.abs(samples.astype(np.int32)).max(initial=1) / 32768
-    return (samples * min(_LOUDEST / peak, _MAX_GAIN)).astype(np.int16)
+    return (samples * gain_of(np.abs(samples.astype(np.int32)).max(initial=0) / 32768)).astype(np.int16)
+
+
+def gain_of(peak: float) -> float:
+    """What makes `peak`, as a share of full scale, 70 % of it; at most 40 dB."""
+    return min(_LOUDEST / max(peak, 1e-6), _MAX_GAIN)
+
+
+def spectra(columns: np.ndarray, sample_rate: int) -> np.ndarray:
+    """Level in frequency bins from 0 Hz to at most 8 kHz, (n, bins) [dB re a full-scale sine].
+
+    Args:
+        columns: (n, window) in [-1, 1].
+        sample_rate: [Hz].
+    """
+    taper = np.hanning(columns.shape[1])
+    power = np.square(np.abs(np.fft.rfft(columns * taper, axis=1))) * (4 / taper.sum() ** 2)
+    n_bins = min(power.shape[1], int(TOP_FREQUENCY * columns.shape[1] / sample_rate) + 1)
+    return 10 * np.log10(power[:, :n_bins] + _POWER_FLOOR)
 
 
 def spectrogram_strip(samples: np.ndarray, sample_rate: int, width: int, height: int) -> np.ndarray:
@@ -62,27 +80,23 @@ def spectrogram_strip(samples: np.ndarray, sample_rate: int, width: int, height:
     Returns:
         (height, width, 3) uint8; 70 dB from the darkest to the brightest colour.
     """
-    window = max(int(_WINDOW_SECONDS * sample_rate), 16)
+    window = max(int(WINDOW_S * sample_rate), 16)
     padded = np.pad(samples.astype(np.float32) / 32768, window // 2 + 1)
     starts = np.linspace(0, max(len(padded) - window, 0), width).astype(int)
-    columns = padded[starts[:, None] + np.arange(window)] * np.hanning(window)  # (width, window)
-    power = np.abs(np.fft.rfft(columns, axis=1)) ** 2  # (width, window // 2 + 1)
-    n_bins = min(power.shape[1], int(_TOP_FREQUENCY * window / sample_rate) + 1)
-    decibels = 10 * np.log10(power[:, :n_bins] + 1e-12)
-    level = np.clip(1 + (decibels - decibels.max()) / _DYNAMIC_RANGE_DB, 0, 1)
-    rows = np.linspace(n_bins - 1, 0, height).round().astype(int)
+    levels = spectra(padded[starts[:, None] + np.arange(window)], sample_rate)  # (width, bins)
+    level = np.clip(1 + (levels - levels.max()) / _DYNAMIC_RANGE_DB, 0, 1)
+    rows = np.linspace(level.shape[1] - 1, 0, height).round().astype(int)
     level = level[:, rows].T  # (height, width)
     scale = np.linspace(0, 1, len(_COLOURS))
     return np.stack([np.interp(level, scale, channel) for channel in _COLOURS.T], axis=-1).astype(np.uint8)
 
 
-def inset(picture: np.ndarray, view: np.ndarray, label: str = "policy's camera") -> np.ndarray:
+def inset(picture: np.ndarray, view: np.ndarray) -> np.ndarray:
     """Puts what the policy's camera sees into the lower left corner of a picture for people.
 
     Args:
         picture: (H, W, 3) uint8.
         view: (h, w, 3) uint8, any size.
-        label: Written above it.
     """
     height = int(picture.shape[0] * _INSET_SHARE)
     size = (round(height * view.shape[1] / view.shape[0]), height)
@@ -90,7 +104,7 @@ def inset(picture: np.ndarray, view: np.ndarray, label: str = "policy's camera")
     corner = (8, framed.height - height - 8)
     framed.paste((255, 255, 255), (corner[0] - 1, corner[1] - 1, corner[0] + size[0] + 1, corner[1] + size[1] + 1))
     framed.paste(Image.fromarray(view).resize(size, Image.Resampling.NEAREST), corner)
-    ImageDraw.Draw(framed).text((corner[0], corner[1] - 14), label, fill=(255, 255, 255))
+    ImageDraw.Draw(framed).text((corner[0], corner[1] - 14), "policy's camera", fill=(255, 255, 255))
     return np.asarray(framed)
 
 
@@ -117,7 +131,7 @@ def compose(
         width = picture.shape[1]
         if strip is None:
             strip = spectrogram_strip(sound[:, 0], sample_rate, width, _STRIP_HEIGHT)
-            strip = _label(strip, f"{min(_TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz")
+            strip = _label(strip, f"{min(TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz")
         cursor = min(round(width * (index + 1) / n_pictures), width - 1)
         shown = strip.copy()
         shown[:, cursor:] = (shown[:, cursor:] * _DIMMED).astype(np.uint8)

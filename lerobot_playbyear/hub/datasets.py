@@ -7,8 +7,8 @@ from tempfile import TemporaryDirectory
 
 from huggingface_hub import HfApi
 
-from lerobot_playbyear.datasets.confines import OutsideError, check_links, entries_below
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
+from lerobot_playbyear.datasets.confines import OutsideError, check_links
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, entries_below
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview
 from lerobot_playbyear.hub.pushing import HubError, PushOptions, push_patiently

@@ -7,6 +7,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_playbyear.inspection.source import INTERVENTION, SUCCESS, DatasetSource
 from lerobot_playbyear.inspection.verdict import Level, Verdict, name_episodes
+from lerobot_playbyear.inspection.waveform import runs
 
 _NORMALISED_SHARE = 0.9  # of all values in [-1, 1]: then the actions are taken to be normalised
 
@@ -53,7 +54,7 @@ def check_interventions(source: DatasetSource) -> Iterator[Verdict]:
         yield Verdict("interventions", "info", f"no '{INTERVENTION}' column")
         return
     tagged = source.values(INTERVENTION).astype(bool)
-    spans = sum(len(intervention_spans(tagged[episode.rows])) for episode in source.episodes)
+    spans = sum(len(runs([tagged[episode.rows]])) for episode in source.episodes)
     share = float(tagged.mean())
     without = [episode.index for episode in source.episodes if not tagged[episode.rows].any()]
     figures = {"share": share, "spans": spans, "episodes_without": len(without)}
@@ -78,9 +79,3 @@ def check_success(source: DatasetSource) -> Iterator[Verdict]:
     message = f"{n_succeeded} of {n_episodes} episodes succeeded"
     figures = {"succeeded": n_succeeded, "episodes": n_episodes}
     yield Verdict("success", "ok" if n_succeeded else "warning", message, SUCCESS, failed, figures)
-
-
-def intervention_spans(tagged: np.ndarray) -> list[tuple[int, int]]:
-    """First and last frame of every span of True, from (n,) bool."""
-    edges = np.diff(np.concatenate([[False], tagged, [False]]).astype(np.int8))
-    return [(int(a), int(b) - 1) for a, b in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)]

@@ -12,33 +12,20 @@ import numpy as np
 from lerobot.utils.constants import ACTION, OBS_STATE, OBS_STR, REWARD
 from PIL import Image
 
-from lerobot_playbyear.inspection.control_checks import intervention_spans
+from lerobot_playbyear.film.video import TOP_FREQUENCY, WINDOW_S, gain_of, spectra
 from lerobot_playbyear.inspection.onsets import sudden_sounds
 from lerobot_playbyear.inspection.source import INTERVENTION, DatasetSource, Episode
-from lerobot_playbyear.inspection.waveform import (
-    FULL_SCALE,
-    PIECE,
-    EpisodeSound,
-    Samples,
-    extremes,
-    mean_and_deviation,
-    pieces,
-)
+from lerobot_playbyear.inspection.waveform import FULL_SCALE, PIECE, EpisodeSound, Samples, block_levels, extremes, runs
 
-_WINDOW_S = 0.032
 _SHORTEST_HOP_S = 0.005
 _MAX_COLUMNS = 1200  # of a spectrogram or waveform: more than a screen shows
-_TOP_FREQUENCY = 8000.0  # Hz
 _GREY_LEVELS = 64  # of a spectrogram's picture; more cannot be told apart, and cost space
 _DARKEST_SHARE = 0.4  # of the levels have the darkest colour: of the background, just something is seen
 _LARGEST_RANGE_DB = 100.0
 _SAMPLED_EPISODES = 12  # that the range of levels is taken from
-_LOUDEST = 0.7  # of full scale, when played
-_MAX_GAIN = 100.0
 _MAX_CURVES = 32  # of one feature
 _PREVIEW_COLUMNS = 60
 _PREVIEW_RANGE_DB = 45.0
-_POWER_FLOOR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -77,8 +64,7 @@ class EpisodeData:
     @cached_property
     def gain(self) -> float:
         """By how much sound is amplified when it is played, the same in all episodes."""
-        peak = max((microphone.peak for microphone in self.microphones), default=1.0)
-        return min(_LOUDEST / max(peak, 1e-6), _MAX_GAIN)
+        return gain_of(max((microphone.peak for microphone in self.microphones), default=1.0))
 
     @cached_property
     def curves(self) -> list[dict[str, Any]]:
@@ -109,13 +95,16 @@ class EpisodeData:
     def draw(self, episode: Episode) -> dict[str, Any]:
         """Everything but the film, for JSON."""
         source = self._source
-        tagged = source.values(INTERVENTION)[episode.rows].astype(bool) if INTERVENTION in source.numbers else None
+        interventions = None  # or the first and the last frame of each
+        if INTERVENTION in source.numbers:
+            tagged = source.values(INTERVENTION)[episode.rows].astype(bool)
+            interventions = [(start, stop - 1) for start, stop in runs([tagged])]
         return {
             "microphones": [
                 self._draw_sound(*pair) for pair in zip(self.microphones, self.sound(episode), strict=True)
             ],
             "curves": [_base64(self._curve(curve["key"], episode)) for curve in self.curves],
-            "interventions": None if tagged is None else intervention_spans(tagged),
+            "interventions": interventions,
         }
 
     def preview(self, episode: Episode) -> list[int]:
@@ -123,13 +112,7 @@ class EpisodeData:
         if not self.microphones:
             return []
         sound = self._source.sound(self.microphones[0].key, episode)
-        mean = mean_and_deviation(sound)[0]
-        rows = max(PIECE // sound.samples_per_frame, 1) * sound.samples_per_frame
-        power = [
-            np.square((piece - mean).reshape(-1, sound.samples_per_frame) / FULL_SCALE).mean(axis=1)
-            for piece in pieces(sound, size=rows)
-        ]
-        level = 10 * np.log10(np.concatenate(power) + _POWER_FLOOR)
+        level = block_levels(sound, sound.samples_per_frame)
         edges = np.linspace(0, len(level), min(_PREVIEW_COLUMNS, len(level)) + 1).astype(int)
         level = np.maximum.reduceat(level, edges[:-1])
         share = 1 + (level - level.max()) / _PREVIEW_RANGE_DB
@@ -149,7 +132,7 @@ class EpisodeData:
             peak=peak,
             top_db=top,
             bottom_db=min(max(bottom, top - _LARGEST_RANGE_DB), top - 5),
-            top_hz=min(_TOP_FREQUENCY, rate / 2),
+            top_hz=min(TOP_FREQUENCY, rate / 2),
         )
 
     def _draw_sound(self, microphone: Microphone, samples: Samples) -> dict[str, Any]:
@@ -176,18 +159,13 @@ def _levels(samples: Samples, sample_rate: int) -> tuple[np.ndarray, float]:
 
     Column j is about the moment (j + 1/2) * hop.
     """
-    window = max(round(_WINDOW_S * sample_rate), 16)
+    window = max(round(WINDOW_S * sample_rate), 16)
     hop = max(round(_SHORTEST_HOP_S * sample_rate), -(-len(samples) // _MAX_COLUMNS), 1)
     n_columns = max(len(samples) // hop, 1)
     samples = samples[:] if len(samples) <= PIECE else samples  # many small reads cost more than one
     starts = hop // 2 - window // 2 + hop * np.arange(n_columns)
-    taper = np.hanning(window)
-    columns = (
-        np.stack([_padded(samples, int(start), window) for start in starts]) / FULL_SCALE * taper
-    )  # (columns, window)
-    power = np.square(np.abs(np.fft.rfft(columns, axis=1))) * (4 / taper.sum() ** 2)  # a full-scale sine has 1
-    n_bins = min(power.shape[1], int(_TOP_FREQUENCY * window / sample_rate) + 1)
-    return 10 * np.log10(power[:, :n_bins] + _POWER_FLOOR), hop / sample_rate
+    columns = np.stack([_padded(samples, int(start), window) for start in starts])  # (columns, window)
+    return spectra(columns / FULL_SCALE, sample_rate), hop / sample_rate
 
 
 def _padded(samples: Samples, start: int, size: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import json as json_module
 import sys
+from collections import deque
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -97,8 +98,7 @@ def _watch_pictures(cfg: InspectConfig, source: DatasetSource, verdicts: list[Ve
             if page is not None:
                 page.add(episode, pictures)
             for stream in pictures.values():
-                for _ in stream:
-                    pass
+                deque(stream, maxlen=0)
         verdicts = [*verdicts, *checks.verdicts()]
         if page is not None:
             page.finish(verdicts)

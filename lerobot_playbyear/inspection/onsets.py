@@ -13,11 +13,11 @@ information, not a verdict: whether the motion must be heard is the task's busin
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.verdict import Verdict
-from lerobot_playbyear.inspection.waveform import FULL_SCALE, PIECE, Samples, mean_and_deviation, pieces
+from lerobot_playbyear.inspection.waveform import Samples, block_levels
 
 _STEP_S = 0.005
 _RISE_DB = 12.0
@@ -25,7 +25,6 @@ _QUIET_BEFORE_S = 0.05
 _LARGEST = 0.1  # share of the frames that count as changes of motion
 _SEARCH_S = 0.5
 _MIN_ONSETS = 5
-_POWER_FLOOR = 1e-12
 
 
 def sudden_sounds(samples: Samples, sample_rate: float) -> np.ndarray:
@@ -35,18 +34,19 @@ def sudden_sounds(samples: Samples, sample_rate: float) -> np.ndarray:
         samples: (n,) in steps of 16-bit PCM.
         sample_rate: [Hz].
     """
-    levels = _levels(samples, sample_rate)
+    step = max(round(_STEP_S * sample_rate), 1)
+    levels = block_levels(samples, step)
     if len(levels) == 0:
         return np.empty(0)
     loud = levels > np.median(levels) + _RISE_DB
     quiet_steps = round(_QUIET_BEFORE_S / _STEP_S)
     recent = np.convolve(loud, np.ones(quiet_steps + 1))[: len(loud)] - loud  # loud steps just before
-    return np.flatnonzero(loud & (recent == 0)) * _step(sample_rate) / sample_rate
+    return np.flatnonzero(loud & (recent == 0)) * step / sample_rate
 
 
 def check_alignment(source: DatasetSource, microphones: Sequence[str]) -> Iterator[Verdict]:
     """How often sudden sounds and changes of motion coincide, for each of these microphones."""
-    motion_key = next((key for key in (OBS_STATE, ACTION) if key in source.numbers), None)
+    motion_key = source.motion_key
     if motion_key is None:
         return
     motion = _motion_changes(source, motion_key)
@@ -88,7 +88,7 @@ def _onset_frames(source: DatasetSource, key: str, episode: Episode) -> np.ndarr
 def _motion_changes(source: DatasetSource, key: str) -> list[np.ndarray]:
     """For every episode the frames of large changes, (n,) bool."""
     order = 2 if key == OBS_STATE else 1
-    values = np.nan_to_num(source.values(key).reshape(len(source), -1).astype(np.float64))
+    values = np.nan_to_num(source.rows(key))
     changes = []
     for episode in source.episodes:
         change = np.zeros((len(episode), values.shape[1]))
@@ -118,21 +118,3 @@ def _near(changes: np.ndarray) -> np.ndarray:
     near[1:] |= changes[:-1]
     near[:-1] |= changes[1:]
     return near
-
-
-def _step(sample_rate: float) -> int:
-    return max(round(_STEP_S * sample_rate), 1)
-
-
-def _levels(samples: Samples, sample_rate: float) -> np.ndarray:
-    """Level of every 5 ms [dBFS]."""
-    step = _step(sample_rate)
-    whole = len(samples) // step * step
-    if not whole:
-        return np.empty(0)
-    mean = np.float32(mean_and_deviation(samples)[0])
-    levels = []
-    for piece in pieces(samples, 0, whole, PIECE // step * step or step):
-        blocks = (piece - mean).reshape(-1, step) / FULL_SCALE
-        levels.append(10 * np.log10(np.square(blocks, dtype=np.float64).mean(axis=1) + _POWER_FLOOR))
-    return np.concatenate(levels)

@@ -1,10 +1,9 @@
 """Checks of what each camera recorded: pictures that repeat while the arm moves, blank ones, damaged ones."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from lerobot.utils.constants import ACTION, OBS_STATE
 from PIL import Image
 
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
@@ -20,16 +19,16 @@ _TOLERATED_SHARE = {"image": 0.01, "video": 0.25}
 
 
 @dataclass
-class _Camera:
+class _Watched:
+    """What one camera recorded in one episode."""
+
+    episode: int
     n_pictures: int = 0
-    n_repeated: int = 0
-    n_moving: int = 0
+    n_blank: int = 0
+    n_moving: int = 0  # taken while the arm moved
+    n_repeated: int = 0  # of those
     longest_freeze: int = 0
-    repeating: list[int] = field(default_factory=list)
-    frozen: list[int] = field(default_factory=list)
-    blank: list[int] = field(default_factory=list)
-    wrong: list[int] = field(default_factory=list)
-    reason: str = ""
+    problem: str = ""
 
 
 class PictureChecks:
@@ -41,74 +40,70 @@ class PictureChecks:
 
     def __init__(self, source: DatasetSource) -> None:
         self._source = source
-        self._cameras = {key: _Camera() for key in source.cameras}
+        self._watched: dict[str, list[_Watched]] = {key: [] for key in source.cameras}
         self._moves = _moving_frames(source)
 
     def watch(self, episode: Episode, camera: str, pictures: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         """Passes an episode's pictures (H, W, 3) on; one that cannot be read ends them, and is noted."""
-        found, moves = self._cameras[camera], self._moves[episode.rows]
+        found, moves = _Watched(episode.index), self._moves[episode.rows]
+        self._watched[camera].append(found)
         before: np.ndarray | None = None
-        n = n_blank = n_repeated = still = still_moving = longest = 0
+        still = still_moving = 0
         try:
             for picture in pictures:
-                n_blank += _spread(picture) < _BLANK_SPREAD
+                found.n_blank += _spread(picture) < _BLANK_SPREAD
                 repeated = before is not None and np.array_equal(picture, before)
-                n_repeated += repeated and bool(moves[n])
-                found.n_moving += bool(moves[n])
-                still, still_moving = (still + 1, still_moving + bool(moves[n])) if repeated else (0, 0)
+                moving = bool(moves[found.n_pictures])
+                found.n_moving += moving
+                found.n_repeated += repeated and moving
+                still, still_moving = (still + 1, still_moving + moving) if repeated else (0, 0)
                 if still_moving >= _MOVING_SHARE * still:
-                    longest = max(longest, still)
+                    found.longest_freeze = max(found.longest_freeze, still)
                 before = picture
-                n += 1
+                found.n_pictures += 1
                 yield picture
         except Exception as error:
-            found.reason = found.reason or f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-            found.wrong.append(episode.index)
-        found.n_pictures += n
-        found.n_repeated += n_repeated
-        found.longest_freeze = max(found.longest_freeze, longest)
-        if n_repeated:
-            found.repeating.append(episode.index)
-        if longest >= _FREEZE_S * self._source.fps:
-            found.frozen.append(episode.index)
-        if n_blank:
-            found.blank.append(episode.index)
+            found.problem = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
     def verdicts(self) -> Iterator[Verdict]:
         """One line per check and camera."""
-        if not self._cameras:
+        if not self._watched:
             yield Verdict("pictures", "info", "no camera")
-        for key, found in self._cameras.items():
-            yield self._judge_files(key, found)
-            if found.n_pictures:
-                yield self._judge_repeats(key, found)
-                yield self._judge_blank(key, found)
+        for key, watched in self._watched.items():
+            n_pictures = sum(each.n_pictures for each in watched)
+            wrong = [each.episode for each in watched if each.problem]
+            if wrong:
+                reason = next(each.problem for each in watched if each.problem)
+                message = f"{name_episodes(wrong)}: pictures cannot be read ({reason})"
+                yield Verdict("pictures", "error", message, key, wrong)
+            else:
+                yield Verdict("pictures", "ok", f"{n_pictures:,} read", key, figures={"pictures": n_pictures})
+            if n_pictures:
+                yield self._judge_repeats(key, watched)
+                yield _judge_blank(key, watched)
 
-    def _judge_files(self, key: str, found: _Camera) -> Verdict:
-        if found.wrong:
-            message = f"{name_episodes(found.wrong)}: pictures cannot be read ({found.reason})"
-            return Verdict("pictures", "error", message, key, found.wrong)
-        return Verdict("pictures", "ok", f"{found.n_pictures:,} read", key, figures={"pictures": found.n_pictures})
-
-    def _judge_repeats(self, key: str, found: _Camera) -> Verdict:
-        share = found.n_repeated / max(found.n_moving, 1)
-        freeze_s = found.longest_freeze / self._source.fps
-        figures = {"repeated_while_moving": found.n_repeated, "share": share, "longest_freeze_s": freeze_s}
-        tolerated = _TOLERATED_SHARE[self._source.features[key]["dtype"]]
-        level: Level = "error" if found.frozen else "warning" if share > tolerated else "ok"
-        if not found.n_repeated:
+    def _judge_repeats(self, key: str, watched: list[_Watched]) -> Verdict:
+        n_repeated = sum(each.n_repeated for each in watched)
+        share = n_repeated / max(sum(each.n_moving for each in watched), 1)
+        freeze_s = max(each.longest_freeze for each in watched) / self._source.fps
+        figures = {"repeated_while_moving": n_repeated, "share": share, "longest_freeze_s": freeze_s}
+        if not n_repeated:
             return Verdict("frames that repeat", "ok", "none while the arm moves", key, figures=figures)
+        tolerated = _TOLERATED_SHARE[self._source.features[key]["dtype"]]
+        level: Level = "error" if freeze_s >= _FREEZE_S else "warning" if share > tolerated else "ok"
+        repeating = [each.episode for each in watched if each.n_repeated]
         message = (
-            f"{found.n_repeated} pictures equal the one before while the arm moves ({share:.1%} of those), for up to "
-            f"{freeze_s:.3g} s; {name_episodes(found.repeating)}"
+            f"{n_repeated} pictures equal the one before while the arm moves ({share:.1%} of those), for up to "
+            f"{freeze_s:.3g} s; {name_episodes(repeating)}"
         )
-        return Verdict("frames that repeat", level, message, key, found.repeating, figures)
+        return Verdict("frames that repeat", level, message, key, repeating, figures)
 
-    def _judge_blank(self, key: str, found: _Camera) -> Verdict:
-        if found.blank:
-            message = f"{name_episodes(found.blank)}: pictures of one colour"
-            return Verdict("blank pictures", "warning", message, key, found.blank)
-        return Verdict("blank pictures", "ok", "none", key)
+
+def _judge_blank(key: str, watched: list[_Watched]) -> Verdict:
+    blank = [each.episode for each in watched if each.n_blank]
+    if blank:
+        return Verdict("blank pictures", "warning", f"{name_episodes(blank)}: pictures of one colour", key, blank)
+    return Verdict("blank pictures", "ok", "none", key)
 
 
 def _spread(picture: np.ndarray) -> float:
@@ -123,11 +118,9 @@ def _moving_frames(source: DatasetSource) -> np.ndarray:
 
     Without a state the action tells; without either, all frames.
     """
-    key = next((key for key in (OBS_STATE, ACTION) if key in source.numbers), None)
-    moving = np.ones(len(source), bool)
-    if key is None:
-        return moving
-    values = np.nan_to_num(source.values(key).reshape(len(source), -1).astype(np.float64))
+    if source.motion_key is None:
+        return np.ones(len(source), bool)
+    values = np.nan_to_num(source.rows(source.motion_key))
     change = np.abs(np.diff(values, axis=0, prepend=values[:1])) / (values.std(axis=0) + 1e-12)
     size = change.max(axis=1)  # (N,)
     moving = size > np.median(size)

@@ -140,6 +140,21 @@ class DatasetSource:
             self._values[key] = values[:, 0] if values.ndim == 2 and values.shape[1] == 1 else values
         return self._values[key]
 
+    def rows(self, key: str) -> np.ndarray:
+        """A numeric column, (N, D) float64.
+
+        Raises:
+            ValueError: As `values`.
+        """
+        return self.values(key).reshape(len(self), -1).astype(np.float64)
+
+    @property
+    def motion_key(self) -> str | None:
+        """What says how the arm moved: the state, or the action in a dataset without one."""
+        from lerobot.utils.constants import ACTION, OBS_STATE
+
+        return next((key for key in (OBS_STATE, ACTION) if key in self.numbers), None)
+
     def pieces(self, key: str) -> Iterator[tuple[int, np.ndarray]]:
         """A numeric column as stored, in parts of bounded size: the first row of each, and its values (n, D).
 

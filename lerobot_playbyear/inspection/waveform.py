@@ -1,7 +1,6 @@
 """Sound that is read where it is indexed: an episode of hours has gigabytes of it."""
 
 from collections.abc import Iterable, Iterator
-from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -14,13 +13,7 @@ FULL_SCALE = 32768.0
 PIECE = 2**20
 """Samples that are looked at together."""
 
-
-class Samples(Protocol):
-    """What checks of sound need of an array (n,) in steps of 16-bit PCM: its length, and slices of it."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, span: slice, /) -> np.ndarray: ...
+_POWER_FLOOR = 1e-12
 
 
 class EpisodeSound:
@@ -46,6 +39,10 @@ class EpisodeSound:
         samples = column_to_numpy(self._column.slice(first, last - first)).reshape(-1)
         before = first * self.samples_per_frame
         return steps(samples[start - before : stop - before])
+
+
+Samples = np.ndarray | EpisodeSound
+"""Sound (n,) in steps of 16-bit PCM, in memory or not."""
 
 
 class Runs:
@@ -123,6 +120,19 @@ def extremes(samples: Samples) -> tuple[float, float]:
     for piece in pieces(samples):
         low, high = min(low, float(piece.min())), max(high, float(piece.max()))
     return low, high
+
+
+def block_levels(samples: Samples, size: int) -> np.ndarray:
+    """Level of every `size` samples, without the mean of all, (n // size,) [dBFS]; -120 for nothing at all."""
+    whole = len(samples) // size * size
+    if not whole:
+        return np.empty(0)
+    mean = np.float32(mean_and_deviation(samples)[0])
+    power = [
+        np.square((piece - mean).reshape(-1, size) / FULL_SCALE, dtype=np.float64).mean(axis=1)
+        for piece in pieces(samples, 0, whole, PIECE // size * size or size)
+    ]
+    return 10 * np.log10(np.concatenate(power) + _POWER_FLOOR)
 
 
 def mean_and_deviation(samples: Samples, start: int = 0, stop: int | None = None) -> tuple[float, float]:

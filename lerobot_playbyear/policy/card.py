@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -31,7 +31,7 @@ def write_card(
         config: The policy's configuration.
         dataset_repo_id: As LeRobot's function takes it, like all that follows.
     """
-    facts = _DatasetFacts.of(dataset_meta) if dataset_meta is not None else None
+    facts = _facts(dataset_meta) if dataset_meta is not None else None
     card = generate(repository_name(dataset_repo_id), *args, dataset_meta=facts, **kwargs)
     names = [*(config.input_features or {}), *(config.output_features or {})]
     for name in sorted(names, key=len, reverse=True):
@@ -59,13 +59,11 @@ def with_hearing(card: ModelCard, config: PlaybyearConfig) -> ModelCard:
 
 def _section(config: PlaybyearConfig) -> str:
     features = config.input_features or {}
-    if config.use_audio:
-        heard = [
-            f"{code(key)}: {config.sample_rate:,} Hz, {features[key].shape[0]:,} samples a step"
-            for key in config.audio_keys
-        ]
-    else:
-        heard = []
+    heard = [
+        f"{code(key)}: {config.sample_rate:,} Hz, {features[key].shape[0]:,} samples a step"
+        for key in config.audio_keys
+        if config.use_audio
+    ]
     seen = [code(key) for key in config.camera_keys] if config.use_vision else []
     rows = [
         ("Microphones", "<br>".join(heard) or "none: it is deaf"),
@@ -93,28 +91,15 @@ def _section(config: PlaybyearConfig) -> str:
     )
 
 
-@dataclass(frozen=True)
-class _DatasetFacts:
-    """What LeRobot's card asks of a dataset's metadata, in words that mean nothing to Markdown, HTML or a shell."""
-
-    repo_id: str
-    total_episodes: int
-    total_frames: int
-    fps: int
-    tasks: pd.DataFrame
-    robot_type: str | None
-    camera_keys: list[str]
-
-    @classmethod
-    def of(cls, meta: Any) -> "_DatasetFacts":
-        """From a `LeRobotDatasetMetadata`."""
-        texts = [] if meta.tasks is None else [plain(str(task)) for task in meta.tasks.index]
-        return cls(
-            repo_id=repository_name(meta.repo_id) or word(meta.repo_id),
-            total_episodes=int(meta.total_episodes),
-            total_frames=int(meta.total_frames),
-            fps=int(meta.fps),
-            tasks=pd.DataFrame(index=texts),
-            robot_type=word(meta.robot_type) if meta.robot_type else None,
-            camera_keys=[plain(key) for key in meta.camera_keys],
-        )
+def _facts(meta: Any) -> SimpleNamespace:
+    """What LeRobot's card asks of a `LeRobotDatasetMetadata`, in words that mean nothing to Markdown, HTML or a shell."""
+    texts = [] if meta.tasks is None else [plain(str(task)) for task in meta.tasks.index]
+    return SimpleNamespace(
+        repo_id=repository_name(meta.repo_id) or word(meta.repo_id),
+        total_episodes=int(meta.total_episodes),
+        total_frames=int(meta.total_frames),
+        fps=int(meta.fps),
+        tasks=pd.DataFrame(index=texts),
+        robot_type=word(meta.robot_type) if meta.robot_type else None,
+        camera_keys=[plain(key) for key in meta.camera_keys],
+    )

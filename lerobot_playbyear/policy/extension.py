@@ -15,8 +15,8 @@ from lerobot_playbyear.policy.spectrogram import to_float_wave
 
 EncoderFactory = Callable[[PlaybyearConfig], nn.Module]
 
-_VISION_ENCODERS: dict[str, EncoderFactory] = {}
-_AUDIO_ENCODERS: dict[str, EncoderFactory] = {}
+_ENCODERS: dict[str, dict[str, EncoderFactory]] = {"vision_encoder": {}, "audio_encoder": {}}
+"""Per option of the policy, by name."""
 
 
 def register_vision_encoder[Factory: EncoderFactory](name: str) -> Callable[[Factory], Factory]:
@@ -32,7 +32,7 @@ def register_vision_encoder[Factory: EncoderFactory](name: str) -> Callable[[Fac
     Raises:
         ValueError: The name is taken.
     """
-    return _register(_VISION_ENCODERS, name)
+    return _register("vision_encoder", name)
 
 
 def register_audio_encoder[Factory: EncoderFactory](name: str) -> Callable[[Factory], Factory]:
@@ -52,25 +52,32 @@ def register_audio_encoder[Factory: EncoderFactory](name: str) -> Callable[[Fact
     Raises:
         ValueError: The name is taken.
     """
-    return _register(_AUDIO_ENCODERS, name)
+    return _register("audio_encoder", name)
 
 
-def make_vision_encoder(config: PlaybyearConfig) -> nn.Module:
-    """One camera's encoder, the one that the configuration names.
+def make_encoder(option: str, config: PlaybyearConfig) -> nn.Module:
+    """One camera's or one microphone's encoder, the one that the configuration names.
 
-    Raises:
-        ValueError: There is none of this name, or it does not say how large its embedding is.
-    """
-    return _make(_VISION_ENCODERS, "vision_encoder", config)
-
-
-def make_audio_encoder(config: PlaybyearConfig) -> nn.Module:
-    """One microphone's encoder, the one that the configuration names.
+    Args:
+        option: `vision_encoder` or `audio_encoder`.
+        config: The policy's configuration.
 
     Raises:
         ValueError: There is none of this name, or it does not say how large its embedding is.
     """
-    return _make(_AUDIO_ENCODERS, "audio_encoder", config)
+    factories, name = _ENCODERS[option], getattr(config, option)
+    if name not in factories:
+        raise ValueError(
+            f"--policy.{option}={name}: there is no such encoder; there are: {', '.join(sorted(factories))}. Install the "
+            "package that registers it: a distribution that LeRobot imports by itself has a name that begins with "
+            "lerobot_policy_ (docs/training.md)."
+        )
+    encoder = factories[name](config)
+    if not isinstance(getattr(encoder, "embedding_size", None), int):
+        raise ValueError(
+            f"--policy.{option}={name}: {type(encoder).__name__} has no `embedding_size`: give it one, an int."
+        )
+    return encoder
 
 
 class MicrophoneStep(ObservationProcessorStep):
@@ -100,7 +107,9 @@ class MicrophoneStep(ObservationProcessorStep):
         return features
 
 
-def _register[Factory: EncoderFactory](factories: dict[str, EncoderFactory], name: str) -> Callable[[Factory], Factory]:
+def _register[Factory: EncoderFactory](option: str, name: str) -> Callable[[Factory], Factory]:
+    factories = _ENCODERS[option]
+
     def add(factory: Factory) -> Factory:
         if name in factories:
             raise ValueError(
@@ -110,19 +119,3 @@ def _register[Factory: EncoderFactory](factories: dict[str, EncoderFactory], nam
         return factory
 
     return add
-
-
-def _make(factories: dict[str, EncoderFactory], option: str, config: PlaybyearConfig) -> nn.Module:
-    name = getattr(config, option)
-    if name not in factories:
-        raise ValueError(
-            f"--policy.{option}={name}: there is no such encoder; there are: {', '.join(sorted(factories))}. Install the "
-            "package that registers it: a distribution that LeRobot imports by itself has a name that begins with "
-            "lerobot_policy_ (docs/training.md)."
-        )
-    encoder = factories[name](config)
-    if not isinstance(getattr(encoder, "embedding_size", None), int):
-        raise ValueError(
-            f"--policy.{option}={name}: {type(encoder).__name__} has no `embedding_size`: give it one, an int."
-        )
-    return encoder

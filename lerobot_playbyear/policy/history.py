@@ -30,13 +30,12 @@ def newest(batch: dict[str, Tensor], key: str, n_frames: int, shape: tuple[int, 
     return values
 
 
-def before_episode(batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor | None:
+def before_episode(batch: dict[str, Tensor], n_frames: int) -> Tensor | None:
     """Which of the last `n_frames` frames lie before the episode, (B, n_frames), or None when nothing says so.
 
-    All keys end at the same frame, so another key's flags do where a renamed key has lost its own.
+    All keys end at the same frame, so any key's flags do; a renamed key has lost its own.
     """
-    flags = [batch[f"{key}_is_pad"]] if f"{key}_is_pad" in batch else []
-    flags += [batch[name] for name in batch if name.startswith(OBS_PREFIX) and name.endswith("_is_pad")]
+    flags = [batch[name] for name in batch if name.startswith(OBS_PREFIX) and name.endswith("_is_pad")]
     return next((is_pad[:, -n_frames:] for is_pad in flags if is_pad.shape[1] >= n_frames), None)
 
 

@@ -14,12 +14,7 @@ from torchvision.models import ResNet
 from lerobot_playbyear.compat import BasicBlock
 from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.extension import (
-    make_audio_encoder,
-    make_vision_encoder,
-    register_audio_encoder,
-    register_vision_encoder,
-)
+from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.history import before_episode, newest
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, to_float_wave
 
@@ -45,11 +40,13 @@ class PlaybyearNetwork(nn.Module):
         )
         n_fused = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
         if config.use_vision:
-            self.vision = nn.ModuleDict({_module_name(key): make_vision_encoder(config) for key in config.camera_keys})
+            encoders = {_module_name(key): make_encoder("vision_encoder", config) for key in config.camera_keys}
+            self.vision = nn.ModuleDict(encoders)
             n_fused += sum(encoder.embedding_size for encoder in self.vision.values())  # type: ignore[misc]
         if config.use_audio:
             self.spectrogram = nn.ModuleDict({_module_name(key): _log_spectrogram(config) for key in config.audio_keys})
-            self.hearing = nn.ModuleDict({_module_name(key): make_audio_encoder(config) for key in config.audio_keys})
+            encoders = {_module_name(key): make_encoder("audio_encoder", config) for key in config.audio_keys}
+            self.hearing = nn.ModuleDict(encoders)
             n_fused += sum(encoder.embedding_size for encoder in self.hearing.values())  # type: ignore[misc]
         self.fusion = Fusion(n_fused, config)
         self.memory_head = MemoryHead(config, config.action_feature.shape[0])
@@ -60,7 +57,7 @@ class PlaybyearNetwork(nn.Module):
         Where the episode had not begun, the first frame's encoding repeats.
         """
         encodings = self._encode(batch, n_frames).unflatten(0, (-1, n_frames))  # (B, n, D)
-        is_pad = before_episode(batch, self._padded_key(), n_frames)  # (B, n)
+        is_pad = before_episode(batch, n_frames)  # (B, n)
         if is_pad is None:
             return encodings
         before = is_pad.sum(dim=1).clamp(max=n_frames - 1)  # (B,)
@@ -84,9 +81,8 @@ class PlaybyearNetwork(nn.Module):
         n_stacked = self.config.frame_stack
         images = newest(batch, key, n_frames + n_stacked - 1)  # (B, n + n_stacked - 1, 3, H, W)
         images = self.prepare_images(images, self.config.feature_shape(key)[-2:])  # (..., 3, size, size)
-        stacks = torch.cat(
-            [images[:, i : i + n_frames] for i in range(n_stacked)], dim=2
-        )  # (B, n, 3 n_stacked, size, size)
+        # (B, n, 3 n_stacked, size, size)
+        stacks = torch.cat([images[:, i : i + n_frames] for i in range(n_stacked)], dim=2)
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
     def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
@@ -99,7 +95,7 @@ class PlaybyearNetwork(nn.Module):
             assert config.sample_rate is not None
             wave = mix_in_noise(wave, config.audio_noise_db, config.sample_rate)
         begun = torch.ones_like(wave, dtype=torch.bool)  # (B, n_heard * S)
-        is_pad = before_episode(batch, key, n_heard)  # (B, n_heard)
+        is_pad = before_episode(batch, n_heard)  # (B, n_heard)
         if is_pad is not None:
             begun = ~is_pad.repeat_interleave(sound.shape[2], dim=1)
         spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
@@ -138,12 +134,6 @@ class PlaybyearNetwork(nn.Module):
             return embeddings
         return _ENCODING_SIZE * functional.layer_norm(embeddings, embeddings.shape[1:])
 
-    def _padded_key(self) -> str:
-        """An observation that every batch has."""
-        config = self.config
-        keys = [*config.low_dimensional_keys, *(config.camera_keys if config.use_vision else []), *config.audio_keys]
-        return keys[0]
-
 
 class VisionEncoder(nn.Module):
     """ResNet-18 from scratch over channel-wise stacked images, up to the layer before the last.
@@ -178,9 +168,8 @@ class SlimResNet(ResNet):
     """torchvision's ResNet-18 with another number of input channels and another width, without the classifier."""
 
     def __init__(self, in_channels: int, width: int):
-        super().__init__(
-            BasicBlock, [2, 2, 2, 2]
-        )  # what follows takes the place of its layers; forward is torchvision's
+        # What follows takes the place of its layers; forward is torchvision's.
+        super().__init__(BasicBlock, [2, 2, 2, 2])
         self.conv1 = nn.Conv2d(in_channels, width, kernel_size=7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)  # (N, W, size / 2, size / 2); then ReLU, and pooling by 2
         self.layer1 = _stage(width, width)  # (N, W, size / 4, size / 4)

@@ -125,7 +125,8 @@ class LogSpectrogram(nn.Module):
             )
         self.n_bins, self.momentum = n_bins, momentum
         self.keeps_statistics = False
-        self.register_buffer("window", torch.hann_window(self.segment), persistent=False)
+        # Not part of a checkpoint, and in storage of its own: torch's is a slice, which safetensors refuses to save.
+        self.register_buffer("window", torch.hann_window(self.segment).clone(), persistent=False)
         # A full-scale sine has power 1 in its bin, whatever the segment's length.
         self.scale = 4.0 / float(self.window.sum()) ** 2
         self.register_buffer("mean", torch.zeros(n_bins))
@@ -134,9 +135,7 @@ class LogSpectrogram(nn.Module):
 
     def log_power(self, wave: Tensor) -> Tensor:
         """(B, samples) in [-1, 1] -> (B, n_bins, n_segments), in units of 10 dB re full scale."""
-        spectrum = torch.stft(
-            wave, self.segment, self.hop, window=self.window, center=False, return_complex=True
-        )  # (B, bins, n_segments)
+        spectrum = torch.stft(wave, self.segment, self.hop, window=self.window, center=False, return_complex=True)
         spectrum = torch.view_as_real(spectrum[:, : self.n_bins])
         power = spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
         return torch.log10(power * self.scale + _POWER_FLOOR)

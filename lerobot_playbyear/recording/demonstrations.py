@@ -59,5 +59,5 @@ def person_rollouts(env_cfg: EnvConfig, expert: TeleopExpertConfig) -> Iterator[
         RolloutError: The environment cannot be made.
         ExpertError: Environment, teleoperator or screen do not do.
     """
-    with closing(env_spec(env_cfg).make()) as env, closing(expert.make_demonstrator(env)) as person:
+    with closing(env_spec(env_cfg).make()) as env, closing(expert.make(env, demonstrates=True)) as person:
         yield PersonRollouts(env, person)

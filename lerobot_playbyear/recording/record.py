@@ -99,10 +99,10 @@ def record(cfg: RecordConfig) -> Path:
             _check_options(cfg)
             check_root(root, resume=cfg.resume)
         with _rollouts(cfg) as pool:
-            facts = pool.facts()
-            _check_facts(facts, cfg.env)
-            features = dataset_features(facts, cfg.dataset.video)
             with errors_of_input():
+                facts = pool.facts()
+                _check_facts(facts, cfg.env)
+                features = dataset_features(facts, cfg.dataset.video)
                 writer = DurableWriter(
                     cfg.dataset.repo_id, root, facts.fps, features, resume=cfg.resume, robot_type=cfg.env.type
                 )

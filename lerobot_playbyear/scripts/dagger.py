@@ -31,6 +31,7 @@ Training
   --batch_size=24              runs of windows per update, half of them demonstrations
   --learning_rate=null         the largest of each round; else the policy's own
   --seed=1000                  of training, and of the first evaluation episode
+  --store=auto                 where demonstrations are kept: memory, disk, or what suits
 
 What comes out
   --output_dir=outputs/dagger  folder of checkpoints, figures and options
@@ -46,7 +47,7 @@ What comes out
 
 import sys
 
-from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
+from lerobot_playbyear.scripts.command import check_local_dataset, run_command, run_with_lerobot
 from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.heap import keep_freed_memory
 
@@ -59,12 +60,19 @@ def main() -> None:
 
 def _correct() -> None:
     keep_freed_memory()
-    from lerobot_playbyear.dagger.config import with_saved_options
-    from lerobot_playbyear.dagger.run import run_dagger
+    from lerobot_playbyear.dagger.config import DaggerConfig, with_saved_options
     from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
 
     sys.argv[1:] = with_saved_options(with_long_store(sys.argv[1:]))
-    run_with_lerobot(run_dagger)
+
+    def correct(cfg: DaggerConfig) -> None:
+        cfg.check()
+        check_local_dataset(cfg.demos.repo_id, cfg.demos.root)
+        from lerobot_playbyear.dagger.run import run_dagger
+
+        run_dagger(cfg)
+
+    run_with_lerobot(correct)
 
 
 if __name__ == "__main__":

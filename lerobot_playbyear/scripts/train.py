@@ -5,7 +5,7 @@ other's), and trains through LeRobot's own update. The dataset is read once and 
 
     playbyear-train --preset=cpu --dataset.repo_id=me/demos --dataset.root=outputs/demos \\
         --output_dir=outputs/train
-    accelerate launch --num_processes=2 $(which playbyear-train) ...   # several processes
+    accelerate launch --multi_gpu --num_processes=2 $(which playbyear-train) ...
     playbyear-train --resume=true --steps=6000 \\
         --config_path=outputs/train/checkpoints/last/pretrained_model/train_config.json
 
@@ -16,9 +16,8 @@ What is trained on
   --dataset.eval_split=0.0     share of the episodes that are held out
   --mix=[]                     further datasets at once, like [{repo_id: me/other, weight: 0.5}]:
                                0.5 runs of it for every one of --dataset
-  --store.place=auto           where frames are kept: memory, disk (files, found again by the
-                               next run; short: --store=disk), or auto: memory where they fill
-                               half of it at most
+  --store=auto                 where frames are kept: memory, disk (files, found again by the
+                               next run), or auto: memory where they fill half of it at most
   --store.device=null          cpu or cuda; else cuda where there is room
 
 What is trained
@@ -56,7 +55,7 @@ What comes of it
 
 import sys
 
-from lerobot_playbyear.scripts.command import run_command, run_with_lerobot
+from lerobot_playbyear.scripts.command import check_local_dataset, run_command, run_with_lerobot
 from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.heap import keep_freed_memory
 
@@ -72,7 +71,13 @@ def _train() -> None:
 
     sys.argv[1:] = apply_preset(with_long_store(sys.argv[1:]))
     keep_freed_memory()
-    from lerobot_playbyear.training.loop import train
+    from lerobot_playbyear.training.config import PlaybyearTrainConfig
+
+    def train(cfg: PlaybyearTrainConfig) -> None:
+        check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
+        from lerobot_playbyear.training import loop
+
+        loop.train(cfg)
 
     run_with_lerobot(train)
 

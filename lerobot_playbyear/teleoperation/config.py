@@ -18,7 +18,7 @@ from lerobot.teleoperators.gamepad import GamepadTeleop
 from lerobot_playbyear.compat import has_gamepad
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
-from lerobot_playbyear.teleoperation.expert import Desk, TeleopExpert
+from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig
 from lerobot_playbyear.teleoperation.levels import microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
@@ -56,14 +56,8 @@ class TeleopExpertConfig(ExpertConfig):
     begin_paused: bool = True
     play_sound: bool = True
 
-    def make(self, env: gym.Env) -> Expert:
-        return self._make(env, demonstrates=False)
-
-    def make_demonstrator(self, env: gym.Env) -> Expert:
-        """The same person with nobody else at the controls."""
-        return self._make(env, demonstrates=True)
-
-    def _make(self, env: gym.Env, demonstrates: bool) -> Expert:
+    def make(self, env: gym.Env, demonstrates: bool = False) -> Expert:
+        """The person, beside a policy or with nobody else at the controls."""
         self._check(env)
         kind, env_fps = self.teleop.type, float(env.metadata["render_fps"])
         fps = self.steps_per_second or env_fps
@@ -74,17 +68,17 @@ class TeleopExpertConfig(ExpertConfig):
             stack.callback(teleop.disconnect)
             directions = self.directions or KNOWN_DIRECTIONS.get(kind, "x,y,z")
             mapping = ActionMapping(_features(teleop), env.action_space, directions, self.speed)
-            speaker, sound = self._make_speaker(env, fps, env_fps)
-            desk = Desk(
+            expert = TeleopExpert(
                 window=window,
                 teleop=teleop,
                 mapping=mapping,
                 gripper=Gripper(round(self.gripper_cooldown_s * env_fps)),
                 pace=Pace(fps),
-                speaker=speaker,
+                speaker=self._make_speaker(env, fps, env_fps),
                 keys=key_help(kind, mapping, demonstrates),
+                begins_paused=self.begin_paused,
+                demonstrates=demonstrates,
             )
-            expert = TeleopExpert(desk, self.begin_paused, demonstrates, sound)
             stack.pop_all()
         return expert
 
@@ -103,17 +97,16 @@ class TeleopExpertConfig(ExpertConfig):
         if not env.metadata.get("render_fps"):
             raise ExpertError("The environment does not say its steps per second, metadata['render_fps'].")
 
-    def _make_speaker(self, env: gym.Env, fps: float, env_fps: float) -> tuple[Speaker | None, str]:
+    def _make_speaker(self, env: gym.Env, fps: float, env_fps: float) -> Speaker:
         assert isinstance(env.observation_space, gym.spaces.Dict)
         blocks = microphone_blocks(env.observation_space.sample())
-        if not blocks:
-            return None, ""
+        size = len(next(iter(blocks.values()), ()))
+        reason = "" if blocks else "no microphone"
         if not self.play_sound:
-            return None, "--expert.play_sound=false"
-        if fps != env_fps:
-            return None, "slow motion"
-        size = len(next(iter(blocks.values())))
-        return Speaker(round(size * env_fps), size), ""
+            reason = "--expert.play_sound=false"
+        elif fps != env_fps:
+            reason = "slow motion"
+        return Speaker(round(size * env_fps), size, reason)
 
 
 def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoperator:

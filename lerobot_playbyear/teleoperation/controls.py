@@ -22,7 +22,6 @@ _EVENTS = (
 )
 """The first that is set says how the attempt ends: LeRobot sets 'terminate' beside the others."""
 
-
 _NO_MOVE = {**dict.fromkeys(DELTAS, 0.0), GRIPPER: STAY}
 
 
@@ -73,7 +72,7 @@ class Controls:
         verdict = next((verdict for key, verdict in _VERDICTS.items() if key in pressed), None)
         return Wish(
             action=action,
-            overrides=self._keys.is_held(OVERRIDE) or events.get(TeleopEvents.IS_INTERVENTION, False),
+            overrides=OVERRIDE in self._keys.held or events.get(TeleopEvents.IS_INTERVENTION, False),
             toggles_gripper=pressed.count(GRIPPER_KEY) % 2 == 1,
             toggles_pause=pressed.count(PAUSE) % 2 == 1,
             verdict=verdict or next((verdict for event, verdict in _EVENTS if event in began), None),

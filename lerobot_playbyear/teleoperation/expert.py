@@ -30,18 +30,20 @@ class PersonLeftError(KeyboardInterrupt):
     """The person closed the window: the command ends as with Ctrl-C, and what was saved is safe."""
 
 
-@dataclass
-class Desk:
-    """What a person works with.
+@dataclass(eq=False)
+class TeleopExpert(Expert):
+    """Shows a person each step in its turn, and lets them take over while they hold a key.
 
-    Attributes:
+    Args:
         window: Shows the scene and hears keys.
         teleop: A connected LeRobot teleoperator.
         mapping: Makes actions of what it gives.
         gripper: What the gripper is told.
         pace: Of the control loop.
-        speaker: Plays the first microphone; None if there is none.
+        speaker: Plays the first microphone.
         keys: What to press, for the window.
+        begins_paused: Whether each attempt waits until the person is ready.
+        demonstrates: Whether nobody but the person acts.
     """
 
     window: Window
@@ -49,29 +51,19 @@ class Desk:
     mapping: ActionMapping
     gripper: Gripper
     pace: Pace
-    speaker: Speaker | None
+    speaker: Speaker
     keys: list[tuple[str, str]]
+    begins_paused: bool = True
+    demonstrates: bool = False
 
-
-class TeleopExpert(Expert):
-    """Shows a person each step in its turn, and lets them take over while they hold a key.
-
-    Args:
-        desk: What they work with.
-        begins_paused: Whether each attempt waits until the person is ready.
-        demonstrates: Whether nobody but the person acts.
-        sound: Why no sound is played, if there is a reason beside the speaker's.
-    """
-
-    def __init__(self, desk: Desk, begins_paused: bool = True, demonstrates: bool = False, sound: str = "") -> None:
-        self._desk, self._demonstrates, self._begins_paused = desk, demonstrates, begins_paused
-        self._controls = Controls(desk.teleop, desk.window.keys)
+    def __post_init__(self) -> None:
+        self._controls = Controls(self.teleop, self.window.keys)
         self._wish = Wish({})
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
-        waiting = "The next attempt is being prepared" if demonstrates else "The policy is learning or evaluated"
-        self._status = Status(fps=desk.pace.fps, keys=desk.keys, waiting=waiting, sound=sound)
-        desk.window.show(self._status)
+        waiting = "The next attempt is being prepared" if self.demonstrates else "The policy is learning or evaluated"
+        self._status = Status(fps=self.pace.fps, keys=self.keys, waiting=waiting)
+        self.window.show(self._status)
 
     def reset(self, env: gym.Env) -> None:
         self._env = env
@@ -80,54 +72,51 @@ class TeleopExpert(Expert):
         status.n_steps, status.task = int(env.get_wrapper_attr("_max_episode_steps")), task_description(env)
         status.levels_db = {}
         status.note = _NOTES[self._verdict] if self._verdict else ""
-        self._verdict, self._last_command, self._is_paused = None, None, self._begins_paused
-        status.control = Control.PERSON if self._demonstrates else Control.POLICY
+        self._verdict, self._last_command, self._is_paused = None, None, self.begins_paused
+        status.control = Control.PERSON if self.demonstrates else Control.POLICY
         if self._controls.read().leaves:  # all else that was pressed meanwhile was not meant for this attempt
             raise PersonLeftError
-        self._desk.gripper.reset()
-        self._desk.pace.start()
-        if self._desk.speaker is not None:
-            self._desk.speaker.clear()
+        self.gripper.reset()
+        self.pace.start()
+        self.speaker.clear()
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
-        desk, status = self._desk, self._status
+        status = self._status
         status.step += 1
         if self._last_command is not None:
-            desk.gripper.follow(self._last_command > 0)
+            self.gripper.follow(self._last_command > 0)
         blocks = microphone_blocks(observation)
         for name, block in blocks.items():
             levels = status.levels_db.setdefault(name, [])
             levels.append(round(level_db(block), 1))
-            del levels[: -max(round(HISTORY_S * desk.pace.fps), 1)]
-        if desk.speaker is not None and blocks:
-            desk.speaker.play(next(iter(blocks.values())))
-        picture = self._env.render()
-        self._show(np.asarray(picture))
-        desk.pace.wait()
+            del levels[: -max(round(HISTORY_S * self.pace.fps), 1)]
+        if blocks:
+            self.speaker.play(next(iter(blocks.values())))
+        self._show(np.ascontiguousarray(self._env.render(), np.uint8))
+        self.pace.wait()
         self._read()
         if self._is_paused and self._verdict is None:
             self._pause()
-        acts = self._demonstrates or self._wish.overrides
+        acts = self.demonstrates or self._wish.overrides
         self._last_command = self._gripper_command() if acts else float(policy_action[-1])
         status.control = Control.PERSON if acts else Control.POLICY
         return acts
 
     def act(self) -> np.ndarray:
-        return self._desk.mapping.vector(self._wish.action, self._gripper_command())
+        return self.mapping.vector(self._wish.action, self._gripper_command())
 
     def verdict(self) -> Verdict | None:
         return self._verdict
 
     def close(self) -> None:
-        if self._desk.speaker is not None:
-            self._desk.speaker.close()
-        if self._desk.teleop.is_connected:
-            self._desk.teleop.disconnect()
-        self._desk.window.close()
+        self.speaker.close()
+        if self.teleop.is_connected:
+            self.teleop.disconnect()
+        self.window.close()
 
     def _read(self) -> None:
         """What the person wants now."""
-        if not self._desk.window.is_open:
+        if not self.window.is_open:
             raise PersonLeftError
         self._wish = self._controls.read()
         if self._wish.leaves:
@@ -142,28 +131,26 @@ class TeleopExpert(Expert):
         while self._is_paused and self._verdict is None:
             status.control = Control.PAUSED
             self._show()
-            time.sleep(1 / self._desk.pace.fps)
+            time.sleep(1 / self.pace.fps)
             self._read()
         status.note = note
-        self._desk.pace.start()
+        self.pace.start()
 
     def _gripper_command(self) -> float:
         """1 closes, -1 opens: what the key or the teleoperator says, or else what it was."""
-        gripper = self._desk.gripper
-        coded = self._wish.action.get(GRIPPER) if self._desk.mapping.moves_hand else None
-        close = gripper.is_closed
+        coded = self._wish.action.get(GRIPPER) if self.mapping.moves_hand else None
+        close = self.gripper.is_closed
         if self._wish.toggles_gripper:
             close = not close
         elif coded is not None and coded in (CLOSE, OPEN):
             close = coded == CLOSE
-        return 1.0 if gripper.wish(close) else -1.0
+        return 1.0 if self.gripper.wish(close) else -1.0
 
     def _show(self, picture: np.ndarray | None = None) -> None:
-        desk, status = self._desk, self._status
-        status.achieved_fps = round(desk.pace.achieved_fps, 1)
-        if desk.mapping.has_gripper:
-            status.gripper = "closed" if desk.gripper.is_closed else "open"
-            status.cooldown_s = round(desk.gripper.blocked_steps / desk.pace.fps, 2)
-        if desk.speaker is not None:
-            status.sound = desk.speaker.problem
-        desk.window.show(status, picture)
+        status = self._status
+        status.achieved_fps = round(self.pace.achieved_fps, 1)
+        if self.mapping.has_gripper:
+            status.gripper = "closed" if self.gripper.is_closed else "open"
+            status.cooldown_s = round(self.gripper.blocked_steps / self.pace.fps, 2)
+        status.sound = self.speaker.problem
+        self.window.show(status, picture)

@@ -1,7 +1,6 @@
 """The window's keys, and the LeRobot teleoperator that moves a hand with them."""
 
 import threading
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,8 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 
 from lerobot_playbyear.teleoperation.actions import DELTAS
 
-MOVES = {"right": (0, 1), "left": (0, -1), "up": (1, 1), "down": (1, -1), "e": (2, 1), "d": (2, -1)}
+_X, _Y, _Z = DELTAS
+_MOVES = {"right": (_X, 1), "left": (_X, -1), "up": (_Y, 1), "down": (_Y, -1), "e": (_Z, 1), "d": (_Z, -1)}
 """Which displacement a key makes, and its sign."""
 
 
@@ -19,6 +19,11 @@ class WindowKeys:
 
     The window's thread writes, and `look` makes a picture of it that holds until the next look: a key that was tapped
     between two looks counts as held once.
+
+    Attributes:
+        held: Keys that were held at the last look, or tapped before it.
+        pressed: Keys that were pressed before the last look, in their order.
+        has_focus: Whether the window hears keys.
     """
 
     def __init__(self) -> None:
@@ -35,16 +40,6 @@ class WindowKeys:
             self.pressed = tuple(self._pressed_since)
             self.held = frozenset(self._held | set(self._pressed_since))
             self._pressed_since.clear()
-
-    def is_held(self, name: str) -> bool:
-        """Whether it was held at the last look, or tapped before it."""
-        return name in self.held
-
-    @property
-    def down(self) -> frozenset[str]:
-        """What is held at this moment."""
-        with self._lock:
-            return frozenset(self._held)
 
     def note(self, name: str, is_pressed: bool) -> None:
         """A key went down or up."""
@@ -72,31 +67,19 @@ class KeyboardWindowTeleop(Teleoperator):
 
     config_class = KeyboardWindowTeleopConfig
     name = "keyboard_window"
+    action_features: dict[str, Any] = dict.fromkeys(DELTAS, float)
+    feedback_features: dict[str, Any] = {}  # noqa: RUF012 (LeRobot declares it so)
+    is_connected = False
+    is_calibrated = True
 
     def __init__(self, config: KeyboardWindowTeleopConfig, keys: WindowKeys | None = None) -> None:
         super().__init__(config)
-        self._keys, self._is_connected = keys, False
-
-    @property
-    def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(DELTAS, float)
-
-    @property
-    def feedback_features(self) -> dict[str, Any]:
-        return {}
-
-    @property
-    def is_connected(self) -> bool:
-        return self._is_connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
+        self._keys = keys
 
     def connect(self, calibrate: bool = True) -> None:
         if self._keys is None:
             raise ConnectionError("keyboard_window has no window: it works with --expert.type=teleop.")
-        self._is_connected = True
+        self.is_connected = True
 
     def calibrate(self) -> None:
         """Keys need none."""
@@ -105,22 +88,16 @@ class KeyboardWindowTeleop(Teleoperator):
         """Keys need none."""
 
     def get_action(self) -> RobotAction:
-        """-1, 0 or 1 for each displacement."""
+        """-1, 0 or 1 for each displacement: what the held keys add up to."""
         assert self._keys is not None
-        return dict(zip(DELTAS, displacement(self._keys.held), strict=True))
+        moved = dict.fromkeys(DELTAS, 0.0)
+        for name in self._keys.held & _MOVES.keys():
+            axis, sign = _MOVES[name]
+            moved[axis] += sign
+        return moved
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Keys take none."""
 
     def disconnect(self) -> None:
-        self._is_connected = False
-
-
-def displacement(held: Iterable[str]) -> list[float]:
-    """What held keys add up to, x, y, z."""
-    moved = [0.0, 0.0, 0.0]
-    for name in held:
-        if name in MOVES:
-            axis, sign = MOVES[name]
-            moved[axis] += sign
-    return moved
+        self.is_connected = False

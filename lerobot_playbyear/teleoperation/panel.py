@@ -16,26 +16,17 @@ _BANNER, _BORDER, _VIEW = 56, 12, 680
 SCENE = (_BORDER, _BANNER, _VIEW, _VIEW)
 """Where the scene is in it: left, top, width, height."""
 
-FRAME = {
-    Control.POLICY: "#0072b2",
-    Control.PERSON: "#e69f00",
-    Control.PAUSED: "#999999",
-    Control.WAITING: "#5a5f66",
+_LOOKS = {
+    Control.POLICY: ("#0072b2", "#ffffff", "The policy is in control"),
+    Control.PERSON: ("#e69f00", "#000000", "You are in control"),
+    Control.PAUSED: ("#999999", "#000000", "Paused"),
+    Control.WAITING: ("#5a5f66", "#ffffff", "Please wait"),
 }
+"""Per state the frame's colour, the colour of letters on it, and the title."""
+
+FRAME = {control: frame for control, (frame, _, _) in _LOOKS.items()}
 """Border per state, from the colours of Okabe and Ito, which people tell apart whatever colours they see."""
 
-_TITLES = {
-    Control.POLICY: "The policy is in control",
-    Control.PERSON: "You are in control",
-    Control.PAUSED: "Paused",
-    Control.WAITING: "Please wait",
-}
-_ON_FRAME = {
-    Control.POLICY: "#ffffff",
-    Control.PERSON: "#000000",
-    Control.PAUSED: "#000000",
-    Control.WAITING: "#ffffff",
-}
 _BACKGROUND, _TEXT, _DIM, _LINE, _WARNING = "#15181c", "#f2f3f4", "#9aa3ad", "#343a42", "#e69f00"
 _BAR, _LOUD = "#56b4e9", "#f0e442"
 _LEFT, _RIGHT = 728, 976  # of the panel's content
@@ -57,11 +48,11 @@ def draw(status: Status) -> np.ndarray:
 
 
 def _draw_frame(draw: ImageDraw.ImageDraw, status: Status) -> None:
-    colour, on_colour = FRAME[status.control], _ON_FRAME[status.control]
+    colour, on_colour, title = _LOOKS[status.control]
     draw.rectangle((0, 0, _VIEW + 2 * _BORDER - 1, SIZE[1] - 1), fill=colour)
     draw.rectangle((_BORDER, _BANNER, _BORDER + _VIEW - 1, _BANNER + _VIEW - 1), fill=_LINE)
     middle = _BANNER // 2
-    draw.text((_BORDER + 6, middle), _TITLES[status.control], on_colour, _font(27), "lm")
+    draw.text((_BORDER + 6, middle), title, on_colour, _font(27), "lm")
     note = status.waiting if status.control is Control.WAITING else status.note
     draw.text((_VIEW + _BORDER - 6, middle), note, on_colour, _font(16), "rm")
 
@@ -81,9 +72,7 @@ def _draw_progress(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
 def _draw_levels(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
     for name, levels in status.levels_db.items():
         level = levels[-1]
-        draw.text((_LEFT, y), f"Microphone {name}", _TEXT, _font(15), "lm")
-        text = "silence" if level <= FLOOR_DB else f"{level:.0f} dB"
-        draw.text((_RIGHT, y), text, _DIM, _font(14), "rm")
+        _draw_fact(draw, y, f"Microphone {name}", "silence" if level <= FLOOR_DB else f"{level:.0f} dB")
         _bar(draw, y + 15, 10, 1 - level / FLOOR_DB, _LOUD if level > _LOUD_DB else _BAR)
         _draw_history(draw, levels, max(round(HISTORY_S * status.fps), 1), y + 31)
         y += 92
@@ -104,21 +93,21 @@ def _draw_history(draw: ImageDraw.ImageDraw, levels: list[float], n_shown: int, 
 
 
 def _draw_gripper(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
-    draw.text((_LEFT, y), "Gripper", _TEXT, _font(15), "lm")
     rest = f"{status.gripper}, changes in {status.cooldown_s:.1f} s" if status.cooldown_s > 0 else status.gripper
-    draw.text((_RIGHT, y), rest, _DIM, _font(14), "rm")
+    _draw_fact(draw, y, "Gripper", rest)
     return y
 
 
 def _draw_pace(draw: ImageDraw.ImageDraw, status: Status, y: int) -> None:
-    if not status.fps:
-        return
-    draw.text((_LEFT, y), "Pace", _TEXT, _font(15), "lm")
     if status.is_slow:
-        text = f"slow: {status.achieved_fps:.0f} of {status.fps:.0f} steps/s"
-        draw.text((_RIGHT, y), text, _WARNING, _font(14), "rm")
-    else:
-        draw.text((_RIGHT, y), f"{status.fps:.0f} steps/s", _DIM, _font(14), "rm")
+        _draw_fact(draw, y, "Pace", f"slow: {status.achieved_fps:.0f} of {status.fps:.0f} steps/s", _WARNING)
+    elif status.fps:
+        _draw_fact(draw, y, "Pace", f"{status.fps:.0f} steps/s")
+
+
+def _draw_fact(draw: ImageDraw.ImageDraw, y: int, name: str, value: str, colour: str = _DIM) -> None:
+    draw.text((_LEFT, y), name, _TEXT, _font(15), "lm")
+    draw.text((_RIGHT, y), value, colour, _font(14), "rm")
 
 
 @cache

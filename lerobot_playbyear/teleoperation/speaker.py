@@ -10,51 +10,27 @@ _LATENCY_BLOCKS = 2  # that are there before the first is played, so that a late
 _MOST_BLOCKS = 6  # more than this is too late to be played
 
 
-class SoundQueue:
-    """Samples between the control loop, which brings a block per step, and the sound card, which takes what it likes."""
-
-    def __init__(self, block_size: int) -> None:
-        self._block_size = block_size
-        self._samples: np.ndarray = np.zeros(0, np.float32)
-        self._is_playing = False
-        self._lock = threading.Lock()
-
-    def put(self, block: np.ndarray) -> None:
-        """Samples (S,) in [-1, 1]."""
-        with self._lock:
-            self._samples = np.concatenate([self._samples, block])[-_MOST_BLOCKS * self._block_size :]
-            self._is_playing |= len(self._samples) >= _LATENCY_BLOCKS * self._block_size
-
-    def take(self, n: int) -> np.ndarray:
-        """The next n samples; silence where there are none."""
-        played = np.zeros(n, np.float32)
-        with self._lock:
-            if self._is_playing:
-                head, self._samples = self._samples[:n], self._samples[n:]
-                played[: len(head)] = head
-                self._is_playing = len(head) == n
-        return played
-
-    def clear(self) -> None:
-        with self._lock:
-            self._samples, self._is_playing = self._samples[:0], False
-
-
 class Speaker:
-    """The default output of the sound card.
+    """The default output of the sound card: the control loop brings a block per step, and it takes what it likes.
 
     Args:
         sample_rate: [Hz].
         block_size: Samples per step.
+        problem: Why it shall stay silent, if so.
 
     Attributes:
         problem: Why nothing is heard; empty if it is.
     """
 
-    def __init__(self, sample_rate: int, block_size: int) -> None:
-        self._queue = SoundQueue(block_size)
+    def __init__(self, sample_rate: int, block_size: int, problem: str = "") -> None:
+        self._block_size = block_size
+        self._samples: np.ndarray = np.zeros(0, np.float32)
+        self._is_playing = False
+        self._lock = threading.Lock()
         self._stream: Any = None
-        self.problem = ""
+        self.problem = problem
+        if problem:
+            return
         try:
             import sounddevice  # type: ignore[import-not-found, import-untyped, unused-ignore]
         except ImportError:
@@ -72,11 +48,24 @@ class Speaker:
 
     def play(self, block: np.ndarray) -> None:
         """What was heard in a step, (S,) in [-1, 1]."""
-        self._queue.put(block)
+        with self._lock:
+            self._samples = np.concatenate([self._samples, block])[-_MOST_BLOCKS * self._block_size :]
+            self._is_playing |= len(self._samples) >= _LATENCY_BLOCKS * self._block_size
+
+    def take(self, n: int) -> np.ndarray:
+        """The next n samples, which are then played; silence where there are none."""
+        played = np.zeros(n, np.float32)
+        with self._lock:
+            if self._is_playing:
+                head, self._samples = self._samples[:n], self._samples[n:]
+                played[: len(head)] = head
+                self._is_playing = len(head) == n
+        return played
 
     def clear(self) -> None:
         """What has not been played yet is not played any more."""
-        self._queue.clear()
+        with self._lock:
+            self._samples, self._is_playing = self._samples[:0], False
 
     def close(self) -> None:
         if self._stream is not None:
@@ -85,4 +74,4 @@ class Speaker:
             self._stream = None
 
     def _fill(self, out: np.ndarray, n_frames: int, time: Any, status: Any) -> None:
-        out[:, 0] = self._queue.take(n_frames)
+        out[:, 0] = self.take(n_frames)

@@ -1,7 +1,6 @@
 """What the window tells a person, as it travels to the window's process."""
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 HISTORY_S = 4.0
@@ -56,13 +55,3 @@ class Status:
     def is_slow(self) -> bool:
         """Whether simulation and policy do not keep up."""
         return 0 < self.achieved_fps < 0.93 * self.fps
-
-    def to_json(self) -> str:
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str) -> "Status":
-        values = json.loads(text)
-        values["control"] = Control(values["control"])
-        values["keys"] = [(key, meaning) for key, meaning in values["keys"]]
-        return cls(**values)

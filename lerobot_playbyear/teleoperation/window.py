@@ -4,6 +4,7 @@ The window lives in a process of its own. It answers while the policy learns for
 the simulation, and the control loop never waits for it.
 """
 
+import copy
 import logging
 import os
 import subprocess
@@ -15,7 +16,7 @@ import numpy as np
 from lerobot_playbyear.episodes.expert import ExpertError
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 from lerobot_playbyear.teleoperation.status import Status
-from lerobot_playbyear.teleoperation.wire import receive, send
+from lerobot_playbyear.teleoperation.wire import Newest, receive, send
 
 _START_TIMEOUT_S = 60.0
 _MODULE = "lerobot_playbyear.teleoperation.window_process"
@@ -29,6 +30,7 @@ class Window:
 
     Attributes:
         keys: What a person presses in it.
+        is_open: Whether nobody has closed it.
 
     Raises:
         ExpertError: There is no screen, or something is not installed.
@@ -36,10 +38,9 @@ class Window:
 
     def __init__(self, title: str) -> None:
         self.keys = WindowKeys()
-        self._is_open = threading.Event()
+        self.is_open = False
         self._problem = ""
-        self._newest: tuple[str, np.ndarray | None] | None = None
-        self._has_newest = threading.Condition()
+        self._newest = Newest()
         self._process = subprocess.Popen(
             [sys.executable, "-m", _MODULE, title], stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
@@ -53,11 +54,6 @@ class Window:
                 f"{self._problem or 'it did not answer'}. A person as expert needs a screen and OpenGL."
             )
 
-    @property
-    def is_open(self) -> bool:
-        """Whether nobody has closed it."""
-        return self._is_open.is_set()
-
     def show(self, status: Status, picture: np.ndarray | None = None) -> None:
         """Show this as soon as possible, unless something newer comes before; returns at once.
 
@@ -65,43 +61,33 @@ class Window:
             status: What to tell.
             picture: (H, W, 3) uint8; None: the last one stays.
         """
-        text = status.to_json()  # now, because it goes on changing
-        with self._has_newest:
-            if picture is None and self._newest is not None:
-                picture = self._newest[1]
-            self._newest = (text, picture)
-            self._has_newest.notify()
+        self._newest.put(copy.deepcopy(status), picture)  # of the status as it is now, because it goes on changing
 
     def close(self) -> None:
         """Closes it; it may be closed already."""
-        self._is_open.clear()
-        with self._has_newest:
-            self._has_newest.notify()
+        self.is_open = False
         self._process.terminate()
         try:
             self._process.wait(timeout=5)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        self._newest.put(Status(), None)  # wakes the thread that writes, and nobody is there to read: it ends
 
     def _write(self) -> None:
         assert self._process.stdin is not None
         while self._process.poll() is None:
-            with self._has_newest:
-                if self._newest is None:
-                    self._has_newest.wait(timeout=1.0)
-                newest, self._newest = self._newest, None
+            newest = self._newest.take(timeout_s=1.0)
             if newest is None:
                 continue
             try:
-                send(self._process.stdin, {"status": newest[0]}, newest[1])
+                send(self._process.stdin, newest)
             except (OSError, ValueError):
                 return
 
     def _read(self) -> None:
         assert self._process.stdout is not None
-        while (received := receive(self._process.stdout)) is not None:
-            message, _ = received
+        while (message := receive(self._process.stdout)) is not None:
             if "key" in message:
                 self.keys.note(message["key"], message["is_pressed"])
             elif "has_focus" in message:
@@ -109,9 +95,9 @@ class Window:
             elif "problem" in message:
                 self._problem = message["problem"]
             elif message.get("is_open"):
-                self._is_open.set()
+                self.is_open = True
                 self._opened.set()
         if self.is_open:
             logging.info("The window was closed.")
-        self._is_open.clear()
+        self.is_open = False
         self._opened.set()

@@ -12,34 +12,25 @@ import numpy as np
 
 from lerobot_playbyear.teleoperation.panel import SCENE, SIZE, draw
 from lerobot_playbyear.teleoperation.status import Control, Status
-from lerobot_playbyear.teleoperation.wire import receive, send
+from lerobot_playbyear.teleoperation.wire import Newest, receive, send
 
 _WAITING_AFTER_S = 0.7  # without a frame the control loop is busy with something else
 _LOOK_S = 0.25  # how often that is looked at
+_PRINTLESS = ("space", "escape", "left", "right", "up", "down")  # keys that have no letter for a name
 
 
-class Inbox:
-    """The newest message, read by a thread; older ones that nobody showed are dropped."""
+class Inbox(Newest):
+    """What comes through a pipe, read by a thread."""
 
     def __init__(self, stream: IO[bytes], wake: Any) -> None:
+        super().__init__()
         self._stream, self._wake = stream, wake
-        self._lock = threading.Lock()
-        self._newest: tuple[Status, np.ndarray | None] | None = None
         self.is_closed = False
         threading.Thread(target=self._read, daemon=True).start()
 
-    def take(self) -> tuple[Status, np.ndarray | None] | None:
-        with self._lock:
-            newest, self._newest = self._newest, None
-        return newest
-
     def _read(self) -> None:
         while (received := receive(self._stream)) is not None:
-            message, picture = received
-            with self._lock:
-                if picture is None and self._newest is not None:
-                    picture = self._newest[1]
-                self._newest = (Status.from_json(message["status"]), picture)
+            self.put(*received)
             self._wake()
         self.is_closed = True
         self._wake()
@@ -110,24 +101,12 @@ class Screen:
         gl.glEnd()
 
 
-def key_names(glfw: Any) -> dict[int, str]:
-    """Names of the keys that print nothing."""
-    return {
-        glfw.KEY_SPACE: "space",
-        glfw.KEY_ESCAPE: "escape",
-        glfw.KEY_LEFT: "left",
-        glfw.KEY_RIGHT: "right",
-        glfw.KEY_UP: "up",
-        glfw.KEY_DOWN: "down",
-    }
-
-
 def run(glfw: Any, screen: Screen, inbox: Inbox, out: IO[bytes]) -> None:
     """Show what comes and tell what is pressed, until either side closes."""
-    names = key_names(glfw)
+    printless = {getattr(glfw, f"KEY_{name.upper()}"): name for name in _PRINTLESS}
 
     def on_key(window: Any, key: int, scancode: int, action: int, modifiers: int) -> None:
-        name = names.get(key) or (glfw.get_key_name(key, scancode) or "").lower()
+        name = printless.get(key) or (glfw.get_key_name(key, scancode) or "").lower()
         if name and action != glfw.REPEAT:
             send(out, {"key": name, "is_pressed": action == glfw.PRESS})
 

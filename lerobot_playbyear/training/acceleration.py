@@ -29,15 +29,15 @@ def prefer_channels_last(policy: nn.Module, optimizer: Optimizer) -> None:
 
 
 def fuse(optimizer: Optimizer) -> None:
-    """Makes Adam's step one kernel. Its state need not lie on the host, so nothing waits for it."""
+    """Makes Adam's step one kernel. Its state need not lie on the host, so nothing waits for it.
+
+    Checkpoints do not say so: LeRobot resumes none whose options have other types than the optimizer's, which were not set.
+    """
     if not isinstance(optimizer, Adam):
         return
-    for group in optimizer.param_groups:
-        group.update(fused=True, foreach=False)
-        for parameter in group["params"]:
-            state = optimizer.state.get(parameter, {})
-            if "step" in state:
-                state["step"] = state["step"].to(parameter.device)
+    optimizer.register_state_dict_post_hook(_as_if_not_fused)
+    optimizer.register_load_state_dict_post_hook(_fused)
+    _fused(optimizer)
 
 
 def compile_networks(policy: nn.Module) -> None:
@@ -49,8 +49,10 @@ def compile_networks(policy: nn.Module) -> None:
     if not isinstance(policy, PlaybyearPolicy):
         raise ValueError("--compile=true is for --policy.type=playbyear: leave it out.")
     network = policy.model
-    parts = [encoder.network for encoder in network.modules() if isinstance(encoder, VisionEncoder)]
-    parts += [*(network.hearing.values() if policy.config.use_audio else []), network.fusion, network.memory_head.head]
+    parts: list[nn.Module] = [network.fusion, network.memory_head.head]
+    parts += [encoder.network for encoder in network.modules() if isinstance(encoder, VisionEncoder)]
+    if policy.config.use_audio:
+        parts += network.hearing.values()
     for part in parts:
         part.compile()
 
@@ -67,3 +69,16 @@ def _like_parameters(optimizer: Optimizer) -> None:
         for key, value in values.items():
             if isinstance(value, Tensor) and value.dim() == _DIMENSIONS:
                 values[key] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
+
+
+def _fused(optimizer: Optimizer) -> None:
+    for group in optimizer.param_groups:
+        group["fused"] = True
+        for parameter in group["params"]:
+            state = optimizer.state.get(parameter, {})
+            if "step" in state:
+                state["step"] = state["step"].to(parameter.device)
+
+
+def _as_if_not_fused(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "param_groups": [{**group, "fused": None} for group in state["param_groups"]]}

@@ -159,11 +159,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         own = (path if path.is_dir() else path.parent) / OWN_CONFIG_NAME
         if own.is_file():
             saved = flatten_dict(json.loads(own.read_text()), sep=".").items()
-            given = [
-                f"--{name}={value if isinstance(value, str) else json.dumps(value)}"
-                for name, value in saved
-                if value is not None and parser.parse_arg(name, cli_args) is None
-            ]
+            missing = {k: v for k, v in saved if v is not None and parser.parse_arg(k, cli_args) is None}
+            given = [f"--{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in missing.items()]
             cli_args = given + cli_args
-        config = super().from_pretrained(pretrained_name_or_path, cli_args=cli_args, **kwargs)
-        return config  # type: ignore[return-value]
+        return super().from_pretrained(pretrained_name_or_path, cli_args=cli_args, **kwargs)  # type: ignore[return-value]

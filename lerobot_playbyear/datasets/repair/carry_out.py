@@ -19,15 +19,14 @@ from lerobot.datasets.utils import (
     STATS_PATH,
 )
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
-from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.columns import column_to_numpy, with_values
+from lerobot_playbyear.datasets.files import list_files, take_over
 from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES, ParquetDamageError, open_checked, write_tables
-from lerobot_playbyear.datasets.repair.data_file import DataFile
-from lerobot_playbyear.datasets.repair.dataset_statistics import settle_stats
-from lerobot_playbyear.datasets.repair.episode_statistics import Frames, episode_stats
-from lerobot_playbyear.datasets.repair.episode_tables import Row
+from lerobot_playbyear.datasets.repair.episodes import Row
+from lerobot_playbyear.datasets.repair.frames import DataFile
 from lerobot_playbyear.datasets.repair.plan import Kept, Plan
-from lerobot_playbyear.datasets.repair.taking_over import take_over, take_over_rest
+from lerobot_playbyear.datasets.repair.statistics import Frames, episode_stats, settle_stats
+from lerobot_playbyear.datasets.repair.taking_over import take_over_rest
 from lerobot_playbyear.datasets.settling import write_rows
 from lerobot_playbyear.datasets.statistics import write_stats
 
@@ -63,12 +62,11 @@ def write_copy(root: Path, target: Path, plan: Plan) -> list[str]:
         take_over(root / STATS_PATH, target / STATS_PATH)
     else:
         write_stats(stats, target)
-    if survey.tasks.is_own:
+    if survey.tasks.note is None:
         take_over(root / DEFAULT_TASKS_PATH, target / DEFAULT_TASKS_PATH)
     else:
         write_tasks(survey.tasks.table, target)
-        lost = "; what it held that no episode says is lost" if survey.tasks.was_lost else ""
-        notes.append(f"{DEFAULT_TASKS_PATH}: made anew from the episodes{lost}")
+        notes.append(survey.tasks.note)
     if plan.tables_stay:
         for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
             take_over(path, target / path.relative_to(root))
@@ -107,8 +105,7 @@ def _write_data(root: Path, target: Path, plan: Plan, episodes: list[Kept]) -> I
     if is_whole:
         take_over(root / file.name, target / file.name)
     else:
-        tables = (_renumbered(rows, episodes[place], offset) for place, offset, rows in _read(file, episodes))
-        write_tables(target / file.name, tables, file.schema)
+        write_tables(target / file.name, (table for _, table in _read(file, episodes)), file.schema)
     for kept in episodes:
         if kept.has_row:
             yield _moved(kept)
@@ -116,50 +113,40 @@ def _write_data(root: Path, target: Path, plan: Plan, episodes: list[Kept]) -> I
         yield _new_row(root, plan, kept, frames)
 
 
-def _read(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[int, int, pa.Table]]:
-    """The rows of these episodes, in parts: the episode's place in the list, the first row's frame number, and rows.
+def _read(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[Kept, pa.Table]]:
+    """The rows of these episodes, in parts, under their new numbers.
 
     Raises:
         OSError: They cannot be read now, or are others than they were.
     """
-    before, offset = -1, 0
-    for place, rows in file.read((kept.run.start, kept.run.length) for kept in episodes):
-        offset = 0 if place != before else offset
-        run = episodes[place].run
-        numbers = run.first_frame + offset + np.arange(len(rows))
-        is_same = (column_to_numpy(rows.column("frame_index")) == numbers) & (
-            column_to_numpy(rows.column("episode_index")) == run.episode
+    for place, offset, rows in file.read((kept.run.start, kept.run.length) for kept in episodes):
+        kept, numbers = episodes[place], offset + np.arange(len(rows))
+        is_same = (column_to_numpy(rows.column("frame_index")) == kept.run.first_frame + numbers) & (
+            column_to_numpy(rows.column("episode_index")) == kept.run.episode
         )
         if not is_same.all():
-            raise OSError(errno.EIO, f"the rows of episode {run.episode} are others than they were", str(file.name))
-        yield place, offset, rows
-        before, offset = place, offset + len(rows)
+            raise OSError(
+                errno.EIO, f"the rows of episode {kept.run.episode} are others than they were", str(file.name)
+            )
+        rows = with_values(rows, "episode_index", np.full(len(rows), kept.number))
+        yield kept, with_values(rows, "index", kept.first_index + numbers)
 
 
 def _frames(file: DataFile, episodes: list[Kept]) -> Iterator[tuple[Kept, Frames]]:
     """Each episode with its frames under their new numbers: in memory, or read again and again where there are many."""
-    for place, group in itertools.groupby(_read(file, episodes), key=lambda found: found[0]):
-        kept, n_bytes = episodes[place], 0
+    of_number = {kept.number: kept for kept in episodes}
+    for number, group in itertools.groupby(_read(file, episodes), key=lambda found: found[0].number):
+        kept, n_bytes = of_number[number], 0
         parts: list[pa.Table] = []
-        for _, offset, rows in group:
+        for _, rows in group:
             n_bytes += rows.nbytes
             if n_bytes <= PIECE_BYTES:
-                parts.append(_renumbered(rows, kept, offset))
+                parts.append(rows)
         yield kept, partial(iter, parts) if n_bytes <= PIECE_BYTES else partial(_again, file, kept)
 
 
 def _again(file: DataFile, kept: Kept) -> Iterator[pa.Table]:
-    return (_renumbered(rows, kept, offset) for _, offset, rows in _read(file, [kept]))
-
-
-def _renumbered(table: pa.Table, kept: Kept, offset: int) -> pa.Table:
-    """Some of an episode's rows, the first of which is its frame `offset`, with the numbers that they have from now on."""
-    first = kept.first_index + offset
-    values = {"episode_index": np.full(len(table), kept.number), "index": np.arange(first, first + len(table))}
-    for name, value in values.items():
-        field = table.schema.field(name)
-        table = table.set_column(table.column_names.index(name), field, pa.array(value, field.type))
-    return table
+    return (rows for _, rows in _read(file, [kept]))
 
 
 def _moved(kept: Kept) -> Row:

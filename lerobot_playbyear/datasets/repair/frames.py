@@ -1,5 +1,6 @@
 """The frames of a dataset: which rows of which data file can be read, and which episode they belong to."""
 
+import errno
 import io
 import itertools
 from collections.abc import Iterable, Iterator
@@ -8,17 +9,103 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import DatasetInfo
 from PIL import Image, UnidentifiedImageError
 
+from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
-from lerobot_playbyear.datasets.repair.data_file import INDEX_COLUMNS, DataFile, open_source, read_indices
-from lerobot_playbyear.datasets.repair.features import check_columns, own_schema
-from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing
+from lerobot_playbyear.datasets.repair.info import check_columns, own_schema
+from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.repair.rescue import rescue
-from lerobot_playbyear.datasets.repair.rescued_file import RescuedFile
+
+INDEX_COLUMNS = ["episode_index", "frame_index", "index", "task_index", "timestamp"]
+
+
+@dataclass
+class DataFile:
+    """A data file that can be read, at least in parts.
+
+    Args:
+        name: Relative to the dataset's folder.
+        path: Where it is.
+        footer: What is taken for its footer; None: its own.
+        is_whole: Whether the file can be taken over as it is.
+        n_rows: How many rows can be read.
+    """
+
+    name: Path
+    path: Path
+    footer: pq.FileMetaData | None = None
+    is_whole: bool = False
+    n_rows: int = 0
+
+    def parts(
+        self, problems: list[str], columns: list[str] | None = None
+    ) -> Iterator[tuple[pa.Table, dict[str, np.ndarray]]]:
+        """The rows that can be read, in parts of bounded size, and their index columns.
+
+        Where a number is missing, which rows these are is not known, and nothing of them is used.
+
+        Args:
+            problems: What is wrong with the others is added here.
+            columns: Which to read; None: all.
+
+        Raises:
+            OSError: They cannot be read now.
+        """
+        with open_checked(self.path, self.footer) as file:
+            for number, table in enumerate(read_row_groups(file, columns, self.path)):
+                try:
+                    if isinstance(table, ParquetDamageError):
+                        raise table
+                    index = {name: column_to_numpy(table.column(name)) for name in INDEX_COLUMNS}
+                except ValueError as error:
+                    problems.append(f"row group {number} is damaged: {error}")
+                else:
+                    yield table, index
+
+    def read(self, spans: Iterable[tuple[int, int]]) -> Iterator[tuple[int, int, pa.Table]]:
+        """Some of the rows that can be read, in parts of bounded size; spans in the file's order are read in one go.
+
+        Args:
+            spans: First row and number of rows of each, counted among those that can be read.
+
+        Returns:
+            The span's place among the spans, how many of its rows came before, and rows of it.
+
+        Raises:
+            OSError: They cannot be read now, or are others than they were.
+        """
+        parts: Iterator[pa.Table] = iter(())
+        part, first = None, 0  # the rows that were read last, and the number of the first of them
+        for place, (start, length) in enumerate(spans):
+            if part is None or start < first:
+                parts, first = self._tables(), 0
+                part = next(parts)
+            at = start
+            while at < start + length:
+                while at >= first + len(part):
+                    first += len(part)
+                    part = next(parts)
+                rows = part.slice(at - first, start + length - at)
+                yield place, at - start, rows
+                at += len(rows)
+
+    @property
+    def schema(self) -> pa.Schema:
+        """Of its columns."""
+        with open_checked(self.path, self.footer) as file:
+            return file.schema_arrow
+
+    def _tables(self) -> Iterator[pa.Table]:
+        n_rows = 0
+        for table, _ in self.parts([]):
+            n_rows += len(table)
+            yield table
+        raise OSError(errno.EIO, f"{self.n_rows} of its rows could be read before, and now {n_rows}", str(self.name))
 
 
 @dataclass(frozen=True)
@@ -48,136 +135,91 @@ class Run:
     damage: str | None = None
 
 
-@dataclass(frozen=True)
-class Frames:
-    """What can be read of a dataset's frames.
-
-    Args:
-        runs: The rows of all data files.
-        frame_seconds: The time between two frames; None where there are not two frames.
-        findings: What was found wrong.
-    """
-
-    runs: tuple[Run, ...]
-    frame_seconds: float | None
-    findings: tuple[Finding, ...]
-
-
-def read_frames(root: Path, info: DatasetInfo, thorough: bool) -> Frames:
+def read_frames(report: RepairReport, info: DatasetInfo, thorough: bool) -> tuple[list[Run], float | None]:
     """Goes through all data files.
 
     Args:
-        root: The dataset's folder.
+        report: Of the dataset; what is wrong is added.
         info: What the dataset says about itself.
         thorough: Read everything, with checksums, and look at every picture; otherwise only the index columns.
+
+    Returns:
+        The rows of all data files, and the time between two frames [s]; None where there are not two frames.
 
     Raises:
         OSError: A file cannot be read now.
     """
     schema = get_hf_features_from_features(info.features).arrow_schema
     pictures = [key for key, feature in info.features.items() if feature["dtype"] == "image"] if thorough else []
-    findings: list[Finding] = []
-    sizes: set[tuple[str, tuple[int, int]]] = set()
+    sizes: dict[str, set[tuple[int, int]]] = {key: set() for key in pictures}
     runs: list[Run] = []
     steps: list[float] = []
-    for path in list_files(root, "data/*/*.parquet"):
-        name = path.relative_to(root)
-        source = _find_source(path, name, schema)
-        if isinstance(source, Finding):
-            findings.append(source)
-            continue
-        rows = _read_rows(source, path, None if thorough else INDEX_COLUMNS, pictures)
-        own, own_steps = _runs(DataFile(name, source, source == path and not rows.problems, rows.n_rows), rows)
-        killed = f"{name} has no valid end, as if the recording had been killed: read from its beginning"
-        said = [] if source == path else [killed]
-        said += [f"{name}: {problem}" for problem in rows.problems]
-        said += [
-            f"{name}: the frames of episode {run.episode} are not numbered one after the other in 'index'"
-            for run in own
-            if not run.is_numbered
-        ]
-        findings += [Finding(Thing.FILE, State.DAMAGED, one) for one in said]
-        sizes |= rows.sizes
-        runs += own
-        steps += own_steps
-    findings += _check_shapes(info, sizes)
-    return Frames(tuple(runs), float(np.median(steps)) if steps else None, tuple(findings))
+    for path in list_files(report.root, "data/*/*.parquet"):
+        file = _find_rows(report, path, schema)
+        if file is not None:
+            own, own_steps = _read_runs(report, file, None if thorough else INDEX_COLUMNS, sizes)
+            runs += own
+            steps += own_steps
+    for key, seen in sorted(sizes.items()):
+        shape = tuple(info.features[key]["shape"])
+        for height, width in sorted(seen - set(itertools.pairwise(shape)))[-1:]:
+            report.undecided.append(
+                f"meta/info.json: '{key}' has shape {shape}, but there are pictures {height} high and {width} wide. "
+                "Correct the shape if these are right"
+            )
+    return runs, float(np.median(steps)) if steps else None
 
 
-def _check_shapes(info: DatasetInfo, sizes: Iterable[tuple[str, tuple[int, int]]]) -> list[Finding]:
-    other = {key: size for key, size in sorted(sizes) if size not in itertools.pairwise(info.features[key]["shape"])}
-    return [
-        Finding(
-            Thing.FEATURE,
-            State.UNDECIDED,
-            f"meta/info.json: '{key}' has shape {tuple(info.features[key]['shape'])}, but there are pictures {height} high "
-            f"and {width} wide. Correct the shape if these are right",
-        )
-        for key, (height, width) in other.items()
-    ]
-
-
-def _find_source(path: Path, name: Path, schema: pa.Schema) -> Path | RescuedFile | Finding:
-    """The file itself, or what can be rescued of it; or why nothing can."""
+def _find_rows(report: RepairReport, path: Path, schema: pa.Schema) -> DataFile | None:
+    """The file as it is, or what can be rescued of it."""
+    name = path.relative_to(report.root)
     try:
         with open_checked(path) as file:
             problem = check_columns(file.schema_arrow, schema)
         if problem is None:
-            return path
+            return DataFile(name, path)
         if own_schema(path) is not None:
             remedy = "Correct the features in meta/info.json, or take the file away"
-            return Finding(Thing.FILE, State.UNDECIDED, f"{name}: {problem}. {remedy}")
+            report.undecided.append(f"{name}: {problem}. {remedy}")
+            return None
     except ParquetDamageError as error:
         problem = str(error)
-    said = f"{name} cannot be read: {problem}, and no complete episode could be found in it"
-    return rescue(path, schema) or Finding(Thing.FILE, State.DAMAGED, said)
+    footer = rescue(path, schema)
+    if footer is None:
+        report.findings.append(f"{name} cannot be read: {problem}, and no complete episode could be found in it")
+        return None
+    report.findings.append(f"{name} has no valid end, as if the recording had been killed: read from its beginning")
+    return DataFile(name, path, footer)
 
 
-@dataclass(frozen=True)
-class _Rows:
-    """The rows of a file that can be read: their index columns, which have a damaged picture, and what is wrong; and for
-    each camera the sizes of its pictures."""
+def _read_runs(
+    report: RepairReport, file: DataFile, columns: list[str] | None, sizes: dict[str, set[tuple[int, int]]]
+) -> tuple[list[Run], list[float]]:
+    """A file's rows, cut where another episode begins or frames are missing, and the times between them [s].
 
-    index: dict[str, np.ndarray]
-    n_rows: int
-    spoilt: dict[int, str]
-    problems: tuple[str, ...]
-    sizes: set[tuple[str, tuple[int, int]]]
-
-
-def _read_rows(source: Path | RescuedFile, path: Path, columns: list[str] | None, pictures: list[str]) -> _Rows:
+    The sizes of the pictures are added to those of each camera.
+    """
     parts: list[dict[str, np.ndarray]] = []
     spoilt: dict[int, str] = {}
-    sizes: set[tuple[str, tuple[int, int]]] = set()
     problems: list[str] = []
-    n_rows = 0
-    with open_source(source) as opened:
-        for number, table in enumerate(read_row_groups(opened, columns, path)):
-            found = table if isinstance(table, ParquetDamageError) else read_indices(table)
-            if isinstance(table, ParquetDamageError) or isinstance(found, ParquetDamageError):
-                problems.append(f"row group {number} is damaged: {found}")
-                continue
-            parts.append(found)
-            for key in pictures:
-                for row, seen in _look_at_pictures(table.column(key), key):
-                    if isinstance(seen, str):
-                        spoilt[n_rows + row] = seen
-                    else:
-                        sizes.add((key, seen))
-            n_rows += len(table)
+    for table, part in file.parts(problems, columns):
+        parts.append(part)
+        for key, own_sizes in sizes.items():
+            for row, seen in _look_at_pictures(table.column(key), key):
+                if isinstance(seen, str):
+                    spoilt[file.n_rows + row] = seen
+                else:
+                    own_sizes.add(seen)
+        file.n_rows += len(table)
     if spoilt:
         problems.append(f"{len(spoilt)} pictures are damaged")
-    index = {name: np.concatenate([part[name] for part in parts]) for name in INDEX_COLUMNS} if parts else {}
-    return _Rows(index, n_rows, spoilt, tuple(problems), sizes)
-
-
-def _runs(file: DataFile, rows: _Rows) -> tuple[list[Run], list[float]]:
-    """A file's rows, cut where another episode begins or frames are missing, and the times between them [s]."""
-    index = rows.index
-    if not rows.n_rows:
+    file.is_whole = file.footer is None and not problems
+    report.findings += [f"{file.name}: {problem}" for problem in problems]
+    if not file.n_rows:
         return [], []
+    index = {name: np.concatenate([part[name] for part in parts]) for name in INDEX_COLUMNS}
     breaks = (np.diff(index["episode_index"]) != 0) | (np.diff(index["frame_index"]) != 1)
-    starts = [0, *(np.flatnonzero(breaks) + 1).tolist(), rows.n_rows]
+    starts = [0, *(np.flatnonzero(breaks) + 1).tolist(), file.n_rows]
     runs = [
         Run(
             file,
@@ -188,9 +230,14 @@ def _runs(file: DataFile, rows: _Rows) -> tuple[list[Run], list[float]]:
             int(index["index"][start]),
             bool((np.diff(index["index"][start:stop]) == 1).all()),
             tuple(np.unique(index["task_index"][start:stop]).tolist()),
-            next((rows.spoilt[row] for row in range(start, stop) if row in rows.spoilt), None),
+            next((spoilt[row] for row in range(start, stop) if row in spoilt), None),
         )
         for start, stop in itertools.pairwise(starts)
+    ]
+    report.findings += [
+        f"{file.name}: the frames of episode {run.episode} are not numbered one after the other in 'index'"
+        for run in runs
+        if not run.is_numbered
     ]
     return runs, np.diff(index["timestamp"])[~breaks].tolist()
 

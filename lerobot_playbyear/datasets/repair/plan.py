@@ -2,14 +2,13 @@
 
 import bisect
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from lerobot.datasets.utils import INFO_PATH, DatasetInfo
 
-from lerobot_playbyear.datasets.repair.episode_tables import Row
-from lerobot_playbyear.datasets.repair.findings import Thing
+from lerobot_playbyear.datasets.repair.episodes import Row
 from lerobot_playbyear.datasets.repair.frames import Run
 from lerobot_playbyear.datasets.repair.survey import Survey
 
@@ -48,29 +47,31 @@ class Plan:
     Args:
         survey: What it follows from.
         kept: The episodes that are kept, in the order of their new numbers.
-        dropped: The others: their numbers, and why.
         info: What the repaired dataset says about itself.
         tables_stay: Whether the tables of episodes stay as they are.
         notes: What will be other than it was, as far as it is known before.
     """
 
     survey: Survey
-    kept: tuple[Kept, ...]
-    dropped: Mapping[int, str]
+    kept: list[Kept]
     info: DatasetInfo
     tables_stay: bool
-    notes: tuple[str, ...]
+    notes: list[str]
 
 
 def make_plan(survey: Survey) -> Plan:
-    """Keeps every whole episode: those after one that is lost move up. Everything that is right stays as it is."""
+    """Keeps every whole episode: those after one that is lost move up. Everything that is right stays as it is.
+
+    The report of the survey says then which are kept, and which are not.
+    """
     kept: list[Kept] = []
     first_index = 0
     for episode in survey.episodes:
         if episode.run is not None:
             kept.append(Kept(len(kept), first_index, episode.run, episode.row))
             first_index += episode.run.length
-    dropped = {episode.number: episode.reason for episode in survey.episodes if not episode.is_whole}
+    survey.report.kept = {one.run.episode: one.number for one in kept}
+    survey.report.dropped = {episode.number: episode.reason for episode in survey.episodes if not episode.run}
     splits, notes = _moved_splits(survey.info, [one.run.episode for one in kept])
     info = replace(
         survey.info,
@@ -80,11 +81,9 @@ def make_plan(survey: Survey) -> Plan:
         splits=splits,
     )
     tables_stay = (
-        not dropped
-        and all(one.has_row and one.frames_stay for one in kept)
-        and not any(finding.thing is Thing.TABLE for finding in survey.findings)
+        survey.tables_are_right and not survey.report.dropped and all(one.has_row and one.frames_stay for one in kept)
     )
-    return Plan(survey, tuple(kept), dropped, info, tables_stay, tuple(notes))
+    return Plan(survey, kept, info, tables_stay, notes)
 
 
 def _moved_splits(info: DatasetInfo, kept: Sequence[int]) -> tuple[dict[str, Any], list[str]]:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from lerobot_playbyear.datasets.journal import finish_journal
 from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
-from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError
 from lerobot_playbyear.datasets.repair.replacing import begin_copy, fingerprint, finish_repair, replace
+from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.repair.plan import Plan
@@ -97,11 +97,10 @@ def repair_dataset(
 
 def _look(root: Path, fps: int | None, features: dict[str, dict] | None, thorough: bool) -> "tuple[RepairReport, Plan]":
     from lerobot_playbyear.datasets.repair.plan import make_plan
-    from lerobot_playbyear.datasets.repair.report import describe
     from lerobot_playbyear.datasets.repair.survey import survey
 
     plan = make_plan(survey(root, fps=fps, features=features, thorough=thorough))
-    return describe(root, plan), plan
+    return plan.survey.report, plan
 
 
 def _confirm(first: "RepairReport", second: "RepairReport") -> None:
@@ -122,14 +121,12 @@ def _confirm(first: "RepairReport", second: "RepairReport") -> None:
 
 @contextlib.contextmanager
 def _lock(root: Path) -> Iterator[DatasetLock | None]:
-    if not root.is_dir():
-        yield None
-        return
     try:
-        lock = DatasetLock(root)
+        lock = DatasetLock(root) if root.is_dir() else None
     except DatasetLockedError as error:
         raise DatasetDamagedError(str(error)) from None
     try:
         yield lock
     finally:
-        lock.release()
+        if lock is not None:
+            lock.release()

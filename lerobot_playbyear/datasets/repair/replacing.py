@@ -12,8 +12,9 @@ import os
 import shutil
 from pathlib import Path
 
-from lerobot_playbyear.datasets.journal import SCRATCH, flush
-from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError
+from lerobot_playbyear.datasets.files import entries_below
+from lerobot_playbyear.datasets.journal import SCRATCH, flush, flush_all, write_at_once
+from lerobot_playbyear.datasets.repair.report import DatasetDamagedError
 
 _BEGUN = SCRATCH / ".repairing"
 _FINISHED = SCRATCH / ".repaired.json"
@@ -60,14 +61,10 @@ def replace(root: Path, copy: Path, source: str) -> Path:
         raise OSError(
             f"{root} was changed while it was repaired: wait until nothing writes to it. Nothing was changed."
         )
-    original = _unused(real)
-    _flush_all(copy)
-    mark = copy / _FINISHED
-    partial = mark.with_suffix(".partial")
-    partial.write_text(json.dumps({"source": source, "original": original.name}))
-    flush(partial)
-    os.replace(partial, mark)
-    flush(mark.parent)
+    names = (real.with_name(f"{real.name}.damaged{f'-{number}' if number else ''}") for number in itertools.count())
+    original = next(name for name in names if not os.path.lexists(name))
+    flush_all(copy)
+    write_at_once(copy / _FINISHED, json.dumps({"source": source, "original": original.name}))
     os.rename(real, original)
     try:
         os.rename(copy, real)
@@ -114,19 +111,12 @@ def fingerprint(folder: Path) -> str:
         OSError: It cannot be read.
     """
     digest = hashlib.sha256()
-    for path in sorted(_files_in(folder)):
+    for path in entries_below(folder):
         name = path.relative_to(folder)
-        if name.parts[0] != SCRATCH.name:
+        if name.parts[0] != SCRATCH.name and not path.is_dir():
             state = path.lstat()
             digest.update(json.dumps([name.as_posix(), state.st_size, state.st_mtime_ns]).encode())
     return digest.hexdigest()
-
-
-def _files_in(folder: Path) -> list[Path]:
-    def stop(error: OSError) -> None:
-        raise error
-
-    return [Path(where) / name for where, _, names in os.walk(folder, onerror=stop) for name in names]
 
 
 def _copy_of(real: Path) -> Path:
@@ -157,16 +147,3 @@ def _remove_marks(folder: Path) -> None:
         (folder / _BEGUN).unlink(missing_ok=True)
         (folder / _FINISHED).unlink(missing_ok=True)
         (folder / SCRATCH).rmdir()
-
-
-def _unused(real: Path) -> Path:
-    """A name beside the dataset for what it was before."""
-    names = (real.with_name(f"{real.name}.damaged{f'-{number}' if number else ''}") for number in itertools.count())
-    return next(name for name in names if not os.path.lexists(name))
-
-
-def _flush_all(folder: Path) -> None:
-    for path in folder.rglob("*"):
-        if not path.is_symlink():
-            flush(path)
-    flush(folder)

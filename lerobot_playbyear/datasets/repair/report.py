@@ -1,25 +1,33 @@
-"""What is said about a dataset that was checked or repaired."""
+"""What is said about a dataset that was checked or repaired.
 
+That something cannot be read now is nothing to report but an OSError, which ends the survey: nothing can be planned on it.
+"""
+
+import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-
-from lerobot_playbyear.datasets.repair.findings import State
-from lerobot_playbyear.datasets.repair.plan import Plan
 
 _MOST_MOVES = 20  # that are named
 
 
+class DatasetDamagedError(ValueError):
+    """A dataset cannot be repaired; nothing was changed."""
+
+
 @dataclass
 class RepairReport:
-    """What was wrong with a dataset, and what became of it.
+    """What was wrong with a dataset, and what became of it. Whoever looks at a part of the dataset adds what is wrong there.
 
     Args:
         root: Its folder.
-        findings: What was proven to be wrong, a line each; empty for a sound dataset.
+        findings: What was proven to be wrong, a line each; empty for a sound dataset. It was read, and is wrong, or a
+            folder that can be listed does not have it; what proves it also says what is right, or that it is lost.
         kept: Where each complete episode is now: its number before, and now.
         dropped: The episodes that are not complete: their number before, and why.
-        undecided: What looks wrong and is not proven, and what a person can do about it; before that nothing is repaired.
-        odd: What looks odd, and stays as it is; no repair depends on it.
+        undecided: Where two things contradict each other, nothing proves which is right, and what a person can do about it;
+            before that nothing is repaired.
+        odd: The same, where no repair depends on it: it stays as it is.
         remade: What of the rest was made anew, is other than it was, or stays behind in `original`, a line each.
         original: Where the damaged dataset was put; None where nothing was changed.
     """
@@ -77,20 +85,15 @@ class RepairReport:
         return f"{self.root} was damaged:" if self.changed else f"{self.root} is damaged:"
 
 
-def describe(root: Path, plan: Plan) -> RepairReport:
-    """Says what was found, and what the plan makes of it."""
-
-    def found(*states: State) -> list[str]:
-        return [finding.said for finding in plan.survey.findings if finding.state in states]
-
-    return RepairReport(
-        root,
-        found(State.DAMAGED, State.MISSING),
-        {kept.run.episode: kept.number for kept in plan.kept},
-        dict(plan.dropped),
-        found(State.UNDECIDED),
-        found(State.ODD),
-    )
+def name_episodes(numbers: Iterable[int]) -> str:
+    """`episode 3`, or `episodes 3, 5 to 9 and 12`."""
+    ordered = sorted(numbers)
+    parts: list[str] = []
+    for _, group in itertools.groupby(enumerate(ordered), key=lambda pair: pair[1] - pair[0]):
+        span = [number for _, number in group]
+        parts.append(str(span[0]) if len(span) == 1 else f"{span[0]} to {span[-1]}")
+    listed = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+    return f"episode{'s' if len(ordered) > 1 else ''} {listed}"
 
 
 def _items(lines: list[str]) -> list[str]:

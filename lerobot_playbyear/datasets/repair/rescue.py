@@ -7,16 +7,17 @@ columns that the dataset's features demand, the footer is written anew; pyarrow 
 
 import io
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.files import naming
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, leaf_columns, parsing, writer_options
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, leaf_columns, open_checked, parsing
 from lerobot_playbyear.datasets.repair import thrift
-from lerobot_playbyear.datasets.repair.rescued_file import FileBytes, RescuedFile
 from lerobot_playbyear.datasets.repair.thrift import Elements, Struct, ThriftError
 
 logger = logging.getLogger(__name__)
@@ -37,149 +38,85 @@ class _Page:
     n_values: int
 
 
-def rescue(path: Path, schema: pa.Schema) -> RescuedFile | None:
-    """A way to read a parquet file without a valid footer.
+def rescue(path: Path, schema: pa.Schema) -> pq.FileMetaData | None:
+    """What a parquet file without a valid footer would say in one.
 
     Args:
         path: The damaged file.
         schema: The columns that it should have, in any order that LeRobot or we write: the schema's.
 
     Returns:
-        The file with a footer that names every complete row group; None where there is none.
+        A footer that names every complete row group; None where there is none.
 
     Raises:
         OSError: The file cannot be read now.
     """
+    values_per_row = [leaf.values_per_row for field in schema for leaf in leaf_columns(field.name, field.type)]
+    if 0 in values_per_row:
+        return None  # lists of no fixed length: where a row ends does not follow from the pages' headers
     with naming(path), path.open("rb") as file:
-        pages = _pages(FileBytes(file))
-    for template in _templates(schema):
-        groups = _row_groups(pages, template)
-        if groups:
-            footer = Struct(template.footer)
-            footer[3] = (thrift.I64, sum(n_rows for n_rows, _ in groups))
-            footer[4] = (
-                thrift.LIST,
-                Elements(thrift.STRUCT, [_row_group(template, n_rows, chunks) for n_rows, chunks in groups]),
-            )
-            last = groups[-1][1][-1][-1]
-            encoded = thrift.write_struct(footer)
-            end = encoded + len(encoded).to_bytes(4, "little") + _MAGIC
-            rescued = RescuedFile(path, last.start + last.stored, end)
-            try:
-                with parsing(path):
-                    pq.ParquetFile(rescued.open())
-            except ParquetDamageError as error:
-                logger.debug("%s: the footer that was made for it is not accepted: %s", path, error)
-                continue
-            return rescued
-    return None
+        pages = _pages(file)
+    groups = _row_groups(pages, values_per_row)
+    if not groups:
+        return None
+    footer = _empty_footer(schema)
+    columns = [chunk.value(3) for chunk in footer.value(4).values[0].value(1).values]
+    footer[3] = (thrift.I64, sum(n_rows for n_rows, _ in groups))
+    row_groups = [_row_group(columns, n_rows, chunks) for n_rows, chunks in groups]
+    footer[4] = (thrift.LIST, Elements(thrift.STRUCT, row_groups))
+    encoded = thrift.write_struct(footer)
+    try:
+        with parsing(path):
+            metadata = pq.read_metadata(io.BytesIO(_MAGIC + encoded + len(encoded).to_bytes(4, "little") + _MAGIC))
+            open_checked(path, metadata).close()
+    except ParquetDamageError as error:
+        logger.debug("%s: the footer that was made for it is not accepted: %s", path, error)
+        return None
+    return metadata
 
 
-@dataclass
-class _Template:
-    """How a writer describes the columns.
-
-    Args:
-        footer: Of a file with one row.
-        columns: Its columns' metadata.
-        values_per_row: How many values of each column make a row.
-    """
-
-    footer: Struct
-    columns: list[Struct]
-    values_per_row: list[int]
-
-
-def _templates(schema: pa.Schema) -> list[_Template]:
-    """The footers of LeRobot's and our own writer for such columns."""
-    sizes = [size for field in schema for size in _values_per_row(field.type)]
-    if 0 in sizes:
-        return []  # lists of no fixed length: where a row ends does not follow from the pages' headers
-    templates = []
-    for options in ({"compression": "snappy", "use_dictionary": True}, writer_options(schema)):
-        # The lengths of lists stand in the schema alone, and may be those that a stranger claims: the row has short ones.
-        short = pa.schema([field.with_type(_shortened(field.type)) for field in schema])
-        row = pa.Table.from_arrays([_one_row(field.type) for field in short], schema=short)
-        chunks = _footer(row, options).value(4).values[0].value(1).values
-        footer = _footer(schema.empty_table(), options)
-        templates.append(_Template(footer, [chunk.value(3) for chunk in chunks], sizes))
-    return templates
-
-
-def _footer(table: pa.Table, options: dict) -> Struct:
+def _empty_footer(schema: pa.Schema) -> Struct:
+    """The footer of a file with one row group, in which no row is: LeRobot's and our own describe the columns alike."""
     buffer = io.BytesIO()
-    pq.write_table(table, buffer, **options)
+    pq.write_table(schema.empty_table(), buffer, compression="snappy")
     data = buffer.getvalue()
-    footer, _ = thrift.read_struct(data, len(data) - 8 - int.from_bytes(data[-8:-4], "little"))
-    return footer
+    return thrift.read_struct(data[-8 - int.from_bytes(data[-8:-4], "little") :])[0]
 
 
-def _shortened(kind: pa.DataType) -> pa.DataType:
-    """A type of lists with one value each: its columns are described alike."""
-    if pa.types.is_fixed_size_list(kind):
-        return pa.list_(kind.value_field.with_type(_shortened(kind.value_type)), 1)
-    return kind
-
-
-def _values_per_row(kind: pa.DataType) -> list[int]:
-    """How many values each of a column's parquet columns has per row; 0 where that varies."""
-    if isinstance(kind, pa.BaseExtensionType):
-        kind = kind.storage_type
-    if pa.types.is_fixed_size_list(kind):
-        return [kind.list_size * size for size in _values_per_row(kind.value_type)]
-    if pa.types.is_struct(kind):
-        return [size for field in kind for size in _values_per_row(field.type)]
-    return [0 if nested else 1 for _, _, nested in leaf_columns("", kind)]
-
-
-def _one_row(kind: pa.DataType) -> pa.Array:
-    """A row of nulls, or of lists of nulls: enough to have the column described."""
-    return (
-        pa.nulls(1, kind)
-        if not isinstance(kind, pa.BaseExtensionType)
-        else kind.wrap_array(pa.nulls(1, kind.storage_type))
-    )
-
-
-def _pages(data: FileBytes) -> list[_Page]:
+def _pages(file: BinaryIO) -> list[_Page]:
     """The pages of a file, from its beginning to the first byte that is none."""
     pages: list[_Page] = []
-    at = len(_MAGIC)
-    while at < len(data):
+    at, size = len(_MAGIC), os.fstat(file.fileno()).st_size
+    while at < size:
+        file.seek(at)
         try:
-            header, body = thrift.read_struct(data[at : at + _MAX_HEADER_BYTES])
-            page = _page(header, at, body)
+            page = _page(at, *thrift.read_struct(file.read(_MAX_HEADER_BYTES)))
         except (ThriftError, AttributeError, TypeError):
             break
-        if page is None or page.start + page.stored > len(data):
+        if page.start + page.stored > size:
             break
         pages.append(page)
         at = page.start + page.stored
     return pages
 
 
-def _page(header: Struct, start: int, header_bytes: int) -> _Page | None:
-    kind, inflated, stored = header.value(1), header.value(2), header.value(3)
+def _page(start: int, header: Struct, header_bytes: int) -> _Page:
+    kind = header.value(1)
     details = header.value({_DATA_PAGE: 5, _DICTIONARY_PAGE: 7, _DATA_PAGE_V2: 8}.get(kind, -1))
-    if not isinstance(details, Struct) or not isinstance(inflated, int) or not isinstance(stored, int) or stored < 0:
-        return None
-    n_values = details.value(1)
-    if not isinstance(n_values, int) or n_values < 0:
-        return None
+    inflated, stored, n_values = header.value(2), header.value(3), details.value(1)
+    if not all(isinstance(number, int) and number >= 0 for number in (inflated, stored, n_values)):
+        raise ThriftError("it is no page")
     return _Page(start, header_bytes + stored, header_bytes + inflated, kind == _DICTIONARY_PAGE, n_values)
 
 
 _Chunks = list[list[_Page]]
 
 
-def _row_groups(pages: list[_Page], template: _Template) -> list[tuple[int, _Chunks]]:
+def _row_groups(pages: list[_Page], values_per_row: list[int]) -> list[tuple[int, _Chunks]]:
     """Cuts the pages into row groups, and these into columns: for each its number of rows and its columns' pages."""
     groups: list[tuple[int, _Chunks]] = []
     at = 0
-    while at < len(pages):
-        found = _next_row_group(pages, at, template.values_per_row)
-        if found is None:
-            break
+    while (found := _next_row_group(pages, at, values_per_row)) is not None:
         groups.append(found)
         at += sum(len(chunk) for chunk in found[1])
     return groups
@@ -218,9 +155,9 @@ def _columns(pages: list[_Page], at: int, n_rows: int, values_per_row: list[int]
     return chunks
 
 
-def _row_group(template: _Template, n_rows: int, chunks: _Chunks) -> Struct:
-    columns = []
-    for column, chunk in zip(template.columns, chunks, strict=True):
+def _row_group(columns: list[Struct], n_rows: int, chunks: _Chunks) -> Struct:
+    described = []
+    for column, chunk in zip(columns, chunks, strict=True):
         details = Struct({field: value for field, value in column.items() if field in (1, 2, 3, 4)})
         data = [page for page in chunk if not page.is_dictionary]
         details[5] = (thrift.I64, sum(page.n_values for page in data))
@@ -229,11 +166,11 @@ def _row_group(template: _Template, n_rows: int, chunks: _Chunks) -> Struct:
         details[9] = (thrift.I64, data[0].start)
         if chunk[0].is_dictionary:
             details[11] = (thrift.I64, chunk[0].start)
-        columns.append(Struct({2: (thrift.I64, 0), 3: (thrift.STRUCT, details)}))
+        described.append(Struct({2: (thrift.I64, 0), 3: (thrift.STRUCT, details)}))
     size = sum(page.inflated for chunk in chunks for page in chunk)
     return Struct(
         {
-            1: (thrift.LIST, Elements(thrift.STRUCT, columns)),
+            1: (thrift.LIST, Elements(thrift.STRUCT, described)),
             2: (thrift.I64, size),
             3: (thrift.I64, n_rows),
         }

@@ -1,26 +1,27 @@
 """What there is of a dataset, and what is wrong with it: everything that is read before a repair."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lerobot.datasets.utils import DatasetInfo
 
-from lerobot_playbyear.datasets.repair.dataset_statistics import OwnStats, read_own_stats
-from lerobot_playbyear.datasets.repair.episode_tables import Row, read_rows
 from lerobot_playbyear.datasets.repair.episodes import (
     Episode,
+    Row,
     check_counts,
     match_episodes,
-    rows_by_number,
+    read_rows,
     with_lost,
+    without_impossible_numbers,
 )
-from lerobot_playbyear.datasets.repair.features import settle_features
-from lerobot_playbyear.datasets.repair.findings import DatasetDamagedError, Finding, State
 from lerobot_playbyear.datasets.repair.frames import read_frames
-from lerobot_playbyear.datasets.repair.info import check_rates, frame_rate, read_info
-from lerobot_playbyear.datasets.repair.tasks import Tasks, read_tasks, settle_tasks
+from lerobot_playbyear.datasets.repair.info import check_rates, read_info, settle_features
+from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport
+from lerobot_playbyear.datasets.repair.statistics import read_own_stats
+from lerobot_playbyear.datasets.repair.tasks import Tasks, settle_tasks
 from lerobot_playbyear.datasets.repair.videos import check_videos
 
 
@@ -29,22 +30,24 @@ class Survey:
     """A dataset as it was found.
 
     Args:
+        report: What is not fine, but for the episodes, which say that themselves.
         info: What it says about itself, made good as far as that is proven.
         info_fields: Everything that its `meta/info.json` holds, also what LeRobot does not know.
         rows: All rows of its tables of episodes that can be read.
+        tables_are_right: Whether these tables are.
         episodes: All episodes, in the order of their numbers, also those that are not whole.
         tasks: Its tasks.
-        stats: Its statistics.
-        findings: All that is not fine, but for the episodes, which say that themselves.
+        stats: The entries of its statistics, as `read_own_stats` has them.
     """
 
+    report: RepairReport
     info: DatasetInfo
     info_fields: Mapping[str, Any]
-    rows: tuple[Row, ...]
-    episodes: tuple[Episode, ...]
+    rows: Sequence[Row]
+    tables_are_right: bool
+    episodes: Sequence[Episode]
     tasks: Tasks
-    stats: OwnStats
-    findings: tuple[Finding, ...]
+    stats: Mapping[str, dict[str, np.ndarray] | None] | None
 
 
 def survey(root: Path, *, fps: int | None, features: dict[str, dict] | None, thorough: bool) -> Survey:
@@ -63,28 +66,19 @@ def survey(root: Path, *, fps: int | None, features: dict[str, dict] | None, tho
     """
     if not root.is_dir():
         raise DatasetDamagedError(f"{root} holds no LeRobotDataset: it is no folder.")
-    info, fields, of_info = read_info(root, fps, features)
-    info, of_features = settle_features(root, info, features)
-    frames = read_frames(root, info, thorough)
-    tables = read_rows(root)
-    episodes, of_episodes = match_episodes(frames.runs, tables.rows, info)
-    rows = rows_by_number(tables.rows)
-    tasks = settle_tasks(read_tasks(root), episodes, rows)
-    rate = frame_rate(info, frames.frame_seconds)
-    episodes, of_videos = check_videos(root, info, rate, with_lost(info, episodes), rows, thorough)
-    stats = read_own_stats(root, info.features)
-    is_begun = not any(episode.is_whole for episode in episodes)  # it may have no statistics yet
-    of_stats = [finding for finding in stats.findings if not (is_begun and finding.state is State.MISSING)]
-    findings = (
-        *of_info,
-        *of_features,
-        *frames.findings,
-        *check_rates(info, frames.frame_seconds),
-        *tables.findings,
-        *of_episodes,
-        *tasks.findings,
-        *of_videos,
-        *check_counts(info, episodes),
-        *of_stats,
-    )
-    return Survey(info, fields, tables.rows, episodes, tasks, stats, findings)
+    report = RepairReport(root)
+    info, fields = read_info(report, fps, features)
+    info = settle_features(report, info, features)
+    runs, frame_seconds = read_frames(report, info, thorough)
+    rate = check_rates(report, info, frame_seconds)
+    n_before = len(report.findings)
+    all_rows = read_rows(report)
+    runs, rows = without_impossible_numbers(report, runs, all_rows)
+    tables_are_right = len(report.findings) == n_before
+    episodes = match_episodes(report, runs, rows, info)
+    first_rows = {row["episode_index"]: row for row in reversed(all_rows)}
+    tasks = settle_tasks(report, episodes, first_rows)
+    checked = check_videos(report, info, rate, with_lost(info, episodes), first_rows, thorough)
+    check_counts(report, info, checked)
+    stats = read_own_stats(report, info.features, is_begun=not any(episode.run for episode in checked))
+    return Survey(report, info, fields, all_rows, tables_are_right, checked, tasks, stats)

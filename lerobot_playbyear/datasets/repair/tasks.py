@@ -4,16 +4,15 @@ import io
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import pandas as pd
 from lerobot.datasets.utils import DEFAULT_TASKS_PATH
 
 from lerobot_playbyear.datasets.files import read_listed
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, parsing
-from lerobot_playbyear.datasets.repair.episode_tables import Row
-from lerobot_playbyear.datasets.repair.episodes import Episode
-from lerobot_playbyear.datasets.repair.findings import Finding, State, Thing, name_episodes
+from lerobot_playbyear.datasets.repair.episodes import Episode, Row
+from lerobot_playbyear.datasets.repair.frames import Run
+from lerobot_playbyear.datasets.repair.report import RepairReport, name_episodes
 
 
 @dataclass(frozen=True)
@@ -22,72 +21,69 @@ class Tasks:
 
     Args:
         table: As LeRobot keeps them: a task's number in `task_index`, its text as the index.
-        is_own: Whether it is the dataset's own, which stays as it is.
-        was_lost: Whether there was none that could be read.
-        findings: What was found wrong.
+        note: What is said of it where it is made anew; None: it is the dataset's own, which stays as it is.
     """
 
     table: pd.DataFrame
-    is_own: bool
-    was_lost: bool
-    findings: tuple[Finding, ...]
+    note: str | None
 
 
-def read_tasks(root: Path) -> pd.DataFrame | Finding:
-    """The table of a dataset's tasks as it is, or what is wrong with it.
+def settle_tasks(report: RepairReport, episodes: Sequence[Episode], rows: Mapping[int, Row]) -> Tasks:
+    """Reads the table of tasks, and holds its texts against the rows of the episodes.
 
-    Raises:
-        OSError: It cannot be read now.
-    """
-    data = read_listed(root, DEFAULT_TASKS_PATH)
-    if data is None:
-        return Finding(Thing.TASKS, State.MISSING, f"{DEFAULT_TASKS_PATH} is missing")
-    try:
-        with parsing():
-            return pd.read_parquet(io.BytesIO(data)).astype({"task_index": int})
-    except (ParquetDamageError, TypeError) as error:
-        return Finding(Thing.TASKS, State.DAMAGED, f"{DEFAULT_TASKS_PATH} cannot be read: {error}")
-
-
-def settle_tasks(own: pd.DataFrame | Finding, episodes: Sequence[Episode], rows: Mapping[int, Row]) -> Tasks:
-    """Holds the texts of the tasks against the rows of the episodes, from which those are taken that the table lacks.
-
-    Only what all episodes of a task say is taken, and only of those with one task: which of several texts belongs to
-    which number their rows do not say.
+    From these the texts are taken that the table lacks: only what all episodes of a task say, and only of those with one
+    task. Which of several texts belongs to which number their rows do not say.
 
     Args:
-        own: The table, or what is wrong with it.
+        report: Of the dataset; what is wrong is added.
         episodes: The whole ones count.
         rows: Their rows, and those of others.
+
+    Raises:
+        OSError: The table cannot be read now.
     """
-    whole = [episode for episode in episodes if episode.is_whole]
-    if isinstance(own, Finding) and own.state is State.MISSING and not whole:  # it has only been begun
-        return Tasks(pd.DataFrame({"task_index": []}, index=pd.Index([], name="task")), True, True, ())
-    said = _texts(whole, rows)
-    findings = [own] if isinstance(own, Finding) else []
-    table = None if isinstance(own, Finding) else own
+    runs = {episode.number: episode.run for episode in episodes if episode.run}
+    data = read_listed(report.root, DEFAULT_TASKS_PATH)
+    if data is None and not runs:  # it has only been begun
+        return Tasks(pd.DataFrame({"task_index": []}, index=pd.Index([], name="task")), None)
+    said = _texts(runs, rows)
+    table = None
+    if data is None:
+        report.findings.append(f"{DEFAULT_TASKS_PATH} is missing")
+    else:
+        try:
+            with parsing():
+                table = pd.read_parquet(io.BytesIO(data)).astype({"task_index": int})
+        except (ParquetDamageError, TypeError) as error:
+            report.findings.append(f"{DEFAULT_TASKS_PATH} cannot be read: {error}")
     table_has = {} if table is None else dict(zip(table["task_index"].tolist(), table.index.astype(str), strict=True))
     known = dict(table_has)
-    for number in sorted({task for episode in whole if episode.run for task in episode.run.tasks}):
+    for number in sorted({task for run in runs.values() for task in run.tasks}):
         texts = said.get(number, {})
         if number in table_has:
-            findings += _differences(number, table_has[number], texts)
+            report.odd += _differences(number, table_has[number], texts)
         elif len(texts) == 1 and next(iter(texts)) not in known.values():
             known[number] = next(iter(texts))
             if table is not None:
-                said_now = f"the text of task {number} was missing; it is {known[number]!r}, as its episodes say"
-                findings.append(_finding(State.MISSING, said_now))
+                report.findings.append(
+                    f"{DEFAULT_TASKS_PATH}: the text of task {number} was missing; it is {known[number]!r}, as its episodes "
+                    "say"
+                )
         elif table is None:
             known[number] = unknown_task(number)
             others = f": the episodes name it {', '.join(map(repr, sorted(texts)))}" if texts else ""
-            lost_text = f"the text of task {number} is lost{others}; it now reads {known[number]!r}"
-            findings.append(_finding(State.MISSING, lost_text))
+            report.findings.append(
+                f"{DEFAULT_TASKS_PATH}: the text of task {number} is lost{others}; it now reads {known[number]!r}"
+            )
         else:
-            remedy = "Put a table from a copy in its place, or correct the frames' task_index"
-            findings.append(_finding(State.UNDECIDED, f"frames are of task {number}, which has no text. {remedy}"))
+            report.undecided.append(
+                f"{DEFAULT_TASKS_PATH}: frames are of task {number}, which has no text. Put a table from a copy in its "
+                "place, or correct the frames' task_index"
+            )
     if table is not None and known == table_has:
-        return Tasks(table, True, False, tuple(findings))
-    return Tasks(_table(table, known), False, table is None, tuple(findings))
+        return Tasks(table, None)
+    lost = "; what it held that no episode says is lost" if table is None else ""
+    return Tasks(_table(table, known), f"{DEFAULT_TASKS_PATH}: made anew from the episodes{lost}")
 
 
 def unknown_task(number: int) -> str:
@@ -95,31 +91,24 @@ def unknown_task(number: int) -> str:
     return f"unknown task {number}"
 
 
-def _texts(whole: Sequence[Episode], rows: Mapping[int, Row]) -> dict[int, dict[str, list[int]]]:
+def _texts(runs: Mapping[int, Run], rows: Mapping[int, Row]) -> dict[int, dict[str, list[int]]]:
     """What the episodes with one task call it: for each task's number, each text and the episodes that say it."""
     said: dict[int, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
-    for episode in whole:
-        texts = rows.get(episode.number, {}).get("tasks")
-        if episode.run and isinstance(texts, list) and len(texts) == 1 and len(episode.run.tasks) == 1:
-            said[episode.run.tasks[0]][str(texts[0])].append(episode.number)
+    for number, run in runs.items():
+        texts = rows.get(number, {}).get("tasks")
+        if isinstance(texts, list) and len(texts) == len(run.tasks) == 1:
+            said[run.tasks[0]][str(texts[0])].append(number)
     return said
 
 
-def _differences(number: int, text: str, texts: Mapping[str, list[int]]) -> list[Finding]:
+def _differences(number: int, text: str, texts: Mapping[str, list[int]]) -> list[str]:
     return [
-        _finding(
-            State.ODD,
-            f"task {number} reads {text!r}; the row{'s' if len(numbers) > 1 else ''} of {name_episodes(numbers)} in "
-            f"meta/episodes say{'' if len(numbers) > 1 else 's'} {other!r}. If nobody renamed it, lerobot-edit-dataset "
-            "with --operation.type=modify_tasks sets the right one",
-        )
+        f"{DEFAULT_TASKS_PATH}: task {number} reads {text!r}; the row{'s' if len(numbers) > 1 else ''} of "
+        f"{name_episodes(numbers)} in meta/episodes say{'' if len(numbers) > 1 else 's'} {other!r}. If nobody renamed it, "
+        "lerobot-edit-dataset with --operation.type=modify_tasks sets the right one"
         for other, numbers in texts.items()
         if other != text
     ]
-
-
-def _finding(state: State, said: str) -> Finding:
-    return Finding(Thing.TASKS, state, f"{DEFAULT_TASKS_PATH}: {said}")
 
 
 def _table(own: pd.DataFrame | None, known: dict[int, str]) -> pd.DataFrame:

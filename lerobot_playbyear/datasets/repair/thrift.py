@@ -1,5 +1,6 @@
 """The Thrift compact protocol: what parquet writes its headers and footers in. As much of it as parquet uses."""
 
+import io
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,109 +24,81 @@ class Elements:
 class Struct(dict[int, tuple[int, Any]]):
     """Fields by their number: type and value."""
 
-    def value(self, field: int, default: Any = None) -> Any:
-        """The value of a field, or `default` where it is absent."""
-        return self[field][1] if field in self else default
+    def value(self, field: int) -> Any:
+        """The value of a field; None where it is absent."""
+        return self[field][1] if field in self else None
 
 
-def read_struct(data: bytes | memoryview, start: int = 0) -> tuple[Struct, int]:
-    """Reads a structure.
-
-    Args:
-        data: The bytes.
-        start: Where it begins.
+def read_struct(data: bytes) -> tuple[Struct, int]:
+    """Reads the structure that some bytes begin with.
 
     Returns:
-        The structure, and where the next byte after it is.
+        The structure, and how many bytes it takes.
 
     Raises:
         ThriftError: There is none.
     """
+    stream = io.BytesIO(data)
     try:
-        return _read_struct(data, start, 0)
-    except (IndexError, UnicodeDecodeError) as error:
+        return _read_value(STRUCT, stream, 0), stream.tell()
+    except (IndexError, OverflowError) as error:
         raise ThriftError("the structure is cut off") from error
 
 
 def write_struct(struct: Struct) -> bytes:
-    """The bytes of a structure."""
+    """The bytes of a structure. In parquet the numbers of two neighbouring fields are never more than 15 apart."""
     out = bytearray()
     last = 0
     for field in sorted(struct):
         kind, value = struct[field]
-        if kind in (BOOL_TRUE, BOOL_FALSE):
-            kind = BOOL_TRUE if value else BOOL_FALSE
-        delta = field - last
-        if 0 < delta <= 15:
-            out.append(delta << 4 | kind)
-        else:
-            out.append(kind)
-            out += _varint(_zigzag(field))
-        if kind not in (BOOL_TRUE, BOOL_FALSE):
+        out.append(field - last << 4 | kind)
+        if kind not in (BOOL_TRUE, BOOL_FALSE):  # their type says it all
             out += _write_value(kind, value)
         last = field
     out.append(0)
     return bytes(out)
 
 
-def _read_struct(data: bytes | memoryview, at: int, depth: int) -> tuple[Struct, int]:
+def _read_struct(stream: io.BytesIO, depth: int) -> Struct:
+    struct, last = Struct(), 0
+    while head := stream.read(1)[0]:
+        kind, delta = head & 15, head >> 4
+        last = last + delta if delta else _read_integer(stream)
+        is_bool = kind in (BOOL_TRUE, BOOL_FALSE)
+        struct[last] = (kind, kind == BOOL_TRUE if is_bool else _read_value(kind, stream, depth + 1))
+    return struct
+
+
+def _read_value(kind: int, stream: io.BytesIO, depth: int) -> Any:
     if depth > _MAX_DEPTH:
         raise ThriftError("the structure is nested too deeply")
-    struct, last = Struct(), 0
-    while True:
-        head = data[at]
-        at += 1
-        if head == 0:
-            return struct, at
-        kind, delta = head & 15, head >> 4
-        if delta:
-            last += delta
-        else:
-            number, at = _read_varint(data, at)
-            last = _unzigzag(number)
-        if kind in (BOOL_TRUE, BOOL_FALSE):
-            struct[last] = (kind, kind == BOOL_TRUE)
-        else:
-            value, at = _read_value(kind, data, at, depth)
-            struct[last] = (kind, value)
-
-
-def _read_value(kind: int, data: bytes | memoryview, at: int, depth: int) -> tuple[Any, int]:
     if kind in (I16, I32, I64):
-        number, at = _read_varint(data, at)
-        return _unzigzag(number), at
+        return _read_integer(stream)
     if kind in (BYTE, BOOL_TRUE, BOOL_FALSE):
-        return data[at], at + 1
-    if kind == DOUBLE:
-        return _read_bytes(data, at, 8)
+        return stream.read(1)[0]
     if kind == BINARY:
-        size, at = _read_varint(data, at)
-        return _read_bytes(data, at, size)
-    if kind in (LIST, SET):
-        head = data[at]
-        size, at = (head >> 4, at + 1) if head >> 4 != 15 else _read_varint(data, at + 1)
-        if size > len(data) - at:
-            raise ThriftError("a list is longer than the file")
-        elements = Elements(head & 15, [])
-        for _ in range(size):
-            value, at = _read_value(elements.type, data, at, depth + 1)
-            elements.values.append(value)
-        return elements, at
+        size = _read_varint(stream)
+        value = stream.read(size)
+        if len(value) < size:
+            raise ThriftError("a value is longer than the file")
+        return value
+    if kind == LIST:
+        head = stream.read(1)[0]
+        size = head >> 4 if head >> 4 != 15 else _read_varint(stream)
+        return Elements(head & 15, [_read_value(head & 15, stream, depth + 1) for _ in range(size)])
     if kind == STRUCT:
-        return _read_struct(data, at, depth + 1)
+        return _read_struct(stream, depth)
     raise ThriftError(f"type {kind} does not occur in parquet")
 
 
 def _write_value(kind: int, value: Any) -> bytes:
     if kind in (I16, I32, I64):
-        return _varint(_zigzag(value))
+        return _varint((value << 1) ^ (value >> 63))
     if kind in (BYTE, BOOL_TRUE, BOOL_FALSE):
         return bytes([value])
-    if kind == DOUBLE:
-        return value
     if kind == BINARY:
         return _varint(len(value)) + value
-    if kind in (LIST, SET):
+    if kind == LIST:
         size = len(value.values)
         head = bytes([size << 4 | value.type]) if size < 15 else bytes([0xF0 | value.type]) + _varint(size)
         return head + b"".join(_write_value(value.type, element) for element in value.values)
@@ -134,23 +107,19 @@ def _write_value(kind: int, value: Any) -> bytes:
     raise ThriftError(f"type {kind} does not occur in parquet")
 
 
-def _read_bytes(data: bytes | memoryview, at: int, size: int) -> tuple[bytes, int]:
-    if size > len(data) - at:
-        raise ThriftError("a value is longer than the file")
-    return bytes(data[at : at + size]), at + size
+def _read_integer(stream: io.BytesIO) -> int:
+    number = _read_varint(stream)
+    return (number >> 1) ^ -(number & 1)
 
 
-def _read_varint(data: bytes | memoryview, at: int) -> tuple[int, int]:
-    number = shift = 0
-    while True:
-        byte = data[at]
-        at += 1
+def _read_varint(stream: io.BytesIO) -> int:
+    number = 0
+    for shift in range(0, 64, 7):
+        byte = stream.read(1)[0]
         number |= (byte & 127) << shift
         if byte < 128:
-            return number, at
-        shift += 7
-        if shift > 63:
-            raise ThriftError("a number has more than 64 bits")
+            return number
+    raise ThriftError("a number has more than 64 bits")
 
 
 def _varint(number: int) -> bytes:
@@ -160,11 +129,3 @@ def _varint(number: int) -> bytes:
         number >>= 7
     out.append(number)
     return bytes(out)
-
-
-def _zigzag(number: int) -> int:
-    return number << 1 if number >= 0 else (-number << 1) - 1
-
-
-def _unzigzag(number: int) -> int:
-    return number >> 1 if not number & 1 else -(number + 1 >> 1)

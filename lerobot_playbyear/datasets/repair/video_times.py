@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -79,14 +79,12 @@ def _decode(path: str) -> dict[str, Any]:
     try:
         with _Film(path) as film:
             answer = _decode_film(film)
-            return _unreadable(film.problem) if film.problem is not None else answer
+            if film.problem is not None:
+                raise film.problem
+            return answer
     except OSError as error:
-        return _unreadable(error)
-
-
-def _unreadable(error: OSError) -> dict[str, Any]:
-    number = error.errno or errno.EIO
-    return {"unreadable": [number, os.strerror(number)]}
+        number = error.errno or errno.EIO
+        return {"unreadable": [number, os.strerror(number)]}
 
 
 def _decode_film(film: _Film) -> dict[str, Any]:
@@ -108,7 +106,7 @@ def _decode_film(film: _Film) -> dict[str, Any]:
                 ]
     except Exception as error:  # what FFmpeg makes of wrong bytes, of which there are many kinds
         if isinstance(error, MemoryError) and not _has_memory():
-            return _unreadable(OSError(errno.ENOMEM, ""))
+            raise OSError(errno.ENOMEM, "") from error
         if not times:
             return {"problem": f"{type(error).__name__}: {error}"}
     return {"times": times}
@@ -122,10 +120,6 @@ def _has_memory() -> bool:
         return False
 
 
-def main(paths: Sequence[str]) -> None:
-    for path in paths:
-        print(json.dumps(_decode(path)), flush=True)
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    for argument in sys.argv[1:]:
+        print(json.dumps(_decode(argument)), flush=True)

@@ -1,6 +1,5 @@
 // Puts the page together: head, list of episodes, stage, timeline, keys.
 
-const SPEEDS = [...byId("speed").options].map((option) => option.value);
 const settings = { own: {}, hidden: {}, toggleScale };
 const player = new Player(byId("video"), showTime);
 let episode = null;
@@ -156,7 +155,7 @@ function toggleChecks() {
 
 function changeSpeed(by) {
   const select = byId("speed");
-  select.selectedIndex = Math.min(Math.max(select.selectedIndex + by, 0), SPEEDS.length - 1);
+  select.selectedIndex = Math.min(Math.max(select.selectedIndex + by, 0), select.options.length - 1);
   select.onchange();
 }
 
@@ -169,8 +168,8 @@ function toNextSound() {
 const KEYS = {
   " ": () => player.toggle(),
   k: () => player.toggle(),
-  ArrowLeft: (event) => player.step(event.shiftKey ? -10 : -1),
-  ArrowRight: (event) => player.step(event.shiftKey ? 10 : 1),
+  ArrowLeft: (event) => player.show(player.frame - (event.shiftKey ? 10 : 1)),
+  ArrowRight: (event) => player.show(player.frame + (event.shiftKey ? 10 : 1)),
   ArrowUp: () => open(wanted - 1),
   ArrowDown: () => open(wanted + 1),
   Home: () => player.show(0),

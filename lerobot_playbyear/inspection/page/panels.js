@@ -16,7 +16,6 @@ class Panel {
     const { context } = contextOf(this.canvas, this.height);
     this.paint(context, 3, this.height - 3);
   }
-  paint() {}
   // Shows the values of a moment in the legend.
   read() {}
 }
@@ -25,7 +24,7 @@ class MomentsPanel extends Panel {
   constructor(episode, axis) {
     super(episode, axis, 30);
     const entries = [];
-    if (episode.interventions) entries.push(swatch("--expert", "expert"));
+    if (episode.interventions) entries.push(make("span", { className: "expert" }, "expert"));
     if (episode.success !== null && episode.success >= 0) entries.push(make("span", {}, "✓ success"));
     if (episode.microphones.length) entries.push(make("span", {}, "▾ sudden sound"));
     this.legend.append(make("p", { className: "moments" }, ...entries));
@@ -33,14 +32,7 @@ class MomentsPanel extends Panel {
   paint(context, top, bottom) {
     const { axis, episode } = this;
     drawGround(context, axis, top, bottom, [], () => 0, "");
-    for (const [first, last] of episode.interventions || []) {
-      const x = axis.x(first / fps);
-      const width = axis.x((last + 1) / fps) - x;
-      context.fillStyle = css("--expert");
-      context.globalAlpha = 0.8;
-      context.fillRect(x, bottom - 7, width, 7);
-      context.globalAlpha = 1;
-    }
+    fillInterventions(context, axis, episode, bottom - 7, bottom, 0.8);
     context.textBaseline = "middle";
     context.textAlign = "center";
     context.fillStyle = css("--sound");
@@ -225,12 +217,6 @@ class TimePanel extends Panel {
 
 const dash = (d) => DASHES[Math.floor(d / N_COLOURS) % DASHES.length];
 const readable = (value) => (Number.isFinite(value) ? (value === 0 || Math.abs(value) >= 0.0005 ? String(Number(value.toPrecision(3))) : value.toExponential(0)) : "NaN");
-
-function swatch(colour, text) {
-  const patch = make("i", { className: "swatch" });
-  patch.style.background = `var(${colour})`;
-  return make("span", {}, patch, text);
-}
 
 function panelsOf(episode, axis, settings) {
   const sound = episode.microphones.flatMap((m) => [new WavePanel(episode, axis, m), new SpectrogramPanel(episode, axis, m)]);

@@ -4,7 +4,7 @@ class Player {
   constructor(video, onTime) {
     Object.assign(this, { video, onTime, episode: null, frame: 0, loop: false, wantsToPlay: false });
     video.addEventListener("play", () => this.follow());
-    video.addEventListener("pause", () => this.stopped());
+    video.addEventListener("pause", () => onTime(this.frame / fps));
     video.addEventListener("ended", () => this.ended());
   }
   get playing() {
@@ -41,9 +41,6 @@ class Player {
     this.video.currentTime = (this.frame + 0.5) / fps;
     this.onTime(this.frame / fps);
   }
-  step(frames) {
-    this.show(this.frame + frames);
-  }
   seek(time) {
     const play = this.wantsToPlay;
     this.show(Math.round(time * fps));
@@ -55,9 +52,6 @@ class Player {
     this.frame = Math.min(Math.floor(time * fps + 1e-6), this.episode.frames - 1);
     this.onTime(time);
     requestAnimationFrame(() => this.follow());
-  }
-  stopped() {
-    this.onTime(this.frame / fps);
   }
   ended() {
     this.frame = this.episode.frames - 1;

@@ -85,12 +85,15 @@ function drawScale(context, top, bottom, ticks, y, unit, format = (value) => Str
 
 // Where the expert was in control: a light band behind the curves, unless that is everywhere.
 function shadeInterventions(context, axis, episode, top, bottom) {
-  const spans = episode.interventions || [];
-  if (spans.length === 1 && spans[0][0] === 0 && spans[0][1] === episode.frames - 1) return;
+  const [first, last] = episode.interventions?.[0] ?? [];
+  if (first !== 0 || last !== episode.frames - 1) fillInterventions(context, axis, episode, top, bottom, 0.14);
+}
+
+function fillInterventions(context, axis, episode, top, bottom, alpha) {
   context.save();
-  context.globalAlpha = 0.14;
+  context.globalAlpha = alpha;
   context.fillStyle = css("--expert");
-  for (const [first, last] of spans) {
+  for (const [first, last] of episode.interventions ?? []) {
     context.fillRect(axis.x(first / fps), top, axis.x((last + 1) / fps) - axis.x(first / fps), bottom - top);
   }
   context.restore();
