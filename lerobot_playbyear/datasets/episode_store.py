@@ -13,7 +13,7 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.reading import INDEX_KEYS, read_dataset
-from lerobot_playbyear.datasets.rows import as_lerobot_has, write_rows
+from lerobot_playbyear.datasets.rows import as_lerobot_has, sent_to, write_rows
 from lerobot_playbyear.datasets.shrinking import shrink
 
 
@@ -77,6 +77,7 @@ class EpisodeStore:
         place: str = "memory",
         image_size: int | None = None,
         cache: Path | None = None,
+        sample_rates: Mapping[str, int] | None = None,
     ) -> "EpisodeStore":
         """Read a dataset, local or from the Hub; the episodes it was opened with.
 
@@ -90,13 +91,16 @@ class EpisodeStore:
             place: "memory", or "disk" for files that are mapped into memory, which the next run finds again.
             image_size: Keep pictures no larger than this, shrunk as the policy `playbyear` does [pixels].
             cache: Folder of the files; None takes one beside LeRobot's cache.
+            sample_rates: Keep these microphones at these rates, resampled where they were recorded at others [Hz].
 
         Raises:
             ValueError: If a key is missing or cannot be kept, sound breaks the contract, a value is NaN or infinite,
                 there are no frames, or the disk has no room.
             MemoryError: If the tensors do not fit into the memory.
         """
-        columns, starts, ends = read_dataset(dataset, keys, device, video_backend, progress, place, image_size, cache)
+        columns, starts, ends = read_dataset(
+            dataset, keys, device, video_backend, progress, place, image_size, cache, sample_rates
+        )
         tasks, device = list(dataset.meta.tasks.index), columns["index"].device
         return cls(columns, starts, ends, dataset.fps, tasks, device, image_size)
 
@@ -183,13 +187,13 @@ class EpisodeStore:
             if offsets not in placed:
                 wanted = last.unsqueeze(1) + torch.tensor(offsets)  # (B, T)
                 inside = torch.minimum(torch.maximum(wanted, first_valid), last_valid)
-                placed[offsets] = (self._sent(inside), self._sent(inside != wanted))
+                placed[offsets] = (sent_to(self.device, inside), sent_to(self.device, inside != wanted))
             index, is_pad = placed[offsets]
             batch[key] = self._gather(key, index, as_lerobot)
             batch[f"{key}_is_pad"] = is_pad.clone()
         if as_lerobot:
             others = [key for key in self._columns if key not in deltas]
-            index = self._sent(last)
+            index = sent_to(self.device, last)
             batch.update({key: self._gather(key, index, as_lerobot) for key in others})
         batch["task"] = [self.tasks[i] for i in self._task_index[last].tolist()]
         return batch
@@ -224,12 +228,6 @@ class EpisodeStore:
         self._starts.append(start)
         self._ends.append(end)
         return self.n_episodes - 1
-
-    def _sent(self, values: Tensor) -> Tensor:
-        """Small numbers of the host, on the store's device; nothing waits for them."""
-        if self.device.type == "cuda":
-            return values.pin_memory().to(self.device, non_blocking=True)
-        return values.to(self.device)
 
     def _gather(self, key: str, index: Tensor, as_lerobot: bool) -> Tensor:
         """The rows `index` (B,) or (B, T) of one column."""

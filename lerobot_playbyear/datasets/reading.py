@@ -20,7 +20,8 @@ from lerobot_playbyear.datasets.disk_columns import DEFAULT_CACHE, disk_columns
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.identity import dataset_identity
 from lerobot_playbyear.datasets.long_dataset import LongDataset
-from lerobot_playbyear.datasets.shrinking import shrink, shrunk_size
+from lerobot_playbyear.datasets.resampling import features_at, resampled_pieces
+from lerobot_playbyear.datasets.shrinking import kept_shape, shrink
 from lerobot_playbyear.datasets.tensors import image_pieces, value_pieces, video_pieces
 
 INDEX_KEYS = ("index", "episode_index", "frame_index", "task_index", "timestamp")
@@ -43,6 +44,7 @@ def read_dataset(
     place: str = "memory",
     image_size: int | None = None,
     cache: Path | None = None,
+    sample_rates: Mapping[str, int] | None = None,
 ) -> tuple[dict[str, Tensor], list[int], list[int]]:
     """Read the episodes that a dataset was opened with; arguments and errors as for `EpisodeStore.from_dataset`.
 
@@ -54,7 +56,9 @@ def read_dataset(
     features = _select_features(dataset, keys)
     with_rate = {key: f for key, f in features.items() if "sample_rate" in (f.get("info") or {})}
     check_audio_features(with_rate, dataset.fps)
-    row_bytes = {key: _row_bytes(feature, image_size) for key, feature in features.items()}
+    kept = features_at(features, sample_rates or {}, dataset.fps)
+    new_rates = {key: kept[key]["info"]["sample_rate"] for key in features if kept[key] is not features[key]}
+    row_bytes = {key: _row_bytes(feature, image_size) for key, feature in kept.items()}
     n_bytes = sum(row_bytes.values()) * len(dataset)
     device = _choose_device(device, n_bytes)
     n_cameras = sum(feature["dtype"] in _CAMERA_DTYPES for feature in features.values())
@@ -62,13 +66,14 @@ def read_dataset(
         total=n_cameras * len(dataset), desc="Reading frames", unit="frame", disable=not (progress and n_cameras)
     )
     with bar:
-        pieces = partial(_pieces, dataset, video_backend, image_size, bar)
+        pieces = partial(_pieces, dataset, video_backend, image_size, new_rates, bar)
         if place == "disk":
             cache = cache or DEFAULT_CACHE
             identity = {
                 **dataset_identity(dataset, features, cache),
                 "image_size": image_size,
                 "decoder": video_backend or get_safe_default_video_backend(),
+                **({"sample_rates": new_rates} if new_rates else {}),
             }
             on_disk = disk_columns(identity, row_bytes, len(dataset), pieces, cache)
             columns = {key: values.to(device) for key, values in on_disk.items()}
@@ -80,7 +85,12 @@ def read_dataset(
     return columns, starts, ends
 
 
-def choose_place(place: str, dataset: LeRobotDataset | LongDataset, keys: Iterable[str] | None = None) -> str:
+def choose_place(
+    place: str,
+    dataset: LeRobotDataset | LongDataset,
+    keys: Iterable[str] | None = None,
+    sample_rates: Mapping[str, int] | None = None,
+) -> str:
     """Where to keep a dataset: "memory" or "disk". "auto" is memory where its frames fill at most half of what is free.
 
     Raises:
@@ -90,7 +100,8 @@ def choose_place(place: str, dataset: LeRobotDataset | LongDataset, keys: Iterab
         raise ValueError(f"--store={place} is not known: wanted one of {', '.join(PLACES)}.")
     if place != "auto":
         return place
-    n_bytes = sum(map(_row_bytes, _select_features(dataset, keys).values())) * len(dataset)
+    kept = features_at(_select_features(dataset, keys), sample_rates or {}, dataset.fps)
+    n_bytes = sum(map(_row_bytes, kept.values())) * len(dataset)
     return "memory" if n_bytes <= _MEMORY_SHARE * available_memory() else "disk"
 
 
@@ -98,12 +109,16 @@ def _pieces(
     dataset: LeRobotDataset | LongDataset,
     video_backend: str | None,
     image_size: int | None,
+    sample_rates: Mapping[str, int],
     bar: tqdm,
     key: str,
     first: int,
 ) -> Iterator[np.ndarray]:
-    """A column from row `first` on, pictures at the size at which they are kept."""
+    """A column from row `first` on, pictures and sound at the size and the rate at which they are kept."""
     dtype = dataset.meta.features[key]["dtype"]
+    if key in sample_rates:
+        yield from resampled_pieces(dataset, key, sample_rates[key], first)
+        return
     if dtype not in _CAMERA_DTYPES:
         yield from value_pieces(dataset, key, first)
         return
@@ -149,8 +164,7 @@ def _row_bytes(feature: Mapping[str, Any], image_size: int | None = None) -> int
     """Of a camera kept at `image_size`, at most."""
     dtype, shape = feature["dtype"], tuple(feature["shape"])
     if dtype in _CAMERA_DTYPES:
-        channels, height, width = shape if shape[0] in (1, 3) else (shape[2], *shape[:2])
-        return channels * math.prod((height, width) if image_size is None else shrunk_size(height, width, image_size))
+        return math.prod(kept_shape(shape, image_size))
     return math.prod(shape) * (4 if dtype.startswith("float") else np.dtype(dtype).itemsize)
 
 

@@ -1,4 +1,4 @@
-"""Rows of a store's columns: in LeRobot's dtypes, and written behind the last ones."""
+"""Rows of a store's columns: in LeRobot's dtypes, on its device, and written behind the last ones."""
 
 import numpy as np
 import torch
@@ -18,6 +18,13 @@ def as_lerobot_has(rows: Tensor) -> Tensor:
     if rows.dtype == torch.uint8:
         return torch.from_numpy(np.divide(values, np.float32(255), dtype=np.float32))
     return torch.from_numpy(values.astype(np.int64))
+
+
+def sent_to(device: torch.device, values: Tensor) -> Tensor:
+    """Small numbers of the host, on a device; nothing waits for them."""
+    if device.type == "cuda":
+        return values.pin_memory().to(device, non_blocking=True)
+    return values.to(device)
 
 
 def write_rows(values: Tensor, position: int, new: Tensor) -> Tensor:

@@ -35,25 +35,39 @@ def value_pieces(dataset: LeRobotDataset | LongDataset, key: str, first: int = 0
     Raises:
         ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values.
     """
-    shape = tuple(dataset.meta.features[key]["shape"])
-    shape = () if shape == (1,) else shape  # LeRobot keeps one value per row as a scalar
+    shape = _row_shape(dataset, key)
     column = dataset.hf_dataset.data.column(key)
     rows = max(_VALUES_AT_ONCE // max(math.prod(shape), 1), 1)
     finite = np.ones(len(column), bool)
     for position in range(first, len(column), rows):
-        part = column.slice(position, rows)
-        try:
-            read = column_to_numpy(part).reshape(len(part), *shape)
-        except ValueError as error:
-            raise ValueError(
-                f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
-                "Record the damaged episodes again, or leave them out with --dataset.episodes."
-            ) from error
+        read = read_rows(dataset, key, position, rows)
         if np.issubdtype(read.dtype, np.floating):
             read = read.astype(np.float32, copy=False)
             finite[position : position + rows] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
         yield read
     check_finite(finite, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
+
+
+def read_rows(dataset: LeRobotDataset | LongDataset, key: str, first: int, n: int) -> np.ndarray:
+    """At most n rows of a numeric column from row `first` on, (n,) or (n, *shape), as they are stored.
+
+    Raises:
+        ValueError: If rows are missing, or differ from the feature's shape.
+    """
+    shape, column = _row_shape(dataset, key), dataset.hf_dataset.data.column(key)
+    part = column.slice(first, n)
+    try:
+        return column_to_numpy(part).reshape(len(part), *shape)
+    except ValueError as error:
+        raise ValueError(
+            f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
+            "Record the damaged episodes again, or leave them out with --dataset.episodes."
+        ) from error
+
+
+def _row_shape(dataset: LeRobotDataset | LongDataset, key: str) -> tuple[int, ...]:
+    shape = tuple(dataset.meta.features[key]["shape"])
+    return () if shape == (1,) else shape  # LeRobot keeps one value per row as a scalar
 
 
 def check_finite(finite: np.ndarray, key: str, episode_index: np.ndarray) -> None:

@@ -14,6 +14,8 @@ What is trained on
   --dataset.root=null          its folder; else LeRobot's cache, or the Hub
   --dataset.episodes=null      only these, like [0,1,2]
   --dataset.eval_split=0.0     share of the episodes that are held out
+  --mix=[]                     further datasets at once, like [{repo_id: me/other, weight: 0.5}]:
+                               0.5 runs of it for every one of --dataset
   --store=auto                 where frames are kept: memory, disk (files, found again by the
                                next run), or auto: memory where they fill half of it at most
   --store.device=null          cpu or cuda; else cuda where there is room

@@ -1,6 +1,7 @@
 """What `playbyear-train` can be told: all of `lerobot-train`'s options, and a few of its own."""
 
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from lerobot.utils.utils import flatten_dict
 OWN_CONFIG_NAME = "playbyear_train_config.json"
 """File beside `train_config.json` that holds the options which lerobot-train does not know."""
 
-_OWN_FIELDS = ("preset", "sampling", "store", "compile")
+_OWN_FIELDS = ("preset", "sampling", "store", "mix", "compile")
 
 
 @dataclass
@@ -62,8 +63,35 @@ class StoreConfig:
 
 
 @dataclass
+class MixConfig:
+    """One more dataset to learn from.
+
+    Attributes:
+        repo_id: Its name.
+        root: Its folder; None: LeRobot's cache, or the Hub.
+        revision: Of the dataset on the Hub.
+        episodes: Only these; None: all.
+        weight: How many runs are drawn from it for every one of `--dataset`, whatever the sizes of both.
+    """
+
+    repo_id: str
+    root: str | None = None
+    revision: str | None = None
+    episodes: list[int] | None = None
+    weight: float = 1.0
+
+    def check(self) -> None:
+        """Raise a ValueError if the weight is out of its range."""
+        if not 0 < self.weight < math.inf:
+            raise ValueError(
+                f"--mix: the weight of '{self.repo_id}' must be above 0 and finite, got {self.weight}. It is how many runs are "
+                "drawn from it for every one of --dataset."
+            )
+
+
+@dataclass
 class PlaybyearTrainConfig(TrainPipelineConfig):
-    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*`, `--store.*` and `--compile`.
+    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*`, `--store.*`, `--mix` and `--compile`.
 
     A checkpoint keeps lerobot-train's options in its `train_config.json` and the others in a file of their own, so
     that lerobot-train can resume what playbyear-train began, and the other way round.
@@ -72,6 +100,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         preset: A named set of defaults, see `lerobot_playbyear.training.presets`.
         sampling: Which moments are learned from more often.
         store: Where the dataset is kept.
+        mix: Further datasets that are learned from at the same time.
         compile: Whether torch compiles the encoders and the head: a minute or more before the first update, and faster
             ones on a GPU.
     """
@@ -79,6 +108,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
     preset: str | None = None
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
+    mix: list[MixConfig] = field(default_factory=list)
     compile: bool = False
 
     def validate(self) -> None:
@@ -89,7 +119,6 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         """
         refused = {
             "--job.target": self.job.is_remote,
-            "--dataset.streaming": self.dataset.streaming,
             "--dataset.image_transforms.enable": self.dataset.image_transforms.enable,
             "--reward_model": self.is_reward_model_training,
             "--peft": self.peft is not None,
@@ -98,7 +127,14 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         for option, is_used in refused.items():
             if is_used:
                 raise ValueError(f"{option} does not work in playbyear-train: leave it out, or use lerobot-train.")
+        if self.dataset.streaming:
+            raise ValueError(
+                "--dataset.streaming does not work in playbyear-train: give --store=disk, which keeps decoded frames in files "
+                "instead of in memory, or use lerobot-train."
+            )
         self.sampling.check()
+        for other in self.mix:
+            other.check()
         super().validate()
 
     def _save_pretrained(self, save_directory: Path) -> None:

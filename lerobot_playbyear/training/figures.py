@@ -7,7 +7,7 @@ import torch
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from torch import Tensor
 
-from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.mixture import Windowed
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -26,14 +26,14 @@ class Figures:
     """
 
     def __init__(
-        self, batch_size: int, store: EpisodeStore, step: int = 0, accelerator: "Accelerator | None" = None
+        self, batch_size: int, store: Windowed, step: int = 0, accelerator: "Accelerator | None" = None
     ) -> None:
         meters = {
-            "loss": AverageMeter("loss", ":.3f"),
+            "loss": AverageMeter("loss", ":.3f", reduction="mean"),
             "grad_norm": AverageMeter("grdn", ":.3f"),
             "lr": AverageMeter("lr", ":0.1e"),
-            "update_s": AverageMeter("updt_s", ":.3f"),
-            "dataloading_s": AverageMeter("data_s", ":.3f"),
+            "update_s": AverageMeter("updt_s", ":.3f", reduction="max"),
+            "dataloading_s": AverageMeter("data_s", ":.3f", reduction="max"),
         }
         if torch.cuda.is_available():
             meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")

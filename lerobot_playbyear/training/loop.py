@@ -21,11 +21,13 @@ from torch import Tensor
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.datasets.errors import errors_of_input
+from lerobot_playbyear.datasets.mixture import StoreMixture, Windowed
 from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
+from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
 from lerobot_playbyear.training.parts import TrainingParts, make_training_parts
 from lerobot_playbyear.training.prefetch import pinned, prefetched
 from lerobot_playbyear.training.processes import make_accelerator, share_of
@@ -53,7 +55,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     init_logging()
     with errors_of_input(FileNotFoundError, MemoryError):
         cfg.validate()
-        check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
+        for each in (cfg.dataset, *cfg.mix):
+            check_dataset_files(each.repo_id, each.root, each.revision)
         if cfg.policy is not None and cfg.policy.push_to_hub:
             warn_without_login()
         if cfg.policy is None:
@@ -66,19 +69,24 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         _configure_backends(cfg)
         with accelerator.main_process_first():  # it downloads, and the others find what is there
             dataset, held_out = make_train_eval_datasets(cfg)
-        parts = make_training_parts(cfg, dataset.meta, accelerator=accelerator)
+            datasets = [dataset, *open_mix(cfg)]
+        meta = learned_meta(cfg, *(each.meta for each in datasets))
+        parts = make_training_parts(cfg, meta, accelerator=accelerator)
         if cfg.seed is not None and accelerator.num_processes > 1:
             set_seed(cfg.seed + accelerator.process_index)  # each its own noise
-        windows = PolicyWindows(parts.policy.config, dataset.meta, cfg.rename_map)
-        store = read_store(dataset, windows, cfg)
+        config = accelerator.unwrap_model(parts.policy).config
+        windows = PolicyWindows(config, meta, cfg.rename_map)
+        stores = [read_store(each, windows, cfg) for each in datasets]
         validation_store = None if held_out is None or cfg.eval_steps <= 0 else read_store(held_out, windows, cfg)
 
-    reach = Reach(parts.policy.config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
-    reach.warn(store.column(ACTION), f"the dataset '{cfg.dataset.repo_id}'")
-    weights = run_weights(store, windows.n_windows, frame_weights(store, cfg.sampling))
-    sampler = RunSampler(weights, cfg.seed or 0)
+    reach = Reach(config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
+    for each, part in zip(datasets, stores, strict=True):
+        reach.warn(part.column(ACTION), f"the dataset '{each.repo_id}'")
+    store = stores[0] if len(stores) == 1 else StoreMixture(stores)
+    weights = [run_weights(part, windows.n_windows, frame_weights(part, cfg.sampling)) for part in stores]
+    sampler = RunSampler(mixed_weights(weights, cfg), cfg.seed or 0)
     sampler.load_state_dict({**sampler.state_dict(), "n_batches": parts.step})
-    _log_start(cfg, parts, store)
+    _log_start(cfg, parts)
     with Report(cfg, store, parts) as report:
         _loop(cfg, parts, windows, store, sampler, validation_store, report)
     if accelerator.is_main_process:
@@ -116,7 +124,7 @@ def _loop(
     cfg: PlaybyearTrainConfig,
     parts: TrainingParts,
     windows: PolicyWindows,
-    store: EpisodeStore,
+    store: Windowed,
     sampler: RunSampler,
     validation_store: EpisodeStore | None,
     report: Report,
@@ -146,7 +154,7 @@ def _batches(
     cfg: PlaybyearTrainConfig,
     accelerator: "Accelerator",
     windows: PolicyWindows,
-    store: EpisodeStore,
+    store: Windowed,
     sampler: RunSampler,
 ) -> Iterator[dict[str, Any]]:
     """This process's share of every batch. All draw the same runs, so that together they have those of one process."""
@@ -169,7 +177,7 @@ def read_store(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTr
     """
     start = time.perf_counter()
     options = cfg.store
-    place = choose_place(options.place, dataset, windows.keys)
+    place = choose_place(options.place, dataset, windows.keys, windows.sample_rates)
     store = EpisodeStore.from_dataset(
         dataset,
         windows.keys,
@@ -177,8 +185,9 @@ def read_store(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTr
         cfg.dataset.video_backend,
         progress=not inside_slurm(),
         place=place,
-        image_size=windows.image_size if place == "disk" else None,
+        image_size=windows.image_size if place == "disk" or cfg.mix else None,  # those of several are equally large
         cache=None if options.cache is None else Path(options.cache),
+        sample_rates=windows.sample_rates,
     )
     where = f"on the disk, {store.device}" if place == "disk" else f"in memory, {store.device}"
     logging.info(
@@ -194,7 +203,7 @@ def _configure_backends(cfg: PlaybyearTrainConfig) -> None:
     torch.backends.cuda.matmul.allow_tf32 = True
 
 
-def _log_start(cfg: PlaybyearTrainConfig, parts: TrainingParts, store: EpisodeStore) -> None:
+def _log_start(cfg: PlaybyearTrainConfig, parts: TrainingParts) -> None:
     n_parameters = sum(p.numel() for p in parts.policy.parameters() if p.requires_grad)
     logging.info(
         f"{format_big_number(n_parameters)} parameters on {parts.accelerator.device}, steps {parts.step} to {cfg.steps} "

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_playbyear.compat import WandBLogger
-from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.mixture import Windowed
 from lerobot_playbyear.hub.training_run import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.figures import Figures
@@ -92,7 +92,7 @@ class Progress(abc.ABC):
 class Report(Progress):
     """Tells a person, a file and W&B how training goes."""
 
-    def __init__(self, cfg: PlaybyearTrainConfig, store: EpisodeStore, parts: TrainingParts) -> None:
+    def __init__(self, cfg: PlaybyearTrainConfig, store: Windowed, parts: TrainingParts) -> None:
         super().__init__(cfg, parts, cfg.steps, parts.step, "step", "Training")
         self._path = Path(str(cfg.output_dir)) / METRICS_NAME
         self._path.parent.mkdir(parents=True, exist_ok=True)

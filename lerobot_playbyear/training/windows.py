@@ -8,7 +8,9 @@ from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_playbyear.datasets import EpisodeStore, audio_keys
+from lerobot_playbyear.datasets import audio_keys
+from lerobot_playbyear.datasets.mixture import Windowed
+from lerobot_playbyear.datasets.resampling import sample_rate_in
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 
@@ -20,7 +22,7 @@ class PolicyWindows:
 
     Args:
         policy: The policy's configuration, complete with its features.
-        meta: The dataset's metadata.
+        meta: The dataset's metadata; of sound at the rate at which it is to be cut out.
         rename_map: The dataset's names of observations, with what the policy calls them.
 
     Attributes:
@@ -33,6 +35,7 @@ class PolicyWindows:
     def __init__(
         self, policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
     ) -> None:
+        self._meta = meta
         self._as_lerobot = not isinstance(policy, PlaybyearConfig)
         if isinstance(policy, PlaybyearConfig):
             names = dataset_names(policy, rename_map)
@@ -50,7 +53,13 @@ class PolicyWindows:
         """The features that a store has to hold; None means all that it can."""
         return None if self._as_lerobot else list(self._deltas)
 
-    def batch(self, store: EpisodeStore, last_frames: Tensor) -> dict[str, Any]:
+    @property
+    def sample_rates(self) -> dict[str, int]:
+        """The rate at which each microphone is cut out [Hz]; of those alone whose feature says it."""
+        rates = {key: sample_rate_in(self._meta.features[key]) for key in audio_keys(self._meta.features)}
+        return {key: rate for key, rate in rates.items() if rate is not None}
+
+    def batch(self, store: Windowed, last_frames: Tensor) -> dict[str, Any]:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""
         return store.windows(last_frames, self._deltas, as_lerobot=self._as_lerobot)
 
