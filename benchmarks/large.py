@@ -50,7 +50,7 @@ def under_limit(root: Path, cache: Path, folder: Path, args: argparse.Namespace)
         *(sys.executable, "-m", "lerobot_playbyear.scripts.train", "--policy.type=playbyear", "--policy.device=cpu"),
         *(f"--policy.fps={FPS}", f"--policy.image_size={args.image_size}", "--policy.vision_width=16"),
         *("--policy.push_to_hub=false", f"--dataset.repo_id={REPO_ID}", f"--dataset.root={root}"),
-        *("--dataset.video_backend=pyav", "--store=disk", f"--store.cache={cache}", "--steps=20", "--batch_size=4"),
+        *("--dataset.video_backend=pyav", "--store=disk", f"--store.cache={cache}", "--steps=20", "--batch_size=1"),
         *("--log_freq=5", "--save_freq=20", f"--output_dir={folder / 'train'}"),
     ]
     shutil.rmtree(folder / "train", ignore_errors=True)
@@ -60,6 +60,7 @@ def under_limit(root: Path, cache: Path, folder: Path, args: argparse.Namespace)
     rows = []
     for name, command in (("building the store", build), ("training from it, 20 updates", train)):
         result = measure(name, command, minutes, limit, {"HF_HOME": str(folder / "home")})
+        print(result, flush=True)
         if result.failure:
             raise RuntimeError(f"{name}: {result.failure}; see {folder}")
         wanted = f"under {args.limit_gib:g} GiB"

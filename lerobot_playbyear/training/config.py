@@ -52,7 +52,7 @@ class StoreConfig:
 
     Attributes:
         place: "memory"; "disk" for files that are mapped into memory, with pictures no larger than the policy looks at them;
-            "auto" is memory where the recorded frames fill at most half of what is free.
+            "auto" is memory where the recorded frames fill at most half of what is free and one process trains.
         device: "cpu" or "cuda"; None means the GPU when at most half of its free memory is needed, otherwise the CPU.
         cache: Folder of the files; None means one beside LeRobot's cache.
     """

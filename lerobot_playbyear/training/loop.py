@@ -76,8 +76,10 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
             set_seed(cfg.seed + accelerator.process_index)  # each its own noise
         config = accelerator.unwrap_model(parts.policy).config
         windows = PolicyWindows(config, meta, cfg.rename_map)
-        stores = [read_store(each, windows, cfg) for each in datasets]
-        validation_store = None if held_out is None or cfg.eval_steps <= 0 else read_store(held_out, windows, cfg)
+        is_shared = accelerator.num_processes > 1
+        stores = [read_store(each, windows, cfg, is_shared) for each in datasets]
+        is_validated = held_out is not None and cfg.eval_steps > 0
+        validation_store = read_store(held_out, windows, cfg, is_shared) if is_validated else None
 
     reach = Reach(config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
     for each, part in zip(datasets, stores, strict=True):
@@ -169,15 +171,24 @@ def _batches(
     return iter(cut, None)
 
 
-def read_store(dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTrainConfig) -> EpisodeStore:
+def read_store(
+    dataset: LeRobotDataset, windows: PolicyWindows, cfg: PlaybyearTrainConfig, is_shared: bool = False
+) -> EpisodeStore:
     """What a policy learns from, in memory or on the disk.
+
+    Args:
+        dataset: The dataset.
+        windows: Say what of it is needed.
+        cfg: The options of the run.
+        is_shared: Whether several processes read it: files are in memory once, and "auto" takes them.
 
     Raises:
         ValueError, MemoryError: As `EpisodeStore.from_dataset`.
     """
     start = time.perf_counter()
     options = cfg.store
-    place = choose_place(options.place, dataset, windows.keys, windows.sample_rates)
+    wanted = "disk" if is_shared and options.place == "auto" else options.place
+    place = choose_place(wanted, dataset, windows.keys, windows.sample_rates)
     store = EpisodeStore.from_dataset(
         dataset,
         windows.keys,
