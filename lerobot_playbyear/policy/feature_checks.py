@@ -33,8 +33,8 @@ def sample_rate_of(features: Mapping[str, Any], config: "PlaybyearConfig") -> in
             )
         if wanted is not None and int(seen) != wanted:
             raise ValueError(
-                f"{key} was recorded at {seen} Hz, but the policy is configured for {wanted} Hz: set "
-                f"--policy.sample_rate={seen}, or train a new policy for this dataset."
+                f"{key} was recorded at {seen} Hz, but the policy is configured for {wanted} Hz: train with "
+                f"playbyear-train, which resamples, or a new policy with --policy.sample_rate={seen}."
             )
         wanted = int(seen)
         _check_samples(key, int(feature["shape"][0]), wanted, config.fps)

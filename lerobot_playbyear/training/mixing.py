@@ -73,7 +73,8 @@ def learned_meta(
     meta.info = copy.copy(main.info)
     meta.info.features = features
     if others:
-        meta.stats = {**main.stats, **_common_statistics([main, *others], cfg.dataset.use_imagenet_stats, used)}
+        common = _common_statistics([main, *others], cfg.dataset.use_imagenet_stats, used)
+        meta.stats = {**(main.stats or {}), **common}
     return meta
 
 
