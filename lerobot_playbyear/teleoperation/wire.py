@@ -1,26 +1,40 @@
-"""How the control loop and the window's process talk: whole objects through pipes, of which only the newest picture counts."""
+"""How the control loop and the window's process talk: lines of JSON through pipes, with a picture behind the line of a status."""
 
-import pickle
+import json
 import threading
+from dataclasses import asdict
 from typing import IO, Any
 
 import numpy as np
 
-from lerobot_playbyear.teleoperation.status import Status
+from lerobot_playbyear.teleoperation.status import Control, Status
 
 
-def send(stream: IO[bytes], message: Any) -> None:
-    """Write one message, whatever pickle can hold."""
-    pickle.dump(message, stream, pickle.HIGHEST_PROTOCOL)
+def send(stream: IO[bytes], message: dict[str, Any] | tuple[Status, np.ndarray | None]) -> None:
+    """Write one message: what json can hold, or a status with a picture (H, W, 3) uint8 or None."""
+    status, picture = message if isinstance(message, tuple) else (None, None)
+    line = {"status": asdict(status), "has_picture": picture is not None} if status is not None else message
+    stream.write(json.dumps(line).encode() + b"\n")
+    if picture is not None:
+        np.lib.format.write_array(stream, picture, allow_pickle=False)
     stream.flush()
 
 
 def receive(stream: IO[bytes]) -> Any:
     """Read one message. None: the other side is gone."""
-    try:
-        return pickle.load(stream)
-    except (EOFError, pickle.UnpicklingError):
+    line = stream.readline()
+    if not line.endswith(b"\n"):
         return None
+    message = json.loads(line)
+    if "status" not in message:
+        return message
+    try:
+        picture = np.lib.format.read_array(stream, allow_pickle=False) if message["has_picture"] else None
+    except ValueError:  # cut off
+        return None
+    values = message["status"]
+    values |= {"control": Control(values["control"]), "keys": [(key, meaning) for key, meaning in values["keys"]]}
+    return Status(**values), picture
 
 
 class Newest:
