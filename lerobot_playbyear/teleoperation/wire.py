@@ -1,4 +1,4 @@
-"""How the control loop and the window's process talk: lines of JSON through pipes, with a picture behind the line of a status."""
+"""How the control loop and the window's process talk: lines of JSON through pipes, a picture behind the line of a status."""
 
 import json
 import threading
