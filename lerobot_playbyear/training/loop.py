@@ -95,6 +95,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         print_results(cfg, report.success)
         if cfg.policy.push_to_hub:
             _push(cfg, parts)
+    accelerator.wait_for_everyone()  # gloo may hang if a group ends while a sum of tensors has just been made
     accelerator.end_training()
     return Path(str(cfg.output_dir))
 
