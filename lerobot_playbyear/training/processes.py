@@ -74,12 +74,21 @@ class Orders:
 
     def take(self) -> dict[str, Any] | None:
         """Waits for the next order, in another process; None when there are no more."""
-        return self._scatter(None)
+        order: dict[str, Any] | None = self._scatter(None)
+        if order is None:
+            self._leave()
+        return order
 
     def end(self) -> None:
         """There are no more."""
         if self._group is not None:
             self._scatter([None] * self._accelerator.num_processes)
+            self._leave()
+
+    def _leave(self) -> None:
+        """All at once: gloo may hang where a group ends while another process still speaks."""
+        distributed.barrier(self._group)
+        self._accelerator.end_training()
 
     def _scatter(self, orders: list[Any] | None) -> Any:
         received: list[Any] = [None]
