@@ -28,6 +28,7 @@ from windows import drawing
 
 from lerobot_playbyear.datasets import EpisodeStore, audio_keys
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.training.heap import keep_freed_memory
 
 REPO_ID = "benchmark/large"
 WANTED_SHARE, WANTED_TIMES, WANTED_FRAMES = 0.8, 100, 20_000
@@ -135,11 +136,13 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30, help="of an episode")
     parser.add_argument("--image_size", type=int, default=224, help="pixels, of the policy")
     parser.add_argument("--limit_gib", type=float, default=4)
+    parser.add_argument("--draw", action="store_true", help="only draw windows, from the store in --folder")
     parser.add_argument("--build", action="store_true", help="only make the store; a part of the benchmark")
     args = parser.parse_args()
     if args.build:
         load(args.folder / "data", args.folder / "cache", args.image_size)
         return
+    keep_freed_memory()  # as playbyear-train does
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", os.cpu_count() or 1)))
     started = machine()
     with tempfile.TemporaryDirectory() as temporary:
@@ -147,8 +150,8 @@ def main() -> None:
         root, cache = folder / "data", folder / "cache"
         if not (root / "meta" / "info.json").is_file():
             make_episodes(root, args.episodes, round(args.seconds * FPS), folder / "sound" / "0.wav")
-        rows = under_limit(root, cache, folder, args)
-        report("large", [*rows, *drawn(root, cache, args)], args.output, started)
+        rows = [] if args.draw else under_limit(root, cache, folder, args)
+        report("large draws" if args.draw else "large", [*rows, *drawn(root, cache, args)], args.output, started)
 
 
 if __name__ == "__main__":
