@@ -111,13 +111,20 @@ def drawn(root: Path, cache: Path, args: argparse.Namespace) -> list[Row]:
             holds=rates["disk"] >= WANTED_SHARE * rates["memory"],
         ),
         Row(
-            f"the same over all {disk.nbytes / GIB:.1f} GiB",
-            rates["all"],
+            "the same",
+            rates["disk"],
             "items/s",
             beside="stock LeRobotDataset",
             theirs=rates["stock"],
             wanted=f"at least {WANTED_TIMES} times",
-            holds=rates["all"] >= WANTED_TIMES * rates["stock"],
+            holds=rates["disk"] >= WANTED_TIMES * rates["stock"],
+        ),
+        Row(
+            f"the same over all {disk.nbytes / GIB:.1f} GiB, as far as they are in the page cache",
+            rates["all"],
+            "items/s",
+            beside="stock LeRobotDataset",
+            theirs=rates["stock"],
         ),
         Row(
             f"pictures of {args.image_size} px in batches",
