@@ -63,7 +63,11 @@ def read_dataset(
     device = _choose_device(device, n_bytes)
     n_cameras = sum(feature["dtype"] in _CAMERA_DTYPES for feature in features.values())
     bar = tqdm(
-        total=n_cameras * len(dataset), desc="Reading frames", unit="frame", disable=not (progress and n_cameras)
+        desc="Reading frames",
+        total=n_cameras * len(dataset),
+        unit="frame",
+        delay=1,  # what is there already takes less
+        disable=not (progress and n_cameras),
     )
     with bar:
         pieces = partial(_pieces, dataset, video_backend, image_size, new_rates, bar)
