@@ -204,6 +204,7 @@ def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(
     assert not any(group["fused"] for group in unfused.optimizer.param_groups)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch compiles for a CPU with g++, which is not here")
 def test_a_compiled_policy_learns_the_same(make, batches):
     _, plain = make()

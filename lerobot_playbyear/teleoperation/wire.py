@@ -1,6 +1,7 @@
 """How the control loop and the window's process talk: lines of JSON through pipes, a picture behind the line of a status."""
 
 import json
+import math
 import threading
 from dataclasses import asdict
 from typing import IO, Any
@@ -13,10 +14,11 @@ from lerobot_playbyear.teleoperation.status import Control, Status
 def send(stream: IO[bytes], message: dict[str, Any] | tuple[Status, np.ndarray | None]) -> None:
     """Write one message: what json can hold, or a status with a picture (H, W, 3) uint8 or None."""
     status, picture = message if isinstance(message, tuple) else (None, None)
-    line = {"status": asdict(status), "has_picture": picture is not None} if status is not None else message
+    shape = None if picture is None else picture.shape
+    line = message if status is None else {"status": asdict(status), "shape": shape}
     stream.write(json.dumps(line).encode() + b"\n")
     if picture is not None:
-        np.lib.format.write_array(stream, picture, allow_pickle=False)
+        stream.write(np.ascontiguousarray(picture).data)
     stream.flush()
 
 
@@ -28,10 +30,12 @@ def receive(stream: IO[bytes]) -> Any:
     message = json.loads(line)
     if "status" not in message:
         return message
-    try:
-        picture = np.lib.format.read_array(stream, allow_pickle=False) if message["has_picture"] else None
-    except ValueError:  # cut off
-        return None
+    picture, shape = None, message["shape"]
+    if shape is not None:
+        pixels = stream.read(math.prod(shape))
+        if len(pixels) < math.prod(shape):  # cut off
+            return None
+        picture = np.frombuffer(pixels, np.uint8).reshape(shape)
     values = message["status"]
     values |= {"control": Control(values["control"]), "keys": [(key, meaning) for key, meaning in values["keys"]]}
     return Status(**values), picture
