@@ -26,6 +26,7 @@ from lerobot_playbyear.compat import (
 )
 from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
+from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.windows import dataset_names
 
@@ -81,7 +82,7 @@ class TrainingParts:
         self.step += 1
         figures = {
             **(figures or {}),
-            "loss": loss.detach(),
+            "loss": mean_over_processes(loss.detach()),
             "grad_norm": norm,
             "lr": self.optimizer.param_groups[0]["lr"],
         }
