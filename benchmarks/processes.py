@@ -3,7 +3,7 @@
     python benchmarks/processes.py
 
 Both train from the same store with as many runs per process, through `accelerate launch`. The rate is that of the log, from the
-fifth update on.
+fifth update on. What the machine allows is the sum of two trainings at the same time that know nothing of each other.
 """
 
 import json
@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from common import Row, machine, parser_for, report
@@ -65,6 +66,7 @@ def main() -> None:
     args = parser.parse_args()
     started = machine()
     rates: dict[int, list[float]] = {1: [], 2: []}
+    apart: list[float] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         record(folder / "data", args.image_size)
@@ -72,6 +74,12 @@ def main() -> None:
             for n, measured in rates.items():
                 output = folder / f"{n}-{turn}"
                 measured.append(windows_per_second(n, folder / "data", output, args.image_size, args.steps))
+            with ThreadPoolExecutor() as pool:
+                places = [folder / f"apart{which}-{turn}" for which in range(2)]
+                work = [
+                    pool.submit(windows_per_second, 1, folder / "data", p, args.image_size, args.steps) for p in places
+                ]
+                apart.append(sum(each.result() for each in work))
     one, two = (sorted(values)[len(values) // 2] for values in rates.values())
     row = Row(
         f"training in two processes, {args.image_size} px, width 16",
@@ -79,6 +87,8 @@ def main() -> None:
         "windows/s",
         beside="in one",
         theirs=one,
+        limit_is="two trainings apart",
+        limit=sorted(apart)[len(apart) // 2],
         wanted=f"at least {WANTED} times",
         holds=two >= WANTED * one,
     )
