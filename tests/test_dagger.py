@@ -11,7 +11,6 @@ from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot.scripts.lerobot_eval import rollout
-from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -25,14 +24,7 @@ from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")

@@ -9,23 +9,15 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from safetensors.torch import load_file
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 FEATURES = dataset_features(image_size=16, microphones=())
 BY_EXPERT = "...xx......xxx.......x..."
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,10 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 from dagger_factory import QUICK, arguments, base_folder, command, dagger, metrics
 from dataset_factory import dataset_features, make_dataset, random_frame
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
-from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, loop
@@ -20,14 +18,7 @@ from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes import frames, saving
 from lerobot_playbyear.scripts import dagger as dagger_script
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.mark.parametrize(

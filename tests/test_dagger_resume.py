@@ -29,17 +29,10 @@ from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.training.parts import TrainingParts
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 RUN = (*QUICK, "--episodes=3", "--warmup_episodes=2")
 EVALUATED = ("--eval_every=2", "--eval.n_episodes=1")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +125,6 @@ def test_resuming_where_there_is_nothing_begins(undisturbed, tmp_path):
 
 
 def _run_command(args):
-    from lerobot.utils.import_utils import register_third_party_plugins
 
     torch.set_num_threads(1)
     register_third_party_plugins()

@@ -264,6 +264,24 @@ def test_a_folder_that_cannot_be_written_is_named(root, tmp_path):
         load(root, tmp_path / "file")
 
 
+def test_a_dataset_that_cannot_be_read_now_is_no_fault_of_the_folder(root, tmp_path, monkeypatch):
+    """Nothing is said of --store.cache; what was decoded before stays, and the next run goes on."""
+    pieces = reading._pieces
+    monkeypatch.setattr(disk_columns, "_SAVED_EVERY_S", 0.0)
+
+    def fails(*args):
+        yield from pieces(*args)
+        if args[-2] == CAMERA:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(root / "videos" / "file.mp4"))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(reading, "_pieces", fails)
+        with pytest.raises(OSError, match=r"Input/output error.*file\.mp4") as raised:
+            load(root, tmp_path)
+    assert not isinstance(raised.value, CacheError)
+    assert_same(load(root, tmp_path), in_memory(root))
+
+
 def test_an_unknown_place_is_refused(root):
     dataset = open_dataset("tests/noise", root, video_backend="pyav")
     with pytest.raises(ValueError, match="--store=tape is not known: wanted one of memory, disk, auto"):

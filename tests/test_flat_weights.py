@@ -13,7 +13,6 @@ from dataset_factory import make_dataset
 from lerobot.configs import parser
 from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from lerobot.scripts import lerobot_train
-from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors import safe_open
 from safetensors.torch import load_file
 from test_policy_contract import make_config, make_policy
@@ -22,6 +21,8 @@ from torch import nn
 
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training import loop
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 train = parser.wrap()(loop.train)
 
@@ -53,15 +54,6 @@ def flatten(lstm):
 @pytest.fixture
 def one_buffer(monkeypatch):
     monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture(scope="module")

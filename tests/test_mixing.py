@@ -12,7 +12,6 @@ from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
 from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
@@ -23,6 +22,8 @@ from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.config import MixConfig, PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.loop import frame_weights
 from lerobot_playbyear.training.mixing import learned_meta, mixed_weights
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 train = parser.wrap()(loop.train)
 
@@ -41,15 +42,6 @@ TINY = (
     "--num_workers=0",
     "--batch_size=4",
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture(scope="module")

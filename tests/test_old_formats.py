@@ -8,28 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_train
-from lerobot.utils.import_utils import register_third_party_plugins
 from old_formats.make import ENV, act
 from safetensors.torch import load_file
 
 from lerobot_playbyear.scripts import dagger, inspect, record, repair, train
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 ARCHIVE = Path(__file__).parent / "old_formats" / "0.1.0.tar.gz"
 CHECKPOINT = Path("train/checkpoints/000004")
 FIGURES = ("loss", "grad_norm")
 """Of a line of figures: what tells whether weights, optimizer and random numbers are those that were saved."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture(autouse=True)

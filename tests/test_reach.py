@@ -12,13 +12,14 @@ from lerobot.configs import parser
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
-from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.reach import Reach
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 train = parser.wrap()(loop.train)
 
@@ -35,15 +36,6 @@ TINY = (
     "--batch_size=2",
     "--steps=1",
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 def write(root, actions, by_expert=None):

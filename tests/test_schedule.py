@@ -8,25 +8,17 @@ import torch
 from dataset_factory import dataset_features, make_dataset
 from lerobot.configs import parser
 from lerobot.scripts import lerobot_train
-from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.presets import apply_preset
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 train = parser.wrap()(loop.train)
 
 TINY = ("--policy.device=cpu", "--policy.push_to_hub=false", "--policy.audio_window_s=0.9", "--num_workers=0")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture

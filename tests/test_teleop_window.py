@@ -8,11 +8,9 @@ from importlib.util import find_spec
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from dagger_factory import arguments, base_folder, column, corrections, metrics
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
-from lerobot.utils.import_utils import register_third_party_plugins
 from virtual_screen import MISSING, VirtualScreen, wait_for
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -29,20 +27,14 @@ from lerobot_playbyear.teleoperation.panel import FRAME
 from lerobot_playbyear.teleoperation.status import Control
 from lerobot_playbyear.teleoperation.window import Window
 
-pytestmark = pytest.mark.skipif(
-    bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (Debian: apt-get install xvfb xdotool)"
-)
+pytestmark = [
+    pytest.mark.usefixtures("one_thread"),
+    pytest.mark.skipif(
+        bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (Debian: apt-get install xvfb xdotool)"
+    ),
+]
 _TITLE = "Play it by ear"
 _MOVES = {"Right": (0, 1), "Up": (1, 1), "d": (2, -1)}  # X's names of keys: axis of the environment, sign
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_train
-from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from torch.utils.data import default_collate
 
@@ -26,6 +25,8 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConf
 from lerobot_playbyear.training.loop import frame_weights
 from lerobot_playbyear.training.presets import PRESETS, RECIPES, apply_preset, preset_options
 from lerobot_playbyear.training.windows import PolicyWindows
+
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 train = parser.wrap()(loop.train)
 
@@ -42,16 +43,6 @@ TINY = (
     "--num_workers=0",
     "--batch_size=4",
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    """Networks this small only lose by waking threads."""
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from dataset_factory import make_dataset
 from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_train import update_policy
-from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from safetensors.torch import load_file
 from test_fake_cuda import Waits, move_to_card, on_card, without_cudnn
+from test_train_command import TINY
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -26,29 +26,9 @@ from lerobot_playbyear.training.parts import make_training_parts
 from lerobot_playbyear.training.prefetch import prefetched
 from lerobot_playbyear.training.windows import PolicyWindows
 
-TINY = (
-    "--policy.type=playbyear",
-    "--policy.device=cpu",
-    "--policy.push_to_hub=false",
-    "--policy.image_size=32",
-    "--policy.vision_width=8",
-    "--policy.audio_window_s=0.9",
-    "--policy.n_memory_steps=3",
-    "--policy.n_supervised_steps=4",
-    "--policy.hidden_size=64",
-    "--policy.audio_noise_db=6",
-    "--batch_size=4",
-    "--steps=20",
-)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    register_third_party_plugins()
-    n_threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(n_threads)
+NOISY = ("--policy.n_supervised_steps=4", "--policy.audio_noise_db=6", "--steps=20")
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +43,7 @@ def make(dataset, monkeypatch, tmp_path):
     """Makes the parts of a training, with the same weights each time."""
 
     def parts(*options):
-        arguments = [*TINY, "--dataset.repo_id=tests/noise", f"--dataset.root={dataset.root}", *options]
+        arguments = [*TINY, *NOISY, "--dataset.repo_id=tests/noise", f"--dataset.root={dataset.root}", *options]
         monkeypatch.setattr(sys, "argv", ["train", *arguments])
 
         @parser.wrap()

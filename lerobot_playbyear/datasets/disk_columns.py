@@ -92,7 +92,17 @@ def _telling(cache: Path) -> Iterator[None]:
                 f"The disk of '{cache}' became full; what was decoded stays, and the next run goes on with it. Make room, "
                 "or name a folder on another disk with --store.cache."
             ) from error
+        if not _concerns(error, cache):  # the dataset cannot be read now, which another folder would not mend
+            raise
         raise CacheError(f"'{cache}' cannot be used ({error}): name another folder with --store.cache.") from error
+
+
+def _concerns(error: OSError, cache: Path) -> bool:
+    """Whether an error is about the cache's folder, something in it, or a folder that it lies in."""
+    if not isinstance(error.filename, str | os.PathLike):
+        return False
+    path = Path(error.filename)
+    return path == cache or cache in path.parents or path in cache.parents
 
 
 @contextlib.contextmanager

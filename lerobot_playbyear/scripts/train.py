@@ -36,7 +36,7 @@ How
   --sampling.start_weight=1.0  how often the first frames of episodes are drawn, as a factor
   --sampling.loud_weight=1.0   the same for frames after a sudden sound
   --policy.use_amp=false       bfloat16 or float16 where the machine computes in it
-  --compile=false              compile the network first; faster updates on a GPU
+  --compile=false              compile the network first; meant for a GPU, not measured yet
 
 What comes of it
   --output_dir=null            folder of checkpoints and figures; must not be there yet

@@ -101,8 +101,8 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         sampling: Which moments are learned from more often.
         store: Where the dataset is kept.
         mix: Further datasets that are learned from at the same time.
-        compile: Whether torch compiles the encoders and the head: a minute or more before the first update, and faster
-            ones on a GPU.
+        compile: Whether torch compiles the encoders and the head, which takes a minute or more before the first update. Meant
+            for GPUs; what it is worth there was not measured.
     """
 
     preset: str | None = None

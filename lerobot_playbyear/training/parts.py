@@ -15,6 +15,7 @@ from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import OBS_STR
+from lerobot.utils.utils import has_method
 
 from lerobot_playbyear.compat import (
     eval_policy_all,
@@ -77,8 +78,9 @@ class TrainingParts:
         self.optimizer.zero_grad()
         if self.scheduler is not None:
             self.scheduler.step()
-        if callable(follow := getattr(self._unwrapped(), "update", None)):  # a policy with buffers of its own
-            follow()
+        unwrapped: Any = self._unwrapped()
+        if has_method(unwrapped, "update"):  # a policy with buffers of its own
+            unwrapped.update()
         self.step += 1
         figures = {
             **(figures or {}),
