@@ -1,0 +1,143 @@
+"""All microphones of a robot: opened card by card, heard tick by tick, watched for what goes wrong."""
+
+import time
+from collections.abc import Hashable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_playbyear.datasets.microphone import DropOut
+from lerobot_playbyear.microphones.card import CardRecording, wait_for_sound
+from lerobot_playbyear.microphones.config import MicrophoneConfig
+from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
+
+_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
+
+
+@dataclass
+class _Card:
+    microphone: Microphone
+    recording: CardRecording
+    latency_s: float
+
+
+class Ears:
+    """The microphones of a robot.
+
+    Args:
+        configs: By their names.
+        fps: Ticks per second [Hz].
+        stalled_s: A card that brings nothing for as long is taken for dead [s].
+        silent_s: A card that gives nothing but zeros for as long is taken for unplugged [s]; 0: never.
+
+    Raises:
+        ValueError: The rate of ticks does not divide a sample rate.
+        MicrophoneError: Microphones of one card are to have different latencies.
+    """
+
+    def __init__(
+        self, configs: Mapping[str, MicrophoneConfig], fps: int, stalled_s: float = 1.0, silent_s: float = 2.0
+    ) -> None:
+        by_card: dict[Hashable, dict[str, MicrophoneConfig]] = {}
+        for name, config in configs.items():
+            by_card.setdefault(config.card, {})[name] = config
+        self._stalled_s, self._silent_s = stalled_s, silent_s
+        self._names = list(configs)
+        self._cards = [_make_card(microphones, fps) for microphones in by_card.values()]
+
+    def connect(self) -> None:
+        """Opens all cards that are not open, and waits for their first sound.
+
+        Raises:
+            MicrophoneError: One cannot be opened, or nothing comes from it. Then none is open.
+        """
+        with ExitStack() as stack:
+            stack.callback(self.disconnect)
+            for card in self._cards:
+                if card.microphone.problem or card.recording.silent_s > self._silent_s > 0:
+                    card.microphone.disconnect()
+                if not card.microphone.is_connected:
+                    card.recording.forget()
+                    card.microphone.connect(card.recording.write)
+            for card in self._cards:
+                if not wait_for_sound(card.recording, _FIRST_SOUND_S):
+                    raise MicrophoneError(
+                        f"From {card.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s. Is it plugged in, and used by no "
+                        "other program? `playbyear-find-microphones` shows whether it hears."
+                    )
+            stack.pop_all()
+
+    def restart(self, now_s: float) -> None:
+        """An episode begins at `now_s` [s of time.perf_counter]."""
+        for card in self._cards:
+            card.recording.restart(now_s + card.latency_s)
+
+    def skip_to(self, now_s: float) -> None:
+        """What was heard until `now_s` belongs to no frame."""
+        for card in self._cards:
+            card.recording.skip_to(now_s + card.latency_s)
+
+    def read(self, until_s: float) -> dict[str, np.ndarray]:
+        """For each microphone (S,) int16: what happened near it up to `until_s`, since the block before.
+
+        Waits for as long as sound needs to come, at most a tenth of a second more.
+        """
+        blocks: dict[str, np.ndarray] = {}
+        for card in self._cards:
+            blocks |= card.recording.read(until_s + card.latency_s)
+        return {name: blocks[name] for name in self._names}
+
+    @property
+    def drop_outs(self) -> dict[str, list[DropOut]]:
+        """Of each microphone, since the episode began."""
+        return {name: list(card.recording.drop_outs) for card in self._cards for name in card.recording.channels}
+
+    @property
+    def latency_s(self) -> float:
+        """Of the slowest [s]."""
+        return max((card.latency_s for card in self._cards), default=0.0)
+
+    @property
+    def problem(self) -> str:
+        """What is wrong, if no more sound comes; empty while all is well."""
+        for card in self._cards:
+            microphone = card.microphone
+            names = ", ".join(card.recording.channels)
+            if microphone.problem:
+                return f"The microphone {names} is gone: {microphone.problem}."
+            if microphone.silent_for_s > self._stalled_s:
+                return f"The microphone {names} has brought nothing for {microphone.silent_for_s:.1f} s."
+            if card.recording.silent_s > self._silent_s > 0:
+                return (
+                    f"The microphone {names} has given nothing but zeros for {card.recording.silent_s:.1f} s: it is muted, or "
+                    "unplugged."
+                )
+        return ""
+
+    def disconnect(self) -> None:
+        """Closes all cards."""
+        for card in self._cards:
+            card.microphone.disconnect()
+
+
+def _make_card(microphones: Mapping[str, MicrophoneConfig], fps: int) -> _Card:
+    first = next(iter(microphones.values()))
+    latencies = {config.latency_s for config in microphones.values()}
+    if len(latencies) > 1:
+        raise MicrophoneError(
+            f"The microphones {', '.join(microphones)} are channels of one card, and have latency_s={sorted(latencies)}: give "
+            "them the same."
+        )
+    channels = {name: config.channel for name, config in microphones.items()}
+    recording = CardRecording(first.sample_rate, fps, channels)
+    return _Card(first.make(max(channels.values()) + 1), recording, first.latency_s)
+
+
+def levels_of(microphone: Microphone, seconds: float) -> np.ndarray:
+    """Listens for a while: all samples that came, (n, channels)."""
+    parts, end = [], time.perf_counter() + seconds
+    while time.perf_counter() < end:
+        time.sleep(0.05)
+        parts.append(microphone.read())
+    return np.concatenate(parts)

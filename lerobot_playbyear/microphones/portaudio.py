@@ -1,0 +1,175 @@
+"""Sound cards through PortAudio."""
+
+import contextlib
+import time
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.microphones.config import PortAudioMicrophoneConfig
+
+_FIND = "`playbyear-find-microphones` lists what there is."
+_OLDEST_S = 1.0  # PortAudio's own times are believed up to this age
+
+
+@dataclass(frozen=True)
+class SoundCard:
+    """A sound card with inputs, as PortAudio sees it.
+
+    Args:
+        number: PortAudio's; it may change when something is plugged in.
+        name: With the name of the sound system.
+        channels: Inputs.
+        sample_rate: The one that it prefers [Hz].
+        is_default: Whether programs that do not ask get it.
+    """
+
+    number: int
+    name: str
+    channels: int
+    sample_rate: int
+    is_default: bool
+
+
+def load_sounddevice() -> ModuleType:
+    """The package `sounddevice`.
+
+    Raises:
+        MicrophoneError: It, or PortAudio, is not installed.
+    """
+    try:
+        import sounddevice  # type: ignore[import-not-found, import-untyped, unused-ignore]
+    except ImportError as error:
+        raise MicrophoneError("Microphones need the package sounddevice: pip install sounddevice.") from error
+    except OSError as error:
+        raise MicrophoneError(
+            f"PortAudio is missing ({error}). Debian, Ubuntu: sudo apt install libportaudio2."
+        ) from error
+    return sounddevice
+
+
+def sound_cards(fresh: bool = False) -> list[SoundCard]:
+    """All cards with inputs.
+
+    Args:
+        fresh: Whether to look for what was plugged in since the first look. No stream may be open then.
+
+    Raises:
+        MicrophoneError: `sounddevice` or PortAudio is not installed, or does not start.
+    """
+    sounddevice = load_sounddevice()
+    try:
+        if fresh:
+            sounddevice._terminate()
+            sounddevice._initialize()
+        systems = sounddevice.query_hostapis()
+        default = sounddevice.default.device[0]
+        return [
+            SoundCard(
+                number,
+                f"{device['name']}, {systems[device['hostapi']]['name']}",
+                int(device["max_input_channels"]),
+                round(device["default_samplerate"]),
+                number == default,
+            )
+            for number, device in enumerate(sounddevice.query_devices())
+            if device["max_input_channels"] > 0
+        ]
+    except sounddevice.PortAudioError as error:
+        raise MicrophoneError(f"PortAudio does not start: {error}.") from error
+
+
+def find_card(wanted: str | int, channels: int) -> SoundCard:
+    """The card that is asked for, and never another one.
+
+    Args:
+        wanted: Its number, its name, or a part of its name that no other card has.
+        channels: How many it needs.
+
+    Raises:
+        MicrophoneError: There is none, or more than one, or it has fewer channels.
+    """
+    cards = sound_cards()
+    listed = "; ".join(f"{card.number}: {card.name}" for card in cards) or "none"
+    text = str(wanted).strip()
+    if not text:
+        raise MicrophoneError(f"device='' of a microphone: name the sound card, of these: {listed}. {_FIND}")
+    if text.isdecimal():
+        found = [card for card in cards if card.number == int(text)]
+    else:
+        exact = [card for card in cards if text in (card.name, card.name.rpartition(", ")[0])]
+        found = exact or [card for card in cards if text.lower() in card.name.lower()]
+    if len(found) != 1:
+        what = "is no sound card with an input" if not found else "fits more than one sound card"
+        raise MicrophoneError(f"device={text!r} {what}. There are: {listed}. {_FIND}")
+    (card,) = found
+    if card.channels < channels:
+        raise MicrophoneError(
+            f"device={text!r}: channel {channels - 1} is asked for, counted from 0, and {card.name} has "
+            f"{card.channels}. {_FIND}"
+        )
+    return card
+
+
+class PortAudioMicrophone(Microphone):
+    """A sound card of this machine.
+
+    Args:
+        config: Its options.
+        channels: How many to open.
+    """
+
+    def __init__(self, config: "PortAudioMicrophoneConfig", channels: int) -> None:
+        super().__init__(f"the microphone {config.device!r}", config.sample_rate, channels)
+        self._config = config
+        self._stream: Any = None
+        self.n_overflows = 0
+
+    def _open(self) -> None:
+        sounddevice, config = load_sounddevice(), self._config
+        card = find_card(config.device, self.channels)
+        try:
+            self._stream = sounddevice.InputStream(
+                samplerate=self.sample_rate,
+                blocksize=max(round(config.block_s * self.sample_rate), 1),
+                device=card.number,
+                channels=self.channels,
+                dtype="int16",
+                latency="low" if config.wait_s is None else config.wait_s,
+                callback=self._take,
+                finished_callback=self._finished,
+            )
+            self._stream.start()
+        except Exception as error:  # PortAudio's errors, and those of its arguments
+            self._stream = None
+            raise MicrophoneError(
+                f"{card.name} cannot be opened with {self.channels} channels at {self.sample_rate} Hz: {error}. Its own "
+                f"rate is {card.sample_rate} Hz. Close programs that use it, or give another sample_rate."
+            ) from error
+
+    def _close(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            with contextlib.suppress(Exception):  # of a card that is gone
+                stream.abort(ignore_errors=True)
+                stream.close(ignore_errors=True)
+
+    def _take(self, chunk: np.ndarray, n: int, when: Any, status: Any) -> None:
+        now = time.perf_counter()
+        if status.input_overflow:
+            self.n_overflows += 1
+        # Age of the first sample, by PortAudio's own clock; on ALSA that clock may stand at 0.
+        age = when.currentTime - when.inputBufferAdcTime
+        came = now
+        if when.inputBufferAdcTime > 0 and 0 <= age < _OLDEST_S:
+            came = now - age + n / self.sample_rate
+        self._heard(chunk, min(came, now))
+
+    def _finished(self) -> None:
+        if self._is_connected:
+            self._end("the sound card, or its sound server, has ended the recording")
