@@ -65,7 +65,7 @@ class PortAudioMicrophoneConfig(MicrophoneConfig):
     """
 
     device: str | int = ""
-    block_s: float = 0.01
+    block_s: float = 0.005
     wait_s: float | None = None
 
     @property

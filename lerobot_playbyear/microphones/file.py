@@ -13,7 +13,7 @@ from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
 if TYPE_CHECKING:
     from lerobot_playbyear.microphones.config import FileMicrophoneConfig
 
-_CHUNK_S = 0.01
+_CHUNK_S = 0.005
 
 
 class FileMicrophone(Microphone):
