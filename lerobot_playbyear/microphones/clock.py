@@ -2,15 +2,17 @@
 
 from collections import deque
 
-_STEADY_S, _RECENT_S = 1.0, 0.25  # of sound, over which chunks are compared
+_STEADY_S = 1.0  # of sound, over which chunks are compared
+_PATIENCE_S = 0.25  # for how long chunks may come late before samples are taken for lost
 
 
 class CardClock:
     """Follows a card's clock by the times at which its chunks come.
 
     A chunk may come late and never early. So the earliest of the last second's, as if the card's rate were exact, tells when
-    samples come; it follows a clock that is fast or slow, and a chunk that comes late changes nothing. Where all chunks of a
-    quarter of a second come late by more than `tolerance_s`, samples were lost.
+    samples come; it follows a clock that is fast or slow, and a chunk that comes late changes nothing. A burst of chunks that
+    were held up ends with one that is not late. Where all chunks of a quarter of a second come late by more than
+    `tolerance_s`, samples were lost.
 
     Args:
         sample_rate: What the card says [Hz].
@@ -20,6 +22,8 @@ class CardClock:
     def __init__(self, sample_rate: int, tolerance_s: float) -> None:
         self._rate, self._tolerance = sample_rate, tolerance_s
         self._offsets: deque[tuple[int, float]] = deque()  # last sample's number + 1, and when sample 0 came by it [s]
+        self._late: list[tuple[int, float]] = []  # those since the last one in time
+        self._late_since_s = 0.0
 
     def note(self, n_written: int, came_s: float) -> int:
         """A chunk came, of which the last sample has the number `n_written - 1`.
@@ -27,22 +31,31 @@ class CardClock:
         Returns:
             How many samples were lost before; the caller counts them as written.
         """
-        self._offsets.append((n_written, came_s - n_written / self._rate))
+        offset = came_s - n_written / self._rate
+        if self._offsets and offset - self._start > self._tolerance:
+            return self._note_late(n_written, offset, came_s)
+        self._late = []
+        self._offsets.append((n_written, offset))
         while self._offsets[0][0] < n_written - _STEADY_S * self._rate:
             self._offsets.popleft()
-        begins = n_written - _RECENT_S * self._rate
-        recent = [offset for n, offset in self._offsets if n > begins]
-        before = [offset for n, offset in self._offsets if n <= begins]
-        if not before or min(recent) - min(before) <= self._tolerance:
+        return 0
+
+    def _note_late(self, n_written: int, offset: float, came_s: float) -> int:
+        if not self._late:
+            self._late_since_s = came_s
+        self._late.append((n_written, offset))
+        if came_s - self._late_since_s < _PATIENCE_S:
             return 0
-        lost = round((min(recent) - min(before)) * self._rate)
+        lost = round((min(late for _, late in self._late) - self._start) * self._rate)
         shift = lost / self._rate
-        self._offsets = deque((n + lost, offset - shift) for n, offset in self._offsets if n > begins)
+        self._offsets = deque((n + lost, late - shift) for n, late in self._late)
+        self._late = []
         return lost
 
     def restart(self) -> None:
         """Forgets what was: the card begins anew."""
         self._offsets.clear()
+        self._late = []
 
     @property
     def is_set(self) -> bool:
@@ -51,5 +64,8 @@ class CardClock:
 
     def written_at(self, time_s: float) -> float:
         """How many samples had come at a time, or will have [s of time.perf_counter]; a fraction between two."""
-        start = min(offset for _, offset in self._offsets)
-        return (time_s - start) * self._rate
+        return (time_s - self._start) * self._rate
+
+    @property
+    def _start(self) -> float:
+        return min(offset for _, offset in self._offsets)

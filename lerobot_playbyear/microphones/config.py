@@ -60,17 +60,31 @@ class PortAudioMicrophoneConfig(MicrophoneConfig):
 
     Args:
         device: Its name, a part of it that no other has, or its number; `playbyear-find-microphones` lists them.
+        card_channels: How many channels the card has; needed where it has more than two and a sound server (PulseAudio,
+            PipeWire) is between, which mixes them where fewer are opened. None: what the card says.
         block_s: How often sound is fetched [s]; shorter costs more processor time.
-        wait_s: How long the card may hold samples back [s]; None: as short as it can.
+        wait_s: How much sound the card keeps while this program is busy [s]; more is lost. On Linux this delays nothing.
     """
 
     device: str | int = ""
+    card_channels: int | None = None
     block_s: float = 0.005
-    wait_s: float | None = None
+    wait_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.001 <= self.block_s <= 0.5:
+            raise InputError(f"block_s={self.block_s} of a microphone: give seconds from 0.001 to 0.5.")
+        if not 0 < self.wait_s <= 2:
+            raise InputError(f"wait_s={self.wait_s} of a microphone: give seconds above 0, up to 2.")
+        if self.card_channels is not None and not self.channel < self.card_channels <= 256:
+            raise InputError(
+                f"card_channels={self.card_channels} of a microphone: give more than its channel={self.channel}, counted from 0."
+            )
 
     @property
     def card(self) -> Hashable:
-        return "portaudio", str(self.device), self.sample_rate
+        return "portaudio", str(self.device), self.sample_rate, self.card_channels
 
     def make(self, channels: int) -> Microphone:
         from lerobot_playbyear.microphones.portaudio import PortAudioMicrophone

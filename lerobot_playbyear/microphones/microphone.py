@@ -68,8 +68,12 @@ class Microphone(abc.ABC):
             return
         self._listener, self._ended, self._chunks, self._n_kept = listener, "", [], 0
         self._last_heard = time.perf_counter()
-        self._open()
-        self._is_connected = True
+        self._is_connected = True  # before it may end by itself
+        try:
+            self._open()
+        except BaseException:
+            self._is_connected = False
+            raise
 
     def read(self) -> np.ndarray:
         """All samples that have come since the last call, (n, channels), of the last minute at most."""

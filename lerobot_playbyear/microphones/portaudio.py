@@ -1,6 +1,7 @@
 """Sound cards through PortAudio."""
 
 import contextlib
+import gc
 import time
 from dataclasses import dataclass
 from types import ModuleType
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 _FIND = "`playbyear-find-microphones` lists what there is."
 _OLDEST_S = 1.0  # PortAudio's own times are believed up to this age
+_MOST_OPENED = 8  # channels of a card that are opened without being asked for; a sound server offers 32, and has fewer
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,34 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
     return card
 
 
+def channels_to_open(card: SoundCard, needed: int, wanted: int | None = None) -> int:
+    """How many channels of a card to open, so that each is its own.
+
+    A sound server that is asked for fewer than a card has mixes them: its mono is the mean of left and right. What it offers
+    is no help, 32 whatever the card has. So two are opened there unless more are needed.
+
+    Args:
+        card: The card.
+        needed: At least so many.
+        wanted: What was asked for, if anything.
+
+    Raises:
+        MicrophoneError: Fewer are asked for than are needed.
+    """
+    if wanted is not None:
+        if wanted < needed:
+            raise MicrophoneError(
+                f"card_channels={wanted} of a microphone: channel {needed - 1} is asked for, counted from 0."
+            )
+        return wanted
+    return card.channels if card.channels <= _MOST_OPENED else max(needed, 2)
+
+
+def _has_open_stream() -> bool:
+    kind = load_sounddevice()._StreamBase
+    return any(isinstance(thing, kind) and not thing.closed for thing in gc.get_objects())
+
+
 class PortAudioMicrophone(Microphone):
     """A sound card of this machine.
 
@@ -131,25 +161,37 @@ class PortAudioMicrophone(Microphone):
         self.n_overflows = 0
 
     def _open(self) -> None:
+        """PortAudio knows the cards that were there when it looked; where none of these can be opened, it looks again."""
+        try:
+            self._open_card(find_card(self._config.device, self.channels))
+        except MicrophoneError:
+            if _has_open_stream():
+                raise
+            sound_cards(fresh=True)
+            self._open_card(find_card(self._config.device, self.channels))
+
+    def _open_card(self, card: SoundCard) -> None:
         sounddevice, config = load_sounddevice(), self._config
-        card = find_card(config.device, self.channels)
+        channels = channels_to_open(card, self.channels, config.card_channels)
         try:
             self._stream = sounddevice.InputStream(
                 samplerate=self.sample_rate,
                 blocksize=max(round(config.block_s * self.sample_rate), 1),
                 device=card.number,
-                channels=self.channels,
+                channels=channels,
                 dtype="int16",
-                latency="low" if config.wait_s is None else config.wait_s,
+                latency=config.wait_s,
                 callback=self._take,
                 finished_callback=self._finished,
             )
             self._stream.start()
         except Exception as error:  # PortAudio's errors, and those of its arguments
             self._stream = None
+            said = str(error).replace("\n", " ")
             raise MicrophoneError(
-                f"{card.name} cannot be opened with {self.channels} channels at {self.sample_rate} Hz: {error}. Its own "
-                f"rate is {card.sample_rate} Hz. Close programs that use it, or give another sample_rate."
+                f"{card.name} cannot be opened with {channels} channels at {self.sample_rate} Hz: {said}. Is it plugged in, and "
+                "its sound server running? Close other programs that use it, or give another sample_rate: its own is "
+                f"{card.sample_rate} Hz."
             ) from error
 
     def _close(self) -> None:
@@ -168,7 +210,7 @@ class PortAudioMicrophone(Microphone):
         came = now
         if when.inputBufferAdcTime > 0 and 0 <= age < _OLDEST_S:
             came = now - age + n / self.sample_rate
-        self._heard(chunk, min(came, now))
+        self._heard(chunk[:, : self.channels], min(came, now))
 
     def _finished(self) -> None:
         if self._is_connected:
