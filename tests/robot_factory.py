@@ -1,6 +1,7 @@
 """A robot's environment for tests: the arm of joints, or the simulated one, with whatever microphones."""
 
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -24,8 +25,32 @@ if str(SIM_ROBOT) not in sys.path:
 def with_sim_robot(environment: dict[str, str] | None = None) -> dict[str, str]:
     """An environment of a command that knows these robots."""
     environment = dict(os.environ if environment is None else environment)
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(SIM_ROBOT), environment.get("PYTHONPATH", "")]))
+    ours = [str(SIM_ROBOT), str(SIM_ROBOT.parent)]
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, [*ours, environment.get("PYTHONPATH", "")]))
     return environment
+
+
+@contextmanager
+def simulation(folder: Path, fifo: Path | str = "", *options: str) -> Iterator[str]:
+    """The task's arm in a process of its own, in real time; the path of its socket.
+
+    Args:
+        folder: For the socket; its path is short.
+        fifo: Where its sound goes.
+        options: Of `lerobot_robot_playbyear_sim.simulation`.
+    """
+    socket = str(folder / "arm")
+    module = "lerobot_robot_playbyear_sim.simulation"
+    command = [sys.executable, "-m", module, f"--socket={socket}", f"--fifo={fifo}", *options]
+    environment = with_sim_robot({**os.environ, "OMP_NUM_THREADS": "1"})
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == "ready"
+        yield socket
+    finally:
+        process.kill()
+        process.wait()
 
 
 def noise_file(folder: Path, sample_rate: int, seconds: float = 5.0, channels: int = 1) -> Path:

@@ -7,59 +7,39 @@ end. The sound of a step is played while the next one is awaited, behind it by `
 """
 
 import argparse
-import contextlib
 import json
-import os
 import queue
 import threading
 import time
 from multiprocessing.connection import Connection, Listener
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from sound_server import Player
 
 STEP_S, GRACE_S = 0.05, 0.03
 LAG_S = 0.015
-_CHUNK_S = 0.005
 
 
 class Loudspeaker:
     """Plays blocks one after the other in real time, and a quiet room between them."""
 
     def __init__(self, fifo: str, sample_rate: int) -> None:
-        self._file = os.open(fifo, os.O_RDWR | os.O_NONBLOCK)  # never blocks, also while nobody reads
-        self._rate = sample_rate
-        self._samples = np.zeros(0, np.int16)
-        self._lock = threading.Lock()
-        self._room = np.random.default_rng(0).normal(0, 3, sample_rate).round().astype(np.int16)
-        self.is_muted = False
-        threading.Thread(target=self._play, daemon=True).start()
+        self._player = Player(Path(fifo), channels=1, sample_rate=sample_rate, noise=2.0)
+        self._player.start()
+        self._rate, self._end = sample_rate, 0.0
 
-    def play(self, block: np.ndarray) -> None:
-        with self._lock:
-            if len(self._samples) == 0:
-                self._samples = self._quiet(round(LAG_S * self._rate))
-            self._samples = np.concatenate([self._samples, block])
-
-    def clear(self) -> None:
-        with self._lock:
-            self._samples = np.zeros(0, np.int16)
-
-    def _quiet(self, n: int) -> np.ndarray:
-        start = np.random.randint(len(self._room) - n)
-        return self._room[start : start + n]
-
-    def _play(self) -> None:
-        size, n, begin = round(_CHUNK_S * self._rate), 0, time.perf_counter()
-        while True:
-            time.sleep(max(begin + n / self._rate - time.perf_counter(), 0))
-            with self._lock:
-                chunk, self._samples = self._samples[:size], self._samples[size:]
-            chunk = np.concatenate([chunk, self._quiet(size - len(chunk))]) if len(chunk) < size else chunk
-            n += size
-            with contextlib.suppress(BlockingIOError):  # nobody listens
-                os.write(self._file, chunk.astype("<i2").tobytes())
+    def play(self, block: np.ndarray) -> float:
+        """Plays it after the one before, or soon. Returns when it begins [s of time.perf_counter]."""
+        soonest = time.perf_counter() + 0.003
+        if self._end < soonest:
+            self._end = soonest + LAG_S
+        begins = self._end
+        self._player.play(block, begins)
+        self._end += len(block) / self._rate
+        return begins
 
 
 class Simulation:
@@ -89,7 +69,6 @@ class Simulation:
         self.n_steps, self.last_grip, self.n_holds = 0, -1.0, 0
         self.next_hold = time.perf_counter() + 1e9
         if self.speaker:
-            self.speaker.clear()
             self._hear()
         return {}
 
@@ -119,8 +98,7 @@ class Simulation:
         rate = self.env.observation_space["audio.gripper"].shape[0] * 20
         wave = 20000 * np.exp(-np.arange(rate // 50) / (rate / 200)) * np.sin(np.arange(rate // 50) * 0.8)
         assert self.speaker is not None
-        self.speaker.play(wave.astype(np.int16))
-        return {"time": time.time()}
+        return {"heard_at_s": self.speaker.play(wave.astype(np.int16))}
 
     def blind(self, is_blind: bool) -> dict[str, Any]:
         self.is_blind = is_blind
