@@ -240,3 +240,124 @@ def test_slow_motion_is_refused():
         pytest.raises(ExpertError, match="no slow motion"),
     ):
         TeleopExpertConfig(steps_per_second=5).make(env)
+
+
+def teleop(env, leader, **options):
+    """A person with a leader arm beside a policy."""
+    from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
+
+    expert = TeleopExpertConfig(teleop=leader, play_sound=False, **options).make(env)
+    return expert, expert.teleop
+
+
+@pytest.mark.parametrize("has_motors", [False, True])
+def test_leader_and_follower_meet_before_a_person_takes_over(has_motors):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    console = ScriptedConsole(lambda status: "p" if "Set the scene" in status.note else None)
+    with robot_env(joint_config(episode_s=8.0, max_step=None, max_relative_target=None), console) as env:
+        expert, leader = teleop(env, JointLeaderConfig(has_motors=has_motors))
+        leader.place = {"shoulder.pos": 8.0, "elbow.pos": 4.0, "gripper.pos": -6.0}
+        n_asked = [0]
+
+        def act(observation):
+            n_asked[0] += 1
+            if n_asked[0] == 5:
+                console.press("space")
+            if n_asked[0] == 12:
+                console.press("space")
+            if n_asked[0] == 16:
+                console.press("s")
+            return np.ones(3, np.float32)
+
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=act), seed=0, expert=expert)
+        told = np.array([target for _, target in env.arm.robot.told])
+        expert.close()
+    assert episode.interventions.tolist() == [False] * 4 + [True] * 7 + [False] * 5
+    assert len(episode) == n_asked[0]  # the policy is asked in every step: its memory goes on
+    assert episode.success
+    by_person = episode.actions[episode.interventions]
+    assert np.abs(np.diff(told, axis=0)).max() < 8 if not has_motors else True
+    if has_motors:  # the leader came to the follower, which was at 1
+        np.testing.assert_allclose(by_person, 1, atol=1e-3)
+        assert len(leader.fed) > 10
+        assert not leader.is_held
+    else:
+        np.testing.assert_allclose(by_person, [[8, 4, -6]] * 7)
+        jumps = np.abs(np.diff(told[:-8], axis=0)).max(axis=0)
+        assert (jumps < 1.01).all()  # in small steps; the leader is up to 7 away
+    facts = episode.facts
+    assert facts["ticks"] == len(episode)
+    assert facts["rate_hz"] == pytest.approx(20, rel=0.05)  # without the time in which the arms met
+
+
+def test_a_leader_that_lacks_a_joint_is_refused():
+    from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
+    from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleopConfig
+
+    config = TeleopExpertConfig(teleop=KeyboardWindowTeleopConfig())
+    needs = "the robot also needs elbow.pos, gripper.pos, shoulder.pos"
+    with robot_env(joint_config(), ScriptedConsole()) as env, pytest.raises(ExpertError, match=needs):
+        config.make(env)
+
+
+def test_escape_while_a_person_acts_holds_and_asks():
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    pressed, pressed_at = [], []
+
+    def press(status):
+        if "Set the scene" in status.note:
+            return "p"
+        if status.note.startswith("You pressed Escape"):
+            pressed.append(status.note)
+            return "r"
+        return None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(episode_s=4.0), console) as env:
+        expert, _ = teleop(env, JointLeaderConfig())
+
+        def act(observation):
+            if env._ticks.n == 6:
+                pressed_at.append(time.perf_counter())
+                console.press("escape")
+            return np.ones(3, np.float32)
+
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=act), seed=0, expert=expert)
+        assert episode.verdict is Verdict.DISCARD
+        assert len(episode) in (6, 7)
+        assert len(pressed) == 1
+        told = [target for when, target in env.arm.robot.told if when > pressed_at[0]]
+        np.testing.assert_allclose(told, [env.arm.robot.place], atol=1e-6)  # it was told to stay, and nothing else
+        expert.close()
+
+
+def test_a_pause_counts_for_nothing(wav):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    paused = [0]
+
+    def press(status):
+        if "Set the scene" in status.note:
+            return "p"
+        if status.note == "Press P to go on":
+            paused[0] += 1
+            return "p" if paused[0] == 10 else None
+        return None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(wav), console) as env:
+        expert, _ = teleop(env, JointLeaderConfig())
+
+        def act(observation):
+            if env._ticks.n == 6 and not paused[0]:
+                console.press("p")
+            return np.zeros(3, np.float32)
+
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=act), seed=0, expert=expert)
+        expert.close()
+    assert paused[0] == 10
+    assert len(episode) == 20
+    assert episode.facts["drop_outs"] == {"gripper": []}
+    assert episode.facts["rate_hz"] == pytest.approx(20, rel=0.05)

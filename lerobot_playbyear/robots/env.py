@@ -69,6 +69,7 @@ class RobotEnv(gym.Env):
         self._pictures: dict[str, np.ndarray] = {n: np.zeros(s, np.uint8) for n, s in arm.cameras.items()}
         self._last: dict[str, Any] | None = None
         self._began_at = 0.0
+        self._stopped: Verdict | None = None
 
     # Gymnasium's interface
 
@@ -91,6 +92,7 @@ class RobotEnv(gym.Env):
         rig.attempt += 1
         self.person.begin(wait=config.wait_for_person, picture=self._look)
         self._same_picture.clear()
+        self._stopped = None
         self._began_at = time.time()
         now = self._ticks.start()
         rig.ears.restart(now - config.camera_latency_s)
@@ -101,6 +103,8 @@ class RobotEnv(gym.Env):
     def step(self, action):
         if self._last is None:
             raise gym.error.ResetNeeded("step() was called before the first attempt: call reset() first.")
+        if self._stopped is not None:  # by an expert, in this step
+            return self._outcome(self._stopped, is_problem=True)
         rig, problem = self._rig, ""
         n_holds = rig.watchdog.n_holds
         try:
@@ -175,13 +179,15 @@ class RobotEnv(gym.Env):
         self._rig.watchdog.feed()
 
     def stop_and_ask(self, reason: str) -> Verdict | None:
-        """The arm holds, and the person says what becomes of the attempt; None: they leave."""
+        """The arm holds, and the person says what becomes of the attempt; None: they leave. The attempt's next step is its
+        last, and moves nothing."""
         self._rig.watchdog.rest()
         try:
             self._rig.arm.hold()
         except RobotError as error:
             logging.error(f"The robot cannot be told to hold: {error}")
-        return self.person.judge(reason, self._rig.ears.drop_outs)
+        self._stopped = self.person.judge(reason, self._rig.ears.drop_outs)
+        return self._stopped
 
     def episode_facts(self) -> dict[str, Any]:
         """Of the attempt so far: when it began [s since 1970], ticks per second, late ticks, drop-outs by microphone."""

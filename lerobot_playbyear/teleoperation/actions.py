@@ -52,7 +52,7 @@ class ActionMapping:
         self.names = list(names or ())
         if self.names and set(self.names) <= set(self._names):
             self._names = self.names
-        elif self.names and not self.moves_hand:
+        elif self.names:
             missing = sorted(set(self.names) - set(self._names))
             raise ExpertError(
                 f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the robot also needs {', '.join(missing)}: "
