@@ -39,11 +39,38 @@ def note_episode_start(root: str | Path, episode_index: int, unix_time_s: float)
     """
     if isinstance(episode_index, bool) or not isinstance(episode_index, int) or episode_index < 0:
         raise ClockError(f"episode_index is {episode_index!r}; wanted a whole number from 0 on.")
-    path = Path(root) / CLOCK_PATH
+    starts = {**(read_episode_starts(root) or {}), episode_index: _seconds(unix_time_s, "unix_time_s")}
+    _write(Path(root) / CLOCK_PATH, starts)
+
+
+def renumber_episode_starts(root: str | Path, numbers: Mapping[int, int]) -> str | None:
+    """Moves the times of episodes that got other numbers, and drops those of episodes that are gone.
+
+    Args:
+        root: The folder of the dataset with the new numbers, which still has the times of the old ones.
+        numbers: The new number of every episode that is still there.
+
+    Returns:
+        What is said of it; None: nothing was to be changed.
+
+    Raises:
+        OSError: The file cannot be read or written.
+    """
+    try:
+        starts = read_episode_starts(root)
+        moved = {numbers[episode]: time_s for episode, time_s in (starts or {}).items() if episode in numbers}
+        if starts is None or moved == starts:
+            return None
+        _write(Path(root) / CLOCK_PATH, moved)
+        return f"{CLOCK_PATH} has the times of {len(moved)} episodes, by their new numbers; it had {len(starts)}"
+    except ClockError as error:
+        return f"{CLOCK_PATH} stays as it is, by the old numbers: {error}"
+
+
+def _write(path: Path, starts: Mapping[int, float]) -> None:
     for part in (path.parent, path, path.with_suffix(".partial")):
         if part.is_symlink():
             raise ClockError(f"{part} is a link; wanted one of the dataset's own. Put what it leads to in its place.")
-    starts = {**(read_episode_starts(root) or {}), episode_index: _seconds(unix_time_s, "unix_time_s")}
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = {str(episode): starts[episode] for episode in sorted(starts)}
     write_at_once(path, json.dumps({_EPISODES: lines}, indent=1) + "\n")

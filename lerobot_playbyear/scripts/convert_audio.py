@@ -1,4 +1,4 @@
-"""playbyear-convert-audio: a copy of a dataset with its sound in columns instead of files, or the other way.
+"""playbyear-convert-audio: a copy of a dataset with its sound in columns, not files, or vice versa.
 
 Files are those of LeRobot's pull request 2824: features of dtype "audio", and the sound in
 audio/<key>/chunk-000/file-000.m4a. Columns are what this plugin trains on. The dataset is not
