@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_attach_audio import FPS, LENGTHS, RATE, SIZE, silent_dataset
 
 from lerobot_playbyear.datasets import AUDIO_PREFIX, episode_waveform
-from lerobot_playbyear.datasets.attach import DatasetPlace
+from lerobot_playbyear.datasets.attach import AttachError, DatasetPlace
 from lerobot_playbyear.datasets.convert_audio import ConvertAudioConfig, convert_audio
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.repair import check_dataset
@@ -247,6 +247,22 @@ def test_a_place_that_cannot_be_is_one_clear_error(with_files, tmp_path, column,
     assert [path.name for path in tmp_path.iterdir()] == ["files"]
 
 
+def test_a_file_that_names_others_is_not_followed(with_files, tmp_path):
+    shutil.copytree(with_files, tmp_path / "files")
+    (tmp_path / f"files/audio/{TABLE}/chunk-000/file-000.m4a").write_text("ffconcat version 1.0\nfile file-001.m4a\n")
+    with pytest.raises(InputError, match=rf"'{TABLE}', episode 0, .*cannot be decoded"):
+        convert(tmp_path / "files", tmp_path / "columns", "columns")
+
+
+def test_a_link_out_of_the_dataset_is_not_followed(with_files, tmp_path):
+    shutil.copytree(with_files, tmp_path / "files")
+    file = tmp_path / f"files/audio/{TABLE}/chunk-000/file-000.m4a"
+    file.unlink()
+    file.symlink_to(with_files / f"audio/{TABLE}/chunk-000/file-000.m4a")
+    with pytest.raises(InputError, match=r"is a link to .*outside the dataset's folder"):
+        convert(tmp_path / "files", tmp_path / "columns", "columns")
+
+
 def test_options_that_do_not_fit_are_told(with_files, silent, tmp_path):
     with pytest.raises(InputError, match="--to=both is not known; wanted columns or files"):
         convert(with_files, tmp_path / "x", "both")
@@ -261,5 +277,7 @@ def test_options_that_do_not_fit_are_told(with_files, silent, tmp_path):
     columns = convert(with_files, tmp_path / "columns", "columns", sample_rate=15980)
     with pytest.raises(InputError, match=r"15980 samples per second, which aac cannot have. Choose --codec=alac"):
         convert(columns, tmp_path / "x", "files", codec="aac")
+    with pytest.raises(AttachError, match=f"'{TABLE}' has its sound in files.*playbyear-convert-audio --to=columns"):
+        convert(with_files, tmp_path / "x", "files")
     with pytest.raises(InputError, match="--codec=mp3 is not known"):
         convert(columns, tmp_path / "x", "files", codec="mp3")

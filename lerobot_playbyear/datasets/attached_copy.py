@@ -17,8 +17,8 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.attached_sound import EpisodesSound
-from lerobot_playbyear.datasets.audio_feature import audio_feature
-from lerobot_playbyear.datasets.audio_layout import AUDIO_DTYPE, AUDIO_FOLDER
+from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature
+from lerobot_playbyear.datasets.audio_layout import AUDIO_FOLDER
 from lerobot_playbyear.datasets.columns import column_to_numpy, numpy_to_column
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,

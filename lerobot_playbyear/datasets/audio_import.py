@@ -14,6 +14,7 @@ CHANNEL_OF, CHANNEL = "channel_of", "channel"
 """In a column's `info`: the microphone of which it is a channel, and which."""
 
 _SPARE_S = 1.0
+_FORMATS = "mov,mp4,m4a,wav,flac,ogg,matroska,webm,mp3,aac"  # none of which names other files
 
 
 class Part:
@@ -121,7 +122,7 @@ def _spool(track: AudioTrack, path: Path, last_s: float, target: Path) -> tuple[
     """Decodes a file as far as it is needed; the samples, and their rate [Hz]."""
     rate = n_samples = 0
     with target.open("wb") as file:
-        for samples, rate in audio_pieces(path):
+        for samples, rate in audio_pieces(path, _FORMATS):
             if samples.shape[1] != track.n_channels:
                 raise AudioFileError(
                     f"it has {samples.shape[1]} channels; the feature's shape says {track.n_channels}. Correct meta/info.json."

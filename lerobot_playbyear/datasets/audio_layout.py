@@ -16,12 +16,11 @@ from typing import Any
 
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, AUDIO_PREFIX
 from lerobot_playbyear.datasets.confines import file_inside
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import INFO_PATH
 
-AUDIO_DTYPE = "audio"
 AUDIO_FOLDER = "audio"
 DEFAULT_AUDIO_PATH = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
 PRE_ROLL_S = 1.0
