@@ -12,7 +12,7 @@ from audio_layout_factory import EARS, PRE_ROLL_S, TABLE, add_files_of_sound, de
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_attach_audio import FPS, LENGTHS, RATE, SIZE, silent_dataset
 
-from lerobot_playbyear.datasets import AUDIO_PREFIX, episode_waveform
+from lerobot_playbyear.datasets import AUDIO_PREFIX, audio_export, episode_waveform
 from lerobot_playbyear.datasets.attach import AttachError, DatasetPlace
 from lerobot_playbyear.datasets.convert_audio import ConvertAudioConfig, convert_audio
 from lerobot_playbyear.datasets.errors import InputError
@@ -135,6 +135,18 @@ def test_there_and_back_is_the_same_dataset(with_files, tmp_path):
             assert first[name] == second[name]
     assert json.loads(first["meta/info.json"]) == json.loads(second["meta/info.json"])
     assert json.loads(first["meta/stats.json"]) == json.loads(second["meta/stats.json"])
+
+
+def test_a_large_file_is_followed_by_another(with_files, tmp_path, monkeypatch):
+    """Here every file is large: each episode gets its own."""
+    once = convert(with_files, tmp_path / "once", "columns")
+    monkeypatch.setattr(audio_export, "FILE_MEGABYTES", 0)
+    files = convert(once, tmp_path / "files", "files")
+    rows = episodes_of(files)
+    assert [row[f"audio/{EARS}/file_index"] for row in rows] == [0, 1, 2]
+    assert [row[f"audio/{EARS}/from_timestamp"] for row in rows] == [0, 0, 0]
+    twice = convert(files, tmp_path / "twice", "columns")
+    assert contents(once)["data/chunk-000/file-000.parquet"] == contents(twice)["data/chunk-000/file-000.parquet"]
 
 
 @pytest.mark.parametrize("n_channels", [1, 2])
