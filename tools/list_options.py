@@ -16,6 +16,7 @@ from draccus.utils import is_choice_type
 
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.attach import AttachAudioConfig
+from lerobot_playbyear.datasets.convert_audio import ConvertAudioConfig
 from lerobot_playbyear.datasets.repair.command import RepairConfig
 from lerobot_playbyear.film.filming import VideoConfig
 from lerobot_playbyear.hub.uploads import PushConfig
@@ -27,6 +28,7 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 CONFIGS: dict[str, type] = {
     "playbyear-attach-audio": AttachAudioConfig,
+    "playbyear-convert-audio": ConvertAudioConfig,
     "playbyear-dagger": DaggerConfig,
     "playbyear-inspect": InspectConfig,
     "playbyear-push": PushConfig,
