@@ -90,7 +90,7 @@ class SoundServer:
         """Starts the server, or starts it again, with all sources."""
         command = [
             *("pulseaudio", "-n", "--daemonize=no", "--exit-idle-time=-1", "--use-pid-file=no", "--disable-shm=yes"),
-            *("--realtime=no", "--high-priority=no"),
+            *("--realtime=no", "--high-priority=yes"),
             f"--load=module-native-protocol-unix auth-anonymous=1 socket={self._socket}",
         ]
         own = {"PULSE_RUNTIME_PATH": str(self._folder / "run"), "PULSE_STATE_PATH": str(self._folder / "state")}
@@ -183,6 +183,8 @@ class Player(threading.Thread):
             self._waiting.append((at_s, np.broadcast_to(wide, (len(wide), self._channels)).astype(np.int32)))
 
     def run(self) -> None:
+        with contextlib.suppress(OSError):  # others than root may not
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), -10)
         rng, n_done, size, start = np.random.default_rng(0), 0, round(_CHUNK_S * self._rate), time.perf_counter()
         while not self._ended.wait(max(start + (n_done + size) / self._rate - time.perf_counter(), 0)):
             chunk = np.round(rng.normal(0, self._noise, (size, self._channels))).astype(np.int32)
