@@ -118,7 +118,9 @@ class SoundServer:
     def add(self, name: str) -> None:
         """Plugs a source in; it is one of those that were named at first."""
         self.fifo(name).unlink(missing_ok=True)  # a server that was killed leaves it
-        what = f"source_name={name} file={self.fifo(name)} format=s16le rate={self._rate} channels={self._sources[name]}"
+        what = (
+            f"source_name={name} file={self.fifo(name)} format=s16le rate={self._rate} channels={self._sources[name]}"
+        )
         loaded = self._pactl("load-module", "module-pipe-source", *what.split())
         assert loaded is not None
         self._modules[name] = loaded.strip()

@@ -22,7 +22,9 @@ class Simulation:
         came: When a chunk comes that was complete at a time [s]; None: never.
     """
 
-    def __init__(self, seconds: float, speed: float = 1.0, came: Callable[[float], float | None] = lambda at: at) -> None:
+    def __init__(
+        self, seconds: float, speed: float = 1.0, came: Callable[[float], float | None] = lambda at: at
+    ) -> None:
         rng = np.random.default_rng(0)
         self.recording = CardRecording(RATE, FPS, {"table": 0}, timeout_s=0)
         true_rate, chunks = RATE * speed, []

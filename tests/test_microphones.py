@@ -74,7 +74,7 @@ def taps_within_ticks(n_ticks: int) -> np.ndarray:
 
 
 def share_of_taps_found(blocks: np.ndarray, taps: np.ndarray, drop_outs: list[DropOut]) -> float:
-    """How many of the taps are where they belong, to 5 ms. Ticks in which a busy machine was late, and said so, do not count."""
+    """How many taps are where they belong, to 5 ms. Ticks in which a busy machine was late, and said so, do not count."""
     noted = {drop.frame + i for drop in drop_outs for i in range(-(-drop.n_samples // SIZE) + 1)}
     ticks = [tick for tick in range(len(blocks)) if tick not in noted]
     assert len(ticks) >= 0.8 * len(blocks), drop_outs
@@ -165,7 +165,9 @@ def test_two_microphones_of_one_card_hear_the_same_samples():
         begins = time.perf_counter() + 0.2
         player.play(np.stack([left, -left], axis=1), begins)
         heard = hear(ears, begins, 16)
-    np.testing.assert_allclose(heard["left"][2:], -heard["right"][2:], atol=60)  # the player's noise is each channel's own
+    np.testing.assert_allclose(
+        heard["left"][2:], -heard["right"][2:], atol=60
+    )  # the player's noise is each channel's own
     assert np.abs(heard["left"][2:].astype(int)).mean() > 10000
 
 
@@ -360,7 +362,9 @@ def test_an_installed_distribution_brings_its_own_type_and_a_broken_one_harms_no
     assert (config.type, config.card, config.latency_s) == ("tin_can", ("tin_can", 2.5), 0.01)
 
 
-@pytest.mark.parametrize("options", [{"sample_rate": 0}, {"channel": -1}, {"latency_s": -0.1}, {"latency_s": float("nan")}])
+@pytest.mark.parametrize(
+    "options", [{"sample_rate": 0}, {"channel": -1}, {"latency_s": -0.1}, {"latency_s": float("nan")}]
+)
 def test_an_option_without_meaning_is_named(options):
     with pytest.raises(InputError, match=next(iter(options))):
         FileMicrophoneConfig(path="x.wav", **options)
@@ -368,7 +372,11 @@ def test_an_option_without_meaning_is_named(options):
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [({"sample_rate": 16000}, "give 48000"), ({"channel": 2}, "channel 2 is asked for"), ({"path": "no.wav"}, "no.wav")],
+    [
+        ({"sample_rate": 16000}, "give 48000"),
+        ({"channel": 2}, "channel 2 is asked for"),
+        ({"path": "no.wav"}, "no.wav"),
+    ],
 )
 def test_a_file_that_does_not_fit_is_refused(options, said, tmp_path):
     write_wav(tmp_path / "sound.wav", np.ones((RATE, 2), np.int16), RATE)

@@ -1,15 +1,16 @@
 """`playbyear-calibrate-latency`: a person taps in view of a camera and near a microphone."""
 
+import contextlib
+import importlib
+import pkgutil
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lerobot.cameras
 from lerobot.cameras import CameraConfig
-from lerobot.cameras.opencv import OpenCVCameraConfig  # noqa: F401: so that these types have a name
-from lerobot.cameras.realsense import RealSenseCameraConfig  # noqa: F401
-from lerobot.cameras.zmq import ZMQCameraConfig  # noqa: F401
 
 from lerobot_playbyear.calibration.estimator import (
     EVENTS,
@@ -30,6 +31,11 @@ _ASKED = {
     "stops": "Tap the table, or clap, {n} times, and let the hand rest after each for half a second.",
     "begins": "Make {n} sounds at which something in the picture begins to move or to shine, a second apart.",
 }
+
+for _module in pkgutil.iter_modules(lerobot.cameras.__path__):
+    if _module.ispkg:
+        with contextlib.suppress(ImportError):  # its maker's software is not installed
+            importlib.import_module(f"lerobot.cameras.{_module.name}")  # registers its type
 
 
 @dataclass
@@ -114,7 +120,9 @@ def _connected(config: CameraConfig) -> Any:
         camera.connect()
     except Exception as error:  # whatever a camera's own program may raise
         said = " ".join(str(error).split())
-        raise CalibrationError(f"The camera cannot be opened: {said} `lerobot-find-cameras` lists what there is.") from error
+        raise CalibrationError(
+            f"The camera cannot be opened: {said} `lerobot-find-cameras` lists what there is."
+        ) from error
     return camera
 
 

@@ -90,8 +90,8 @@ def sound_onsets(times_s: np.ndarray, level: np.ndarray) -> np.ndarray:
 def motion_intervals(times_s: np.ndarray, motion: np.ndarray, event: str) -> np.ndarray:
     """Between which times motions stop, or begin.
 
-    A picture shows that something has moved since the one before, not when. So every motion gives an interval of a picture's time,
-    and taps at different moments between pictures narrow it down.
+    A picture shows that something has moved since the one before, not when. So every motion gives an interval as long as a
+    picture's time, and taps at different moments between pictures narrow it down.
 
     Args:
         times_s: (n,) of the pictures [s], ascending.

@@ -52,7 +52,7 @@ def write_plot(
         draw.line((x_of(tap.heard_s), bottom - _ROW + 10, x_of(tap.heard_s), bottom), fill=_MARK)
         draw.text((8, bottom - 14), f"{tap.latency_s * 1000:+.0f} ms", fill=_INK)
     bottom = image.height - 20
-    for at in np.arange(-_BEFORE_S, _AFTER_S + 0.01, 0.1):
+    for at in np.arange(-_BEFORE_S, _AFTER_S + 0.01, 0.1).tolist():
         x = _LEFT + (at + _BEFORE_S) / (_BEFORE_S + _AFTER_S) * (_WIDTH - 2 * _LEFT)
         draw.line((x, bottom - 6, x, bottom), fill=_INK)
         draw.text((x - 12, bottom + 2), f"{at * 1000:.0f}", fill=_INK)

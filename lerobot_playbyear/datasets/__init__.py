@@ -13,6 +13,7 @@ from lerobot_playbyear.datasets.audio_feature import (
 )
 from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.columns import check_dataset_files
+from lerobot_playbyear.datasets.episode_clock import note_episode_start
 from lerobot_playbyear.datasets.microphone import MicrophoneBuffer, SoundCardBuffer
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ __all__ = [
     "cut_into_frames",
     "episode_waveform",
     "loud_frames",
+    "note_episode_start",
     "read_audio",
     "resample",
     "run_weights",

@@ -5,7 +5,9 @@ LeRobot is imported when the dataset's files have been looked at.
 
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +22,6 @@ from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
-    from lerobot_playbyear.datasets.attached_sound import EpisodesSound
     from lerobot_playbyear.datasets.long_dataset import LongDataset
 
 
@@ -48,8 +49,13 @@ class AttachAudioConfig:
     Args:
         dataset: The dataset that gets sound; it is not changed. Without a root it may come from the Hub.
         output: The copy with sound.
-        files: The sound of each episode: a path in which `{episode}` stands for the episode's number, for example
-            `sound/{episode:06d}.wav`. WAV, FLAC, or a film whose sound track is taken.
+        files: The sound of each episode, if each has a file: a path in which `{episode}` stands for the episode's number,
+            for example `sound/{episode:06d}.wav`. WAV, FLAC, or a film whose sound track is taken.
+        session: One file with the sound of the whole session, in place of `files`.
+        clock: When each episode's first frame was taken [s]: a table (CSV) of episode and seconds, or JSON. None: the
+            dataset says so itself, in `meta/playbyear_clock.json`.
+        marks: Moments that are known in the session's file and on that clock, such as a clap at the start and one at the
+            end: `2.31=1754400000.12, 1802.74=1754401800.55`. None: the clock's seconds are the file's.
         microphone: What the microphone is called: the column is `observation.audio.<microphone>`. For files of
             several channels, a name for each, separated by commas.
         channel: Take only this channel of the files, counted from 0.
@@ -61,7 +67,10 @@ class AttachAudioConfig:
 
     dataset: DatasetPlace
     output: DatasetPlace
-    files: str
+    files: str | None = None
+    session: Path | None = None
+    clock: Path | None = None
+    marks: str | None = None
     microphone: str = "microphone"
     channel: int | None = None
     offset: float = 0.0
@@ -83,30 +92,39 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         AttachError: Naming every episode whose sound is missing, too short, or of another kind.
         OSError: The copy cannot be written.
     """
-    target = Path(cfg.output.root) if cfg.output.root else HF_LEROBOT_HOME / cfg.output.repo_id
-    if target.exists():
-        raise AttachError(f"{target} is there already. Choose another --output.root, or delete it.")
-    dataset = _open(cfg.dataset)
+    _check_source(cfg)
+    target = new_folder(cfg.output)
+    dataset = open_for_copy(cfg.dataset)
+    from lerobot_playbyear.datasets.attached_copy import write_with_sound
     from lerobot_playbyear.datasets.attached_sound import read_sound
     from lerobot_playbyear.datasets.long_dataset import scratch_folder
+    from lerobot_playbyear.datasets.session_sound import read_session
 
     keys = _keys(cfg, dataset)
     with scratch_folder() as scratch:
-        sound = read_sound(cfg, dataset, keys, Path(scratch))
-        _write(Path(dataset.root), target, sound)
+        sound = (read_sound if cfg.session is None else read_session)(cfg, dataset, keys, Path(scratch))
+        write_new_dataset(Path(dataset.root), target, partial(write_with_sound, sounds=[sound], fps=dataset.fps))
     print(f"\nDataset: {target} ({dataset.num_episodes} episodes with {', '.join(keys)} at {sound.sample_rate} Hz)")
     return target
 
 
-def _write(root: Path, target: Path, sound: "EpisodesSound") -> None:
-    """The copy, which is there only when it is complete."""
-    from lerobot_playbyear.datasets.attached_copy import write_with_sound
+def write_new_dataset(root: Path, target: Path, write: Callable[[Path, Path], None]) -> None:
+    """Writes a dataset made from another, which is there only when it is complete and on the disk itself.
 
+    Args:
+        root: The other's folder.
+        target: Its folder, which is not there yet.
+        write: Given `root` and an empty folder, writes it there.
+
+    Raises:
+        AttachError: A table of the other is damaged.
+        OSError: Something cannot be read or written.
+    """
     unfinished = target.absolute().with_name(f".{target.name}.attaching")
     shutil.rmtree(unfinished, ignore_errors=True)  # of one that was killed
     try:
         unfinished.mkdir(parents=True)
-        write_with_sound(root, unfinished, sound)
+        write(root, unfinished)
         flush_all(unfinished)
         os.rename(unfinished, target)
         flush(target.absolute().parent)
@@ -116,7 +134,24 @@ def _write(root: Path, target: Path, sound: "EpisodesSound") -> None:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def _open(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
+def new_folder(place: DatasetPlace) -> Path:
+    """Where a new dataset is to be written.
+
+    Raises:
+        AttachError: Something is there already.
+    """
+    target = Path(place.root) if place.root else HF_LEROBOT_HOME / place.repo_id
+    if target.exists():
+        raise AttachError(f"{target} is there already. Choose another --output.root, or delete it.")
+    return target
+
+
+def open_for_copy(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
+    """Opens a dataset of which a copy is to be made: no link leads out of it, and its tables of episodes are whole.
+
+    Raises:
+        AttachError: There is none, or it is not so.
+    """
     if place.root is not None and not (Path(place.root) / INFO_PATH).is_file():
         raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
     try:
@@ -133,6 +168,18 @@ def _open(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
         raise AttachError(f"The dataset '{place.repo_id}' cannot be opened: {error}") from error
 
 
+def _check_source(cfg: AttachAudioConfig) -> None:
+    """Whether the options say where the sound is, and in one way."""
+    if (cfg.files is None) == (cfg.session is None):
+        both = "both are given" if cfg.files else "neither is given"
+        raise AttachError(f"--files has the sound of each episode, --session that of all; {both}. Give one of them.")
+    if cfg.files is not None and "{episode" not in cfg.files:
+        raise AttachError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
+    for name in ("clock", "marks"):
+        if cfg.session is None and getattr(cfg, name) is not None:
+            raise AttachError(f"--{name}={getattr(cfg, name)} is for --session. Leave it out.")
+
+
 def _keys(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset") -> list[str]:
     names = [name.strip() for name in cfg.microphone.split(",")]
     keys = [name if name.startswith(AUDIO_PREFIX) else AUDIO_PREFIX + name for name in names]
@@ -141,8 +188,6 @@ def _keys(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset") -> li
             raise AttachError(f"--microphone={cfg.microphone}: give each microphone a name of its own, without '/'.")
         if key in dataset.meta.features:
             raise AttachError(f"'{key}' is in the dataset already. Give another --microphone.")
-    if "{episode" not in cfg.files:
-        raise AttachError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
     if cfg.channel is not None and len(keys) > 1:
         raise AttachError(f"--channel={cfg.channel} is for one microphone; --microphone names {len(keys)}.")
     return keys

@@ -1,21 +1,24 @@
-"""The copy of a dataset that gets sound: every file as it is, with a column more in its tables."""
+"""The copy of a dataset whose sound is stored otherwise, or that gets sound: every other file as it is."""
 
 import itertools
+import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from lerobot.datasets.feature_utils import get_hf_features_from_features
-from lerobot.datasets.io_utils import load_info, load_stats, write_info
+from lerobot.datasets.io_utils import load_stats
 from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.attached_sound import EpisodesSound
-from lerobot_playbyear.datasets.audio_feature import audio_feature
+from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature
+from lerobot_playbyear.datasets.audio_layout import AUDIO_FOLDER
 from lerobot_playbyear.datasets.columns import column_to_numpy, numpy_to_column
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
@@ -30,79 +33,137 @@ from lerobot_playbyear.datasets.statistics import Stats, add_stats, with_sound_s
 _SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
 
 
-def write_with_sound(root: Path, target: Path, sound: EpisodesSound) -> None:
+@dataclass
+class SoundChange:
+    """In what a copy differs from its dataset.
+
+    Args:
+        added: The features that it has more.
+        stats: Their statistics, for each episode.
+        sounds: Of all episodes, where these features are columns.
+        removed: The features that it lacks, with their columns, statistics and files of sound.
+        episode_columns: Columns that `meta/episodes` has more, a value per episode.
+        info: Fields of `meta/info.json` that differ; None: left out.
+    """
+
+    added: dict[str, dict[str, Any]]
+    stats: list[Stats]
+    sounds: Sequence[EpisodesSound] = ()
+    removed: Collection[str] = ()
+    episode_columns: Mapping[str, Sequence] = field(default_factory=dict)
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+
+def write_with_sound(
+    root: Path, target: Path, sounds: Sequence[EpisodesSound], fps: int, removed: Collection[str] = ()
+) -> None:
     """Writes a dataset with microphones more.
 
     Args:
         root: The dataset.
         target: An empty folder.
-        sound: Of all its episodes.
+        sounds: Of all its episodes.
+        fps: Its frames per second [Hz].
+        removed: Features in whose place they come.
 
     Raises:
         ParquetDamageError: A table is damaged, or names other frames than there is sound for.
         OSError: Something cannot be read or written.
     """
-    info = load_info(root)
-    info.features = _with_microphones(info.features, sound, info.fps)
-    schema = get_hf_features_from_features(info.features).arrow_schema
-    stats = [sound.stats(episode) for episode in range(len(sound.episodes))]
+    added: dict[str, dict[str, Any]] = {}
+    for sound in sounds:
+        for key, notes in zip(sound.keys, sound.notes or [{}] * len(sound.keys), strict=True):
+            feature = audio_feature(sound.sample_rate, fps)
+            added[key] = {**feature, "info": {**feature["info"], **notes}}
+    n_episodes = len(sounds[0].episodes)
+    stats = [{key: own for sound in sounds for key, own in sound.stats(i).items()} for i in range(n_episodes)]
+    info = {"audio_path": None, "audio_files_size_in_mb": None} if removed else {}
+    write_changed(root, target, SoundChange(added, stats, sounds, removed, info=info))
+
+
+def write_changed(root: Path, target: Path, change: SoundChange) -> None:
+    """Writes a dataset with other sound. Arguments and errors as for `write_with_sound`.
+
+    Args:
+        change: In what it differs.
+    """
+    info = json.loads((root / INFO_PATH).read_text())
+    features = _changed_features(info["features"], change)
+    in_columns = {
+        key: {**feature, "shape": tuple(feature["shape"])}
+        for key, feature in features.items()
+        if feature["dtype"] != AUDIO_DTYPE
+    }
+    schema = get_hf_features_from_features(in_columns).arrow_schema
+    folders = [(AUDIO_FOLDER, key) for key in change.removed]
     paths = sorted(
         path for path in root.rglob("*") if path.is_file() and path.relative_to(root).parts[0] not in _SCRATCH
     )
     for path in tqdm(paths, desc="Writing", unit="file"):
         name = path.relative_to(root)
+        if name.parts[:2] in folders:
+            continue
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         if name.parts[0] == "data":
-            _write_data(path, target / name, schema, sound)
+            _write_data(path, target / name, schema, change)
         elif name.parts[:2] == ("meta", "episodes"):
-            _write_rows(path, target / name, stats)
+            _write_rows(path, target / name, change)
         elif name != Path(INFO_PATH):
             shutil.copyfile(path, target / name)
-    known = load_stats(root) or {}
-    write_stats({**known, **add_stats(None, stats, sound.keys)}, target)
-    write_info(info, target)
+    known = {key: stats for key, stats in (load_stats(root) or {}).items() if key not in change.removed}
+    write_stats({**known, **add_stats(None, change.stats, change.added)}, target)
+    info = {**info, "features": features, **change.info}
+    kept = {name: value for name, value in info.items() if name not in change.info or value is not None}
+    (target / INFO_PATH).write_text(json.dumps(kept, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def _with_microphones(features: dict[str, dict], sound: EpisodesSound, fps: int) -> dict[str, dict[str, Any]]:
-    own = {key: feature for key, feature in features.items() if key not in DEFAULT_FEATURES}
-    return {**own, **{key: audio_feature(sound.sample_rate, fps) for key in sound.keys}, **features}
+def _changed_features(features: Mapping[str, dict], change: SoundChange) -> dict[str, dict[str, Any]]:
+    kept = {key: feature for key, feature in features.items() if key not in change.removed}
+    own = {key: feature for key, feature in kept.items() if key not in DEFAULT_FEATURES}
+    return {**own, **change.added, **kept}
 
 
-def _write_data(source: Path, target: Path, schema: pa.Schema, sound: EpisodesSound) -> None:
+def _write_data(source: Path, target: Path, schema: pa.Schema, change: SoundChange) -> None:
+    keys = [key for sound in change.sounds for key in sound.keys]
     with open_checked(source) as file:
         metadata = file.schema_arrow.metadata or {}
         if b"huggingface" in metadata:
             metadata = {**metadata, **(schema.metadata or {})}
-        target_schema = pa.schema([*file.schema_arrow, *(schema.field(key) for key in sound.keys)], metadata)
+        kept = [column for column in file.schema_arrow if column.name not in change.removed]
+        target_schema = pa.schema([*kept, *(schema.field(key) for key in keys)], metadata)
 
-        def add(table: pa.Table) -> pa.Table:
+        def convert(table: pa.Table) -> pa.Table:
             try:
-                return _with_columns(table, target_schema, sound)
+                return _with_columns(table.select([column.name for column in kept]), target_schema, change.sounds)
             except ValueError as error:
                 raise ParquetDamageError(f"{source} is damaged: {error}.") from error
 
-        write_tables(target, map(add, _tables(file, source, sound.rows_at_once)), target_schema)
+        rows = min((sound.rows_at_once for sound in change.sounds), default=None)
+        write_tables(target, map(convert, _tables(file, source, rows)), target_schema)
 
 
-def _tables(file: Any, source: Path, rows: int) -> Iterator[pa.Table]:
+def _tables(file: Any, source: Path, rows: int | None) -> Iterator[pa.Table]:
     for table in read_row_groups(file):
         if isinstance(table, ParquetDamageError):
             raise ParquetDamageError(f"{source} is damaged: {table}.")
-        for start in range(0, len(table), rows):
+        for start in range(0, len(table), rows or max(len(table), 1)):
             yield table.slice(start, rows)
 
 
-def _with_columns(table: pa.Table, schema: pa.Schema, sound: EpisodesSound) -> pa.Table:
-    episodes = column_to_numpy(table.column("episode_index"))
-    frames = column_to_numpy(table.column("frame_index"))
-    edges = np.flatnonzero((np.diff(episodes) != 0) | (np.diff(frames) != 1)) + 1
-    parts = []
-    for first, stop in itertools.pairwise([0, *edges.tolist(), len(table)]):
-        start = int(frames[first])
-        parts.append(sound.blocks(int(episodes[first]), start, start + stop - first))
-    blocks = np.concatenate(parts)
-    for i, key in enumerate(sound.keys):
-        table = table.append_column(key, numpy_to_column(blocks[..., i], schema.field(key).type))
+def _with_columns(table: pa.Table, schema: pa.Schema, sounds: Sequence[EpisodesSound]) -> pa.Table:
+    if sounds:
+        episodes = column_to_numpy(table.column("episode_index"))
+        frames = column_to_numpy(table.column("frame_index"))
+        edges = np.flatnonzero((np.diff(episodes) != 0) | (np.diff(frames) != 1)) + 1
+        runs = list(itertools.pairwise([0, *edges.tolist(), len(table)]))
+    for sound in sounds:
+        parts = [
+            sound.blocks(int(episodes[first]), int(frames[first]), int(frames[first]) + stop - first)
+            for first, stop in runs
+        ]
+        blocks = np.concatenate(parts)
+        for i, key in enumerate(sound.keys):
+            table = table.append_column(key, numpy_to_column(blocks[..., i], schema.field(key).type))
     return table.replace_schema_metadata(schema.metadata)
 
 
@@ -114,7 +175,15 @@ def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
         raise ParquetDamageError(f"{path} is damaged: {error}.") from error
 
 
-def _write_rows(source: Path, target: Path, stats: list[Stats]) -> None:
+def _write_rows(source: Path, target: Path, change: SoundChange) -> None:
     rows = read_named_table(source)
-    own = [stats[episode] for episode in rows.column("episode_index").to_pylist()]
-    write_rows(with_sound_stats(rows, own).replace_schema_metadata(None), target)
+    episodes = rows.column("episode_index").to_pylist()
+    for episode in episodes:
+        if not isinstance(episode, int) or not 0 <= episode < len(change.stats):
+            raise ParquetDamageError(f"{source} is damaged: it names episode {episode} of {len(change.stats)}.")
+    prefixes = tuple(f"{folder}/{key}/" for key in change.removed for folder in ("stats", AUDIO_FOLDER))
+    rows = rows.select([name for name in rows.column_names if not name.startswith(prefixes)])
+    rows = with_sound_stats(rows, [change.stats[episode] for episode in episodes])
+    for name, values in change.episode_columns.items():
+        rows = rows.append_column(name, pa.array([values[episode] for episode in episodes]))
+    write_rows(rows.replace_schema_metadata(None), target)

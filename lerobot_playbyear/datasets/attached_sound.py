@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDataset
@@ -48,12 +49,14 @@ class EpisodesSound:
         keys: The columns.
         samples_per_frame: S.
         episodes: For each episode (n_frames * S, columns) int16, read where it is indexed.
+        notes: For each column what its feature's `info` says besides the rate; None: nothing.
     """
 
     sample_rate: int
     keys: list[str]
     samples_per_frame: int
     episodes: list[Cut]
+    notes: list[dict[str, Any]] | None = None
 
     @property
     def rows_at_once(self) -> int:
@@ -95,21 +98,17 @@ def read_sound(
     cfg: AttachAudioConfig, dataset: LeRobotDataset | LongDataset, keys: list[str], scratch: Path
 ) -> EpisodesSound:
     """Decodes all files, so that what is wrong with them is known before anything is written."""
-    offsets = _offsets(cfg, dataset.num_episodes)
+    offsets = offsets_of(cfg, dataset.num_episodes)
+    pattern = str(cfg.files)
     lengths = [int(length) for length in dataset.meta.episodes["length"]]
     errors: list[str] = []
     rates: dict[int, int] = {}
     episodes: list[Cut] = []
     for episode, length in enumerate(tqdm(lengths, desc="Reading sound", unit="episode")):
-        path = Path(_format(cfg.files, episode))
+        path = Path(_format(pattern, episode))
         try:
-            samples, rate = _spool(cfg, path, len(keys), scratch / str(episode))
-            rates[episode] = cfg.sample_rate or rate
-            if rates[episode] % dataset.fps:
-                raise AudioFileError(
-                    f"it has {rate} samples per second, which is no multiple of {dataset.fps} frames per second. "
-                    f"Resample it, for example with --sample_rate={max(1, round(rate / dataset.fps)) * dataset.fps}."
-                )
+            samples, rate = spool(cfg, path, len(keys), scratch / str(episode))
+            rates[episode] = checked_rate(cfg, rate, dataset.fps)
             resampled = Resampled(samples, rate, rates[episode])
             episodes.append(Cut(resampled, rates[episode], dataset.fps, length, offsets[episode], cfg.pad))
         except (AudioFileError, ValueError) as error:
@@ -119,13 +118,37 @@ def read_sound(
             f"{rate} Hz (episode {list(rates.values()).index(rate)})" for rate in sorted(set(rates.values()))
         )
         errors.append(f"the files have different sample rates, {each}. Give --sample_rate to resample them.")
-    if errors:
-        more = f"\n  ... and {len(errors) - _MOST_ERRORS} more" if len(errors) > _MOST_ERRORS else ""
-        raise AttachError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
+    raise_all(errors)
     return EpisodesSound(rates[0], keys, rates[0] // dataset.fps, episodes)
 
 
-def _spool(cfg: AttachAudioConfig, path: Path, n_microphones: int, target: Path) -> tuple[SpooledFile, int]:
+def checked_rate(cfg: AttachAudioConfig, own_rate: int, fps: int) -> int:
+    """The rate that a file of the rate `own_rate` is to have [Hz].
+
+    Raises:
+        AudioFileError: The frame rate does not divide it.
+    """
+    rate = cfg.sample_rate or own_rate
+    if rate % fps:
+        raise AudioFileError(
+            f"it has {own_rate} samples per second, which is no multiple of {fps} frames per second. "
+            f"Resample it, for example with --sample_rate={max(1, round(own_rate / fps)) * fps}."
+        )
+    return rate
+
+
+def raise_all(errors: list[str]) -> None:
+    """Ends with what is wrong with sound, the first of it where it is much.
+
+    Raises:
+        AttachError: If there is anything.
+    """
+    if errors:
+        more = f"\n  ... and {len(errors) - _MOST_ERRORS} more" if len(errors) > _MOST_ERRORS else ""
+        raise AttachError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
+
+
+def spool(cfg: AttachAudioConfig, path: Path, n_microphones: int, target: Path) -> tuple[SpooledFile, int]:
     """Decodes the channels of a file that are wanted; the samples, and their rate [Hz]."""
     rate = 0
     with target.open("wb") as file:
@@ -144,7 +167,12 @@ def _format(pattern: str, episode: int) -> str:
         ) from error
 
 
-def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
+def offsets_of(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
+    """The offset of each episode [s], from the options.
+
+    Raises:
+        AttachError: `offsets` is no list of as many numbers.
+    """
     if cfg.offsets is None:
         return [cfg.offset] * n_episodes
     try:

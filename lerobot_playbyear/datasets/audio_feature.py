@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 AUDIO_PREFIX = "observation.audio."
 """What the key of every microphone starts with."""
 
+AUDIO_DTYPE = "audio"
+"""Of a feature whose sound lies in files beside the frames, which is not our layout: see `audio_layout`."""
+
 PCM_S16 = "pcm_s16"
 _PCM_S16_FULL_SCALE = 32768
 _DTYPES = ("int16", "float32", "float64")
@@ -88,6 +91,10 @@ def check_audio_features(features: Mapping[str, Mapping[str, Any]], fps: int) ->
 
 
 def _check_one(key: str, feature: Mapping[str, Any], fps: int) -> int:
+    if feature["dtype"] == AUDIO_DTYPE:
+        raise ValueError(
+            f"'{key}' has its sound in files (dtype 'audio'); wanted a column. Make one: playbyear-convert-audio --to=columns."
+        )
     if feature["dtype"] not in _DTYPES:
         raise ValueError(
             f"'{key}' has dtype {feature['dtype']!r}; wanted 'int16' (PCM) or 'float32' (in [-1, 1]). Convert the column."

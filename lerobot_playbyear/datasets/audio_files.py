@@ -48,8 +48,13 @@ def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
     return np.concatenate([samples for samples, _ in parts]), parts[0][1]
 
 
-def audio_pieces(path: str | Path) -> Iterator[tuple[np.ndarray, int]]:
+def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarray, int]]:
     """As `read_audio`, in pieces of less than a second, each with the sample rate; a late sound track's silence is one.
+
+    Args:
+        path: The file.
+        formats: FFmpeg's names of the formats that it may have, separated by commas; empty: any. A stranger's file of some
+            formats (playlists) would have others opened.
 
     Raises:
         AudioFileError: The file is missing, or holds no sound that can be decoded.
@@ -59,7 +64,7 @@ def audio_pieces(path: str | Path) -> Iterator[tuple[np.ndarray, int]]:
         raise AudioFileError(f"There is no sound file {path}.")
     position = rate = 0
     try:
-        with av.open(str(path)) as container:
+        with av.open(str(path), options={"format_whitelist": formats} if formats else {}) as container:
             if not container.streams.audio:
                 raise AudioFileError(f"{path} holds no sound.")
             rate = container.streams.audio[0].rate

@@ -5,11 +5,13 @@ episode as one: two hours with two microphones take more than 4 GB. Such a datas
 imported when the files have been looked at, so that damage is told at once.
 """
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, check_audio_features
 from lerobot_playbyear.datasets.columns import check_dataset_files
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -31,10 +33,11 @@ def open_dataset(
         video_backend: LeRobot's video decoder.
 
     Raises:
-        ValueError: If a file of the dataset is truncated, or it is empty.
+        ValueError: If a file of the dataset is truncated, or it is empty, or its sound lies in files beside the frames.
         Exception: Whatever LeRobot raises where there is none, or it cannot be read.
     """
     footers = check_dataset_files(repo_id, root)
+    _check_sound(Path(root) if root is not None else HF_LEROBOT_HOME / repo_id)
     from lerobot.datasets import LeRobotDataset
 
     from lerobot_playbyear.datasets.long_dataset import LongDataset
@@ -43,3 +46,15 @@ def open_dataset(
     if any(size > _LARGE_ROW_GROUP for size in sizes):
         return LongDataset(repo_id, Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, episodes)
     return LeRobotDataset(repo_id, root=root, episodes=episodes, video_backend=video_backend)
+
+
+def _check_sound(folder: Path) -> None:
+    """Refuses sound in files, as LeRobot's pull request 2824 has it, which LeRobot itself cannot open."""
+    if not (folder / INFO_PATH).is_file():
+        return
+    try:
+        features = json.loads((folder / INFO_PATH).read_text()).get("features")
+        in_files = {key: one for key, one in features.items() if one.get("dtype") == AUDIO_DTYPE}
+    except (ValueError, AttributeError):
+        return  # LeRobot says what is wrong
+    check_audio_features(in_files, 1)

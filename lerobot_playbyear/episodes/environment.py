@@ -28,14 +28,18 @@ class EnvSpec:
     kwargs: dict[str, Any] = field(default_factory=dict)
 
     def make(self) -> gym.Env:
-        """Makes the environment and resets it once, so that whatever is missing shows now.
+        """Makes the environment and resets it once, so that whatever is missing shows now. One that has `connect`, such as a
+        robot that a reset would move, is only connected.
 
         Raises:
             RolloutError: It cannot be made: not installed, a wrong argument, no OpenGL library.
         """
         try:
             env = gym.make(self.id, disable_env_checker=True, **self.kwargs)
-            env.reset(seed=0)
+            if env.has_wrapper_attr("connect"):
+                env.get_wrapper_attr("connect")()
+            else:
+                env.reset(seed=0)
         except Exception as error:
             raise RolloutError(f"{self.id} does not start: {error}") from error
         return env
@@ -54,6 +58,8 @@ class EnvFacts:
     action_space: gym.spaces.Box
     fps: int
     has_expert: bool
+    state_names: list[str] | None = None
+    action_names: list[str] | None = None
 
 
 def env_facts(env: gym.Env) -> EnvFacts:
@@ -71,6 +77,8 @@ def env_facts(env: gym.Env) -> EnvFacts:
         action_space=env.action_space,
         fps=int(env.metadata.get("render_fps", 0)),
         has_expert=callable(getattr(env.unwrapped, "scripted_expert", None)),
+        state_names=getattr(env.unwrapped, "state_names", None),
+        action_names=getattr(env.unwrapped, "action_names", None),
     )
 
 

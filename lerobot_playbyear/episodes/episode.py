@@ -33,6 +33,7 @@ class Episode:
         successes: (T,) bool, `info["is_success"]` after each action, or what the expert's verdict says.
         interventions: (T,) bool, whether the expert beside the actor chose the action; None if nobody was beside it.
         verdict: How the expert ended it, if so.
+        facts: What the environment says about how the episode went, such as drop-outs of its microphones; None if it does not.
         watched: T + 1 values of what `play` was asked to watch, such as pictures; otherwise none.
     """
 
@@ -45,6 +46,7 @@ class Episode:
     interventions: np.ndarray | None = None
     verdict: Verdict | None = None
     watched: list[Any] = field(default_factory=list)
+    facts: dict[str, Any] | None = None
 
     @property
     def success(self) -> bool:

@@ -39,6 +39,7 @@ def dataset_features(facts: EnvFacts, video: bool = False) -> dict[str, dict[str
         InputError: An observation has no place in a LeRobotDataset.
     """
     features: dict[str, dict[str, Any]] = {}
+    names: list[str] | None
     for key, space in _observation_boxes(facts.observation_space).items():
         if key.startswith((OBS_IMAGES, OBS_IMAGE)):
             names = ["height", "width", "channel"]
@@ -46,8 +47,9 @@ def dataset_features(facts: EnvFacts, video: bool = False) -> dict[str, dict[str
         elif key.startswith(AUDIO_PREFIX):
             features[key] = audio_feature(sample_rate=space.shape[0] * facts.fps, fps=facts.fps)
         else:
-            features[key] = {"dtype": "float32", "shape": space.shape, "names": None}
-    features[ACTION] = {"dtype": "float32", "shape": facts.action_space.shape, "names": None}
+            names = facts.state_names if key == OBS_STATE else None
+            features[key] = {"dtype": "float32", "shape": space.shape, "names": names}
+    features[ACTION] = {"dtype": "float32", "shape": facts.action_space.shape, "names": facts.action_names}
     for key, dtype in ((INTERVENTION, "bool"), (REWARD, "float32"), (SUCCESS, "bool"), (DONE, "bool"), (SEED, "int64")):
         features[key] = {"dtype": dtype, "shape": (1,), "names": None}
     return features

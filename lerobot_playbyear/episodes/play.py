@@ -68,7 +68,7 @@ def play(
 
     Args:
         env: The environment; `info["is_success"]` is there after every step, and `_max_episode_steps`, if it has that,
-            limits their number.
+            limits their number. `info["verdict"]`, if it is there, ends the episode as a `Verdict`'s value says.
         actor: Who acts.
         seed, options: For `env.reset`.
         expert: Who may take over.
@@ -97,7 +97,9 @@ def play(
                 action = expert.act()
             action = np.asarray(action, np.float32).clip(space.low, space.high)
             observation, reward, terminated, truncated, info = env.step(action)
-            verdict = expert.verdict() if expert is not None else None
+            verdict = Verdict(info["verdict"]) if info.get("verdict") else None
+            if expert is not None:
+                verdict = verdict or expert.verdict()
         observations.append(observation)
         actions.append(action)
         rewards.append(float(reward))
@@ -116,4 +118,5 @@ def play(
         interventions=None if expert is None else np.asarray(interventions, bool),
         verdict=verdict,
         watched=watched,
+        facts=env.get_wrapper_attr("episode_facts")() if env.has_wrapper_attr("episode_facts") else None,
     )

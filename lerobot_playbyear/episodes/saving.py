@@ -5,6 +5,7 @@ from typing import Any
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.recording_notes import note_recording
 from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.frames import episode_frames
 
@@ -21,7 +22,9 @@ def save_episode(episode: Episode, writer: DurableWriter) -> list[dict[str, Any]
     frames = episode_frames(episode, writer.features)
     for frame in frames:
         writer.add_frame(frame)
-    save_or_ask(writer)
+    index = save_or_ask(writer)
+    if episode.facts is not None:
+        note_recording(writer.root, index, episode.facts)
     return frames
 
 

@@ -80,7 +80,7 @@ class PortAudioMicrophoneConfig(MicrophoneConfig):
             raise InputError(f"wait_s={self.wait_s} of a microphone: give seconds above 0, up to 2.")
         if self.card_channels is not None and not self.channel < self.card_channels <= 256:
             raise InputError(
-                f"card_channels={self.card_channels} of a microphone: give more than its channel={self.channel}, counted from 0."
+                f"card_channels={self.card_channels} of a microphone: give more than its channel={self.channel}."
             )
 
     @property

@@ -28,8 +28,8 @@ _QUIETEST_DB, _BAR = -60, 20
 _LOOK_S = 0.1
 _CLIPPED = 32700
 _NO_CARD = (
-    "There is no sound card with an input. Plug a microphone in; on Linux `arecord -l` lists what the system sees, and you must be "
-    "in the group audio. In a container pass --device=/dev/snd, or the socket of PulseAudio or PipeWire."
+    "There is no sound card with an input. Plug a microphone in. On Linux `arecord -l` lists what the system sees, and you "
+    "must be in the group audio. In a container pass --device=/dev/snd, or the socket of PulseAudio or PipeWire."
 )
 
 
@@ -109,7 +109,8 @@ def described(card: SoundCard, rates: tuple[int, ...]) -> Iterator[str]:
 def level_text(samples: np.ndarray) -> str:
     """How loud each channel is: (n, channels) int16 as bars from -60 dB to full scale."""
     texts = []
-    for number, channel in enumerate(samples.T.astype(np.float64)):
+    for number in range(samples.shape[1]):
+        channel = samples[:, number].astype(np.float64)
         loudest = float(np.abs(channel).max()) if len(channel) else 0.0
         level = max(20 * np.log10(loudest / 32768), _QUIETEST_DB) if loudest else _QUIETEST_DB
         bar = "#" * round(_BAR * (level - _QUIETEST_DB) / -_QUIETEST_DB)

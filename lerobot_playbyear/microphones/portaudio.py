@@ -188,8 +188,8 @@ class PortAudioMicrophone(Microphone):
             self._stream = None
             said = str(error).replace("\n", " ")
             raise MicrophoneError(
-                f"{card.name} cannot be opened with {channels} channels at {self.sample_rate} Hz: {said}. Is it plugged in, and "
-                "its sound server running? Close other programs that use it, or give another sample_rate: its own is "
+                f"{card.name} cannot be opened with {channels} channels at {self.sample_rate} Hz: {said}. Is it plugged in, "
+                "and its sound server running? Close other programs that use it, or give another sample_rate: its own is "
                 f"{card.sample_rate} Hz."
             ) from error
 

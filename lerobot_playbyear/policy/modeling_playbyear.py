@@ -133,7 +133,11 @@ class PlaybyearPolicy(PreTrainedPolicy):
 
         Returns:
             (B, n_actions), normalised.
+
+        Raises:
+            ValueError: There is no sound in the observation.
         """
+        self._check_sound(batch)
         if self.training:
             self.eval()
         run = self._recent.add(batch, self.model.prepare_images)
@@ -145,6 +149,15 @@ class PlaybyearPolicy(PreTrainedPolicy):
             else:
                 self._encodings = torch.cat([self._encodings[:, 1:], encoding.unsqueeze(1)], dim=1)
             return self.model.memory_head(self._encodings)[:, -1]
+
+    def _check_sound(self, batch: dict[str, Tensor]) -> None:
+        missing = [key for key in self.config.audio_keys if key not in batch] if self.config.use_audio else []
+        if missing:
+            raise ValueError(
+                f"This policy hears, and there is no sound in the observation: {', '.join(missing)} is missing. "
+                "lerobot-rollout, lerobot-record and lerobot.async_inference carry no sound (LeRobot 0.6). On a robot, use "
+                "lerobot-eval or playbyear-dagger with --env.type=playbyear_robot, --env.robot.type and --env.microphones."
+            )
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

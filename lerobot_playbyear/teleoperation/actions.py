@@ -1,6 +1,6 @@
 """From what a LeRobot teleoperator gives to an environment's action."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -27,13 +27,21 @@ class ActionMapping:
         features: The teleoperator's `action_features`.
         space: The environment's actions.
         directions: What moves the hand along x, y and z: three of `x`, `y`, `z`, with `-` for the opposite direction.
+        names: Of the environment's actions in their order, if they are names of what the teleoperator gives.
         speed: What a full displacement of the teleoperator is for the environment, whose largest is 1.
 
     Raises:
         ExpertError: They do not fit, or `directions` is none.
     """
 
-    def __init__(self, features: Mapping[str, Any], space: gym.Space, directions: str, speed: float) -> None:
+    def __init__(
+        self,
+        features: Mapping[str, Any],
+        space: gym.Space,
+        directions: str,
+        speed: float,
+        names: Sequence[str] | None = None,
+    ) -> None:
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise ExpertError(f"A person can act where actions are a Box of one dimension; here they are {space}.")
         self._names = action_names(features)
@@ -41,6 +49,15 @@ class ActionMapping:
         n = space.shape[0]
         self.moves_hand = set(DELTAS) <= set(self._names)
         self.has_gripper = self.moves_hand and n == len(DELTAS) + 1
+        self.names = list(names or ())
+        if self.names and set(self.names) <= set(self._names):
+            self._names = self.names
+        elif self.names:
+            missing = sorted(set(self.names) - set(self._names))
+            raise ExpertError(
+                f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the robot also needs {', '.join(missing)}: "
+                "give a teleoperator of the same kind as the robot, such as so101_leader for so101_follower."
+            )
         if n != len(self._names) and not (self.moves_hand and n in (3, 4)):
             raise ExpertError(
                 f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the environment's action is {n} numbers. "
@@ -48,6 +65,11 @@ class ActionMapping:
                 "actions dx, dy, dz and gripper, or one with as many numbers as the action has."
             )
         self._axes, self._signs = _parse(directions)
+
+    @property
+    def moves_joints(self) -> bool:
+        """Whether the teleoperator gives where each of the robot's joints shall be."""
+        return bool(self.names) and self._names == self.names and all(name.endswith(".pos") for name in self.names)
 
     def vector(self, action: Mapping[str, Any], gripper: float = 0.0) -> np.ndarray:
         """The action vector (action dim,), inside the environment's limits.

@@ -1,29 +1,37 @@
 """`--expert.type=teleop`: its options, and how everything that a person needs is put together."""
 
+import importlib
+import pkgutil
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
-from lerobot.teleoperators import (
-    Teleoperator,
-    TeleoperatorConfig,
-    gamepad,  # noqa: F401  (registers --expert.teleop.type=gamepad)
-    keyboard,  # noqa: F401  (and keyboard_ee)
-    make_teleoperator_from_config,
-)
+from lerobot import teleoperators
+from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, make_teleoperator_from_config
 from lerobot.teleoperators.gamepad import GamepadTeleop
 
 from lerobot_playbyear.compat import has_gamepad
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
+from lerobot_playbyear.teleoperation.controls import OVERRIDE
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig
 from lerobot_playbyear.teleoperation.levels import microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.window import Window
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.robots.console import Console
+
+for _module in pkgutil.iter_modules(
+    teleoperators.__path__
+):  # registers --expert.teleop.type=so101_leader and the others
+    if _module.ispkg:
+        with suppress(ImportError):  # its maker's software is not installed
+            importlib.import_module(f"{teleoperators.__name__}.{_module.name}")
 
 _MOVING_KEYS: Mapping[str, list[tuple[str, str]]] = {
     "keyboard_window": [("Arrows", "right, left, away, near"), ("E  D", "up, down")],
@@ -45,6 +53,9 @@ class TeleopExpertConfig(ExpertConfig):
         gripper_cooldown_s: For how long after a change the gripper cannot change again [s]; the paper's and our tasks' is 2.
         steps_per_second: Control steps per second; fewer than the environment's are slow motion. None: the environment's.
         begin_paused: Each attempt waits until the person presses P.
+        takeover: How a person takes over from a policy: `hold` the key, or `toggle` it with one press, and hand back with
+            another. `auto`: hold it where the keyboard says when a key is let go, as a window does and a terminal does not.
+        takeover_key: The key, such as `space` or `b`; most pedals are keyboards with one key.
         play_sound: Play the first microphone, if the package sounddevice is installed.
     """
 
@@ -54,6 +65,8 @@ class TeleopExpertConfig(ExpertConfig):
     gripper_cooldown_s: float = 2.0
     steps_per_second: float | None = None
     begin_paused: bool = True
+    takeover: str = "auto"
+    takeover_key: str = OVERRIDE
     play_sound: bool = True
 
     def make(self, env: gym.Env, demonstrates: bool = False) -> Expert:
@@ -61,25 +74,38 @@ class TeleopExpertConfig(ExpertConfig):
         self._check(env)
         kind, env_fps = self.teleop.type, float(env.metadata["render_fps"])
         fps = self.steps_per_second or env_fps
+        robot: Any = env.unwrapped if getattr(env.unwrapped, "is_real_time", False) else None
         with ExitStack() as stack:  # closes what was opened if a later part fails
-            window = Window(f"Play it by ear: {_title(env)}")
-            stack.callback(window.close)
+            window: Window | Console  # (an annotation of a local name is not evaluated)
+            if robot is None:
+                window = Window(f"Play it by ear: {_title(env)}")
+                stack.callback(window.close)
+            else:
+                window = robot.console
             teleop = connect_teleoperator(self.teleop, window)
             stack.callback(teleop.disconnect)
             directions = self.directions or KNOWN_DIRECTIONS.get(kind, "x,y,z")
-            mapping = ActionMapping(_features(teleop), env.action_space, directions, self.speed)
+            mapping = ActionMapping(
+                _features(teleop), env.action_space, directions, self.speed, getattr(robot, "action_names", None)
+            )
+            toggles = self.takeover == "toggle" or (self.takeover == "auto" and not window.has_key_releases)
             expert = TeleopExpert(
                 window=window,
                 teleop=teleop,
                 mapping=mapping,
                 gripper=Gripper(round(self.gripper_cooldown_s * env_fps)),
-                pace=Pace(fps),
+                pace=Pace(fps, waits=robot is None),
                 speaker=self._make_speaker(env, fps, env_fps),
-                keys=key_help(kind, mapping, demonstrates),
-                begins_paused=self.begin_paused,
+                keys=key_help(kind, mapping, demonstrates, toggles, self.takeover_key),
+                begins_paused=self.begin_paused and robot is None,  # a robot's attempt begins when the person is ready
                 demonstrates=demonstrates,
+                toggles=toggles,
+                override=self.takeover_key,
+                robot=robot,
             )
             stack.pop_all()
+        if robot is not None:
+            robot.person.has_expert = True
         return expert
 
     def _check(self, env: gym.Env) -> None:
@@ -94,6 +120,12 @@ class TeleopExpertConfig(ExpertConfig):
             raise ExpertError(f"--expert.gripper_cooldown_s={self.gripper_cooldown_s}: give 0 or more seconds.")
         if self.steps_per_second is not None and not self.steps_per_second > 0:
             raise ExpertError(f"--expert.steps_per_second={self.steps_per_second}: give a number above 0.")
+        if self.takeover not in ("auto", "hold", "toggle"):
+            raise ExpertError(f"--expert.takeover={self.takeover!r}: give auto, hold or toggle.")
+        if getattr(env.unwrapped, "is_real_time", False) and self.steps_per_second is not None:
+            raise ExpertError(
+                f"--expert.steps_per_second={self.steps_per_second}: a robot has no slow motion; give --env.fps."
+            )
         if not env.metadata.get("render_fps"):
             raise ExpertError("The environment does not say its steps per second, metadata['render_fps'].")
 
@@ -109,7 +141,7 @@ class TeleopExpertConfig(ExpertConfig):
         return Speaker(round(size * env_fps), size, reason)
 
 
-def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoperator:
+def connect_teleoperator(config: TeleoperatorConfig, window: "Window | Console") -> Teleoperator:
     """Make and connect a LeRobot teleoperator.
 
     Args:
@@ -152,15 +184,19 @@ def _features(teleop: Teleoperator) -> dict[str, Any]:
         ) from error
 
 
-def key_help(kind: str, mapping: ActionMapping, demonstrates: bool) -> list[tuple[str, str]]:
+def key_help(
+    kind: str, mapping: ActionMapping, demonstrates: bool, toggles: bool = False, override: str = OVERRIDE
+) -> list[tuple[str, str]]:
     """What to press, and what it does.
 
     Args:
         kind: The teleoperator's type.
         mapping: Knows whether there is a gripper.
         demonstrates: Whether nobody but the person acts.
+        toggles: Whether a press takes over, or hands back.
+        override: The key that does.
     """
-    takeover = [] if demonstrates else [("Space", "hold to take over")]
+    takeover = [] if demonstrates else [(override.title(), "take over, hand back" if toggles else "hold to take over")]
     gripper = [("G", "open or close the gripper")] if mapping.has_gripper else []
     return [
         *takeover,

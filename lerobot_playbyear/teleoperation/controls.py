@@ -25,6 +25,10 @@ _EVENTS = (
 _NO_MOVE = {**dict.fromkeys(DELTAS, 0.0), GRIPPER: STAY}
 
 
+class PersonLeftError(KeyboardInterrupt):
+    """The person wants to leave: the command ends as with Ctrl-C, and what was saved is safe."""
+
+
 @dataclass(frozen=True)
 class Wish:
     """What a person wants.
@@ -51,11 +55,18 @@ class Controls:
     Args:
         teleop: A connected teleoperator; `get_teleop_events` is used if it has it.
         keys: The window's.
+        toggles: Whether a press of the key takes over, or hands back, instead of holding it.
+        override: The key.
     """
 
-    def __init__(self, teleop: Teleoperator, keys: WindowKeys) -> None:
+    def __init__(self, teleop: Teleoperator, keys: WindowKeys, toggles: bool = False, override: str = OVERRIDE) -> None:
         self._teleop, self._keys = teleop, keys
+        self._toggles, self._override, self._is_on = toggles, override, False
         self._events: dict[TeleopEvents, bool] = {}
+
+    def reset(self) -> None:
+        """A new attempt: nobody has taken over."""
+        self._is_on = False
 
     def read(self) -> Wish:
         """What a person wants now; what was pressed counts once, and then never again."""
@@ -70,9 +81,11 @@ class Controls:
         self._events = events
         pressed = self._keys.pressed
         verdict = next((verdict for key, verdict in _VERDICTS.items() if key in pressed), None)
+        self._is_on ^= pressed.count(self._override) % 2 == 1
+        by_key = self._is_on if self._toggles else self._override in self._keys.held
         return Wish(
             action=action,
-            overrides=OVERRIDE in self._keys.held or events.get(TeleopEvents.IS_INTERVENTION, False),
+            overrides=by_key or events.get(TeleopEvents.IS_INTERVENTION, False),
             toggles_gripper=pressed.count(GRIPPER_KEY) % 2 == 1,
             toggles_pause=pressed.count(PAUSE) % 2 == 1,
             verdict=verdict or next((verdict for event, verdict in _EVENTS if event in began), None),

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -11,12 +12,16 @@ from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.episode import Observation, Verdict
 from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
-from lerobot_playbyear.teleoperation.controls import Controls, Wish
+from lerobot_playbyear.teleoperation.controls import OVERRIDE, Controls, PersonLeftError, Wish
+from lerobot_playbyear.teleoperation.handover import hand_over
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.status import HISTORY_S, Control, Status
 from lerobot_playbyear.teleoperation.window import Window
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.robots.console import Console
 
 _BEGIN = "Press P to begin"
 _NOTES = {
@@ -26,16 +31,12 @@ _NOTES = {
 }
 
 
-class PersonLeftError(KeyboardInterrupt):
-    """The person closed the window: the command ends as with Ctrl-C, and what was saved is safe."""
-
-
 @dataclass(eq=False)
 class TeleopExpert(Expert):
     """Shows a person each step in its turn, and lets them take over while they hold a key.
 
     Args:
-        window: Shows the scene and hears keys.
+        window: Shows the scene and hears keys; on a robot, its console.
         teleop: A connected LeRobot teleoperator.
         mapping: Makes actions of what it gives.
         gripper: What the gripper is told.
@@ -44,9 +45,12 @@ class TeleopExpert(Expert):
         keys: What to press, for the window.
         begins_paused: Whether each attempt waits until the person is ready.
         demonstrates: Whether nobody but the person acts.
+        toggles: Whether a press of the key takes over, or hands back, instead of holding it.
+        override: The key.
+        robot: The robot's environment, if it is one; its console is not closed here.
     """
 
-    window: Window
+    window: "Window | Console"
     teleop: Teleoperator
     mapping: ActionMapping
     gripper: Gripper
@@ -55,9 +59,12 @@ class TeleopExpert(Expert):
     keys: list[tuple[str, str]]
     begins_paused: bool = True
     demonstrates: bool = False
+    toggles: bool = False
+    override: str = OVERRIDE
+    robot: Any = None
 
     def __post_init__(self) -> None:
-        self._controls = Controls(self.teleop, self.window.keys)
+        self._controls = Controls(self.teleop, self.window.keys, self.toggles, self.override)
         self._wish = Wish({})
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
@@ -74,8 +81,11 @@ class TeleopExpert(Expert):
         status.note = _NOTES[self._verdict] if self._verdict else ""
         self._verdict, self._last_command, self._is_paused = None, None, self.begins_paused
         status.control = Control.PERSON if self.demonstrates else Control.POLICY
+        self._controls.reset()
         if self._controls.read().leaves:  # all else that was pressed meanwhile was not meant for this attempt
             raise PersonLeftError
+        self._controls.reset()
+        self._acts = False
         self.gripper.reset()
         self.pace.start()
         self.speaker.clear()
@@ -98,6 +108,9 @@ class TeleopExpert(Expert):
         if self._is_paused and self._verdict is None:
             self._pause()
         acts = self.demonstrates or self._wish.overrides
+        if acts and not self._acts and self.robot is not None and self.mapping.moves_joints and self._verdict is None:
+            self._meet()
+        self._acts = acts
         self._last_command = self._gripper_command() if acts else float(policy_action[-1])
         status.control = Control.PERSON if acts else Control.POLICY
         return acts
@@ -112,28 +125,47 @@ class TeleopExpert(Expert):
         self.speaker.close()
         if self.teleop.is_connected:
             self.teleop.disconnect()
-        self.window.close()
+        if self.robot is None:
+            self.window.close()
+        else:
+            self.robot.person.has_expert = False
 
     def _read(self) -> None:
         """What the person wants now."""
         if not self.window.is_open:
             raise PersonLeftError
         self._wish = self._controls.read()
-        if self._wish.leaves:
+        verdict = self._wish.verdict
+        if self._wish.leaves and self.robot is not None:
+            verdict = self.robot.stop_and_ask("You pressed Escape.")
+        if self._wish.leaves and verdict is None:
             raise PersonLeftError
         self._is_paused ^= self._wish.toggles_pause
-        self._verdict = self._wish.verdict
+        self._verdict = verdict
 
     def _pause(self) -> None:
         """Nothing moves until the person goes on, or ends the attempt."""
         status = self._status
         note, status.note = status.note, _BEGIN if status.step == 0 else "Press P to go on"
+        if self.robot is not None:
+            self.robot.hold()
         while self._is_paused and self._verdict is None:
             status.control = Control.PAUSED
             self._show()
             time.sleep(1 / self.pace.fps)
             self._read()
         status.note = note
+        self.pace.start()
+        if self.robot is not None:
+            self.robot.go_on()
+
+    def _meet(self) -> None:
+        """Leader and follower come together before the person acts."""
+        self._status.note = "The arms meet"
+        self._show()
+        hand_over(self._env, self.teleop, self.robot.arm.by_name(self.mapping.vector(self._wish.action)))
+        self._status.note = ""
+        self._wish = self._controls.read()
         self.pace.start()
 
     def _gripper_command(self) -> float:
@@ -153,4 +185,5 @@ class TeleopExpert(Expert):
             status.gripper = "closed" if self.gripper.is_closed else "open"
             status.cooldown_s = round(self.gripper.blocked_steps / self.pace.fps, 2)
         status.sound = self.speaker.problem
+        status.drop_outs = self.robot.n_drop_outs if self.robot is not None else 0
         self.window.show(status, picture)

@@ -14,16 +14,18 @@ class Pace:
 
     Args:
         fps: Steps per second.
+        waits: Whether it waits, and not only measures.
         clock, sleep: As in `time`.
     """
 
     def __init__(
         self,
         fps: float,
+        waits: bool = True,
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.fps = fps
+        self.fps, self._waits = fps, waits
         self._clock, self._sleep = clock, sleep
         self._due: float | None = None
         self._times: deque[float] = deque()
@@ -36,7 +38,7 @@ class Pace:
     def wait(self) -> None:
         """Returns when the next step is due."""
         now = self._clock()
-        if self._due is None or now > self._due:
+        if self._due is None or now > self._due or not self._waits:
             self._due = now
         else:
             self._sleep(self._due - now)

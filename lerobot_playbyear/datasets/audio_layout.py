@@ -1,0 +1,186 @@
+"""Sound in files beside the frames, as LeRobot's pull request 2824 stores it, and where in these files an episode's lies.
+
+A feature `observation.audio.<microphone>` of dtype "audio" and shape (channels,) has no column. Its sound lies in
+`audio/<key>/chunk-000/file-000.m4a`, several episodes one after the other; `meta/episodes` says where each begins. The sound
+of an episode begins `info.start_time_s` before its first frame. All this may be a stranger's, and is checked here.
+"""
+
+import bisect
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, AUDIO_PREFIX
+from lerobot_playbyear.datasets.confines import file_inside
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import INFO_PATH
+
+AUDIO_FOLDER = "audio"
+DEFAULT_AUDIO_PATH = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
+PRE_ROLL_S = 1.0
+"""How long before an episode's first frame its sound begins [s]."""
+
+_TEMPLATE = re.compile(r"(?:[^{}]|\{(?:audio_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
+_MOST_CHANNELS, _MOST_START_S, _MOST_INDEX = 64, 60.0, 10**6
+_TOLERANCE, _SPARE_S = 4, 60.0  # times as long as the episodes, and so much more, may the files claim to last
+
+
+class AudioLayoutError(InputError):
+    """What a dataset says of its files of sound cannot be so."""
+
+
+@dataclass(frozen=True)
+class AudioSpan:
+    """Where an episode's sound lies.
+
+    Args:
+        path: The file.
+        start_s: Where in it the sound begins [s].
+        end_s: Where it ends [s]; None: with the file.
+    """
+
+    path: Path
+    start_s: float
+    end_s: float | None
+
+
+@dataclass(frozen=True)
+class AudioTrack:
+    """A microphone.
+
+    Args:
+        key: Its feature.
+        n_channels: Of its files.
+        sample_rate: Of its files, as the feature says [Hz]; None: it says nothing.
+        start_time_s: How long before an episode's first frame its sound begins [s].
+        spans: Of every episode.
+    """
+
+    key: str
+    n_channels: int
+    sample_rate: int | None
+    start_time_s: float
+    spans: list[AudioSpan]
+
+
+def read_tracks(root: Path, rows: pa.Table, seconds: float, start_time_s: float | None = None) -> list[AudioTrack]:
+    """The microphones of a dataset in this layout.
+
+    Args:
+        root: Its folder.
+        rows: Its `meta/episodes`, in the order of the episodes.
+        seconds: How long all episodes last together [s].
+        start_time_s: What is taken for `info.start_time_s` [s]; None: what the dataset says.
+
+    Raises:
+        AudioLayoutError: There is none; or a name, a number or a time is missing or cannot be right.
+        OutsideError: A file lies outside the folder.
+    """
+    info = json.loads((root / INFO_PATH).read_text())
+    features = {key: one for key, one in info["features"].items() if one.get("dtype") == AUDIO_DTYPE}
+    if not features:
+        raise AudioLayoutError(
+            f"{root / INFO_PATH} has no feature of dtype 'audio'. Sound in columns becomes files with --to=files."
+        )
+    template = info.get("audio_path") or DEFAULT_AUDIO_PATH
+    if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
+        raise AudioLayoutError(
+            f"{root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
+        )
+    return [_track(root, key, feature, template, rows, seconds, start_time_s) for key, feature in features.items()]
+
+
+def column_names(track: AudioTrack) -> list[str]:
+    """The columns that a microphone becomes: one for each channel, numbered from 0 if there are several."""
+    return [track.key] if track.n_channels == 1 else [f"{track.key}_{channel}" for channel in range(track.n_channels)]
+
+
+def _track(
+    root: Path,
+    key: str,
+    feature: Mapping[str, Any],
+    template: str,
+    rows: pa.Table,
+    seconds: float,
+    start_time_s: float | None,
+) -> AudioTrack:
+    if not key.startswith(AUDIO_PREFIX) or key == AUDIO_PREFIX or "/" in key or "\\" in key:
+        raise AudioLayoutError(
+            f"'{key}' has dtype 'audio'; wanted a key like '{AUDIO_PREFIX}<microphone>', without '/'. Rename it."
+        )
+    info = feature.get("info") or {}
+    if not isinstance(info, Mapping):
+        raise AudioLayoutError(f"'{key}': info is {info!r}; wanted fields such as sample_rate. Correct {INFO_PATH}.")
+    shape = feature.get("shape")
+    n_channels = shape[0] if isinstance(shape, list) and len(shape) == 1 else None
+    n_channels = _number(key, "shape", shape, n_channels, 1, _MOST_CHANNELS, "(channels,)")
+    rate = info.get("sample_rate", info.get("audio.sample_rate"))
+    if rate is not None:
+        rate = _number(key, "info.sample_rate", rate, rate, 1, 1_000_000, "a whole number of Hz")
+    start = info.get("start_time_s") if start_time_s is None else start_time_s
+    is_time = isinstance(start, int | float) and not isinstance(start, bool) and 0 <= start <= _MOST_START_S
+    if start is None or not is_time:
+        raise AudioLayoutError(
+            f"'{key}': info.start_time_s is {start!r}; wanted how long before an episode's first frame its sound begins, "
+            f"0 to {_MOST_START_S:g} s. Say it with --start_time_s={PRE_ROLL_S:g}."
+        )
+    latest_s = _TOLERANCE * (seconds + len(rows) * start) + _SPARE_S
+    spans = _spans(root, key, template, rows, latest_s)
+    return AudioTrack(key, int(n_channels), None if rate is None else int(rate), float(start), spans)
+
+
+def _spans(root: Path, key: str, template: str, rows: pa.Table, latest_s: float) -> list[AudioSpan]:
+    names = {name: f"{AUDIO_FOLDER}/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")}
+    missing = [name for name in names.values() if name not in rows.column_names]
+    if missing:
+        raise AudioLayoutError(
+            f"'{key}': meta/episodes has no column {missing[0]!r}, so nothing says where the sound lies. "
+            "Record again, or add the column."
+        )
+    columns = {name: rows.column(column).to_pylist() for name, column in names.items()}
+    end_name = f"{AUDIO_FOLDER}/{key}/to_timestamp"
+    ends = rows.column(end_name).to_pylist() if end_name in rows.column_names else [None] * len(rows)
+    spans: list[AudioSpan] = []
+    for episode, (chunk, file, start, end) in enumerate(zip(*columns.values(), ends, strict=True)):
+        of = f"{key}', episode {episode}, '{AUDIO_FOLDER}"
+        for name, value in (("chunk_index", chunk), ("file_index", file)):
+            _number(of, name, value, value, 0, _MOST_INDEX, "a whole number")
+        _time(of, "from_timestamp", start, 0, latest_s)
+        if end is not None:
+            _time(of, "to_timestamp", end, start, latest_s)
+        path = file_inside(root, template.format(audio_key=key, chunk_index=int(chunk), file_index=int(file)))
+        spans.append(AudioSpan(path, float(start), None if end is None else float(end)))
+    starts: dict[Path, list[float]] = {}
+    for span in spans:
+        starts.setdefault(span.path, []).append(span.start_s)
+    for own in starts.values():
+        own.sort()
+    return [span if span.end_s is not None else _up_to_the_next(span, starts[span.path]) for span in spans]
+
+
+def _up_to_the_next(span: AudioSpan, starts: list[float]) -> AudioSpan:
+    """A span without an end, which ends where the next one in its file begins, if there is one."""
+    later = bisect.bisect_right(starts, span.start_s)
+    return AudioSpan(span.path, span.start_s, starts[later] if later < len(starts) else None)
+
+
+def _number(of: str, name: str, seen: Any, value: Any, least: int, most: int, wanted: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | float) or value % 1 or not least <= value <= most:
+        raise AudioLayoutError(
+            f"'{of}': {name} is {seen!r}; wanted {wanted}, {least} to {most:,}. Correct it, or ask who made the dataset."
+        )
+    return int(value)
+
+
+def _time(of: str, name: str, value: Any, least: float, most: float) -> None:
+    if not isinstance(value, int | float) or not math.isfinite(value) or not least <= value <= most:
+        raise AudioLayoutError(
+            f"'{of}': {name} is {value!r}; wanted seconds, {least:g} to {most:g}, which is {_TOLERANCE} times what the "
+            "episodes last. Correct it, or ask who made the dataset."
+        )

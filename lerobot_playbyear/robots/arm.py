@@ -1,0 +1,265 @@
+"""A LeRobot robot, as the environment needs it: vectors instead of names, limits, and a hold that is always possible."""
+
+import copy
+import logging
+import threading
+import time
+from collections.abc import Mapping
+
+import numpy as np
+from lerobot.robots import Robot, RobotConfig, make_robot_from_config
+
+from lerobot_playbyear.robots.errors import RobotError
+
+_POSITION = ".pos"
+_MOVE_FPS = 30
+
+
+class Arm:
+    """A robot that gets nothing but finite, limited actions.
+
+    Args:
+        config: Of the robot.
+        max_relative_target: Filled in where the robot has this option and was not given it.
+        max_step: How much what a joint is told may change from one action to the next; None: no limit.
+        calibrate: Whether LeRobot asks for a calibration when there is none.
+
+    Attributes:
+        state_names, action_names: Of the numbers in state and action, in their order.
+        cameras: The shape (height, width, 3) of each camera's pictures.
+
+    Raises:
+        RobotError: It cannot be made, or gives something that has no place in an observation.
+    """
+
+    def __init__(
+        self,
+        config: RobotConfig,
+        max_relative_target: float | None = None,
+        max_step: float | None = None,
+        calibrate: bool = True,
+    ) -> None:
+        config = copy.deepcopy(config)
+        if max_relative_target is not None and getattr(config, "max_relative_target", 0) is None:
+            config.max_relative_target = max_relative_target  # type: ignore[attr-defined]
+        try:
+            self.robot: Robot = make_robot_from_config(config)
+            observations, actions = self.robot.observation_features, self.robot.action_features
+        except Exception as error:  # whatever a maker's software may say
+            raise RobotError(f"--env.robot.type={config.type} cannot be made: {error}") from error
+        self._calibrate, self._max_step = calibrate, max_step
+        self.state_names = [name for name, kind in observations.items() if kind in (float, int)]
+        self.cameras = {name: tuple(kind) for name, kind in observations.items() if isinstance(kind, tuple | list)}
+        strange = [
+            f"{name}: {kind}"
+            for name, kind in observations.items()
+            if name not in self.state_names and not (name in self.cameras and self.cameras[name][2:] == (3,))
+        ]
+        if strange:
+            raise RobotError(
+                f"--env.robot.type={config.type} observes {', '.join(strange)}; wanted numbers and pictures (height, width, "
+                "3). Turn it off in the robot's options."
+            )
+        self.action_names = [name for name, kind in actions.items() if kind in (float, int)]
+        if not self.action_names or len(self.action_names) < len(actions):
+            raise RobotError(f"--env.robot.type={config.type} takes {actions}; wanted numbers by name.")
+        self._lock = threading.RLock()
+        self._last: np.ndarray | None = None
+        self._has_command = False
+
+    @property
+    def has_positions(self) -> bool:
+        """Whether its actions are joint targets that are in its state, too: then it holds by being told where it is."""
+        return all(name.endswith(_POSITION) and name in self.state_names for name in self.action_names)
+
+    def connect(self) -> None:
+        """Connects to robot and cameras; nothing if it is connected.
+
+        Raises:
+            RobotError: It cannot.
+        """
+        if self.robot.is_connected:
+            return
+        try:
+            self.robot.connect(calibrate=self._calibrate)
+        except Exception as error:
+            with_cameras = f" with the cameras {', '.join(self.cameras)}" if self.cameras else ""
+            raise RobotError(
+                f"The robot {self.robot.name}{with_cameras} cannot be connected: {error} Look at its cable, its power and its "
+                "port (lerobot-find-port, lerobot-find-cameras)."
+            ) from error
+        self._last = None
+
+    def disconnect(self) -> None:
+        """Lets go of it; errors are logged."""
+        with self._lock:
+            try:
+                if self.robot.is_connected:
+                    self.robot.disconnect()
+            except Exception as error:
+                logging.warning(f"The robot {self.robot.name} could not be disconnected: {error}")
+
+    def begin_episode(self, seed: int | None) -> None:
+        """Of a simulated robot that has `reset_episode(seed)`: sets its scene up, as a person does with a real one.
+
+        Raises:
+            RobotError: It does not answer.
+        """
+        reset = getattr(self.robot, "reset_episode", None)
+        if callable(reset):
+            with self._lock:
+                try:
+                    reset(seed)
+                except Exception as error:
+                    raise RobotError(f"The robot {self.robot.name} cannot set its scene up: {error}") from error
+
+    def observe(self) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Its state (len(state_names),) float32, and each camera's picture (height, width, 3) uint8.
+
+        Raises:
+            RobotError: It, or a camera, does not answer, or gives something else than it said.
+        """
+        try:
+            with self._lock:
+                observation = self.robot.get_observation()
+            state = np.array([float(observation[name]) for name in self.state_names], np.float32)
+            pictures = {name: np.asarray(observation[name]) for name in self.cameras}
+        except Exception as error:
+            raise RobotError(f"The robot {self.robot.name}, or a camera, does not answer: {error}") from error
+        for name, picture in pictures.items():
+            if picture.shape != self.cameras[name] or picture.dtype != np.uint8:
+                raise RobotError(
+                    f"The camera {name} gives pictures {picture.dtype} {picture.shape}; wanted uint8 {self.cameras[name]}. "
+                    "Give its real width and height."
+                )
+        if not np.isfinite(state).all():
+            bad = [name for name, value in zip(self.state_names, state, strict=True) if not np.isfinite(value)]
+            raise RobotError(f"The robot {self.robot.name} gives no finite value for {', '.join(bad)}.")
+        return state, pictures
+
+    def send(self, action: np.ndarray) -> np.ndarray:
+        """Sends an action (len(action_names),), changed by no more than the limit per step since the last one.
+
+        Returns:
+            What was sent, as far as the robot says so.
+
+        Raises:
+            ValueError: It is not finite; nothing was sent.
+            RobotError: The robot does not answer.
+        """
+        action = np.asarray(action, np.float64)
+        if not np.isfinite(action).all():
+            raise ValueError("The action holds a value that is not finite.")
+        with self._lock:
+            if self._max_step is not None and self._last is not None and self.has_positions:
+                action = action.clip(self._last - self._max_step, self._last + self._max_step)
+            sent = self._send(action)
+            self._last = action
+        return sent
+
+    def hold(self) -> None:
+        """Stops where it is: targets become where the joints are, displacements become none.
+
+        Raises:
+            RobotError: The robot does not answer.
+        """
+        with self._lock:
+            self._send(self.resting_action())
+            self._last = None
+
+    def resting_action(self) -> np.ndarray:
+        """The action (len(action_names),) that moves nothing now."""
+        if not self.has_positions:
+            return np.zeros(len(self.action_names))
+        state, _ = self.observe()
+        by_name = dict(zip(self.state_names, state, strict=True))
+        return np.array([by_name[name] for name in self.action_names], np.float64)
+
+    def position(self) -> dict[str, float]:
+        """Where each joint is that can be told where to go; none for robots that are moved by displacements."""
+        return self.by_name(self.resting_action()) if self.has_positions else {}
+
+    def move_to(self, target: Mapping[str, float], duration_s: float) -> None:
+        """Moves there in a straight line, in as long a time as is given; joints that are not named stay.
+
+        Raises:
+            RobotError: A name is none of its joints, or it does not answer.
+        """
+        from lerobot.common.control_utils import follower_smooth_move_to
+
+        unknown = sorted(set(target) - set(self.action_names))
+        if unknown or not self.has_positions:
+            raise RobotError(
+                f"The robot {self.robot.name} cannot be told to go to {dict(target)}: its joints are {self.action_names}."
+            )
+        with self._lock:
+            limited, self._max_step = self._max_step, None  # the line is smooth by itself
+            try:
+                follower_smooth_move_to(self.robot, self.position(), dict(target), duration_s, _MOVE_FPS)
+            except Exception as error:
+                raise RobotError(f"The robot {self.robot.name} does not answer: {error}") from error
+            finally:
+                self._max_step, self._last = limited, None
+
+    def by_name(self, action: np.ndarray) -> dict[str, float]:
+        """An action (len(action_names),) as LeRobot's robots take it."""
+        return {name: float(value) for name, value in zip(self.action_names, action, strict=True)}
+
+    def _send(self, action: np.ndarray) -> np.ndarray:
+        try:
+            sent = self.robot.send_action(self.by_name(action)) or {}
+        except Exception as error:
+            raise RobotError(f"The robot {self.robot.name} does not take an action: {error}") from error
+        return np.array([sent.get(name, value) for name, value in zip(self.action_names, action, strict=True)])
+
+
+class Watchdog:
+    """Holds the arm when no action has come for too long while it is on duty.
+
+    Args:
+        arm: The arm.
+        after_s: For how long [s].
+    """
+
+    def __init__(self, arm: Arm, after_s: float) -> None:
+        self._arm, self._after = arm, after_s
+        self._due: float | None = None
+        self._wake = threading.Condition()
+        self._is_over = False
+        self.n_holds = 0
+        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._thread.start()
+
+    def feed(self) -> None:
+        """An action was sent: it is on duty."""
+        with self._wake:
+            self._due = time.perf_counter() + self._after
+            self._wake.notify()
+
+    def rest(self) -> None:
+        """Nothing moves: it is off duty."""
+        with self._wake:
+            self._due = None
+
+    def close(self) -> None:
+        """Ends it."""
+        with self._wake:
+            self._is_over = True
+            self._wake.notify()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while True:
+            with self._wake:
+                wait = None if self._due is None else self._due - time.perf_counter()
+                if self._is_over:
+                    return
+                if wait is None or wait > 0:
+                    self._wake.wait(wait)
+                    continue
+                self._due = None
+            self.n_holds += 1
+            try:
+                self._arm.hold()
+            except RobotError as error:
+                logging.error(f"The loop stands still, and the robot cannot be told to hold: {error}")

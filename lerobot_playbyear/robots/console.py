@@ -1,0 +1,162 @@
+"""Where a person beside a robot sees what goes on, and presses keys: a window, a terminal, or nothing."""
+
+import os
+import sys
+import threading
+import time
+from typing import Any, Protocol
+
+import numpy as np
+
+from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.teleoperation.keyboard import WindowKeys
+from lerobot_playbyear.teleoperation.status import Status
+from lerobot_playbyear.teleoperation.window import Window
+
+_ESCAPES = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[C": "right", "\x1b[D": "left"}
+_NAMES = {" ": "space", "\x1b": "escape", "\x03": "escape", "\r": "enter", "\n": "enter"}
+_LINE_EVERY_S = 0.2
+
+
+class Console(Protocol):
+    """What a person sees and presses.
+
+    Attributes:
+        keys: What is pressed.
+        is_open: Whether anybody is there.
+        has_key_releases: Whether it knows when a key is let go.
+    """
+
+    keys: WindowKeys
+    is_open: bool
+    has_key_releases: bool
+
+    def show(self, status: Status, picture: np.ndarray | None = None) -> None:
+        """Shows this as soon as possible; returns at once."""
+
+    def close(self) -> None:
+        """Ends it."""
+
+
+class TerminalConsole:
+    """The terminal that the program was started in: one line that tells how it goes, and keys without Enter.
+
+    Raises:
+        RobotError: The program has no terminal.
+    """
+
+    has_key_releases = False
+
+    def __init__(self) -> None:
+        try:
+            import termios
+            import tty
+        except ImportError as error:
+            raise RobotError("--env.console=terminal needs Linux or macOS: give window or none.") from error
+        if not (sys.stdin and sys.stdin.isatty()):
+            raise RobotError("--env.console=terminal, and the program has no terminal: give window or none.")
+        self.keys = WindowKeys()
+        self.keys.has_focus = True
+        self.is_open = True
+        self._file = sys.stdin.fileno()
+        self._termios: Any = termios
+        self._before = termios.tcgetattr(self._file)
+        tty.setcbreak(self._file)
+        self._note, self._shown = "", 0.0
+        self._stop_read, self._stop_write = os.pipe()
+        self._thread = threading.Thread(target=self._read, name="terminal", daemon=True)
+        self._thread.start()
+
+    def show(self, status: Status, picture: np.ndarray | None = None) -> None:
+        now = time.monotonic()
+        if status.note != self._note and status.note:
+            self._write(f"\r\x1b[K{status.note}\n")
+        elif now - self._shown < _LINE_EVERY_S:
+            return
+        self._note, self._shown = status.note, now
+        levels = ", ".join(f"{name} {values[-1]:.0f} dB" for name, values in status.levels_db.items() if values)
+        rate = f"{status.achieved_fps:.1f} Hz" if status.achieved_fps else ""
+        lost = f"{status.drop_outs} drop-outs" if status.drop_outs else ""
+        parts = [
+            f"attempt {status.attempt}, step {status.step} of {status.n_steps}",
+            status.control,
+            rate,
+            levels,
+            lost,
+        ]
+        self._write("\r\x1b[K" + "  ".join(part for part in parts if part))
+
+    def close(self) -> None:
+        if self.is_open:
+            self.is_open = False
+            os.write(self._stop_write, b"x")
+            self._thread.join()
+            self._termios.tcsetattr(self._file, self._termios.TCSADRAIN, self._before)
+            for end in (self._stop_read, self._stop_write):
+                os.close(end)
+            self._write("\n")
+
+    def _write(self, text: str) -> None:
+        sys.stderr.write(text)
+        sys.stderr.flush()
+
+    def _read(self) -> None:
+        import select
+
+        while self.is_open:
+            ready, _, _ = select.select([self._file, self._stop_read], [], [])
+            if self._stop_read in ready:
+                return
+            try:
+                text = os.read(self._file, 64).decode(errors="replace")
+            except OSError:
+                text = ""
+            if not text:  # the terminal is gone
+                self.keys.note("escape", True)
+                return
+            for name in _names(text):
+                self.keys.note(name, True)
+                self.keys.note(name, False)
+
+
+class NoConsole:
+    """Nobody: attempts begin by themselves and end with their time, or as the expert says."""
+
+    has_key_releases = False
+
+    def __init__(self) -> None:
+        self.keys, self.is_open = WindowKeys(), True
+
+    def show(self, status: Status, picture: np.ndarray | None = None) -> None:
+        """Nobody looks."""
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def make_console(kind: str, title: str) -> Console:
+    """A console of a kind: `window`, `terminal`, `none`, or `auto`: a window where there is a screen, else a terminal.
+
+    Raises:
+        RobotError: There is no terminal.
+        ExpertError: There is no screen.
+    """
+    if kind == "auto":
+        screen = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        kind = "window" if screen else "terminal" if sys.stdin and sys.stdin.isatty() else "none"
+    if kind == "window":
+        return Window(title)
+    return TerminalConsole() if kind == "terminal" else NoConsole()
+
+
+def _names(text: str) -> list[str]:
+    """The keys in what a terminal sends."""
+    names = []
+    while text:
+        escape = next((code for code in _ESCAPES if text.startswith(code)), "")
+        if escape:
+            names.append(_ESCAPES[escape])
+        else:
+            names.append(_NAMES.get(text[0], text[0].lower()))
+        text = text[len(escape) or 1 :]
+    return names

@@ -1,0 +1,260 @@
+"""A real robot as a Gymnasium environment, in real time."""
+
+import logging
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.episodes.episode import Verdict
+from lerobot_playbyear.robots.arm import Arm
+from lerobot_playbyear.robots.config import RobotEnvConfig
+from lerobot_playbyear.robots.console import Console
+from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.robots.person import Person, StopPressedError, count
+from lerobot_playbyear.robots.rig import leave_rig, open_rig
+from lerobot_playbyear.robots.ticks import Ticks
+from lerobot_playbyear.teleoperation.controls import PersonLeftError
+
+
+class RobotEnv(gym.Env):
+    """Any LeRobot robot with any number of microphones.
+
+    `reset` brings the arm to rest and waits for the person. `step` sends an action, waits for the tick, and returns pictures,
+    joints, and what each microphone heard since the tick before, up to when the pictures were exposed. Whatever goes wrong,
+    the arm holds, the person is asked what becomes of the attempt, and it ends.
+
+    Observations: `pixels` {camera: (height, width, 3) uint8}, `agent_pos` (numbers of the state,) float32 in the order of
+    `state_names`, `audio.<microphone>` (samples per tick,) int16. Actions: (numbers,) in the order of `action_names`, in the
+    robot's own units.
+
+    Args:
+        config: The options.
+        render_mode: `rgb_array`: `render` gives all cameras side by side.
+
+    Raises:
+        RobotError: No robot is given, or it cannot be made.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium declares it so)
+    is_real_time = True
+
+    def __init__(self, config: RobotEnvConfig, render_mode: str = "rgb_array") -> None:
+        self.config, self.render_mode = config, render_mode
+        self.metadata = {**self.metadata, "render_fps": config.fps}
+        self.task = self.task_description = config.task or ""
+        self._max_episode_steps = max(round(config.episode_s * config.fps), 1)
+        self._rig = open_rig(config)
+        self._is_closed = False
+        arm = self._rig.arm
+        self.state_names, self.action_names = arm.state_names, arm.action_names
+        observation: dict[str, spaces.Space] = {}
+        if arm.cameras:
+            pictures: dict[str, spaces.Space] = {n: spaces.Box(0, 255, s, np.uint8) for n, s in arm.cameras.items()}
+            observation["pixels"] = spaces.Dict(pictures)
+        if self.state_names:
+            observation["agent_pos"] = spaces.Box(-np.inf, np.inf, (len(self.state_names),), np.float32)
+        for name, microphone in config.microphones.items():
+            shape = (microphone.sample_rate // config.fps,)
+            observation[f"audio.{name}"] = spaces.Box(-32768, 32767, shape, np.int16)
+        self.observation_space = spaces.Dict(observation)
+        limit = np.inf if arm.has_positions else 1.0
+        self.action_space = spaces.Box(-limit, limit, (len(self.action_names),), np.float32)
+        self.person = Person(self._rig, self._max_episode_steps)
+        self._ticks = Ticks(config.fps)
+        self._same_picture: dict[str, tuple[int, float]] = {}
+        self._pictures: dict[str, np.ndarray] = {n: np.zeros(s, np.uint8) for n, s in arm.cameras.items()}
+        self._last: dict[str, Any] | None = None
+        self._began_at = 0.0
+        self._stopped: Verdict | None = None
+
+    # Gymnasium's interface
+
+    def connect(self) -> None:
+        """Opens everything, so that whatever is missing shows now.
+
+        Raises:
+            RobotError, MicrophoneError: Something cannot be used.
+        """
+        self._rig.connect()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        super().reset(seed=seed)
+        rig, config = self._rig, self.config
+        rig.watchdog.rest()
+        self._connect_or_ask()
+        if rig.home or config.rest:
+            rig.arm.move_to(config.rest if config.rest is not None else rig.home or {}, config.rest_s)
+        rig.arm.begin_episode(seed)
+        rig.attempt += 1
+        self.person.begin(wait=config.wait_for_person, picture=self._look)
+        self._same_picture.clear()
+        self._stopped = None
+        self._began_at = time.time()
+        now = self._ticks.start()
+        rig.ears.restart(now - config.camera_latency_s)
+        rig.watchdog.feed()
+        self._last = self._observe(now)
+        return self._last, {"is_success": False}
+
+    def step(self, action):
+        if self._last is None:
+            raise gym.error.ResetNeeded("step() was called before the first attempt: call reset() first.")
+        if self._stopped is not None:  # by an expert, in this step
+            return self._outcome(self._stopped, is_problem=True)
+        rig, problem = self._rig, ""
+        n_holds = rig.watchdog.n_holds
+        try:
+            if self._ticks.n and time.perf_counter() - self._tick_at > self.config.stall_s:
+                problem = f"The loop stood still for {time.perf_counter() - self._tick_at:.1f} s."
+            elif not np.isfinite(np.asarray(action, np.float64)).all():
+                problem = "The policy's action holds a value that is not finite (NaN)."
+            else:
+                rig.arm.send(action)
+                rig.watchdog.feed()
+        except RobotError as error:
+            problem = str(error)
+        if not problem:
+            due = self._ticks.wait()
+            try:
+                self._last = self._observe(due)
+            except RobotError as error:
+                problem = str(error)
+            if not problem and self._ticks.lateness[-1] > self.config.stall_s:
+                problem = f"The program stood still for {self._ticks.lateness[-1]:.1f} s."
+        problem = problem or self._frozen_camera() or rig.ears.problem
+        if problem:
+            return self._end(problem)
+        if rig.watchdog.n_holds > n_holds:
+            logging.debug("The arm held for a moment: an action came late.")
+        try:
+            verdict = self.person.look(self._last, self.render(), self._ticks, rig.ears.drop_outs)
+        except StopPressedError:
+            return self._end("You pressed Escape.")
+        return self._outcome(verdict)
+
+    def render(self) -> np.ndarray:
+        """All cameras side by side, (height, width, 3) uint8; the highest gives the height."""
+        pictures = list(self._pictures.values()) or [np.zeros((64, 64, 3), np.uint8)]
+        height = max(picture.shape[0] for picture in pictures)
+        padded = [np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0))) for p in pictures]
+        return np.ascontiguousarray(np.concatenate(padded, axis=1))
+
+    def close(self) -> None:
+        """The arm holds, and everything is let go."""
+        if not self._is_closed:
+            self._is_closed = True
+            leave_rig(self._rig)
+
+    # For an expert beside a policy
+
+    @property
+    def arm(self) -> Arm:
+        """The robot."""
+        return self._rig.arm
+
+    @property
+    def console(self) -> Console:
+        """Where the person is."""
+        return self._rig.console
+
+    @property
+    def n_drop_outs(self) -> int:
+        """Places of this attempt at which sound is missing."""
+        return count(self._rig.ears.drop_outs)
+
+    def hold(self) -> None:
+        """The arm stops, and time does not count until `go_on`."""
+        self._rig.watchdog.rest()
+        self._rig.arm.hold()
+
+    def go_on(self) -> None:
+        """After `hold`: what was heard meanwhile belongs to no frame."""
+        now = self._ticks.go_on()
+        self._tick_at = now
+        self._rig.ears.skip_to(now - self.config.camera_latency_s)
+        self._rig.watchdog.feed()
+
+    def stop_and_ask(self, reason: str) -> Verdict | None:
+        """The arm holds, and the person says what becomes of the attempt; None: they leave. The attempt's next step is its
+        last, and moves nothing."""
+        self._rig.watchdog.rest()
+        try:
+            self._rig.arm.hold()
+        except RobotError as error:
+            logging.error(f"The robot cannot be told to hold: {error}")
+        self._stopped = self.person.judge(reason, self._rig.ears.drop_outs)
+        return self._stopped
+
+    def episode_facts(self) -> dict[str, Any]:
+        """Of the attempt so far: when it began [s since 1970], ticks per second, late ticks, drop-outs by microphone."""
+        lateness = sorted(self._ticks.lateness) or [0.0]
+        return {
+            "begun_at_s": round(self._began_at, 6),
+            "rate_hz": round(self._ticks.rate, 3),
+            "ticks": self._ticks.n,
+            "late_ticks": self._ticks.n_late,
+            "worst_lateness_s": round(lateness[-1], 4),
+            "drop_outs": {
+                name: [[drop.frame, drop.n_samples, drop.reason] for drop in drops]
+                for name, drops in self._rig.ears.drop_outs.items()
+            },
+        }
+
+    def _connect_or_ask(self) -> None:
+        while True:
+            try:
+                self._rig.connect()
+                return
+            except PlaybyearError as error:
+                if not self.person.is_there or not self.person.wants_again(str(error)):
+                    raise
+
+    def _look(self) -> np.ndarray:
+        """What the cameras see between attempts."""
+        _, self._pictures = self._rig.arm.observe()
+        return self.render()
+
+    def _observe(self, due: float) -> dict[str, Any]:
+        state, self._pictures = self._rig.arm.observe()
+        self._tick_at = time.perf_counter()
+        heard = self._rig.ears.read(due - self.config.camera_latency_s)
+        observation: dict[str, Any] = {}
+        if self._pictures:
+            observation["pixels"] = self._pictures
+        if self.state_names:
+            observation["agent_pos"] = state
+        return observation | {f"audio.{name}": block for name, block in heard.items()}
+
+    def _frozen_camera(self) -> str:
+        """Why a camera is taken for dead, if one is."""
+        now, longest = time.perf_counter(), self.config.frozen_s
+        for name, picture in self._pictures.items() if longest else ():
+            print_ = hash(picture[::8, ::8].tobytes())
+            before, since = self._same_picture.get(name, (None, now))
+            self._same_picture[name] = (print_, since if print_ == before else now)
+            if now - self._same_picture[name][1] > longest:
+                return f"The camera {name} has given the same picture for {longest:.1f} s."
+        return ""
+
+    def _end(self, problem: str):
+        """The attempt ends because something went wrong."""
+        logging.error(f"{problem} The robot holds.")
+        verdict = self.stop_and_ask(problem)
+        if verdict is None:
+            raise PersonLeftError
+        return self._outcome(verdict, is_problem=True)
+
+    def _outcome(self, verdict: Verdict | None, is_problem: bool = False):
+        success = verdict is Verdict.SUCCESS
+        info: dict[str, Any] = {"is_success": success}
+        if verdict is not None:
+            info["verdict"] = verdict.value
+            self._rig.watchdog.rest()
+        is_over = self._ticks.n >= self._max_episode_steps
+        if is_over:
+            self._rig.watchdog.rest()
+        return self._last, float(success), verdict is not None and not is_problem, is_problem or is_over, info

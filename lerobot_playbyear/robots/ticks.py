@@ -1,0 +1,66 @@
+"""The ticks of a real robot: each at its time, and an account of those that were not."""
+
+import time
+from collections.abc import Callable
+
+_LATE_S = 0.005
+
+
+class Ticks:
+    """Waits for each tick of a control loop.
+
+    A tick that comes late does not move the others, unless it is later than a whole period: then all later ones move.
+
+    Args:
+        fps: Ticks per second [Hz].
+        clock, sleep: As in `time`.
+
+    Attributes:
+        n: Ticks since the start.
+        n_late: How many came more than 5 ms after their time.
+        lateness: How late each came [s].
+    """
+
+    def __init__(
+        self,
+        fps: float,
+        clock: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._period, self._clock, self._sleep = 1 / fps, clock, sleep
+        self.start()
+
+    def start(self) -> float:
+        """The first tick is now. Returns when that is [s]."""
+        self._began = self._due = self._clock()
+        self.n = self.n_late = 0
+        self.lateness: list[float] = []
+        self._paused = 0.0
+        return self._due
+
+    def go_on(self) -> float:
+        """After a pause: the next tick is a period from now. Returns the time that takes the last tick's place [s]."""
+        now = self._clock()
+        self._paused += now - self._due
+        self._due = now
+        return now
+
+    def wait(self) -> float:
+        """Returns when the next tick is due, or at once if that is over: the tick's own time [s]."""
+        self._due += self._period
+        left = self._due - self._clock()
+        if left > 0:
+            self._sleep(left)
+        late = max(self._clock() - self._due, 0.0)
+        self.n += 1
+        self.n_late += late > _LATE_S
+        self.lateness.append(late)
+        if late > self._period:
+            self._due += late
+        return self._due
+
+    @property
+    def rate(self) -> float:
+        """Ticks per second since the start, without pauses; 0 before the first."""
+        passed = self._due - self._began - self._paused
+        return self.n / passed if passed > 0 else 0.0

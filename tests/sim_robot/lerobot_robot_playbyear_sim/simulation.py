@@ -1,0 +1,176 @@
+"""A process of its own: the task's arm in real time, its sound played into a sound server's FIFO.
+
+    python -m lerobot_robot_playbyear_sim.simulation --socket=PATH --fifo=PATH --task=OccludedGrasp-v0
+
+An action moves the arm for one control step; where none comes in time, it holds. The picture is that of the last step's
+end. The sound of a step is played while the next one is awaited, behind it by `LAG_S`.
+"""
+
+import argparse
+import json
+import queue
+import threading
+import time
+from multiprocessing.connection import Connection, Listener
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from sound_server import Player
+
+STEP_S, GRACE_S = 0.05, 0.03
+LAG_S = 0.015
+
+
+class Loudspeaker:
+    """Plays blocks one after the other in real time, and a quiet room between them."""
+
+    def __init__(self, fifo: str, sample_rate: int) -> None:
+        self._player = Player(Path(fifo), channels=1, sample_rate=sample_rate, noise=2.0)
+        self._player.start()
+        self._rate, self._end = sample_rate, 0.0
+
+    def play(self, block: np.ndarray) -> float:
+        """Plays it after the one before, or soon. Returns when it begins [s of time.perf_counter]."""
+        soonest = time.perf_counter() + 0.003
+        if self._end < soonest:
+            self._end = soonest + LAG_S
+        begins = self._end
+        self._player.play(block, begins)
+        self._end += len(block) / self._rate
+        return begins
+
+
+class Simulation:
+    """The task, stepped by whoever asks, in one thread."""
+
+    def __init__(self, task: str, fifo: str, image_size: int, sample_rate: int, variant: str) -> None:
+        self.env = gym.make(
+            f"gym_playbyear:gym_playbyear/{task}",
+            disable_env_checker=True,
+            image_size=image_size,
+            sample_rate=sample_rate,
+            variant=variant,
+            render_mode="rgb_array",
+        ).unwrapped
+        self.speaker = Loudspeaker(fifo, sample_rate) if fifo else None
+        self.requests: queue.Queue = queue.Queue()
+        self.is_blind = False
+        self._seed = 0
+        self.reset(0)
+
+    def reset(self, seed: int | None) -> dict[str, Any]:
+        self._seed = self._seed + 1 if seed is None else seed
+        self.observation, _ = self.env.reset(seed=self._seed)
+        self.success = self.failed = self.wants_control = False
+        self.gate, self.demonstrator = self.env.intervention_gate(), self.env.scripted_expert()
+        self.scripted: dict[tuple[int, bool], list[float]] = {}
+        self.n_steps, self.last_grip, self.n_holds = 0, -1.0, 0
+        self.next_hold = time.perf_counter() + 1e9
+        if self.speaker:
+            self._hear()
+        return {}
+
+    def act(self, action: list[float]) -> dict[str, Any]:
+        self._step(np.array(action, np.float32))
+        self.wants_control = bool(self.gate.wants_control(np.array(action, np.float32)))
+        return {}
+
+    def observe(self) -> dict[str, Any]:
+        if self.is_blind:
+            return {"error": "the camera has stopped"}
+        return {"state": self.observation["agent_pos"].tolist(), "picture": self.observation["pixels"]["front"]}
+
+    def script(self, demonstrates: bool) -> dict[str, Any]:
+        key = (self.n_steps, demonstrates)  # asked twice in a step, it says the same
+        if key not in self.scripted:
+            script = self.demonstrator if demonstrates else self.gate
+            self.scripted[key] = np.asarray(script.act(), float).tolist()
+        return {"action": self.scripted[key]}
+
+    def status(self) -> dict[str, Any]:
+        names = ("success", "failed", "wants_control", "n_steps", "n_holds")
+        return {name: getattr(self, name) for name in names} | {"seed": self._seed}
+
+    def tap(self) -> dict[str, Any]:
+        """A short loud sound, now."""
+        rate = self.env.observation_space["audio.gripper"].shape[0] * 20
+        wave = 20000 * np.exp(-np.arange(rate // 50) / (rate / 200)) * np.sin(np.arange(rate // 50) * 0.8)
+        assert self.speaker is not None
+        return {"heard_at_s": self.speaker.play(wave.astype(np.int16))}
+
+    def blind(self, is_blind: bool) -> dict[str, Any]:
+        self.is_blind = is_blind
+        return {}
+
+    def run(self) -> None:
+        while True:
+            try:
+                request, answer = self.requests.get(timeout=max(min(self.next_hold - time.perf_counter(), 1), 0))
+            except queue.Empty:
+                if time.perf_counter() > self.next_hold:
+                    self.n_holds += 1
+                    self._step(np.array([0, 0, 0, self.last_grip], np.float32))
+                continue
+            try:
+                answer.put(getattr(self, request.pop("what"))(**request))
+            except Exception as error:
+                answer.put({"error": repr(error)})
+
+    def _step(self, action: np.ndarray) -> None:
+        if self.success or self.failed:
+            self.next_hold = time.perf_counter() + 1e9
+            return
+        self.observation, _, terminated, _, info = self.env.step(action)
+        self.last_grip, self.n_steps = float(action[3]), self.n_steps + 1
+        self.success = bool(info["is_success"])
+        self.failed = terminated and not self.success
+        self._hear()
+        self.next_hold = time.perf_counter() + STEP_S + GRACE_S
+
+    def _hear(self) -> None:
+        if self.speaker:
+            self.speaker.play(self.observation["audio.gripper"])
+
+
+def answer(connection: Connection, simulation: Simulation) -> None:
+    reply: queue.Queue = queue.Queue()
+    while True:
+        try:
+            simulation.requests.put((json.loads(connection.recv_bytes()), reply))
+            told = reply.get()
+            picture = told.get("picture")
+            if picture is not None:
+                told = {**told, "picture": list(picture.shape)}
+            connection.send_bytes(json.dumps(told).encode())
+            if picture is not None:
+                connection.send_bytes(np.ascontiguousarray(picture).tobytes())
+        except (OSError, EOFError):
+            return
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--socket", required=True)
+    parser.add_argument("--fifo", default="")
+    parser.add_argument("--task", default="OccludedGrasp-v0")
+    parser.add_argument("--variant", default="default")
+    parser.add_argument("--image_size", type=int, default=84)
+    parser.add_argument("--sample_rate", type=int, default=16000)
+    args = parser.parse_args()
+    simulation = Simulation(args.task, args.fifo, args.image_size, args.sample_rate, args.variant)
+    listener = Listener(args.socket, "AF_UNIX")
+
+    def accept() -> None:
+        while True:
+            connection = listener.accept()
+            threading.Thread(target=answer, args=(connection, simulation), daemon=True).start()
+
+    threading.Thread(target=accept, daemon=True).start()
+    print("ready", flush=True)
+    simulation.run()
+
+
+if __name__ == "__main__":
+    main()

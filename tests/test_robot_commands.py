@@ -1,0 +1,97 @@
+"""From nothing to a corrected policy on a robot, with the commands: in real time, through a sound server, with a person."""
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from robot_factory import simulation, with_sim_robot
+from sound_server import SoundServer, why_not
+
+pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not())
+
+RATE = 16000
+TINY = (
+    *("--policy.type=playbyear", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.image_size=32"),
+    *("--policy.vision_width=8", "--policy.hidden_size=64", "--policy.n_memory_steps=3", "--policy.audio_window_s=0.9"),
+)
+
+
+class Bench:
+    """The arm on its table, the sound card, and the options that name both."""
+
+    def __init__(self, stack: ExitStack, folder: Path) -> None:
+        server = stack.enter_context(SoundServer(folder, {"gripper": 1}, RATE))
+        self.server = server
+        self.socket = stack.enter_context(simulation(folder, server.fifo("gripper")))
+        self.environment = with_sim_robot({**os.environ, "OMP_NUM_THREADS": "1", "MUJOCO_GL": "egl"})
+        microphone = f"{{gripper: {{type: portaudio, device: gripper, sample_rate: {RATE}}}}}"
+        self.env = (
+            *("--env.type=playbyear_robot", "--env.robot.type=playbyear_sim", f"--env.robot.socket={self.socket}"),
+            *(f"--env.microphones={microphone}", "--env.fps=20", "--env.task=Find the cube", "--env.episode_s=20"),
+            *("--env.frozen_s=0", "--env.console=terminal"),
+        )
+        leader = ("--expert.type=teleop", "--expert.teleop.type=playbyear_sim_leader", "--expert.play_sound=false")
+        self.leader = (*leader, f"--expert.teleop.socket={self.socket}", "--expert.teleop.judges=false")
+
+    def person(self, corrects: bool = False, most_steps: int = 400):
+        from simulated_person import SimulatedPerson
+
+        return SimulatedPerson(self.socket, most_steps, corrects)
+
+
+def program(name: str) -> str:
+    return str(Path(sys.executable).parent / name)
+
+
+@pytest.fixture
+def bench(tmp_path_factory) -> Iterator[Bench]:
+    import tempfile
+
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(dir="/tmp")))  # sockets have short paths
+        yield Bench(stack, folder)
+
+
+def test_from_nothing_to_a_corrected_policy(bench, tmp_path):
+    demos, train, dagger = tmp_path / "demos", tmp_path / "train", tmp_path / "dagger"
+    data = ("--dataset.repo_id=me/demos", f"--dataset.root={demos}")
+    person = bench.person()
+    record = (program("playbyear-record"), *bench.env, *bench.leader, "--expert.teleop.demonstrates=true", *data)
+    status = person.run([*record, "--dataset.num_episodes=2"], bench.environment)
+    assert status == 0, person.output[-3000:]
+    assert person.pressed == ["p", "s"] * 2
+    notes = [json.loads(line) for line in (demos / "meta" / "playbyear_recording.jsonl").read_text().splitlines()]
+    assert [note["episode"] for note in notes] == [0, 1]
+    assert all(note["rate_hz"] == pytest.approx(20, rel=0.05) for note in notes)
+
+    steps = ("--steps=3", "--batch_size=4", "--save_freq=3", "--num_workers=0", f"--output_dir={train}")
+    status = person.run([program("playbyear-train"), *TINY, *data, *steps], bench.environment)
+    assert status == 0, person.output[-3000:]
+    policy = train / "checkpoints" / "last" / "pretrained_model"
+
+    person = bench.person(most_steps=20)
+    evaluate = (program("lerobot-eval"), f"--policy.path={policy}", "--policy.device=cpu", *bench.env)
+    status = person.run([*evaluate, "--eval.n_episodes=2", f"--output_dir={tmp_path / 'eval'}"], bench.environment)
+    assert status == 0, person.output[-3000:]
+    assert person.pressed == ["p", "q"] * 2
+    assert json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]["pc_success"] == 0.0
+
+    person = bench.person(corrects=True)
+    options = (
+        *(f"--policy.path={policy}", "--demos.repo_id=me/demos", f"--demos.root={demos}"),
+        *("--interventions.repo_id=me/corrections", f"--interventions.root={tmp_path / 'corrections'}"),
+        *("--episodes=1", "--updates_per_episode=2", "--warmup_episodes=1", "--batch_size=4", "--eval_every=0"),
+        *(f"--output_dir={dagger}",),
+    )
+    status = person.run([program("playbyear-dagger"), *options, *bench.env, *bench.leader], bench.environment)
+    assert status == 0, person.output[-3000:]
+    assert " " in person.pressed
+    attempts = [json.loads(line) for line in (dagger / "metrics.jsonl").read_text().splitlines()]
+    kept = [each for each in attempts if each.get("outcome") == "kept"]
+    assert len(kept) == 1
+    assert 0 < kept[0]["intervention_share"] < 1
+    person.close()

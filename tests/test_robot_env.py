@@ -1,0 +1,363 @@
+"""A robot as an environment: time, limits, faults, and the person beside it."""
+
+import logging
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from robot_factory import ScriptedConsole, joint_config, noise_file, robot_env
+
+from lerobot_playbyear.dagger import ExpertError
+from lerobot_playbyear.episodes.environment import env_facts, env_spec
+from lerobot_playbyear.episodes.episode import Verdict
+from lerobot_playbyear.episodes.frames import dataset_features
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.robots.ticks import Ticks
+from lerobot_playbyear.teleoperation.controls import PersonLeftError
+
+REST = np.zeros(3, np.float32)
+
+
+@pytest.fixture
+def wav(tmp_path):
+    return noise_file(tmp_path, 16000)
+
+
+def test_it_observes_what_robot_and_microphones_give_and_keeps_the_time(wav):
+    with robot_env(joint_config(wav)) as env:
+        observation, _ = env.reset(seed=0)
+        assert env.observation_space.contains(observation)
+        start, blocks = time.perf_counter(), []
+        for _ in range(10):
+            observation, _, terminated, truncated, info = env.step(REST)
+            assert [terminated, truncated, info["is_success"]] == [False] * 3
+            assert env.observation_space.contains(observation)
+            blocks.append(observation["audio.gripper"])
+        passed = time.perf_counter() - start
+        assert 0.45 < passed < 0.6
+        facts = env.episode_facts()
+    assert facts["rate_hz"] == pytest.approx(20, rel=0.03)
+    assert facts["ticks"] == 10
+    assert facts["drop_outs"] == {"gripper": []}
+    from lerobot_playbyear.datasets.audio_files import read_audio
+
+    played, heard = read_audio(wav)[0][:, 0].astype(float), np.concatenate(blocks).astype(float)
+    found = np.correlate(played, heard, "valid")
+    assert found.max() > 0.99 * np.dot(heard, heard)  # the blocks join without a gap
+
+
+def test_names_of_joints_reach_the_dataset(wav):
+    config = joint_config(wav)
+    env = env_spec(config).make()
+    try:
+        facts = env_facts(env)
+    finally:
+        env.close()
+    features = dataset_features(facts)
+    joints = ["shoulder.pos", "elbow.pos", "gripper.pos"]
+    assert features["observation.state"]["names"] == features["action"]["names"] == joints
+    assert features["observation.audio.gripper"]["shape"] == (800,)
+    assert facts.fps == 20
+
+
+def test_an_action_changes_by_no_more_than_the_limit(wav):
+    with robot_env(joint_config(max_step=5.0, max_relative_target=None)) as env:
+        env.reset(seed=0)
+        env.step(REST)
+        for _ in range(3):
+            env.step(np.array([100, -100, 1], np.float32))
+        targets = [target for _, target in env.arm.robot.told][-3:]
+    np.testing.assert_allclose(targets, [[5, -5, 1], [10, -10, 1], [15, -15, 1]])
+
+
+def test_the_limit_of_the_robot_itself_is_on_by_default():
+    with robot_env(joint_config()) as env:
+        assert env.arm.robot.config.max_relative_target == 20.0
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_not_finite_never_reaches_the_robot(value, caplog):
+    with robot_env(joint_config()) as env:
+        env.reset(seed=0)
+        env.step(np.full(3, 2, np.float32))
+        env.step(np.full(3, 2, np.float32))
+        n_told = len(env.arm.robot.told)
+        _, _, terminated, truncated, info = env.step(np.array([0, value, 0], np.float32))
+        told = env.arm.robot.told[n_told:]
+    assert truncated
+    assert not terminated
+    assert info["verdict"] == "discard"
+    assert not info["is_success"]
+    assert len(told) == 1  # it holds where it is, at once
+    np.testing.assert_allclose(told[0][1], 2, atol=1e-6)
+    assert [r.getMessage() for r in caplog.records if r.levelno == logging.ERROR] == [
+        "The policy's action holds a value that is not finite (NaN). The robot holds."
+    ]
+
+
+def test_a_camera_that_stops_ends_the_attempt_and_the_next_one_goes_on(caplog):
+    with robot_env(joint_config()) as env:
+        env.reset(seed=0)
+        env.step(REST)
+        env.arm.robot.is_blind = True
+        _, _, _, truncated, info = env.step(REST)
+        assert truncated
+        assert info["verdict"] == "discard"
+        assert "does not answer: front latest frame is too old" in caplog.text
+        with pytest.raises(RobotError, match="does not answer"):
+            env.reset(seed=1)
+        env.arm.robot.is_blind = False
+        env.reset(seed=1)
+        assert not env.step(REST)[3]
+
+
+def test_a_frozen_picture_is_noticed(monkeypatch):
+    with robot_env(joint_config(frozen_s=0.2, episode_s=5.0)) as env:
+        env.reset(seed=0)
+        monkeypatch.setattr(np, "roll", lambda picture, *_, **__: picture)
+        steps = [env.step(REST) for _ in range(7)]
+    assert [step[3] for step in steps].index(True) in (5, 6)
+
+
+def test_a_loop_that_stands_still_makes_the_arm_hold_and_ends_the_attempt(caplog):
+    with robot_env(joint_config(stall_s=0.4)) as env:
+        env.arm.robot.config.speed = 10.0  # units per second
+        env.reset(seed=0)
+        env.step(np.full(3, 9, np.float32))
+        time.sleep(0.5)
+        held = env.arm.robot.told[-1]
+        assert held[1].max() < 5  # where it was after a tenth of a second, and not where it was told to go
+        sent = [when for when, target in env.arm.robot.told if target.max() == 9][-1]
+        assert 0.09 < held[0] - sent < 0.2  # two ticks
+        _, _, _, truncated, info = env.step(REST)
+    assert truncated
+    assert info["verdict"] == "discard"
+    assert "stood still" in caplog.text
+
+
+def test_a_person_begins_judges_and_stops():
+    def press(status):
+        if status.note.startswith("Set the scene up"):
+            return "p"
+        return "s" if status.step == 3 else None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(episode_s=5.0), console) as env:
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=lambda o: REST), seed=0)
+        assert episode.verdict is Verdict.SUCCESS
+        assert episode.success
+        assert len(episode) == 3
+        assert episode.facts["ticks"] == 3
+        console.on_show = lambda status: {3: "escape", 0: "p"}.get(status.step) if not status.note else "q"
+        console.press("p")
+        console.on_show = lambda s: "p" if "Set the scene" in s.note else "q" if s.note else "escape"
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=lambda o: REST), seed=0)
+        assert episode.verdict is Verdict.FAILURE
+        assert not episode.success
+        assert any(note.startswith("You pressed Escape.") for note in console.notes)
+        told = env.arm.robot.told[-1][1]
+        np.testing.assert_allclose(told, env.arm.robot.place)
+        console.on_show = lambda s: "escape"
+        with pytest.raises(PersonLeftError):
+            env.reset(seed=1)
+
+
+def test_the_arm_goes_to_rest_before_an_attempt():
+    with robot_env(joint_config(rest={"shoulder.pos": 3.0})) as env:
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.full(3, 2, np.float32))
+        env.reset(seed=1)
+        time.sleep(0.02)
+        assert env.arm.position() == pytest.approx({"shoulder.pos": 3.0, "elbow.pos": 2.0, "gripper.pos": 2.0})
+    with robot_env(joint_config(rest={"wrist.pos": 3.0})) as env, pytest.raises(RobotError, match="its joints are"):
+        env.reset(seed=0)
+    with robot_env(joint_config()) as env:  # by default: where it was when the program began
+        env.reset(seed=0)
+        env.step(np.full(3, 2, np.float32))
+        env.reset(seed=1)
+        time.sleep(0.02)
+        np.testing.assert_allclose(env.arm.robot.place, 0, atol=1e-6)
+
+
+def test_two_environments_of_one_robot_share_it(wav):
+    config = joint_config(wav)
+    with robot_env(config) as one, robot_env(config) as other:
+        assert one.arm is other.arm
+        one.reset(seed=0)
+        other.reset(seed=1)
+        other.step(REST)
+        other.close()
+        one.reset(seed=2)
+        one.step(REST)
+        robot = one.arm.robot
+        assert robot.is_connected
+    assert not robot.is_connected
+
+
+def test_ticks_do_not_drift_and_a_long_delay_moves_them():
+    now = [0.0]
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    ticks = Ticks(10, clock=lambda: now[0], sleep=sleep)
+    for _ in range(5):
+        now[0] += 0.03
+        ticks.wait()
+    assert now[0] == pytest.approx(0.5)
+    now[0] += 0.11  # a little late
+    ticks.wait()
+    assert ticks.n_late == 1
+    ticks.wait()
+    assert now[0] == pytest.approx(0.7)
+    now[0] += 0.35
+    ticks.wait()
+    assert ticks.wait() == pytest.approx(1.15)
+    assert ticks.n_late == 2
+
+
+def test_lerobot_makes_one_robot_however_many_environments_it_asks_for(wav):
+    from lerobot.envs import make_env
+
+    config = joint_config(wav)
+    (vec,) = make_env(config, n_envs=4)["playbyear_robot"].values()
+    try:
+        assert vec.num_envs == 1
+        assert config.features_map["audio.gripper"] == "observation.audio.gripper"
+        assert config.features["pixels/front"].shape == (48, 64, 3)
+    finally:
+        vec.close()
+
+
+def test_slow_motion_is_refused():
+    from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
+
+    with (
+        robot_env(joint_config(), ScriptedConsole()) as env,
+        pytest.raises(ExpertError, match="no slow motion"),
+    ):
+        TeleopExpertConfig(steps_per_second=5).make(env)
+
+
+def teleop(env, leader, **options):
+    """A person with a leader arm beside a policy."""
+    from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
+
+    expert = TeleopExpertConfig(teleop=leader, play_sound=False, **options).make(env)
+    return expert, expert.teleop
+
+
+@pytest.mark.parametrize("has_motors", [False, True])
+def test_leader_and_follower_meet_before_a_person_takes_over(has_motors):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    console = ScriptedConsole(lambda status: "p" if "Set the scene" in status.note else None)
+    with robot_env(joint_config(episode_s=8.0, max_step=None, max_relative_target=None), console) as env:
+        expert, leader = teleop(env, JointLeaderConfig(has_motors=has_motors))
+        leader.place = {"shoulder.pos": 8.0, "elbow.pos": 4.0, "gripper.pos": -6.0}
+        n_asked = [0]
+
+        def act(observation):
+            n_asked[0] += 1
+            if n_asked[0] == 5:
+                console.press("space")
+            if n_asked[0] == 12:
+                console.press("space")
+            if n_asked[0] == 16:
+                console.press("s")
+            return np.ones(3, np.float32)
+
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=act), seed=0, expert=expert)
+        told = np.array([target for _, target in env.arm.robot.told])
+        expert.close()
+    assert episode.interventions.tolist() == [False] * 4 + [True] * 7 + [False] * 5
+    assert len(episode) == n_asked[0]  # the policy is asked in every step: its memory goes on
+    assert episode.success
+    by_person = episode.actions[episode.interventions]
+    assert np.abs(np.diff(told, axis=0)).max() < 8 if not has_motors else True
+    if has_motors:  # the leader came to the follower, which was at 1
+        np.testing.assert_allclose(by_person, 1, atol=1e-3)
+        assert len(leader.fed) > 10
+        assert not leader.is_held
+    else:
+        np.testing.assert_allclose(by_person, [[8, 4, -6]] * 7)
+        jumps = np.abs(np.diff(told[:-8], axis=0)).max(axis=0)
+        assert (jumps < 1.01).all()  # in small steps; the leader is up to 7 away
+    facts = episode.facts
+    assert facts["ticks"] == len(episode)
+    assert facts["rate_hz"] == pytest.approx(20, rel=0.05)  # without the time in which the arms met
+
+
+def test_a_leader_that_lacks_a_joint_is_refused():
+    from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
+    from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleopConfig
+
+    config = TeleopExpertConfig(teleop=KeyboardWindowTeleopConfig())
+    needs = "the robot also needs elbow.pos, gripper.pos, shoulder.pos"
+    with robot_env(joint_config(), ScriptedConsole()) as env, pytest.raises(ExpertError, match=needs):
+        config.make(env)
+
+
+def test_escape_while_a_person_acts_holds_and_asks():
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    pressed, pressed_at = [], []
+
+    def press(status):
+        if "Set the scene" in status.note:
+            return "p"
+        if status.note.startswith("You pressed Escape"):
+            pressed.append(status.note)
+            return "r"
+        return None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(episode_s=4.0), console) as env:
+        expert, _ = teleop(env, JointLeaderConfig())
+
+        def act(observation):
+            if env._ticks.n == 6:
+                pressed_at.append(time.perf_counter())
+                console.press("escape")
+            return np.ones(3, np.float32)
+
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=act), seed=0, expert=expert)
+        assert episode.verdict is Verdict.DISCARD
+        assert len(episode) in (6, 7)
+        assert len(pressed) == 1
+        told = [target for when, target in env.arm.robot.told if when > pressed_at[0]]
+        np.testing.assert_allclose(told, [env.arm.robot.place], atol=1e-6)  # it was told to stay, and nothing else
+        expert.close()
+
+
+def test_a_pause_counts_for_nothing(wav):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    paused = [0]
+
+    def press(status):
+        if "Set the scene" in status.note:
+            return "p"
+        if status.note == "Press P to go on":
+            paused[0] += 1
+            return "p" if paused[0] == 10 else None
+        return None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(wav), console) as env:
+        expert, _ = teleop(env, JointLeaderConfig())
+
+        def act(observation):
+            if env._ticks.n == 6 and not paused[0]:
+                console.press("p")
+            return np.zeros(3, np.float32)
+
+        episode = play(env, SimpleNamespace(reset=lambda env: None, act=act), seed=0, expert=expert)
+        expert.close()
+    assert paused[0] == 10
+    assert len(episode) == 20
+    assert episode.facts["drop_outs"] == {"gripper": []}
+    assert episode.facts["rate_hz"] == pytest.approx(20, rel=0.05)
