@@ -18,9 +18,11 @@ inspection      datasets film
 hub             datasets policy film inspection
 training        datasets policy hub
 teleoperation   episodes
+microphones     datasets
+calibration     datasets microphones
 recording       datasets episodes hub teleoperation
 dagger          datasets episodes hub training
-scripts         datasets policy episodes film inspection hub training teleoperation recording dagger
+scripts         datasets policy episodes film inspection hub training teleoperation recording dagger microphones calibration
 """
 _ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}
 _AT_THE_TOP = {"__init__.py", "compat.py"}

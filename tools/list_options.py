@@ -14,6 +14,7 @@ from typing import Any
 from draccus.argparsing import ArgumentParser
 from draccus.utils import is_choice_type
 
+from lerobot_playbyear.calibration.calibrate import CalibrateLatencyConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.attach import AttachAudioConfig
 from lerobot_playbyear.datasets.convert_audio import ConvertAudioConfig
@@ -21,6 +22,7 @@ from lerobot_playbyear.datasets.repair.command import RepairConfig
 from lerobot_playbyear.film.filming import VideoConfig
 from lerobot_playbyear.hub.uploads import PushConfig
 from lerobot_playbyear.inspection.inspecting import InspectConfig
+from lerobot_playbyear.microphones.finding import FindMicrophonesConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.recording.record import RecordConfig
 from lerobot_playbyear.scripts.command import OPTIONS_FILE
@@ -28,8 +30,10 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 CONFIGS: dict[str, type] = {
     "playbyear-attach-audio": AttachAudioConfig,
+    "playbyear-calibrate-latency": CalibrateLatencyConfig,
     "playbyear-convert-audio": ConvertAudioConfig,
     "playbyear-dagger": DaggerConfig,
+    "playbyear-find-microphones": FindMicrophonesConfig,
     "playbyear-inspect": InspectConfig,
     "playbyear-push": PushConfig,
     "playbyear-record": RecordConfig,

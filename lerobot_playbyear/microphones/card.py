@@ -12,6 +12,7 @@ from lerobot_playbyear.microphones.clock import CardClock
 
 _KEPT_S = 3.0
 _STRETCH = 0.02  # of a block: how much of a drift is made up in one tick, without a gap
+_LATE_S = 0.01  # samples that come later than this, for a quarter of a second, come after others that were lost
 _SLACK_S = 0.001  # of drift that is left alone: then samples are those that the card gave, bit for bit
 
 
@@ -43,7 +44,7 @@ class CardRecording:
         self._columns = list(channels.values())
         self._rate, self._timeout = sample_rate, timeout_s
         self._size = samples_per_frame(sample_rate, fps)
-        self._clock = CardClock(sample_rate, tolerance_s=0.5 / fps)
+        self._clock = CardClock(sample_rate, tolerance_s=min(_LATE_S, 0.5 / fps))
         self._changed = threading.Condition()
         self._kept = np.zeros((round(_KEPT_S * sample_rate), len(channels)), np.int16)  # a ring, by number of sample
         self._written = 0
@@ -68,7 +69,7 @@ class CardRecording:
         """An episode begins: its first block ends at `now_s`, or is silence as far as nothing was heard then."""
         with self._changed:
             self._tick, self.drop_outs = 0, []
-            self._stop = self._place(now_s) - self._size
+            self._stop = self._place(now_s) - self._size if self._clock.is_set else None
 
     def forget(self) -> None:
         """The card begins anew, such as after it was plugged in again."""
@@ -79,19 +80,26 @@ class CardRecording:
     def skip_to(self, now_s: float) -> None:
         """What was heard until `now_s` belongs to no frame, such as during a pause."""
         with self._changed:
-            self._stop = max(self._place(now_s), self._stop or 0)
+            if self._clock.is_set:
+                self._stop = max(self._place(now_s), self._stop or 0)
 
     def read(self, until_s: float) -> dict[str, np.ndarray]:
         """For each microphone (S,) int16: what was heard since the block before, up to `until_s` [s of time.perf_counter]."""
         with self._changed:
+            if not self._clock.is_set:
+                self._changed.wait_for(lambda: self._clock.is_set, self._timeout)
+            if not self._clock.is_set:
+                self._note_nothing()
+                return {name: np.zeros(self._size, np.int16) for name in self.channels}
             if self._stop is None:
                 self._stop = self._place(until_s) - self._size
             self._changed.wait_for(lambda: self._written >= self._span(until_s)[1], self._timeout)
             start, stop = self._span(until_s)
             if start > self._stop:
                 self._note(self._stop, start - self._stop, "skipped")
-            if stop > self._written:
-                self._note(self._written, stop - self._written, "late")
+            heard = max(self._written, start)
+            if stop > heard:
+                self._note(heard, stop - heard, "late")
             block = self._between(start, stop)
             self._stop, self._tick = stop, self._tick + 1
         return dict(zip(self.channels, np.ascontiguousarray(block.T), strict=True))
@@ -102,7 +110,7 @@ class CardRecording:
         return self._zeros / self._rate
 
     def _place(self, time_s: float) -> int:
-        return round(self._clock.written_at(time_s)) if self._clock.is_set else self._written
+        return round(self._clock.written_at(time_s))
 
     def _span(self, until_s: float) -> tuple[int, int]:
         """Where the next block begins and ends: a block on from the last one, or a little more or less after the clock."""
@@ -134,6 +142,10 @@ class CardRecording:
         samples = samples[-len(self._kept) :]
         self._kept[np.arange(last - len(samples), last) % len(self._kept)] = samples
         self._written = last
+
+    def _note_nothing(self) -> None:
+        self.drop_outs.append(DropOut(self._tick, self._size, "late"))
+        self._tick += 1
 
     def _note(self, sample: int, n_samples: int, reason: str) -> None:
         if self._stop is not None:

@@ -63,23 +63,24 @@ class PortAudioMicrophoneConfig(MicrophoneConfig):
         card_channels: How many channels the card has; needed where it has more than two and a sound server (PulseAudio,
             PipeWire) is between, which mixes them where fewer are opened. None: what the card says.
         block_s: How often sound is fetched [s]; shorter costs more processor time.
-        wait_s: How much sound the card keeps while this program is busy [s]; more is lost. On Linux this delays nothing.
+        wait_s: How much sound the card keeps while this program is busy [s]; more is lost. It then comes in chunks of about a
+            third of that. None: as short as the card can.
     """
 
     device: str | int = ""
     card_channels: int | None = None
     block_s: float = 0.005
-    wait_s: float = 0.1
+    wait_s: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.001 <= self.block_s <= 0.5:
             raise InputError(f"block_s={self.block_s} of a microphone: give seconds from 0.001 to 0.5.")
-        if not 0 < self.wait_s <= 2:
+        if self.wait_s is not None and not 0 < self.wait_s <= 2:
             raise InputError(f"wait_s={self.wait_s} of a microphone: give seconds above 0, up to 2.")
         if self.card_channels is not None and not self.channel < self.card_channels <= 256:
             raise InputError(
-                f"card_channels={self.card_channels} of a microphone: give more than its channel={self.channel}, counted from 0."
+                f"card_channels={self.card_channels} of a microphone: give more than its channel={self.channel}."
             )
 
     @property

@@ -55,7 +55,7 @@ class Ears:
         with ExitStack() as stack:
             stack.callback(self.disconnect)
             for card in self._cards:
-                if card.microphone.problem or card.recording.silent_s > self._silent_s > 0:
+                if self._problem_of(card):
                     card.microphone.disconnect()
                 if not card.microphone.is_connected:
                     card.recording.forget()
@@ -101,18 +101,19 @@ class Ears:
     @property
     def problem(self) -> str:
         """What is wrong, if no more sound comes; empty while all is well."""
-        for card in self._cards:
-            microphone = card.microphone
-            names = ", ".join(card.recording.channels)
-            if microphone.problem:
-                return f"The microphone {names} is gone: {microphone.problem}."
-            if microphone.silent_for_s > self._stalled_s:
-                return f"The microphone {names} has brought nothing for {microphone.silent_for_s:.1f} s."
-            if card.recording.silent_s > self._silent_s > 0:
-                return (
-                    f"The microphone {names} has given nothing but zeros for {card.recording.silent_s:.1f} s: it is muted, or "
-                    "unplugged."
-                )
+        return next(filter(None, map(self._problem_of, self._cards)), "")
+
+    def _problem_of(self, card: _Card) -> str:
+        microphone, names = card.microphone, ", ".join(card.recording.channels)
+        if microphone.problem:
+            return f"The microphone {names} is gone: {microphone.problem}."
+        if microphone.silent_for_s > self._stalled_s:
+            return f"The microphone {names} has brought nothing for {microphone.silent_for_s:.1f} s."
+        if card.recording.silent_s > self._silent_s > 0:
+            return (
+                f"The microphone {names} has given nothing but zeros for {card.recording.silent_s:.1f} s: it is muted, or "
+                "unplugged."
+            )
         return ""
 
     def disconnect(self) -> None:

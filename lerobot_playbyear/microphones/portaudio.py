@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from lerobot_playbyear.microphones.config import PortAudioMicrophoneConfig
 
 _FIND = "`playbyear-find-microphones` lists what there is."
-_OLDEST_S = 1.0  # PortAudio's own times are believed up to this age
 _MOST_OPENED = 8  # channels of a card that are opened without being asked for; a sound server offers 32, and has fewer
 
 
@@ -180,7 +179,7 @@ class PortAudioMicrophone(Microphone):
                 device=card.number,
                 channels=channels,
                 dtype="int16",
-                latency=config.wait_s,
+                latency="low" if config.wait_s is None else config.wait_s,
                 callback=self._take,
                 finished_callback=self._finished,
             )
@@ -189,8 +188,8 @@ class PortAudioMicrophone(Microphone):
             self._stream = None
             said = str(error).replace("\n", " ")
             raise MicrophoneError(
-                f"{card.name} cannot be opened with {channels} channels at {self.sample_rate} Hz: {said}. Is it plugged in, and "
-                "its sound server running? Close other programs that use it, or give another sample_rate: its own is "
+                f"{card.name} cannot be opened with {channels} channels at {self.sample_rate} Hz: {said}. Is it plugged in, "
+                "and its sound server running? Close other programs that use it, or give another sample_rate: its own is "
                 f"{card.sample_rate} Hz."
             ) from error
 
@@ -205,12 +204,8 @@ class PortAudioMicrophone(Microphone):
         now = time.perf_counter()
         if status.input_overflow:
             self.n_overflows += 1
-        # Age of the first sample, by PortAudio's own clock; on ALSA that clock may stand at 0.
-        age = when.currentTime - when.inputBufferAdcTime
-        came = now
-        if when.inputBufferAdcTime > 0 and 0 <= age < _OLDEST_S:
-            came = now - age + n / self.sample_rate
-        self._heard(chunk[:, : self.channels], min(came, now))
+        # PortAudio's own times are estimates that may be too early, and on ALSA they may stand at 0.
+        self._heard(chunk[:, : self.channels], now)
 
     def _finished(self) -> None:
         if self._is_connected:

@@ -1,0 +1,140 @@
+"""`playbyear-calibrate-latency`: a person taps in view of a camera and near a microphone."""
+
+import contextlib
+import importlib
+import pkgutil
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lerobot.cameras
+from lerobot.cameras import CameraConfig
+
+from lerobot_playbyear.calibration.estimator import (
+    EVENTS,
+    FEWEST_TAPS,
+    CalibrationError,
+    Latency,
+    estimate_latency,
+    sound_onsets,
+)
+from lerobot_playbyear.calibration.listening import Motion, SoundLevel
+from lerobot_playbyear.calibration.plot import write_plot
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.microphones.config import MicrophoneConfig, make_microphone
+
+_LOOK_S = 0.2
+_AFTER_LAST_S = 0.7
+_ASKED = {
+    "stops": "Tap the table, or clap, {n} times, and let the hand rest after each for half a second.",
+    "begins": "Make {n} sounds at which something in the picture begins to move or to shine, a second apart.",
+}
+
+for _module in pkgutil.iter_modules(lerobot.cameras.__path__):
+    if _module.ispkg:
+        with contextlib.suppress(ImportError):  # its maker's software is not installed
+            importlib.import_module(f"lerobot.cameras.{_module.name}")  # registers its type
+
+
+@dataclass
+class CalibrateLatencyConfig:
+    """Options of `playbyear-calibrate-latency`.
+
+    Args:
+        camera: LeRobot's options of a camera.
+        microphone: Its options; its `latency_s` is not used.
+        taps: How many.
+        event: Whether motion "stops" with the sound, as a hand that taps does, or "begins".
+        timeout_s: For how long it waits for the taps [s].
+        plot: A picture of what was measured.
+    """
+
+    camera: CameraConfig
+    microphone: MicrophoneConfig
+    taps: int = 10
+    event: str = "stops"
+    timeout_s: float = 60.0
+    plot: Path = Path("outputs/latency.png")
+
+    def __post_init__(self) -> None:
+        if self.taps < FEWEST_TAPS:
+            raise InputError(f"taps={self.taps}: give at least {FEWEST_TAPS}.")
+        if self.event not in EVENTS:
+            raise InputError(f"event={self.event!r}: give one of {', '.join(EVENTS)}.")
+        if not 1 <= self.timeout_s <= 3600:
+            raise InputError(f"timeout_s={self.timeout_s}: give seconds from 1 to 3600.")
+
+
+def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
+    """Measures how much later sound arrives than pictures, writes the plot, and prints which option to give.
+
+    Raises:
+        CalibrationError: The camera gives no pictures, or the taps do not tell the latency.
+        MicrophoneError: The microphone cannot be opened.
+    """
+    level = SoundLevel(cfg.microphone.sample_rate, cfg.microphone.channel)
+    microphone = make_microphone(cfg.microphone)
+    with ExitStack() as stack:
+        camera = _connected(cfg.camera)
+        stack.callback(camera.disconnect)
+        motion = Motion(camera)
+        motion.start()
+        stack.callback(motion.end)
+        microphone.connect(level.listen)
+        stack.callback(microphone.disconnect)
+        print(_ASKED[cfg.event].format(n=cfg.taps), flush=True)
+        _wait_for_taps(cfg, level, motion)
+        pictures, sound = motion.so_far(), level.so_far()
+    found = estimate_latency(*pictures, *sound, cfg.event)
+    write_plot(cfg.plot, found, pictures, sound)
+    print(told(found, cfg.plot))
+    return found
+
+
+def told(found: Latency, plot: Path) -> str:
+    """What was found, and which option to give."""
+    ms = found.latency_s * 1000
+    side = f"{abs(ms):.0f} ms later than the picture" if ms >= 0 else f"{abs(ms):.0f} ms earlier than the picture"
+    lines = [
+        f"Sound arrives {side}, within about {found.resolution_s * 500 + 1:.0f} ms.",
+        f"{len(found.taps)} of {found.n_heard} taps; median {found.median_s * 1000:.0f} ms, median absolute deviation "
+        f"{found.spread_s * 1000:.0f} ms. Each tap alone is as coarse as the camera's pictures.",
+    ]
+    if ms >= 0:
+        lines.append(
+            f"Give the microphone latency_s: {found.latency_s:.3f}, such as "
+            f"--env.microphones='{{table: {{type: portaudio, device: ..., latency_s: {found.latency_s:.3f}}}}}'"
+        )
+    else:
+        lines.append(f"Give the camera --env.camera_latency_s={-found.latency_s:.3f}")
+    return "\n".join([*lines, f"Plot: {plot}"])
+
+
+def _connected(config: CameraConfig) -> Any:
+    from lerobot.cameras.utils import make_cameras_from_configs
+
+    try:
+        camera = make_cameras_from_configs({"camera": config})["camera"]
+        camera.connect()
+    except Exception as error:  # whatever a camera's own program may raise
+        said = " ".join(str(error).split())
+        raise CalibrationError(
+            f"The camera cannot be opened: {said} `lerobot-find-cameras` lists what there is."
+        ) from error
+    return camera
+
+
+def _wait_for_taps(cfg: CalibrateLatencyConfig, level: SoundLevel, motion: Motion) -> None:
+    end, n_told = time.perf_counter() + cfg.timeout_s, 0
+    while time.perf_counter() < end:
+        time.sleep(_LOOK_S)
+        motion.so_far()  # says if the camera is gone
+        n_heard = len(sound_onsets(*level.so_far()))
+        if n_heard > n_told:
+            n_told = n_heard
+            print(f"{n_heard} of {cfg.taps}", flush=True)
+        if n_heard >= cfg.taps:
+            time.sleep(_AFTER_LAST_S)
+            return
