@@ -27,6 +27,9 @@ class Arm:
     Attributes:
         state_names, action_names: Of the numbers in state and action, in their order.
         cameras: The shape (height, width, 3) of each camera's pictures.
+        told: What it was last told (len(action_names),), as far as the robot says so; None: nothing since it was connected or
+            moved to a place.
+        n_breaks: How often it was held, moved to a place or connected: what it is told next need not follow from the last.
 
     Raises:
         RobotError: It cannot be made, or gives something that has no place in an observation.
@@ -47,7 +50,7 @@ class Arm:
             observations, actions = self.robot.observation_features, self.robot.action_features
         except Exception as error:  # whatever a maker's software may say
             raise RobotError(f"--env.robot.type={config.type} cannot be made: {error}") from error
-        self._calibrate, self._max_step = calibrate, max_step
+        self._calibrate, self.max_step = calibrate, max_step
         self.state_names = [name for name, kind in observations.items() if kind in (float, int)]
         self.cameras = {name: tuple(kind) for name, kind in observations.items() if isinstance(kind, tuple | list)}
         strange = [
@@ -65,7 +68,8 @@ class Arm:
             raise RobotError(f"--env.robot.type={config.type} takes {actions}; wanted numbers by name.")
         self._lock = threading.RLock()
         self._last: np.ndarray | None = None
-        self._has_command = False
+        self.told: np.ndarray | None = None
+        self.n_breaks = 0
 
     @property
     def has_positions(self) -> bool:
@@ -88,7 +92,7 @@ class Arm:
                 f"The robot {self.robot.name}{with_cameras} cannot be connected: {error} Look at its cable, its power and its "
                 "port (lerobot-find-port, lerobot-find-cameras)."
             ) from error
-        self._last = None
+        self._break()
 
     def disconnect(self) -> None:
         """Lets go of it; errors are logged."""
@@ -151,8 +155,8 @@ class Arm:
         if not np.isfinite(action).all():
             raise ValueError("The action holds a value that is not finite.")
         with self._lock:
-            if self._max_step is not None and self._last is not None and self.has_positions:
-                action = action.clip(self._last - self._max_step, self._last + self._max_step)
+            if self.max_step is not None and self._last is not None and self.has_positions:
+                action = action.clip(self._last - self.max_step, self._last + self.max_step)
             sent = self._send(action)
             self._last = action
         return sent
@@ -164,8 +168,8 @@ class Arm:
             RobotError: The robot does not answer.
         """
         with self._lock:
+            self._break()
             self._send(self.resting_action())
-            self._last = None
 
     def resting_action(self) -> np.ndarray:
         """The action (len(action_names),) that moves nothing now."""
@@ -193,13 +197,14 @@ class Arm:
                 f"The robot {self.robot.name} cannot be told to go to {dict(target)}: its joints are {self.action_names}."
             )
         with self._lock:
-            limited, self._max_step = self._max_step, None  # the line is smooth by itself
+            limited, self.max_step = self.max_step, None  # the line is smooth by itself
             try:
                 follower_smooth_move_to(self.robot, self.position(), dict(target), duration_s, _MOVE_FPS)
             except Exception as error:
                 raise RobotError(f"The robot {self.robot.name} does not answer: {error}") from error
             finally:
-                self._max_step, self._last = limited, None
+                self.max_step = limited
+                self._break()
 
     def by_name(self, action: np.ndarray) -> dict[str, float]:
         """An action (len(action_names),) as LeRobot's robots take it."""
@@ -210,7 +215,12 @@ class Arm:
             sent = self.robot.send_action(self.by_name(action)) or {}
         except Exception as error:
             raise RobotError(f"The robot {self.robot.name} does not take an action: {error}") from error
-        return np.array([sent.get(name, value) for name, value in zip(self.action_names, action, strict=True)])
+        self.told = np.array([sent.get(name, value) for name, value in zip(self.action_names, action, strict=True)])
+        return self.told
+
+    def _break(self) -> None:
+        self._last = self.told = None
+        self.n_breaks += 1
 
 
 class Watchdog:

@@ -21,6 +21,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from lerobot_playbyear.microphones.config import MicrophoneConfig, register_microphone_plugins
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
 from lerobot_playbyear.robots import ENV_ID
+from lerobot_playbyear.robots.end_effector import EndEffectorConfig
 
 
 def register_devices() -> None:
@@ -45,6 +46,7 @@ class RobotEnvConfig(EnvConfig):
         task: What is to be done, in words; datasets and policies get it.
         fps: Ticks per second [Hz]: pictures, actions and blocks of sound.
         robot: The robot, as for lerobot-record.
+        end_effector: Actions are displacements of the hand instead of the robot's joints. None: they are the robot's own.
         microphones: By their names.
         episode_s: How long an attempt may take [s].
         camera_latency_s: How long after it was exposed a picture arrives [s]; `playbyear-calibrate-latency` measures it.
@@ -68,6 +70,7 @@ class RobotEnvConfig(EnvConfig):
     task: str | None = "Do the task."
     fps: int = 30
     robot: RobotConfig | None = None
+    end_effector: EndEffectorConfig | None = None
     microphones: dict[str, MicrophoneConfig] = field(default_factory=dict)
     episode_s: float = 30.0
     camera_latency_s: float = 0.0

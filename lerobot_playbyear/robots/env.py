@@ -13,6 +13,7 @@ from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.robots.arm import Arm
 from lerobot_playbyear.robots.config import RobotEnvConfig
 from lerobot_playbyear.robots.console import Console
+from lerobot_playbyear.robots.end_effector import EndEffector
 from lerobot_playbyear.robots.errors import RobotError
 from lerobot_playbyear.robots.person import Person, StopPressedError, count
 from lerobot_playbyear.robots.rig import leave_rig, open_rig
@@ -29,7 +30,7 @@ class RobotEnv(gym.Env):
 
     Observations: `pixels` {camera: (height, width, 3) uint8}, `agent_pos` (numbers of the state,) float32 in the order of
     `state_names`, `audio.<microphone>` (samples per tick,) int16. Actions: (numbers,) in the order of `action_names`, in the
-    robot's own units.
+    robot's own units; with `end_effector` they are displacements of the hand and the gripper, in [-1, 1].
 
     Args:
         config: The options.
@@ -51,6 +52,9 @@ class RobotEnv(gym.Env):
         self._is_closed = False
         arm = self._rig.arm
         self.state_names, self.action_names = arm.state_names, arm.action_names
+        self._hand = self._make_hand()
+        if self._hand is not None:
+            self.action_names = self._hand.action_names
         observation: dict[str, spaces.Space] = {}
         if arm.cameras:
             pictures: dict[str, spaces.Space] = {n: spaces.Box(0, 255, s, np.uint8) for n, s in arm.cameras.items()}
@@ -61,7 +65,7 @@ class RobotEnv(gym.Env):
             shape = (microphone.sample_rate // config.fps,)
             observation[f"audio.{name}"] = spaces.Box(-32768, 32767, shape, np.int16)
         self.observation_space = spaces.Dict(observation)
-        limit = np.inf if arm.has_positions else 1.0
+        limit = np.inf if arm.has_positions and self._hand is None else 1.0
         self.action_space = spaces.Box(-limit, limit, (len(self.action_names),), np.float32)
         self.person = Person(self._rig, self._max_episode_steps)
         self._ticks = Ticks(config.fps)
@@ -113,7 +117,7 @@ class RobotEnv(gym.Env):
             elif not np.isfinite(np.asarray(action, np.float64)).all():
                 problem = "The policy's action holds a value that is not finite (NaN)."
             else:
-                rig.arm.send(action)
+                self._send(action)
                 rig.watchdog.feed()
         except RobotError as error:
             problem = str(error)
@@ -203,6 +207,22 @@ class RobotEnv(gym.Env):
                 for name, drops in self._rig.ears.drop_outs.items()
             },
         }
+
+    def _make_hand(self) -> EndEffector | None:
+        if self.config.end_effector is None:
+            return None
+        try:
+            return EndEffector(self._rig.arm, self.config.end_effector)
+        except PlaybyearError:
+            leave_rig(self._rig)
+            raise
+
+    def _send(self, action: np.ndarray) -> None:
+        if self._hand is None:
+            self._rig.arm.send(action)
+        else:
+            assert self._last is not None
+            self._hand.send(action, dict(zip(self.state_names, self._last["agent_pos"].tolist(), strict=True)))
 
     def _connect_or_ask(self) -> None:
         while True:

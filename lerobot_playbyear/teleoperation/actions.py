@@ -16,6 +16,9 @@ CLOSE, STAY, OPEN = 0, 1, 2
 KNOWN_DIRECTIONS = {"keyboard_ee": "-x,-y,z", "gamepad": "-y,x,z"}
 """For the view of our tasks (right on the screen is x, away is y), per type of teleoperator; others have `x,y,z`."""
 
+BASE_DIRECTIONS = {"keyboard_window": "y,-x,z", "keyboard_ee": "-y,x,z", "gamepad": "x,y,z"}
+"""For a robot's base frame (x forward, y left, z up) as a person behind the robot sees it."""
+
 
 class ActionMapping:
     """Makes action vectors of a teleoperator's.
@@ -50,6 +53,9 @@ class ActionMapping:
         self.moves_hand = set(DELTAS) <= set(self._names)
         self.has_gripper = self.moves_hand and n == len(DELTAS) + 1
         self.names = list(names or ())
+        is_hand = bool(self.names) and set(self.names) <= {*DELTAS, GRIPPER}
+        if is_hand:
+            self.names = []  # they are taken by their meaning
         if self.names and set(self.names) <= set(self._names):
             self._names = self.names
         elif self.names:
@@ -58,7 +64,7 @@ class ActionMapping:
                 f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the robot also needs {', '.join(missing)}: "
                 "give a teleoperator of the same kind as the robot, such as so101_leader for so101_follower."
             )
-        if n != len(self._names) and not (self.moves_hand and n in (3, 4)):
+        if (is_hand or n != len(self._names)) and not (self.moves_hand and n in (3, 4)):
             raise ExpertError(
                 f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the environment's action is {n} numbers. "
                 "Give a teleoperator of the end effector (--expert.teleop.type=keyboard_window, keyboard_ee, gamepad) for "

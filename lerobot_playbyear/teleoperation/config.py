@@ -14,7 +14,7 @@ from lerobot.teleoperators.gamepad import GamepadTeleop
 
 from lerobot_playbyear.compat import has_gamepad
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
-from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
+from lerobot_playbyear.teleoperation.actions import BASE_DIRECTIONS, DELTAS, KNOWN_DIRECTIONS, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.controls import OVERRIDE
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig
@@ -49,7 +49,8 @@ class TeleopExpertConfig(ExpertConfig):
         teleop: What they move the arm with: `keyboard_window` (the keys of the window, nothing to install), `keyboard_ee`,
             `gamepad`, or another registered one.
         speed: What a full displacement is, as a share of the largest that the environment takes.
-        directions: What moves the hand along x, y and z, such as `-y,x,z`. None: what fits the view of our tasks.
+        directions: What moves the hand along x, y and z, such as `-y,x,z`. None: what fits the view of our tasks, or of a
+            person behind a robot whose base looks along x.
         gripper_cooldown_s: For how long after a change the gripper cannot change again [s]; the paper's and our tasks' is 2.
         steps_per_second: Control steps per second; fewer than the environment's are slow motion. None: the environment's.
         begin_paused: Each attempt waits until the person presses P.
@@ -84,10 +85,10 @@ class TeleopExpertConfig(ExpertConfig):
                 window = robot.console
             teleop = connect_teleoperator(self.teleop, window)
             stack.callback(teleop.disconnect)
-            directions = self.directions or KNOWN_DIRECTIONS.get(kind, "x,y,z")
-            mapping = ActionMapping(
-                _features(teleop), env.action_space, directions, self.speed, getattr(robot, "action_names", None)
-            )
+            names = getattr(robot, "action_names", None)
+            known = BASE_DIRECTIONS if set(DELTAS) <= set(names or ()) else KNOWN_DIRECTIONS
+            directions = self.directions or known.get(kind, "x,y,z")
+            mapping = ActionMapping(_features(teleop), env.action_space, directions, self.speed, names)
             toggles = self.takeover == "toggle" or (self.takeover == "auto" and not window.has_key_releases)
             expert = TeleopExpert(
                 window=window,

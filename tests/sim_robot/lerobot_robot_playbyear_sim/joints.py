@@ -19,10 +19,16 @@ class JointArmConfig(RobotConfig):
     """Args:
     pictures: (height, width) of each camera.
     speed: Of the joints [units per second].
+    joints: Their names.
+    start: Where they are at first; 0 if not named.
+    use_degrees: Which units it says it has.
     """
 
     pictures: dict[str, tuple[int, int]] = field(default_factory=lambda: {"front": (48, 64)})
     speed: float = 1000.0
+    joints: list[str] = field(default_factory=lambda: [name.removesuffix(".pos") for name in JOINTS])
+    start: dict[str, float] = field(default_factory=dict)
+    use_degrees: bool = True
     max_relative_target: float | None = None
 
 
@@ -37,7 +43,9 @@ class JointArm(Robot):
         self.is_on = False
         self.is_blind = False
         self.told: list[tuple[float, np.ndarray]] = []
-        self.place = self.target = np.zeros(len(JOINTS))
+        self.joints = [f"{name}.pos" for name in config.joints]
+        self.place = self.target = np.array([config.start.get(name, 0.0) for name in self.joints])
+        self.sag = np.zeros(len(self.joints))
         self._at = time.perf_counter()
         rng = np.random.default_rng(0)
         self._backgrounds = {
@@ -47,11 +55,11 @@ class JointArm(Robot):
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
-        return {**dict.fromkeys(JOINTS, float), **{n: (h, w, 3) for n, (h, w) in self.config.pictures.items()}}
+        return {**dict.fromkeys(self.joints, float), **{n: (h, w, 3) for n, (h, w) in self.config.pictures.items()}}
 
     @cached_property
     def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(JOINTS, float)
+        return dict.fromkeys(self.joints, float)
 
     @property
     def is_connected(self) -> bool:
@@ -70,21 +78,25 @@ class JointArm(Robot):
         self.place = self.place + np.clip(self.target - self.place, -most, most)
         self._at = now
 
+    def push(self, by: np.ndarray) -> None:
+        """Somebody moves it by hand."""
+        self.place = self.target = self.place + by
+
     def get_observation(self) -> dict[str, Any]:
         if self.is_blind:
             raise TimeoutError("front latest frame is too old")
         self._move()
         self.n_observed += 1
         pictures = {n: np.roll(b, 7 * self.n_observed, axis=1) for n, b in self._backgrounds.items()}
-        return {**dict(zip(JOINTS, self.place.tolist(), strict=True)), **pictures}
+        return {**dict(zip(self.joints, (self.place + self.sag).tolist(), strict=True)), **pictures}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         self._move()
         if self.config.max_relative_target is not None:
-            now = dict(zip(JOINTS, self.place, strict=True))
-            goals = {name: (action[name], now[name]) for name in JOINTS}
+            now = dict(zip(self.joints, self.place, strict=True))
+            goals = {name: (action[name], now[name]) for name in self.joints}
             action = ensure_safe_goal_position(goals, self.config.max_relative_target)
-        self.target = np.array([action[name] for name in JOINTS], float)
+        self.target = np.array([action[name] for name in self.joints], float)
         assert np.isfinite(self.target).all()
         self.told.append((time.perf_counter(), self.target.copy()))
         return action
