@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -111,6 +113,20 @@ def test_the_whole_path_with_a_kill_and_a_fault(bench, tmp_path):
     assert "gripper" in person.output
     assert len(list((tmp_path / "heard").glob("*.wav"))) == 1
 
+    calibrate = (
+        *(
+            program("playbyear-calibrate-latency"),
+            "--camera.type=playbyear_sim_lamp",
+            f"--camera.socket={bench.socket}",
+        ),
+        *("--microphone.type=portaudio", "--microphone.device=gripper", f"--microphone.sample_rate={RATE}"),
+        *("--event=begins", "--taps=8", f"--plot={tmp_path / 'latency.png'}"),
+    )
+    status = person.run(calibrate, bench.environment, at_times=taps)
+    assert status == 0, person.output[-3000:]
+    latency_ms = float(re.search(r"Sound arrives (\d+) ms later", person.output).group(1))
+    assert 0 <= latency_ms < 150
+
     record = (program("playbyear-record"), *bench.env, *bench.leader, "--expert.teleop.demonstrates=true", *data)
     record = (*record, "--dataset.num_episodes=5")
 
@@ -160,6 +176,13 @@ def test_the_whole_path_with_a_kill_and_a_fault(bench, tmp_path):
     assert status == 0, person.output[-3000:]
     assert n_episodes(tmp_path / "corrections") == 3
     person.close()
+
+
+def taps(person) -> None:
+    """Taps once a second when it is asked for."""
+    if "a second apart" in person.output and time.monotonic() - person.tapped > 1:
+        person.tapped = time.monotonic()
+        person._link.ask("tap")
 
 
 def n_episodes(root: Path) -> int:
