@@ -19,12 +19,12 @@ import pytest
 from sound_server import RATE, Player, SoundServer, why_not
 
 from lerobot_playbyear.datasets.audio_feature import write_wav
-from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.microphone import DropOut
 from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.config import (
     FileMicrophoneConfig,
     MicrophoneConfig,
+    MicrophoneOptionError,
     PortAudioMicrophoneConfig,
     make_microphone,
     register_microphone_plugins,
@@ -149,7 +149,7 @@ def test_how_many_channels_are_opened():
 
     assert [channels_to_open(card(4), 1), channels_to_open(card(1), 1), channels_to_open(card(32), 1)] == [4, 1, 2]
     assert [channels_to_open(card(32), 3), channels_to_open(card(32), 1, 4)] == [3, 4]
-    with pytest.raises(InputError, match="card_channels=1"):
+    with pytest.raises(MicrophoneOptionError, match="card_channels=1"):
         PortAudioMicrophoneConfig(device="x", channel=1, card_channels=1)
 
 
@@ -366,7 +366,7 @@ def test_an_installed_distribution_brings_its_own_type_and_a_broken_one_harms_no
     "options", [{"sample_rate": 0}, {"channel": -1}, {"latency_s": -0.1}, {"latency_s": float("nan")}]
 )
 def test_an_option_without_meaning_is_named(options):
-    with pytest.raises(InputError, match=next(iter(options))):
+    with pytest.raises(MicrophoneOptionError, match=next(iter(options))):
         FileMicrophoneConfig(path="x.wav", **options)
 
 

@@ -58,7 +58,11 @@ class CalibrateLatencyConfig:
     timeout_s: float = 60.0
     plot: Path = Path("outputs/latency.png")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """
+        Raises:
+            InputError: An option is out of range.
+        """
         if self.taps < FEWEST_TAPS:
             raise InputError(f"taps={self.taps}: give at least {FEWEST_TAPS}.")
         if self.event not in EVENTS:
@@ -74,6 +78,7 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
         CalibrationError: The camera gives no pictures, or the taps do not tell the latency.
         MicrophoneError: The microphone cannot be opened.
     """
+    cfg.check()
     level = SoundLevel(cfg.microphone.sample_rate, cfg.microphone.channel)
     microphone = make_microphone(cfg.microphone)
     with ExitStack() as stack:
