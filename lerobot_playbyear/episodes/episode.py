@@ -27,7 +27,7 @@ class Episode:
     Args:
         seed: What the environment was reset with.
         task: What was to be done, in words.
-        observations: T + 1 raw observations, the last one after the last action.
+        observations: T + 1 raw observations, the last one after the last action; none where they went elsewhere as they came.
         actions: (T, action dim) float32.
         rewards: (T,) float32.
         successes: (T,) bool, `info["is_success"]` after each action, or what the expert's verdict says.

@@ -63,21 +63,46 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
         features: From `dataset_features`.
     """
     by_expert = np.ones(len(episode), bool) if episode.interventions is None else episode.interventions
-    frames = []
-    for t in range(len(episode)):
-        frame: dict[str, Any] = dict(_flat_observation(episode.observations[t]))
-        for key, value in frame.items():
-            if features[key]["dtype"] == "float32":
-                frame[key] = np.asarray(value, np.float32)
-        frame[ACTION] = episode.actions[t]
-        frame[INTERVENTION] = by_expert[t : t + 1]
-        frame[REWARD] = episode.rewards[t : t + 1]
-        frame[SUCCESS] = episode.successes[t : t + 1]
-        frame[DONE] = np.array([t == len(episode) - 1])
-        frame[SEED] = np.array([episode.seed], np.int64)
-        frame["task"] = episode.task
-        frames.append(frame)
-    return frames
+    return [
+        make_frame(
+            features,
+            episode.observations[t],
+            episode.actions[t],
+            episode.rewards[t],
+            episode.successes[t],
+            by_expert[t],
+            t == len(episode) - 1,
+            episode.seed,
+            episode.task,
+        )
+        for t in range(len(episode))
+    ]
+
+
+def make_frame(
+    features: dict[str, dict[str, Any]],
+    observation: Observation,
+    action: np.ndarray,
+    reward: float,
+    success: bool,
+    by_expert: bool,
+    is_last: bool,
+    seed: int,
+    task: str,
+) -> dict[str, Any]:
+    """One frame, as LeRobot's datasets take it: what was observed, the action taken then, and what came of it."""
+    frame: dict[str, Any] = dict(_flat_observation(observation))
+    for key, value in frame.items():
+        if features[key]["dtype"] == "float32":
+            frame[key] = np.asarray(value, np.float32)
+    frame[ACTION] = action
+    frame[INTERVENTION] = np.array([by_expert], bool)
+    frame[REWARD] = np.array([reward], np.float32)
+    frame[SUCCESS] = np.array([success], bool)
+    frame[DONE] = np.array([is_last])
+    frame[SEED] = np.array([seed], np.int64)
+    frame["task"] = task
+    return frame
 
 
 def next_seed(root: Path, seed: int) -> int:

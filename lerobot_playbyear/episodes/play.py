@@ -19,6 +19,15 @@ if TYPE_CHECKING:
     from lerobot_playbyear.episodes.expert import Expert
 
 
+class Sink(Protocol):
+    """Who takes the steps of an episode as they come."""
+
+    def __call__(
+        self, observation: Observation, action: np.ndarray, reward: float, success: bool, by_expert: bool, is_last: bool
+    ) -> None:
+        """A step was made: what was observed, what was done then, and what came of it."""
+
+
 class Actor(Protocol):
     """Whoever chooses the actions of an episode, unless an expert does."""
 
@@ -60,6 +69,7 @@ def play(
     options: dict[str, Any] | None = None,
     watch: Callable[[], Any] | None = None,
     seconds: Seconds | None = None,
+    sink: Sink | None = None,
 ) -> Episode:
     """Plays one episode until the environment or the expert ends it, or its steps are used up.
 
@@ -73,6 +83,7 @@ def play(
         seed, options: For `env.reset`.
         expert: Who may take over.
         watch: Called after the reset and after every step; what it returns is kept, such as `env.render` pictures.
+        sink: Takes every step when it was made; the episode then keeps no observations.
         seconds: Counts `simulation` (environment and expert) and `inference` (actor).
     """
     seconds = seconds or Seconds()
@@ -85,7 +96,7 @@ def play(
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     limit = env.get_wrapper_attr("_max_episode_steps") if env.has_wrapper_attr("_max_episode_steps") else np.inf
-    observations, actions, rewards, successes, interventions = [observation], [], [], [], []
+    observations, actions, rewards, successes, interventions = [observation] if sink is None else [], [], [], [], []
     watched = [watch()] if watch else []
     verdict, ended = None, False
     while not ended:
@@ -96,11 +107,11 @@ def play(
             if expert is not None and by_expert:
                 action = expert.act()
             action = np.asarray(action, np.float32).clip(space.low, space.high)
-            observation, reward, terminated, truncated, info = env.step(action)
+            after, reward, terminated, truncated, info = env.step(action)
             verdict = Verdict(info["verdict"]) if info.get("verdict") else None
             if expert is not None:
                 verdict = verdict or expert.verdict()
-        observations.append(observation)
+        seen, observation = observation, after
         actions.append(action)
         rewards.append(float(reward))
         successes.append(verdict is Verdict.SUCCESS or (verdict is None and bool(info["is_success"])))
@@ -108,6 +119,10 @@ def play(
         if watch:
             watched.append(watch())
         ended = terminated or truncated or verdict is not None or len(actions) >= limit
+        if sink is None:
+            observations.append(observation)
+        else:
+            sink(seen, action, rewards[-1], successes[-1], by_expert, ended)
     return Episode(
         seed=seed,
         task=task_description(env),

@@ -14,12 +14,12 @@ def save_episode(episode: Episode, writer: DurableWriter) -> list[dict[str, Any]
     """Appends an episode to a dataset.
 
     Returns:
-        Its frames, as the dataset holds them.
+        Its frames, as the dataset holds them; none of an episode that went to the writer while it was played.
 
     Raises:
         DatasetWriteError: As `save_or_ask`; the dataset is as it was before.
     """
-    frames = episode_frames(episode, writer.features)
+    frames = episode_frames(episode, writer.features) if episode.observations else []  # else the writer has them
     for frame in frames:
         writer.add_frame(frame)
     index = save_or_ask(writer)

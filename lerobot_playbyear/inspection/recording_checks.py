@@ -23,7 +23,7 @@ def check_recording(source: DatasetSource) -> Iterator[Verdict]:
     figures: dict[str, Any] = {"drop_outs": {str(index): drops[index] for index in with_drops}}
     if with_drops:
         total = sum(drops.values())
-        message = f"{total} places without sound, or with sound left out ({name_episodes(with_drops)})"
+        message = f"{total} place{'s' if total > 1 else ''} without sound, or with sound left out ({name_episodes(with_drops)})"
         yield Verdict("drop-outs", "warning", message, None, with_drops, figures)
     else:
         yield Verdict("drop-outs", "ok", f"none in {len(notes)} episodes", figures=figures)

@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lerobot.configs.video import RGBEncoderConfig
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from tqdm import tqdm
@@ -35,6 +36,8 @@ class RecordDatasetConfig:
         root: Its folder. None: in LeRobot's own cache, under its name.
         num_episodes: How many successful episodes it shall have.
         video: Whether pictures are encoded as video; otherwise each is stored without loss.
+        streaming_encoding: Whether video is encoded while it is recorded, as by lerobot-record; otherwise after each episode.
+        rgb_encoder: Codec and quality of video, such as `--dataset.rgb_encoder.vcodec=h264`.
         push_to_hub: Whether to upload it when it is complete.
         private: Whether the uploaded repository is private. None: as the account's default says.
         tags: For its card on the Hub.
@@ -44,6 +47,8 @@ class RecordDatasetConfig:
     root: str | None = None
     num_episodes: int = 50
     video: bool = False
+    streaming_encoding: bool = False
+    rgb_encoder: RGBEncoderConfig = field(default_factory=RGBEncoderConfig)
     push_to_hub: bool = False
     private: bool | None = None
     tags: list[str] | None = None
@@ -104,9 +109,18 @@ def record(cfg: RecordConfig) -> Path:
                 _check_facts(facts, cfg.env)
                 features = dataset_features(facts, cfg.dataset.video)
                 writer = DurableWriter(
-                    cfg.dataset.repo_id, root, facts.fps, features, resume=cfg.resume, robot_type=cfg.env.type
+                    cfg.dataset.repo_id,
+                    root,
+                    facts.fps,
+                    features,
+                    resume=cfg.resume,
+                    robot_type=cfg.env.type,
+                    streaming_encoding=cfg.dataset.streaming_encoding and cfg.dataset.video,
+                    rgb_encoder=cfg.dataset.rgb_encoder,
                 )
             with writer:
+                if isinstance(pool, PersonRollouts):
+                    pool.writer = writer
                 _record_episodes(cfg, pool, writer)
                 summary = f"{writer.num_episodes} episodes, {writer.num_frames} frames"
     except MemoryError as error:

@@ -1,0 +1,85 @@
+"""An episode that goes to disk while it is played, so that a long one of large pictures needs no memory."""
+
+import queue
+import threading
+from typing import Any
+
+import numpy as np
+
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.episodes.episode import Observation
+from lerobot_playbyear.episodes.frames import make_frame
+
+_MOST_BYTES = 256 * 2**20  # that wait for the disk; a robot's loop that waits for more stands still, and holds
+
+
+class FrameStream:
+    """Takes the steps of an episode as they come, and adds them to a dataset in a thread of its own.
+
+    Args:
+        writer: Of the dataset.
+        seed, task: As of `Episode`.
+
+    Raises:
+        DatasetWriteError: On the call after the disk did not take a frame.
+    """
+
+    def __init__(self, writer: DurableWriter, seed: int, task: str) -> None:
+        self._writer, self._seed, self._task = writer, seed, task
+        self._waiting: queue.Queue[dict[str, Any] | None] = queue.Queue()
+        self._room = threading.Condition()
+        self._n_bytes = 0
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._write, name="frames", daemon=True)
+        self._thread.start()
+
+    def __call__(
+        self,
+        observation: Observation,
+        action: np.ndarray,
+        reward: float,
+        success: bool,
+        by_expert: bool,
+        is_last: bool,
+    ) -> None:
+        """A step was made. Waits only where the disk is far behind."""
+        self._check()
+        frame = make_frame(
+            self._writer.features, observation, action, reward, success, by_expert, is_last, self._seed, self._task
+        )
+        size = _size(frame)
+        with self._room:
+            self._room.wait_for(lambda: self._n_bytes + size <= _MOST_BYTES or self._n_bytes == 0 or self._error)
+            self._n_bytes += size
+        self._waiting.put(frame)
+
+    def finish(self) -> None:
+        """Returns when all frames are with the writer."""
+        self._waiting.put(None)
+        self._thread.join()
+        self._check()
+
+    def abandon(self) -> None:
+        """What was added is forgotten."""
+        self._waiting.put(None)
+        self._thread.join()
+        self._writer.discard_episode()
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+    def _write(self) -> None:
+        while (frame := self._waiting.get()) is not None:
+            try:
+                if self._error is None:
+                    self._writer.add_frame(frame)
+            except Exception as error:  # told in the thread that plays
+                self._error = error
+            with self._room:
+                self._n_bytes -= _size(frame)
+                self._room.notify()
+
+
+def _size(frame: dict[str, Any]) -> int:
+    return sum(value.nbytes for value in frame.values() if isinstance(value, np.ndarray))
