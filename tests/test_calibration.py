@@ -1,19 +1,17 @@
 """The latency of sound beside pictures is found from taps, whatever the rate of pictures, or refused."""
 
 import contextlib
-import tempfile
 import threading
 import time
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 from lerobot.cameras import Camera, CameraConfig
 from PIL import Image
-from sound_server import RATE, Player, SoundServer, why_not
+from sound_server import RATE, Player, started, why_not
 
 from lerobot_playbyear.calibration.calibrate import CalibrateLatencyConfig, calibrate_latency
 from lerobot_playbyear.calibration.estimator import CalibrationError, estimate_latency
@@ -189,8 +187,7 @@ def microphone(kind: str) -> Iterator[MicrophoneConfig]:
         yield LateTapsConfig()
         return
     with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        server = stack.enter_context(SoundServer(folder, {"table": 1}))
+        server = stack.enter_context(started(table=1))
         player = stack.enter_context(Player(server.fifo("table"), 1))
         Taps.begin()
         for tap in Taps.times:

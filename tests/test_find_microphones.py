@@ -1,12 +1,10 @@
 """playbyear-find-microphones lists sound cards as they are chosen, and hears each."""
 
-import tempfile
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from sound_server import Player, SoundServer, why_not
+from sound_server import Player, started, why_not
 
 from lerobot_playbyear.datasets.audio_files import read_audio
 from lerobot_playbyear.datasets.errors import InputError
@@ -20,10 +18,13 @@ needs_server = pytest.mark.skipif(bool(why_not()), reason=why_not())
 @needs_server
 def test_each_card_is_listed_heard_and_written(tmp_path, capsys):
     loud = np.full((96000, 2), [8000, 1], np.int16)
-    with tempfile.TemporaryDirectory() as folder, SoundServer(Path(folder), {"bench": 2, "table": 1}) as server:
-        with Player(server.fifo("bench"), 2) as bench, Player(server.fifo("table"), 1, noise=0):
-            bench.play(loud, time.perf_counter())
-            find_microphones(FindMicrophonesConfig(seconds=0.5, output_dir=tmp_path))
+    with (
+        started(bench=2, table=1) as server,
+        Player(server.fifo("bench"), 2) as bench,
+        Player(server.fifo("table"), 1, noise=0),
+    ):
+        bench.play(loud, time.perf_counter())
+        find_microphones(FindMicrophonesConfig(seconds=0.5, output_dir=tmp_path))
     said = capsys.readouterr().out
     assert "0: bench, ALSA (default)" in said
     assert "sample rates: 8000, 16000, 32000, 44100, 48000, 96000 Hz" in said
@@ -37,7 +38,7 @@ def test_each_card_is_listed_heard_and_written(tmp_path, capsys):
 
 @needs_server
 def test_listing_opens_nothing(tmp_path, capsys):
-    with tempfile.TemporaryDirectory() as folder, SoundServer(Path(folder), {"bench": 2}):
+    with started(bench=2):
         find_microphones(FindMicrophonesConfig(list=True, output_dir=tmp_path / "none"))
     assert "bench" in capsys.readouterr().out
     assert not (tmp_path / "none").exists()
@@ -45,20 +46,19 @@ def test_listing_opens_nothing(tmp_path, capsys):
 
 @needs_server
 def test_a_card_that_cannot_be_opened_is_told_and_the_others_are_heard(tmp_path, capsys):
-    with tempfile.TemporaryDirectory() as folder, SoundServer(Path(folder), {"bench": 1, "table": 1}) as server:
-        with Player(server.fifo("table"), 1):
-            server.remove("bench")
+    with started(bench=1, table=1) as server, Player(server.fifo("table"), 1):
+        server.remove("bench")
+        find_microphones(FindMicrophonesConfig(seconds=0.3, output_dir=tmp_path))
+        assert "bench, ALSA cannot be opened" in capsys.readouterr().out
+        assert [path.name for path in tmp_path.iterdir()] == ["microphone_1.wav"]
+        server.remove("table")
+        with pytest.raises(MicrophoneError, match="None of these"):
             find_microphones(FindMicrophonesConfig(seconds=0.3, output_dir=tmp_path))
-            assert "bench, ALSA cannot be opened" in capsys.readouterr().out
-            assert [path.name for path in tmp_path.iterdir()] == ["microphone_1.wav"]
-            server.remove("table")
-            with pytest.raises(MicrophoneError, match="None of these"):
-                find_microphones(FindMicrophonesConfig(seconds=0.3, output_dir=tmp_path))
 
 
 @needs_server
 def test_where_there_is_no_card_it_says_what_to_do():
-    with tempfile.TemporaryDirectory() as folder, SoundServer(Path(folder), {}):
+    with started():
         if sound_cards():
             pytest.skip("this machine has a sound card")
         with pytest.raises(MicrophoneError, match="Plug a microphone in"):

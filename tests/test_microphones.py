@@ -6,17 +6,15 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import draccus
 import numpy as np
 import pytest
-from sound_server import RATE, Player, SoundServer, why_not
+from sound_server import RATE, Player, started, why_not
 
 from lerobot_playbyear.datasets.audio_feature import write_wav
 from lerobot_playbyear.datasets.microphone import DropOut
@@ -38,12 +36,6 @@ SIZE, TICK_S = RATE // FPS, 1 / FPS
 TAP = np.full(48, 20000, np.int16)  # a millisecond
 
 needs_server = pytest.mark.skipif(bool(why_not()), reason=why_not())
-
-
-@contextlib.contextmanager
-def started(**sources: int) -> Iterator[SoundServer]:
-    with tempfile.TemporaryDirectory() as folder, SoundServer(Path(folder), sources) as server:
-        yield server
 
 
 @contextlib.contextmanager

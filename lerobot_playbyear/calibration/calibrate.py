@@ -126,7 +126,7 @@ def _connected(config: CameraConfig) -> Any:
     except Exception as error:  # whatever a camera's own program may raise
         said = " ".join(str(error).split())
         raise CalibrationError(
-            f"The camera cannot be opened: {said} `lerobot-find-cameras` lists what there is."
+            f"The camera cannot be opened: {said} (lerobot-find-cameras lists what there is)"
         ) from error
     return camera
 
