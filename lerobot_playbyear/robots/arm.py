@@ -13,6 +13,7 @@ from lerobot_playbyear.robots.errors import RobotError
 
 _POSITION = ".pos"
 _MOVE_FPS = 30
+_RECENT_S = 1.0  # for as long an arm that does not answer is taken to be where it was seen
 
 
 class Arm:
@@ -65,7 +66,8 @@ class Arm:
             raise RobotError(f"--env.robot.type={config.type} takes {actions}; wanted numbers by name.")
         self._lock = threading.RLock()
         self._last: np.ndarray | None = None
-        self._has_command = False
+        self._seen: np.ndarray | None = None  # its state when it last answered
+        self._seen_s = 0.0
 
     @property
     def has_positions(self) -> bool:
@@ -135,6 +137,7 @@ class Arm:
         if not np.isfinite(state).all():
             bad = [name for name, value in zip(self.state_names, state, strict=True) if not np.isfinite(value)]
             raise RobotError(f"The robot {self.robot.name} gives no finite value for {', '.join(bad)}.")
+        self._seen, self._seen_s = state, time.perf_counter()
         return state, pictures
 
     def send(self, action: np.ndarray) -> np.ndarray:
@@ -168,10 +171,21 @@ class Arm:
             self._last = None
 
     def resting_action(self) -> np.ndarray:
-        """The action (len(action_names),) that moves nothing now."""
+        """The action (len(action_names),) that moves nothing now; of an arm that does not answer: to where it was just seen.
+
+        Raises:
+            RobotError: It has not answered for long.
+        """
         if not self.has_positions:
             return np.zeros(len(self.action_names))
-        state, _ = self.observe()
+        try:
+            state, _ = self.observe()
+        except (
+            RobotError
+        ):  # LeRobot's robots read joints and cameras together: one camera that is gone hides the joints
+            if self._seen is None or time.perf_counter() - self._seen_s > _RECENT_S:
+                raise
+            state = self._seen
         by_name = dict(zip(self.state_names, state, strict=True))
         return np.array([by_name[name] for name in self.action_names], np.float64)
 

@@ -242,6 +242,7 @@ class RobotEnv(gym.Env):
 
     def _end(self, problem: str):
         """The attempt ends because something went wrong."""
+        problem = problem.rstrip(". ") + "."
         logging.error(f"{problem} The robot holds.")
         verdict = self.stop_and_ask(problem)
         if verdict is None:
