@@ -13,7 +13,7 @@ from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.frames import dataset_features
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.robots.arm import RobotError
 from lerobot_playbyear.robots.ticks import Ticks
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
 

@@ -10,13 +10,12 @@ from gymnasium import spaces
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.robots.arm import Arm
+from lerobot_playbyear.robots.arm import Arm, RobotError
 from lerobot_playbyear.robots.config import RobotEnvConfig
-from lerobot_playbyear.robots.console import Console
-from lerobot_playbyear.robots.errors import RobotError
 from lerobot_playbyear.robots.person import Person, StopPressedError, count
 from lerobot_playbyear.robots.rig import leave_rig, open_rig
 from lerobot_playbyear.robots.ticks import Ticks
+from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
 
 

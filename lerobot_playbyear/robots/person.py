@@ -8,8 +8,8 @@ import numpy as np
 
 from lerobot_playbyear.datasets.microphone import DropOut
 from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.robots.console import NoConsole
 from lerobot_playbyear.robots.ticks import Ticks
+from lerobot_playbyear.teleoperation.console import NoConsole
 from lerobot_playbyear.teleoperation.controls import FAILURE, LEAVE, PAUSE, RERECORD, SUCCESS, PersonLeftError
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.status import HISTORY_S, Control, Status
