@@ -13,7 +13,7 @@ from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.frames import dataset_features
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.robots.arm import RobotError
 from lerobot_playbyear.robots.ticks import Ticks
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
 
@@ -361,3 +361,25 @@ def test_a_pause_counts_for_nothing(wav):
     assert len(episode) == 20
     assert episode.facts["drop_outs"] == {"gripper": []}
     assert episode.facts["rate_hz"] == pytest.approx(20, rel=0.05)
+
+
+def test_an_evaluation_can_be_paused_and_the_arm_holds_at_its_end():
+    n_paused = [0]
+
+    def press(status):
+        if "Set the scene" in status.note:
+            return "p"
+        if status.note == "Press P to go on":
+            n_paused[0] += 1
+            return "p" if n_paused[0] == 5 else None
+        return "p" if status.step == 4 and not n_paused[0] else None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(max_step=None, max_relative_target=None), console) as env:
+        env.reset(seed=0)
+        env.arm.robot.config.speed = 5.0  # units per second
+        steps = [env.step(np.full(3, 10, np.float32)) for _ in range(20)]
+        assert n_paused[0] == 5
+        assert [step[3] for step in steps] == [False] * 19 + [True]
+        assert env.episode_facts()["rate_hz"] == pytest.approx(20, rel=0.05)
+        assert env.arm.robot.told[-1][1].max() < 9

@@ -9,11 +9,15 @@ from collections.abc import Mapping
 import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.datasets.errors import PlaybyearError
 
 _POSITION = ".pos"
 _MOVE_FPS = 30
 _RECENT_S = 1.0  # for as long an arm that does not answer is taken to be where it was seen
+
+
+class RobotError(PlaybyearError, RuntimeError):
+    """A robot, or something on it, cannot be used; the message says what, and what to do. Nothing saved is lost."""
 
 
 class Arm:

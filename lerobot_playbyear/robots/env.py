@@ -10,13 +10,12 @@ from gymnasium import spaces
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.robots.arm import Arm
+from lerobot_playbyear.robots.arm import Arm, RobotError
 from lerobot_playbyear.robots.config import RobotEnvConfig
-from lerobot_playbyear.robots.console import Console
-from lerobot_playbyear.robots.errors import RobotError
 from lerobot_playbyear.robots.person import Person, StopPressedError, count
 from lerobot_playbyear.robots.rig import leave_rig, open_rig
 from lerobot_playbyear.robots.ticks import Ticks
+from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
 
 
@@ -132,6 +131,12 @@ class RobotEnv(gym.Env):
             logging.debug("The arm held for a moment: an action came late.")
         try:
             verdict = self.person.look(self._last, self.render(), self._ticks, rig.ears.drop_outs)
+            if self.person.wants_pause:
+                self.hold()
+                self.person.pause()
+                self.go_on()
+        except RobotError as error:
+            return self._end(str(error))
         except StopPressedError:
             return self._end("You pressed Escape.")
         return self._outcome(verdict)
@@ -254,8 +259,10 @@ class RobotEnv(gym.Env):
         info: dict[str, Any] = {"is_success": success}
         if verdict is not None:
             info["verdict"] = verdict.value
-            self._rig.watchdog.rest()
         is_over = self._ticks.n >= self._max_episode_steps
-        if is_over:
-            self._rig.watchdog.rest()
+        if (is_over or verdict is not None) and not is_problem:
+            try:
+                self.hold()
+            except RobotError as error:
+                logging.error(f"The robot cannot be told to hold: {error}")
         return self._last, float(success), verdict is not None and not is_problem, is_problem or is_over, info

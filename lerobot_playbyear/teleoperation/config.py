@@ -5,7 +5,7 @@ import pkgutil
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 from lerobot import teleoperators
@@ -15,6 +15,7 @@ from lerobot.teleoperators.gamepad import GamepadTeleop
 from lerobot_playbyear.compat import has_gamepad
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
+from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import OVERRIDE
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig
@@ -22,9 +23,6 @@ from lerobot_playbyear.teleoperation.levels import microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.window import Window
-
-if TYPE_CHECKING:
-    from lerobot_playbyear.robots.console import Console
 
 for _module in pkgutil.iter_modules(
     teleoperators.__path__
@@ -76,7 +74,7 @@ class TeleopExpertConfig(ExpertConfig):
         fps = self.steps_per_second or env_fps
         robot: Any = env.unwrapped if getattr(env.unwrapped, "is_real_time", False) else None
         with ExitStack() as stack:  # closes what was opened if a later part fails
-            window: Window | Console  # (an annotation of a local name is not evaluated)
+            window: Window | Console
             if robot is None:
                 window = Window(f"Play it by ear: {_title(env)}")
                 stack.callback(window.close)
@@ -141,7 +139,7 @@ class TeleopExpertConfig(ExpertConfig):
         return Speaker(round(size * env_fps), size, reason)
 
 
-def connect_teleoperator(config: TeleoperatorConfig, window: "Window | Console") -> Teleoperator:
+def connect_teleoperator(config: TeleoperatorConfig, window: Window | Console) -> Teleoperator:
     """Make and connect a LeRobot teleoperator.
 
     Args:

@@ -8,7 +8,9 @@ end. The sound of a step is played while the next one is awaited, behind it by `
 
 import argparse
 import json
+import os
 import queue
+import sys
 import threading
 import time
 from multiprocessing.connection import Connection, Listener
@@ -173,7 +175,12 @@ def main() -> None:
             connection = listener.accept()
             threading.Thread(target=answer, args=(connection, simulation), daemon=True).start()
 
-    threading.Thread(target=accept, daemon=True).start()
+    def end_with_parent() -> None:
+        sys.stdin.read()
+        os._exit(0)
+
+    for work in (accept, end_with_parent):
+        threading.Thread(target=work, daemon=True).start()
     print("ready", flush=True)
     simulation.run()
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.episodes.expert import ExpertError
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 from lerobot_playbyear.teleoperation.status import Status
 from lerobot_playbyear.teleoperation.window import Window
@@ -42,7 +42,7 @@ class TerminalConsole:
     """The terminal that the program was started in: one line that tells how it goes, and keys without Enter.
 
     Raises:
-        RobotError: The program has no terminal.
+        ExpertError: The program has no terminal.
     """
 
     has_key_releases = False
@@ -52,9 +52,9 @@ class TerminalConsole:
             import termios
             import tty
         except ImportError as error:
-            raise RobotError("--env.console=terminal needs Linux or macOS: give window or none.") from error
+            raise ExpertError("--env.console=terminal needs Linux or macOS: give window or none.") from error
         if not (sys.stdin and sys.stdin.isatty()):
-            raise RobotError("--env.console=terminal, and the program has no terminal: give window or none.")
+            raise ExpertError("--env.console=terminal, and the program has no terminal: give window or none.")
         self.keys = WindowKeys()
         self.keys.has_focus = True
         self.is_open = True
@@ -138,8 +138,7 @@ def make_console(kind: str, title: str) -> Console:
     """A console of a kind: `window`, `terminal`, `none`, or `auto`: a window where there is a screen, else a terminal.
 
     Raises:
-        RobotError: There is no terminal.
-        ExpertError: There is no screen.
+        ExpertError: There is no screen, or no terminal.
     """
     if kind == "auto":
         screen = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
