@@ -18,6 +18,8 @@ from lerobot_playbyear.robots.ticks import Ticks
 from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
 
+_MOST_SHOWN = 720  # pixels
+
 
 class RobotEnv(gym.Env):
     """Any LeRobot robot with any number of microphones.
@@ -60,8 +62,8 @@ class RobotEnv(gym.Env):
             shape = (microphone.sample_rate // config.fps,)
             observation[f"audio.{name}"] = spaces.Box(-32768, 32767, shape, np.int16)
         self.observation_space = spaces.Dict(observation)
-        limit = np.inf if arm.has_positions else 1.0
-        self.action_space = spaces.Box(-limit, limit, (len(self.action_names),), np.float32)
+        self._limit = np.inf if arm.has_positions else 1.0
+        self.action_space = spaces.Box(-self._limit, self._limit, (len(self.action_names),), np.float32)
         self.person = Person(self._rig, self._max_episode_steps)
         self._ticks = Ticks(config.fps)
         self._same_picture: dict[str, tuple[int, float]] = {}
@@ -85,11 +87,17 @@ class RobotEnv(gym.Env):
         rig, config = self._rig, self.config
         rig.watchdog.rest()
         self._connect_or_ask()
-        if rig.home or config.rest:
-            rig.arm.move_to(config.rest if config.rest is not None else rig.home or {}, config.rest_s)
-        rig.arm.begin_episode(seed)
         rig.attempt += 1
-        self.person.begin(wait=config.wait_for_person, picture=self._look)
+        rest = config.rest if config.rest is not None else rig.home or {}
+        self.person.begin()
+        if rig.arm.is_away_from(rest):
+            if config.wait_for_person:
+                self.person.wait_for("Press P to let the arm go to its rest pose", self._look)
+            rig.arm.move_to(rest, config.rest_s)
+        rig.arm.begin_episode(seed)
+        if config.wait_for_person:
+            self.person.wait_for("Set the scene up, then press P to begin", self._look)
+        self.person.begins()
         self._same_picture.clear()
         self._stopped = None
         self._began_at = time.time()
@@ -112,7 +120,7 @@ class RobotEnv(gym.Env):
             elif not np.isfinite(np.asarray(action, np.float64)).all():
                 problem = "The policy's action holds a value that is not finite (NaN)."
             else:
-                rig.arm.send(action)
+                rig.arm.send(np.clip(action, -self._limit, self._limit))
                 rig.watchdog.feed()
         except RobotError as error:
             problem = str(error)
@@ -142,11 +150,16 @@ class RobotEnv(gym.Env):
         return self._outcome(verdict)
 
     def render(self) -> np.ndarray:
-        """All cameras side by side, (height, width, 3) uint8; the highest gives the height."""
+        """All cameras side by side, (side, side, 3) uint8: a square, as the window shows, of at most 720 pixels."""
         pictures = list(self._pictures.values()) or [np.zeros((64, 64, 3), np.uint8)]
-        height = max(picture.shape[0] for picture in pictures)
-        padded = [np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0))) for p in pictures]
-        return np.ascontiguousarray(np.concatenate(padded, axis=1))
+        height, width = max(p.shape[0] for p in pictures), sum(p.shape[1] for p in pictures)
+        step, side = -(-max(height, width) // _MOST_SHOWN), max(height, width)
+        scene, left = np.zeros((side, side, 3), np.uint8), (side - width) // 2
+        for picture in pictures:
+            top = (side - picture.shape[0]) // 2
+            scene[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+            left += picture.shape[1]
+        return np.ascontiguousarray(scene[::step, ::step])
 
     def close(self) -> None:
         """The arm holds, and everything is let go."""

@@ -50,16 +50,8 @@ class Person:
         """Whether anybody can be asked."""
         return not isinstance(self._rig.console, NoConsole)
 
-    def begin(self, wait: bool, picture: Callable[[], np.ndarray]) -> None:
-        """An attempt is about to begin: waits until the person is ready.
-
-        Args:
-            wait: Whether to wait at all.
-            picture: What the cameras see.
-
-        Raises:
-            PersonLeftError: They leave.
-        """
+    def begin(self) -> None:
+        """An attempt is about to begin; what was pressed before was not meant for it."""
         config, console = self._rig.config, self._rig.console
         self._status = Status(
             control=Control.PAUSED,
@@ -69,12 +61,27 @@ class Person:
             fps=config.fps,
             keys=_KEYS,
             waiting="Please wait",
+            sound="the robot's microphones would hear it",
         )
         self._verdict: Verdict | None = None
         console.keys.look()
-        if wait and self.is_there:
-            self._status.note = "Set the scene up, then press P to begin"
+
+    def wait_for(self, note: str, picture: Callable[[], np.ndarray]) -> None:
+        """Waits until the person presses P, if anybody is there.
+
+        Args:
+            note: What they are told.
+            picture: What the cameras see.
+
+        Raises:
+            PersonLeftError: They leave.
+        """
+        if self.is_there:
+            self._status.note = note
             self._wait_for({PAUSE, "enter"}, picture)
+
+    def begins(self) -> None:
+        """From here on the arm moves."""
         self._status.note, self._status.control = "", Control.POLICY
 
     def look(
@@ -132,7 +139,7 @@ class Person:
             return Verdict.DISCARD
         self._status.drop_outs = count(drop_outs)
         self._status.control = Control.PAUSED
-        self._status.note = f"{reason} R throws the attempt away, Q keeps it as failed, S as a success; Esc leaves."
+        self._status.note = f"{reason} R throws the attempt away, Q counts it as failed, S as a success; Esc leaves."
         try:
             key = self._wait_for(set(_VERDICTS), None)
         except PersonLeftError:

@@ -16,7 +16,7 @@ from lerobot_playbyear.compat import has_gamepad
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.console import Console
-from lerobot_playbyear.teleoperation.controls import OVERRIDE
+from lerobot_playbyear.teleoperation.controls import OVERRIDE, TAKEN
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig
 from lerobot_playbyear.teleoperation.levels import microphone_blocks
@@ -54,7 +54,8 @@ class TeleopExpertConfig(ExpertConfig):
         takeover: How a person takes over from a policy: `hold` the key, or `toggle` it with one press, and hand back with
             another. `auto`: hold it where the keyboard says when a key is let go, as a window does and a terminal does not.
         takeover_key: The key, such as `space` or `b`; most pedals are keyboards with one key.
-        play_sound: Play the first microphone, if the package sounddevice is installed.
+        play_sound: Play the first microphone, if the package sounddevice is installed. None: only in simulation, for a
+            robot would hear it.
     """
 
     teleop: TeleoperatorConfig = field(default_factory=KeyboardWindowTeleopConfig)
@@ -65,7 +66,7 @@ class TeleopExpertConfig(ExpertConfig):
     begin_paused: bool = True
     takeover: str = "auto"
     takeover_key: str = OVERRIDE
-    play_sound: bool = True
+    play_sound: bool | None = None
 
     def make(self, env: gym.Env, demonstrates: bool = False) -> Expert:
         """The person, beside a policy or with nobody else at the controls."""
@@ -118,6 +119,11 @@ class TeleopExpertConfig(ExpertConfig):
             raise ExpertError(f"--expert.gripper_cooldown_s={self.gripper_cooldown_s}: give 0 or more seconds.")
         if self.steps_per_second is not None and not self.steps_per_second > 0:
             raise ExpertError(f"--expert.steps_per_second={self.steps_per_second}: give a number above 0.")
+        if self.takeover_key in TAKEN or not self.takeover_key:
+            raise ExpertError(
+                f"--expert.takeover_key={self.takeover_key!r} means something else already: give another one than "
+                f"{', '.join(sorted(TAKEN))}, such as space or b."
+            )
         if self.takeover not in ("auto", "hold", "toggle"):
             raise ExpertError(f"--expert.takeover={self.takeover!r}: give auto, hold or toggle.")
         if getattr(env.unwrapped, "is_real_time", False) and self.steps_per_second is not None:
@@ -132,7 +138,10 @@ class TeleopExpertConfig(ExpertConfig):
         blocks = microphone_blocks(env.observation_space.sample())
         size = len(next(iter(blocks.values()), ()))
         reason = "" if blocks else "no microphone"
-        if not self.play_sound:
+        is_robot = getattr(env.unwrapped, "is_real_time", False)
+        if is_robot and self.play_sound is None:
+            reason = "the robot's microphones would hear it"
+        elif self.play_sound is False:
             reason = "--expert.play_sound=false"
         elif fps != env_fps:
             reason = "slow motion"
