@@ -105,9 +105,9 @@ def demonstrate(cfg: Options) -> dict[str, Any]:
 
 def scene(cfg: Options, stack: ExitStack) -> tuple[gym.Env, Any, Any]:
     """Where the policy acts: the environment, its configuration, and what asks the simulation how it stands."""
-    from lerobot_env_playbyear.config import PlaybyearEnv
+    from lerobot_env_playbyear.config import PlaybyearEnvConfig
 
-    simulated = PlaybyearEnv(task=cfg.task)
+    simulated = PlaybyearEnvConfig(task=cfg.task)
     task_env = gym.make(
         f"{simulated.package_name}:{simulated.gym_id}", disable_env_checker=True, **simulated.gym_kwargs
     )

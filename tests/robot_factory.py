@@ -43,7 +43,9 @@ def simulation(folder: Path, fifo: Path | str = "", *options: str) -> Iterator[s
     module = "lerobot_robot_playbyear_sim.simulation"
     command = [sys.executable, "-m", module, f"--socket={socket}", f"--fifo={fifo}", *options]
     environment = with_sim_robot({**os.environ, "OMP_NUM_THREADS": "1"})
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=environment, text=True)
+    # It ends with its standard input, so also when this process is killed.
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    process = subprocess.Popen(command, env=environment, text=True, **pipes)
     try:
         assert process.stdout is not None
         assert process.stdout.readline().strip() == "ready"

@@ -29,6 +29,7 @@ class SimulatedPerson:
         self.pressed: list[str] = []
         self._acts, self._n_begun = False, 0
         self._judged = -1
+        self.tapped = 0.0
 
     def run(
         self,
@@ -36,6 +37,7 @@ class SimulatedPerson:
         environment: Mapping[str, str],
         timeout_s: float = 300,
         kill_when: Callable[["SimulatedPerson"], bool] = lambda person: False,
+        at_times: Callable[["SimulatedPerson"], None] = lambda person: None,
     ) -> int:
         """Runs a command in a terminal of its own and sits before it. Returns its exit status, -9 if it was killed."""
         self.output = ""
@@ -54,6 +56,7 @@ class SimulatedPerson:
                 if kill_when(self):
                     os.killpg(process.pid, signal.SIGKILL)
                     break
+                at_times(self)
                 key = self._wish()
                 if key:
                     self.pressed.append(key)

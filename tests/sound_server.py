@@ -1,6 +1,6 @@
 """A real PulseAudio server whose sound cards are FIFOs: microphones through PortAudio without a sound card.
 
-    with SoundServer(tmp_path, {"bench": 2}) as server, Player(server.fifo("bench"), channels=2) as player:
+    with started(bench=2) as server, Player(server.fifo("bench"), channels=2) as player:
         player.play(samples, at_s=time.perf_counter() + 0.5)
         ...  # PortAudioMicrophoneConfig(device="bench")
 
@@ -16,9 +16,10 @@ import os
 import shutil
 import signal
 import subprocess
+import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -143,6 +144,13 @@ class SoundServer:
         command = ["pactl", f"--server=unix:{self._socket}", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, check=check)
         return done.stdout if done.returncode == 0 else None
+
+
+@contextlib.contextmanager
+def started(**sources: int) -> Iterator[SoundServer]:
+    """A server in a folder of its own, with sources of so many channels."""
+    with tempfile.TemporaryDirectory() as folder, SoundServer(Path(folder), sources) as server:
+        yield server
 
 
 def look_again() -> None:

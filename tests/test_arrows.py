@@ -20,6 +20,7 @@ training        datasets policy hub
 teleoperation   episodes
 microphones     datasets
 calibration     datasets microphones
+robots          datasets policy episodes teleoperation microphones
 recording       datasets episodes hub teleoperation
 dagger          datasets episodes hub training
 scripts         datasets policy episodes film inspection hub training teleoperation recording dagger microphones calibration

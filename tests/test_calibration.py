@@ -1,9 +1,24 @@
 """The latency of sound beside pictures is found from taps, whatever the rate of pictures, or refused."""
 
+import contextlib
+import threading
+import time
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
 import numpy as np
 import pytest
+from lerobot.cameras import Camera, CameraConfig
+from PIL import Image
+from sound_server import RATE, Player, started, why_not
 
+from lerobot_playbyear.calibration.calibrate import CalibrateLatencyConfig, calibrate_latency
 from lerobot_playbyear.calibration.estimator import CalibrationError, estimate_latency
+from lerobot_playbyear.calibration.listening import SoundLevel
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.microphones.config import MicrophoneConfig, PortAudioMicrophoneConfig
+from lerobot_playbyear.microphones.microphone import Microphone
 
 
 def recorded(
@@ -68,3 +83,165 @@ def test_silence_and_a_picture_in_which_nothing_moves_are_refused():
         estimate_latency(picture_times, motion, sound_times, np.zeros_like(level))
     with pytest.raises(CalibrationError, match="0 motions"):
         estimate_latency(picture_times, np.zeros_like(motion), sound_times, level)
+
+
+# In real time, with a camera and a microphone
+
+FPS = 30
+LATENCY_S = 0.037
+TAP = np.full(96, 20000, np.int16)
+
+
+class Taps:
+    """When something happens that is seen and heard [s of time.perf_counter]."""
+
+    times: ClassVar[np.ndarray] = np.zeros(0)
+
+    @classmethod
+    def begin(cls, n_taps: int = 10) -> None:
+        """A tap every 0.7 s, each at another moment between two pictures."""
+        cls.times = time.perf_counter() + 1 + np.arange(n_taps) * (0.7 + 0.37 / FPS)
+
+
+@CameraConfig.register_subclass("lamp")
+@dataclass(kw_only=True)
+class LampCameraConfig(CameraConfig):
+    works: bool = True
+
+
+class LampCamera(Camera):
+    """Sees a lamp that is switched with every tap; gives its pictures at their pace, as they were when they were due."""
+
+    def __init__(self, config: LampCameraConfig) -> None:
+        super().__init__(config)
+        self._works, self._next, self._is_connected = config.works, 0.0, False
+
+    @property
+    def is_connected(self) -> bool:
+        return self._is_connected
+
+    @staticmethod
+    def find_cameras() -> list[dict[str, Any]]:
+        return []
+
+    def connect(self, warmup: bool = True) -> None:
+        self._is_connected, self._next = True, time.perf_counter()
+
+    def read(self) -> np.ndarray:
+        return self.async_read()
+
+    def async_read(self, timeout_ms: float = 200) -> np.ndarray:
+        if not self._works:
+            raise TimeoutError("no picture came")
+        time.sleep(max(self._next - time.perf_counter(), 0))
+        lit = int((Taps.times <= self._next).sum()) % 2
+        self._next += 1 / FPS
+        picture = np.full((120, 160, 3), 40, np.uint8)
+        picture[40:80, 60:100] += np.uint8(150 * lit)
+        return picture
+
+    def disconnect(self) -> None:
+        self._is_connected = False
+
+
+@MicrophoneConfig.register_subclass("late_taps")
+@dataclass(kw_only=True)
+class LateTapsConfig(MicrophoneConfig):
+    @property
+    def card(self) -> Hashable:
+        return "late_taps"
+
+    def make(self, channels: int) -> Microphone:
+        return LateTaps("late taps", self.sample_rate, channels)
+
+
+class LateTaps(Microphone):
+    """Hears the taps in quiet noise, and brings them 37 ms later."""
+
+    def _open(self) -> None:
+        self._ended = ""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._play, daemon=True)
+        self._thread.start()
+
+    def _close(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _play(self) -> None:
+        rng, size, start, n = np.random.default_rng(0), 240, time.perf_counter(), 0
+        while not self._stop.wait(max(start + (n + size) / self.sample_rate - time.perf_counter(), 0)):
+            chunk = rng.normal(0, 5, (size, self.channels)).astype(np.int16)
+            first = np.round((Taps.times + LATENCY_S - start) * self.sample_rate).astype(int) - n
+            for begin in first[(first > -len(TAP)) & (first < size)]:
+                chunk[max(begin, 0) : max(begin + len(TAP), 0)] += TAP[0]
+            n += size
+            self._heard(chunk, time.perf_counter())
+
+
+@contextlib.contextmanager
+def microphone(kind: str) -> Iterator[MicrophoneConfig]:
+    """One that is 37 ms late; begins the taps."""
+    if kind == "late_taps":
+        Taps.begin()
+        yield LateTapsConfig()
+        return
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(started(table=1))
+        player = stack.enter_context(Player(server.fifo("table"), 1))
+        Taps.begin()
+        for tap in Taps.times:
+            player.play(TAP, tap + LATENCY_S)
+        yield PortAudioMicrophoneConfig(device="table")
+
+
+_NEEDS_SERVER = pytest.mark.skipif(bool(why_not()), reason=why_not())
+
+
+@pytest.mark.parametrize("kind", ["late_taps", pytest.param("portaudio", marks=_NEEDS_SERVER)])
+def test_a_latency_of_37_ms_is_found_to_5_ms(kind, tmp_path, capsys):
+    with microphone(kind) as config:
+        cfg = CalibrateLatencyConfig(LampCameraConfig(), config, event="begins", plot=tmp_path / "plots/latency.png")
+        found = calibrate_latency(cfg)
+    assert found.latency_s == pytest.approx(LATENCY_S, abs=0.005)
+    assert len(found.taps) >= 9
+    said = capsys.readouterr().out
+    assert f"latency_s: {found.latency_s:.3f}" in said
+    assert "10 of 10" in said
+    with Image.open(cfg.plot) as plot:
+        assert plot.format == "PNG"
+        assert len(plot.convert("RGB").getcolors(1 << 16)) > 4
+
+
+def test_a_camera_that_gives_no_pictures_ends_it_with_one_line(tmp_path):
+    cfg = CalibrateLatencyConfig(LampCameraConfig(works=False), LateTapsConfig(), plot=tmp_path / "latency.png")
+    with pytest.raises(CalibrationError, match="The camera gives no pictures: no picture came"):
+        calibrate_latency(cfg)
+
+
+def test_where_nobody_taps_it_ends_in_time_and_says_so(tmp_path):
+    Taps.times = np.zeros(0)
+    cfg = CalibrateLatencyConfig(LampCameraConfig(), LateTapsConfig(), timeout_s=1, plot=tmp_path / "latency.png")
+    with pytest.raises(CalibrationError, match="5 are needed"):
+        calibrate_latency(cfg)
+    assert not cfg.plot.exists()
+
+
+@pytest.mark.parametrize("options", [{"taps": 4}, {"event": "jumps"}, {"timeout_s": 0}])
+def test_an_option_without_meaning_is_named(options):
+    with pytest.raises(InputError, match=next(iter(options))):
+        calibrate_latency(CalibrateLatencyConfig(LampCameraConfig(), LateTapsConfig(), **options))
+
+
+def test_the_level_of_sound_stands_at_the_time_at_which_it_came_also_after_a_loss():
+    level, rng = SoundLevel(RATE, 1), np.random.default_rng(0)
+    for k in range(600):
+        if 200 <= k < 240:
+            continue  # a fifth of a second is lost
+        chunk = np.zeros((240, 2), np.int16)
+        chunk[0, 1] = 10000 if k % 100 == 50 else 0
+        level.listen(chunk, 100 + (k + 1) * 0.005 + rng.uniform(0, 0.003))
+    times, levels = level.so_far()
+    heard = times[levels > 5000]
+    wanted = 100 + np.array([50, 150, 350, 450, 550]) * 0.005
+    assert [np.abs(heard - time_s).min() < 0.004 for time_s in wanted] == [True] * 5

@@ -10,8 +10,8 @@ from draccus.utils import DecodingError
 from robot_factory import ScriptedConsole, joint_config, robot_env
 
 from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.robots.arm import RobotError
 from lerobot_playbyear.robots.end_effector import EndEffectorConfig
-from lerobot_playbyear.robots.errors import RobotError
 
 needs_placo = pytest.mark.skipif(
     find_spec("placo") is None, reason='placo is not installed: pip install "lerobot[kinematics]"'
@@ -194,7 +194,7 @@ def test_a_value_that_is_not_finite_never_reaches_the_robot(urdf, value):
         assert len(told) == 1  # it holds where it is
         np.testing.assert_allclose(told[0][1], place, atol=1e-4)
         with pytest.raises(ValueError, match="not finite"):
-            env._hand.send(np.array([value, 0, 0, 0]), BENT)
+            env._hand.send(np.array([value, 0, 0, 0]), np.zeros(5))
 
 
 @needs_placo

@@ -2,7 +2,10 @@
 
 import json
 import os
+import re
+import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -95,3 +98,97 @@ def test_from_nothing_to_a_corrected_policy(bench, tmp_path):
     assert len(kept) == 1
     assert 0 < kept[0]["intervention_share"] < 1
     person.close()
+
+
+@pytest.mark.slow
+def test_the_whole_path_with_a_kill_and_a_fault(bench, tmp_path):
+    """Find, calibrate, record 5, train, evaluate, correct 3, go on after SIGKILL; a sound server that dies in between."""
+    demos, train, dagger = tmp_path / "demos", tmp_path / "train", tmp_path / "dagger"
+    data = ("--dataset.repo_id=me/demos", f"--dataset.root={demos}")
+    person = bench.person()
+    status = person.run(
+        [program("playbyear-find-microphones"), "--seconds=1", f"--output_dir={tmp_path / 'heard'}"], bench.environment
+    )
+    assert status == 0, person.output[-3000:]
+    assert "gripper" in person.output
+    assert len(list((tmp_path / "heard").glob("*.wav"))) == 1
+
+    calibrate = (
+        *(
+            program("playbyear-calibrate-latency"),
+            "--camera.type=playbyear_sim_lamp",
+            f"--camera.socket={bench.socket}",
+        ),
+        *("--microphone.type=portaudio", "--microphone.device=gripper", f"--microphone.sample_rate={RATE}"),
+        *("--event=begins", "--taps=8", f"--plot={tmp_path / 'latency.png'}"),
+    )
+    status = person.run(calibrate, bench.environment, at_times=taps)
+    assert status == 0, person.output[-3000:]
+    latency_ms = float(re.search(r"Sound arrives (\d+) ms later", person.output).group(1))
+    assert 0 <= latency_ms < 150
+
+    record = (program("playbyear-record"), *bench.env, *bench.leader, "--expert.teleop.demonstrates=true", *data)
+    record = (*record, "--dataset.num_episodes=5")
+
+    def is_second(person) -> bool:
+        return person._n_begun >= 3 and person._link.ask("status")["n_steps"] > 20
+
+    status = person.run(record, bench.environment, kill_when=is_second)
+    assert status == -9
+    assert n_episodes(demos) == 2  # and the third is gone, and nothing else
+    bench.server.kill()
+    status = person.run([*record, "--resume=true", "--env.wait_for_person=false"], bench.environment, 120, gives_up)
+    assert n_episodes(demos) == 2
+    bench.server.start()
+    status = person.run([*record, "--resume=true"], bench.environment)
+    assert status == 0, person.output[-3000:]
+    assert n_episodes(demos) == 5
+    subprocess.run([program("playbyear-inspect"), *data], check=True, env=bench.environment, capture_output=True)
+
+    steps = ("--steps=200", "--batch_size=8", "--save_freq=200", "--num_workers=0", f"--output_dir={train}")
+    status = person.run([program("playbyear-train"), *TINY, *data, *steps], bench.environment, timeout_s=900)
+    assert status == 0, person.output[-3000:]
+    policy = train / "checkpoints" / "last" / "pretrained_model"
+
+    person = bench.person(most_steps=40)
+    evaluate = (program("lerobot-eval"), f"--policy.path={policy}", "--policy.device=cpu", *bench.env)
+    status = person.run([*evaluate, "--eval.n_episodes=2", f"--output_dir={tmp_path / 'eval'}"], bench.environment)
+    assert status == 0, person.output[-3000:]
+
+    person = bench.person(corrects=True)
+    options = (
+        *(f"--policy.path={policy}", "--demos.repo_id=me/demos", f"--demos.root={demos}"),
+        *("--interventions.repo_id=me/corrections", f"--interventions.root={tmp_path / 'corrections'}"),
+        *("--episodes=3", "--updates_per_episode=5", "--warmup_episodes=1", "--batch_size=4", "--eval_every=0"),
+        *(f"--output_dir={dagger}",),
+    )
+    correct = [program("playbyear-dagger"), *options, *bench.env, *bench.leader]
+
+    def has_kept_one(person) -> bool:
+        return (dagger / "metrics.jsonl").is_file() and '"kept"' in (dagger / "metrics.jsonl").read_text()
+
+    status = person.run(correct, bench.environment, timeout_s=600, kill_when=has_kept_one)
+    assert status == -9
+    n_before = n_episodes(tmp_path / "corrections")
+    assert n_before in (1, 2)
+    again = [program("playbyear-dagger"), "--resume=true", f"--output_dir={dagger}"]
+    status = person.run(again, bench.environment, timeout_s=600)
+    assert status == 0, person.output[-3000:]
+    assert n_episodes(tmp_path / "corrections") == 3
+    person.close()
+
+
+def taps(person) -> None:
+    """Taps once a second when it is asked for."""
+    if "a second apart" in person.output and time.monotonic() - person.tapped > 1:
+        person.tapped = time.monotonic()
+        person._link.ask("tap")
+
+
+def n_episodes(root: Path) -> int:
+    return json.loads((root / "meta" / "info.json").read_text())["total_episodes"]
+
+
+def gives_up(person) -> bool:
+    """The command says what is wrong, and the person leaves."""
+    return "P tries again" in person.output

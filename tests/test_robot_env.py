@@ -13,7 +13,7 @@ from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.frames import dataset_features
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.robots.arm import RobotError
 from lerobot_playbyear.robots.ticks import Ticks
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
 
@@ -128,8 +128,8 @@ def test_a_loop_that_stands_still_makes_the_arm_hold_and_ends_the_attempt(caplog
         env.step(np.full(3, 9, np.float32))
         time.sleep(0.5)
         held = env.arm.robot.told[-1]
-        assert held[1].max() < 5  # where it was after a tenth of a second, and not where it was told to go
-        sent = [when for when, target in env.arm.robot.told if target.max() == 9][-1]
+        assert held[1][:2].max() < 5  # where it was after a tenth of a second, and not where it was told to go
+        sent = [when for when, target in env.arm.robot.told if target[0] == 9][-1]
         assert 0.09 < held[0] - sent < 0.2  # two ticks
         _, _, _, truncated, info = env.step(REST)
     assert truncated
@@ -158,25 +158,27 @@ def test_a_person_begins_judges_and_stops():
         assert not episode.success
         assert any(note.startswith("You pressed Escape.") for note in console.notes)
         told = env.arm.robot.told[-1][1]
-        np.testing.assert_allclose(told, env.arm.robot.place)
+        np.testing.assert_allclose(told, env.arm.robot.place, atol=1e-6)
         console.on_show = lambda s: "escape"
         with pytest.raises(PersonLeftError):
             env.reset(seed=1)
 
 
 def test_the_arm_goes_to_rest_before_an_attempt():
-    with robot_env(joint_config(rest={"shoulder.pos": 3.0})) as env:
+    limits = {"max_step": None, "max_relative_target": None}
+    with robot_env(joint_config(rest={"shoulder.pos": 9.0}, **limits)) as env:
         env.reset(seed=0)
         for _ in range(3):
-            env.step(np.full(3, 2, np.float32))
+            env.step(np.full(3, 4, np.float32))
         env.reset(seed=1)
         time.sleep(0.02)
-        assert env.arm.position() == pytest.approx({"shoulder.pos": 3.0, "elbow.pos": 2.0, "gripper.pos": 2.0})
+        assert env.arm.position() == pytest.approx({"shoulder.pos": 9.0, "elbow.pos": 4.0, "gripper.pos": 4.0})
     with robot_env(joint_config(rest={"wrist.pos": 3.0})) as env, pytest.raises(RobotError, match="its joints are"):
         env.reset(seed=0)
-    with robot_env(joint_config()) as env:  # by default: where it was when the program began
+    with robot_env(joint_config(**limits)) as env:  # by default: where it was when the program began
         env.reset(seed=0)
-        env.step(np.full(3, 2, np.float32))
+        for _ in range(2):
+            env.step(np.full(3, 4, np.float32))
         env.reset(seed=1)
         time.sleep(0.02)
         np.testing.assert_allclose(env.arm.robot.place, 0, atol=1e-6)
@@ -361,3 +363,64 @@ def test_a_pause_counts_for_nothing(wav):
     assert len(episode) == 20
     assert episode.facts["drop_outs"] == {"gripper": []}
     assert episode.facts["rate_hz"] == pytest.approx(20, rel=0.05)
+
+
+def test_an_evaluation_can_be_paused_and_the_arm_holds_at_its_end():
+    n_paused = [0]
+
+    def press(status):
+        if "Set the scene" in status.note:
+            return "p"
+        if status.note == "Press P to go on":
+            n_paused[0] += 1
+            return "p" if n_paused[0] == 5 else None
+        return "p" if status.step == 4 and not n_paused[0] else None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(max_step=None, max_relative_target=None), console) as env:
+        env.reset(seed=0)
+        env.arm.robot.config.speed = 5.0  # units per second
+        steps = [env.step(np.full(3, 10, np.float32)) for _ in range(20)]
+        assert n_paused[0] == 5
+        assert [step[3] for step in steps] == [False] * 19 + [True]
+        assert env.episode_facts()["rate_hz"] == pytest.approx(20, rel=0.05)
+        assert env.arm.robot.told[-1][1][:2].max() < 9
+
+
+def test_the_arm_goes_to_rest_when_the_person_says_so():
+    notes = []
+
+    def press(status):
+        notes.append((status.note, env.arm.robot.place.max()))
+        return "p" if status.note.startswith(("Press P to let", "Set the scene")) else None
+
+    with robot_env(joint_config(max_step=None, max_relative_target=None), ScriptedConsole(press)) as env:
+        env.reset(seed=0)
+        assert [note for note, _ in notes] == ["Set the scene up, then press P to begin"]
+        for _ in range(3):
+            env.step(np.full(3, 8, np.float32))
+        notes.clear()
+        env.reset(seed=1)
+    asked = [note for note, _ in notes if note]
+    assert asked == ["Press P to let the arm go to its rest pose", "Set the scene up, then press P to begin"]
+    assert notes[0][1] == pytest.approx(8)  # it had not moved yet
+
+
+KEYS = [("\x1b", ["escape"]), ("\x1b[A p", ["up", "space", "p"]), ("\x1bOP\x1b[3~S", ["s"])]
+
+
+@pytest.mark.parametrize(("sent", "names"), KEYS)
+def test_keys_of_a_terminal(sent, names):
+    from lerobot_playbyear.teleoperation.console import _names
+
+    assert _names(sent) == names
+
+
+def test_nobody_to_ask_is_an_error_unless_it_is_meant(monkeypatch):
+    from lerobot_playbyear.teleoperation.console import make_console
+
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.stdin", None)
+    with pytest.raises(ExpertError, match=r"--env\.console=none"):
+        make_console("auto", "robot")

@@ -37,6 +37,20 @@ VIRTUAL_ENV=$PWD/.venv "$uv" pip install --python .venv/bin/python \
   --constraint constraints.txt --build-constraint constraints.txt \
   -e . -e envs --group dev
 
+# Tests of microphones run a sound server, which hears files in place of a sound card. Without it they are skipped.
+has_sound() { command -v pulseaudio && command -v pactl && .venv/bin/python -c 'import sounddevice' \
+  && ls /usr/lib/*/alsa-lib/libasound_module_pcm_pulse.so; } >/dev/null 2>&1
+if [ "$(uname -s)" = Linux ] && ! has_sound; then
+  sound="pulseaudio pulseaudio-utils libportaudio2 libasound2-plugins"
+  if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+    echo "Installing a sound server for the tests of microphones"
+    # shellcheck disable=SC2086
+    { apt-get update -qq && DEBIAN_FRONTEND=noninteractive timeout 300 apt-get install -y -qq --no-install-recommends $sound; } \
+      >/dev/null 2>&1 || true
+  fi
+  has_sound || echo "The tests of microphones through a sound server will be skipped. For them: sudo apt-get install $sound"
+fi
+
 # Rendering without a window needs EGL.
 has_egl() { .venv/bin/python -c 'import ctypes; ctypes.CDLL("libEGL.so.1")' >/dev/null 2>&1; }
 if [ "$(uname -s)" = Linux ] && ! has_egl; then

@@ -58,7 +58,11 @@ class CalibrateLatencyConfig:
     timeout_s: float = 60.0
     plot: Path = Path("outputs/latency.png")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """
+        Raises:
+            InputError: An option is out of range.
+        """
         if self.taps < FEWEST_TAPS:
             raise InputError(f"taps={self.taps}: give at least {FEWEST_TAPS}.")
         if self.event not in EVENTS:
@@ -74,6 +78,7 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
         CalibrationError: The camera gives no pictures, or the taps do not tell the latency.
         MicrophoneError: The microphone cannot be opened.
     """
+    cfg.check()
     level = SoundLevel(cfg.microphone.sample_rate, cfg.microphone.channel)
     microphone = make_microphone(cfg.microphone)
     with ExitStack() as stack:
@@ -121,7 +126,7 @@ def _connected(config: CameraConfig) -> Any:
     except Exception as error:  # whatever a camera's own program may raise
         said = " ".join(str(error).split())
         raise CalibrationError(
-            f"The camera cannot be opened: {said} `lerobot-find-cameras` lists what there is."
+            f"The camera cannot be opened: {said} (lerobot-find-cameras lists what there is)"
         ) from error
     return camera
 

@@ -108,7 +108,12 @@ def motion_intervals(times_s: np.ndarray, motion: np.ndarray, event: str) -> np.
     parts = np.split(moving, np.flatnonzero(np.diff(times_s[moving]) > _QUIET_S) + 1)
     chosen = np.array([part[0] if event == "begins" else part[-1] for part in parts])
     chosen = chosen[chosen > 0]
-    return np.stack([times_s[chosen - 1], times_s[chosen]], axis=1)
+    intervals = np.stack([times_s[chosen - 1], times_s[chosen]], axis=1)
+    if (
+        event == "stops"
+    ):  # a hand that stopped in the first part of a picture's time has moved too little to be seen in it
+        intervals += _FRACTION_OF_PEAK * (intervals[:, 1:] - intervals[:, :1])
+    return intervals
 
 
 def estimate_latency(

@@ -55,7 +55,7 @@ def write_plot(
     for at in np.arange(-_BEFORE_S, _AFTER_S + 0.01, 0.1).tolist():
         x = _LEFT + (at + _BEFORE_S) / (_BEFORE_S + _AFTER_S) * (_WIDTH - 2 * _LEFT)
         draw.line((x, bottom - 6, x, bottom), fill=_INK)
-        draw.text((x - 12, bottom + 2), f"{at * 1000:.0f}", fill=_INK)
+        draw.text((x - 12, bottom + 2), str(round(at * 1000)), fill=_INK)
     path.parent.mkdir(parents=True, exist_ok=True)
     image.save(path, format="PNG")
     return path

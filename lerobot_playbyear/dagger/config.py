@@ -20,6 +20,7 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 CONFIG_NAME = "dagger_config.json"
 """File in the output folder with the options of the run."""
 
+_MOST_WATCHED = 20  # episodes
 _LEAST = {"warmup_episodes": 1, "max_attempts": 1}  # of the other whole numbers: 0
 
 
@@ -144,6 +145,12 @@ class DaggerConfig:
             raise InputError("--updates is for --episodes=0; with episodes give --updates_per_episode.")
         if not self.is_online and not self.updates:
             raise InputError("--episodes=0 collects nothing: give --updates, how many to make from what is there.")
+        takes_a_person = self.eval_every > 0 and getattr(self.env, "is_real_time", False)
+        if takes_a_person and self.eval.n_episodes > _MOST_WATCHED:
+            raise InputError(
+                f"--eval.n_episodes={self.eval.n_episodes} of every evaluation on a robot take a person's time, the first "
+                f"before any attempt: give --eval_every=0, or --eval.n_episodes of at most {_MOST_WATCHED}."
+            )
         if self.is_online and self.env is None:
             raise InputError(
                 "No environment: give --env.type and --env.task, or --episodes=0 --updates=N to learn from recorded "

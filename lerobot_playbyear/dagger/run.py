@@ -1,6 +1,7 @@
 """A run of HG-DAgger from its options: what it needs is made and checked, then `Loop` runs."""
 
 import logging
+import shlex
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -127,7 +128,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         facts = env_facts(env)
         features = dataset_features(facts)
         check_alike(observed, demos.meta, features, facts.fps, f"--env.type={cfg.env.type}")
-        corrections.open_for_writing(facts.fps, features, cfg.env.type)
+        corrections.open_for_writing(facts.fps, features, getattr(cfg.env, "robot_type", cfg.env.type))
     else:
         check_alike(observed, demos.meta, corrections.meta.features, corrections.meta.fps, "the corrections")
     if state.first_episodes is None:
@@ -184,7 +185,7 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> Non
     if cfg.is_online:
         print(
             f"Attempts:    {state.attempts}: {state.kept} kept in {cfg.interventions.folder}, {state.failed} failed, "
-            f"{state.unneeded} needed no help"
+            f"{state.unneeded} needed no help, {state.discarded} thrown away"
         )
     if state.success is not None:
         print(f"Success:     {state.success:.1f} % of {cfg.eval.n_episodes} episodes")
@@ -192,7 +193,10 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> Non
         print("No update was made: --warmup_episodes is larger than what was collected.")
         return
     policy = folder.checkpoints / "last" / PRETRAINED_MODEL_DIR
-    env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."
+    env = " --env.type=..."
+    if cfg.env is not None:
+        env = f" --env.type={cfg.env.type} --env.task={shlex.quote(str(cfg.env.task))}"
+        env += " ... (the robot's options)" if getattr(cfg.env, "is_real_time", False) else ""
     print(f"Policy:      {policy}")
     print(f"Evaluate:    lerobot-eval --policy.path={policy}{env}")
     print(f"Go on:       playbyear-dagger --resume=true --output_dir={folder.path} --episodes=...")

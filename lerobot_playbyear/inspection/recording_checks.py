@@ -24,9 +24,9 @@ def check_recording(source: DatasetSource) -> Iterator[Verdict]:
     if with_drops:
         total = sum(drops.values())
         message = f"{total} place{'s' if total > 1 else ''} without sound, or with sound left out ({name_episodes(with_drops)})"
-        yield Verdict("drop-outs", "warning", message, None, with_drops, figures)
+        yield Verdict("drop-outs noted", "warning", message, None, with_drops, figures)
     else:
-        yield Verdict("drop-outs", "ok", f"none in {len(notes)} episodes", figures=figures)
+        yield Verdict("drop-outs noted", "ok", f"none in {len(notes)} episodes", figures=figures)
     ticks, late = (sum(_whole(note.get(name)) for note in notes.values()) for name in ("ticks", "late_ticks"))
     if ticks:
         share = late / ticks

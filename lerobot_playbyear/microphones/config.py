@@ -9,12 +9,20 @@ from dataclasses import dataclass
 from importlib import metadata
 
 import draccus
+from draccus.utils import DecodingError
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.microphones.microphone import Microphone
 
 PLUGIN_PREFIX = "lerobot_microphone_"
 """What the name of a distribution begins with that brings a type of microphone; its module has the same name."""
+
+
+class MicrophoneOptionError(PlaybyearError, DecodingError):
+    """An option of a microphone has no meaning. Being draccus' own as well, LeRobot's commands say it in one line."""
+
+    def __init__(self, message: str) -> None:
+        DecodingError.__init__(self, (), message)
 
 
 @dataclass(kw_only=True)
@@ -25,6 +33,9 @@ class MicrophoneConfig(draccus.ChoiceRegistry, abc.ABC):
         sample_rate: Samples per second [Hz], a multiple of the frames per second.
         channel: The card's channel, counted from 0.
         latency_s: How long after it was heard a sample arrives [s]; `playbyear-calibrate-latency` measures it.
+
+    Raises:
+        MicrophoneOptionError: An option is out of range.
     """
 
     sample_rate: int = 48000
@@ -33,11 +44,15 @@ class MicrophoneConfig(draccus.ChoiceRegistry, abc.ABC):
 
     def __post_init__(self) -> None:
         if self.sample_rate <= 0:
-            raise InputError(f"sample_rate={self.sample_rate} of a microphone: give Hz above 0, such as 48000.")
+            raise MicrophoneOptionError(
+                f"sample_rate={self.sample_rate} of a microphone: give Hz above 0, such as 48000."
+            )
         if not 0 <= self.channel < 256:
-            raise InputError(f"channel={self.channel} of a microphone: give the card's channel, counted from 0.")
+            raise MicrophoneOptionError(
+                f"channel={self.channel} of a microphone: give the card's channel, counted from 0."
+            )
         if not (math.isfinite(self.latency_s) and 0 <= self.latency_s <= 2):
-            raise InputError(f"latency_s={self.latency_s} of a microphone: give seconds from 0 to 2.")
+            raise MicrophoneOptionError(f"latency_s={self.latency_s} of a microphone: give seconds from 0 to 2.")
 
     @property
     def type(self) -> str:
@@ -75,11 +90,11 @@ class PortAudioMicrophoneConfig(MicrophoneConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0.001 <= self.block_s <= 0.5:
-            raise InputError(f"block_s={self.block_s} of a microphone: give seconds from 0.001 to 0.5.")
+            raise MicrophoneOptionError(f"block_s={self.block_s} of a microphone: give seconds from 0.001 to 0.5.")
         if self.wait_s is not None and not 0 < self.wait_s <= 2:
-            raise InputError(f"wait_s={self.wait_s} of a microphone: give seconds above 0, up to 2.")
+            raise MicrophoneOptionError(f"wait_s={self.wait_s} of a microphone: give seconds above 0, up to 2.")
         if self.card_channels is not None and not self.channel < self.card_channels <= 256:
-            raise InputError(
+            raise MicrophoneOptionError(
                 f"card_channels={self.card_channels} of a microphone: give more than its channel={self.channel}."
             )
 

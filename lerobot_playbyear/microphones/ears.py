@@ -1,6 +1,5 @@
 """All microphones of a robot: opened card by card, heard tick by tick, watched for what goes wrong."""
 
-import time
 from collections.abc import Hashable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -133,12 +132,3 @@ def _make_card(microphones: Mapping[str, MicrophoneConfig], fps: int) -> _Card:
     channels = {name: config.channel for name, config in microphones.items()}
     recording = CardRecording(first.sample_rate, fps, channels)
     return _Card(first.make(max(channels.values()) + 1), recording, first.latency_s)
-
-
-def levels_of(microphone: Microphone, seconds: float) -> np.ndarray:
-    """Listens for a while: all samples that came, (n, channels)."""
-    parts, end = [], time.perf_counter() + seconds
-    while time.perf_counter() < end:
-        time.sleep(0.05)
-        parts.append(microphone.read())
-    return np.concatenate(parts)

@@ -47,7 +47,11 @@ class FindMicrophonesConfig:
     seconds: float = 3.0
     output_dir: Path = Path("outputs/microphones")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """
+        Raises:
+            InputError: An option is out of range.
+        """
         if not 0.1 <= self.seconds <= 60:
             raise InputError(f"seconds={self.seconds}: give seconds from 0.1 to 60.")
 
@@ -58,6 +62,7 @@ def find_microphones(cfg: FindMicrophonesConfig) -> None:
     Raises:
         MicrophoneError: There is no card, or nothing can be heard with any.
     """
+    cfg.check()
     cards = sound_cards(fresh=True)
     if not cards:
         raise MicrophoneError(_NO_CARD)

@@ -141,8 +141,9 @@ def channels_to_open(card: SoundCard, needed: int, wanted: int | None = None) ->
 
 
 def _has_open_stream() -> bool:
+    """Whether a stream of this process is open, anyone's; PortAudio would close it when it looks again."""
     kind = load_sounddevice()._StreamBase
-    return any(isinstance(thing, kind) and not thing.closed for thing in gc.get_objects())
+    return any(issubclass(type(thing), kind) and not thing.closed for thing in gc.get_objects())
 
 
 class PortAudioMicrophone(Microphone):

@@ -24,6 +24,7 @@ from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
+_POLICY_FPS = 20  # of a policy that is not told
 _MIN_ATTEMPTS_PER_SUCCESS = 20  # attempts in a row without one success after which recording gives up
 
 
@@ -114,7 +115,7 @@ def record(cfg: RecordConfig) -> Path:
                     facts.fps,
                     features,
                     resume=cfg.resume,
-                    robot_type=cfg.env.type,
+                    robot_type=getattr(cfg.env, "robot_type", cfg.env.type),
                     streaming_encoding=cfg.dataset.streaming_encoding and cfg.dataset.video,
                     rgb_encoder=cfg.dataset.rgb_encoder,
                 )
@@ -129,10 +130,11 @@ def record(cfg: RecordConfig) -> Path:
         ) from error
     except OSError as error:
         raise PlaybyearError(f"Cannot write to {root}: {error}") from error
+    fps = f" --policy.fps={facts.fps}" if facts.fps != _POLICY_FPS else ""
     print(f"\nDataset: {root} ({summary})")
     print(
         "Train on it: playbyear-train --policy.type=playbyear --policy.push_to_hub=false "
-        f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={root}"
+        f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={root}{fps}"
     )
     if cfg.dataset.push_to_hub:
         options = PushOptions(cfg.dataset.private, cfg.dataset.tags)
@@ -162,7 +164,7 @@ def _record_episodes(cfg: RecordConfig, pool: RolloutPool | PersonRollouts, writ
                 successes += 1
                 progress.update()
             progress.set_postfix_str(f"success rate {successes / attempts:.0%} of {attempts} attempts")
-            if failures_in_a_row >= _MIN_ATTEMPTS_PER_SUCCESS:
+            if failures_in_a_row >= _MIN_ATTEMPTS_PER_SUCCESS and not isinstance(pool, PersonRollouts):
                 raise InputError(
                     f"The expert failed {failures_in_a_row} times in a row, up to seed {episode.seed}: something is "
                     f"wrong with the task's options. {writer.num_episodes} episodes are saved in {writer.root}."

@@ -9,10 +9,17 @@ from collections.abc import Mapping
 import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.datasets.errors import PlaybyearError
 
 _POSITION = ".pos"
 _MOVE_FPS = 30
+_NEAR = 2.0  # degrees, or percent of a joint's range
+_GRIPPER = "gripper"
+_RECENT_S = 1.0  # for as long an arm that does not answer is taken to be where it was seen
+
+
+class RobotError(PlaybyearError, RuntimeError):
+    """A robot, or something on it, cannot be used; the message says what, and what to do. Nothing saved is lost."""
 
 
 class Arm:
@@ -27,7 +34,7 @@ class Arm:
     Attributes:
         state_names, action_names: Of the numbers in state and action, in their order.
         cameras: The shape (height, width, 3) of each camera's pictures.
-        told: What it was last told (len(action_names),), as far as the robot says so; None: nothing since it was connected or
+        sent: What it was last told (len(action_names),), as far as the robot says so; None: nothing since it was connected or
             moved to a place.
         n_breaks: How often it was held, moved to a place or connected: what it is told next need not follow from the last.
 
@@ -68,8 +75,11 @@ class Arm:
             raise RobotError(f"--env.robot.type={config.type} takes {actions}; wanted numbers by name.")
         self._lock = threading.RLock()
         self._last: np.ndarray | None = None
-        self.told: np.ndarray | None = None
+        self.sent: np.ndarray | None = None
         self.n_breaks = 0
+        self._told: np.ndarray | None = None  # the last action
+        self._seen: np.ndarray | None = None  # its state when it last answered
+        self._seen_s = 0.0
 
     @property
     def has_positions(self) -> bool:
@@ -139,6 +149,7 @@ class Arm:
         if not np.isfinite(state).all():
             bad = [name for name, value in zip(self.state_names, state, strict=True) if not np.isfinite(value)]
             raise RobotError(f"The robot {self.robot.name} gives no finite value for {', '.join(bad)}.")
+        self._seen, self._seen_s = state, time.perf_counter()
         return state, pictures
 
     def send(self, action: np.ndarray) -> np.ndarray:
@@ -158,11 +169,13 @@ class Arm:
             if self.max_step is not None and self._last is not None and self.has_positions:
                 action = action.clip(self._last - self.max_step, self._last + self.max_step)
             sent = self._send(action)
-            self._last = action
+            self._last = self._told = action
         return sent
 
     def hold(self) -> None:
         """Stops where it is: targets become where the joints are, displacements become none.
+
+        A gripper goes on to do what it was told.
 
         Raises:
             RobotError: The robot does not answer.
@@ -172,16 +185,41 @@ class Arm:
             self._send(self.resting_action())
 
     def resting_action(self) -> np.ndarray:
-        """The action (len(action_names),) that moves nothing now."""
+        """The action (len(action_names),) that moves nothing now; of an arm that does not answer: to where it was just seen.
+
+        Raises:
+            RobotError: It has not answered for long.
+        """
         if not self.has_positions:
             return np.zeros(len(self.action_names))
-        state, _ = self.observe()
+        try:
+            state, _ = self.observe()
+        except (
+            RobotError
+        ):  # LeRobot's robots read joints and cameras together: one camera that is gone hides the joints
+            if self._seen is None or time.perf_counter() - self._seen_s > _RECENT_S:
+                raise
+            state = self._seen
         by_name = dict(zip(self.state_names, state, strict=True))
+        if self._told is not None:  # a gripper goes on to squeeze what it holds
+            told = dict(zip(self.action_names, self._told, strict=True))
+            by_name |= {name: value for name, value in told.items() if _GRIPPER in name}
         return np.array([by_name[name] for name in self.action_names], np.float64)
 
     def position(self) -> dict[str, float]:
         """Where each joint is that can be told where to go; none for robots that are moved by displacements."""
-        return self.by_name(self.resting_action()) if self.has_positions else {}
+        if not self.has_positions:
+            return {}
+        state, _ = self.observe()
+        by_name = dict(zip(self.state_names, state, strict=True))
+        return {name: float(by_name[name]) for name in self.action_names}
+
+    def is_away_from(self, target: Mapping[str, float]) -> bool:
+        """Whether any of the joints named is elsewhere, by more than a small part of what a joint moves."""
+        if not target:
+            return False
+        place = self.position()
+        return any(abs(place.get(name, np.inf) - value) > _NEAR for name, value in target.items())
 
     def move_to(self, target: Mapping[str, float], duration_s: float) -> None:
         """Moves there in a straight line, in as long a time as is given; joints that are not named stay.
@@ -215,61 +253,9 @@ class Arm:
             sent = self.robot.send_action(self.by_name(action)) or {}
         except Exception as error:
             raise RobotError(f"The robot {self.robot.name} does not take an action: {error}") from error
-        self.told = np.array([sent.get(name, value) for name, value in zip(self.action_names, action, strict=True)])
-        return self.told
+        self.sent = np.array([sent.get(name, value) for name, value in zip(self.action_names, action, strict=True)])
+        return self.sent
 
     def _break(self) -> None:
-        self._last = self.told = None
+        self._last = self.sent = None
         self.n_breaks += 1
-
-
-class Watchdog:
-    """Holds the arm when no action has come for too long while it is on duty.
-
-    Args:
-        arm: The arm.
-        after_s: For how long [s].
-    """
-
-    def __init__(self, arm: Arm, after_s: float) -> None:
-        self._arm, self._after = arm, after_s
-        self._due: float | None = None
-        self._wake = threading.Condition()
-        self._is_over = False
-        self.n_holds = 0
-        self._thread = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        self._thread.start()
-
-    def feed(self) -> None:
-        """An action was sent: it is on duty."""
-        with self._wake:
-            self._due = time.perf_counter() + self._after
-            self._wake.notify()
-
-    def rest(self) -> None:
-        """Nothing moves: it is off duty."""
-        with self._wake:
-            self._due = None
-
-    def close(self) -> None:
-        """Ends it."""
-        with self._wake:
-            self._is_over = True
-            self._wake.notify()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        while True:
-            with self._wake:
-                wait = None if self._due is None else self._due - time.perf_counter()
-                if self._is_over:
-                    return
-                if wait is None or wait > 0:
-                    self._wake.wait(wait)
-                    continue
-                self._due = None
-            self.n_holds += 1
-            try:
-                self._arm.hold()
-            except RobotError as error:
-                logging.error(f"The loop stands still, and the robot cannot be told to hold: {error}")

@@ -108,6 +108,16 @@ class RobotEnvConfig(EnvConfig):
                 )
 
     @property
+    def is_real_time(self) -> bool:
+        """An attempt takes a person's time."""
+        return True
+
+    @property
+    def robot_type(self) -> str:
+        """Of the robot, for datasets."""
+        return self.robot.type if self.robot is not None else str(self.type)
+
+    @property
     def package_name(self) -> str:
         return "lerobot_playbyear.robots"
 

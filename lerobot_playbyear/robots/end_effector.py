@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from draccus.utils import DecodingError
 
-from lerobot_playbyear.robots.arm import Arm
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.robots.arm import Arm, RobotError
 from lerobot_playbyear.teleoperation.actions import DELTAS, GRIPPER
 
 _OPTION = "--env.end_effector"
@@ -106,12 +105,12 @@ class EndEffector:
         self._target: np.ndarray | None = None  # (3,) [m]; None: where the hand is
         self._breaks = -1
 
-    def send(self, action: np.ndarray, state: Mapping[str, float]) -> None:
+    def send(self, action: np.ndarray, state: np.ndarray) -> None:
         """Moves the hand.
 
         Args:
             action: (len(action_names),); what is beyond [-1, 1] is cut off.
-            state: Where each joint is, for the beginning.
+            state: The arm's (len(arm.state_names),), for the beginning.
 
         Raises:
             ValueError: The action is not finite; nothing was sent.
@@ -121,7 +120,9 @@ class EndEffector:
         if not np.isfinite(action).all():
             raise ValueError("The action holds a value that is not finite.")
         action = action.clip(-1, 1)
-        told = self._arm.by_name(self._arm.told) if self._arm.told is not None else dict(state)
+        told = dict(zip(self._arm.state_names, map(float, state), strict=True))
+        if self._arm.sent is not None:
+            told |= self._arm.by_name(self._arm.sent)
         if self._breaks != self._arm.n_breaks:
             self._target, self._breaks = None, self._arm.n_breaks
         targets = self._joint_targets(action, told)

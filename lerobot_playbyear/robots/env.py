@@ -10,15 +10,16 @@ from gymnasium import spaces
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.robots.arm import Arm
+from lerobot_playbyear.robots.arm import Arm, RobotError
 from lerobot_playbyear.robots.config import RobotEnvConfig
-from lerobot_playbyear.robots.console import Console
 from lerobot_playbyear.robots.end_effector import EndEffector
-from lerobot_playbyear.robots.errors import RobotError
 from lerobot_playbyear.robots.person import Person, StopPressedError, count
 from lerobot_playbyear.robots.rig import leave_rig, open_rig
 from lerobot_playbyear.robots.ticks import Ticks
+from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
+
+_MOST_SHOWN = 720  # pixels
 
 
 class RobotEnv(gym.Env):
@@ -65,8 +66,8 @@ class RobotEnv(gym.Env):
             shape = (microphone.sample_rate // config.fps,)
             observation[f"audio.{name}"] = spaces.Box(-32768, 32767, shape, np.int16)
         self.observation_space = spaces.Dict(observation)
-        limit = np.inf if arm.has_positions and self._hand is None else 1.0
-        self.action_space = spaces.Box(-limit, limit, (len(self.action_names),), np.float32)
+        self._limit = np.inf if arm.has_positions and self._hand is None else 1.0
+        self.action_space = spaces.Box(-self._limit, self._limit, (len(self.action_names),), np.float32)
         self.person = Person(self._rig, self._max_episode_steps)
         self._ticks = Ticks(config.fps)
         self._same_picture: dict[str, tuple[int, float]] = {}
@@ -90,11 +91,17 @@ class RobotEnv(gym.Env):
         rig, config = self._rig, self.config
         rig.watchdog.rest()
         self._connect_or_ask()
-        if rig.home or config.rest:
-            rig.arm.move_to(config.rest if config.rest is not None else rig.home or {}, config.rest_s)
-        rig.arm.begin_episode(seed)
         rig.attempt += 1
-        self.person.begin(wait=config.wait_for_person, picture=self._look)
+        rest = config.rest if config.rest is not None else rig.home or {}
+        self.person.begin()
+        if rig.arm.is_away_from(rest):
+            if config.wait_for_person:
+                self.person.wait_for("Press P to let the arm go to its rest pose", self._look)
+            rig.arm.move_to(rest, config.rest_s)
+        rig.arm.begin_episode(seed)
+        if config.wait_for_person:
+            self.person.wait_for("Set the scene up, then press P to begin", self._look)
+        self.person.begins()
         self._same_picture.clear()
         self._stopped = None
         self._began_at = time.time()
@@ -117,7 +124,7 @@ class RobotEnv(gym.Env):
             elif not np.isfinite(np.asarray(action, np.float64)).all():
                 problem = "The policy's action holds a value that is not finite (NaN)."
             else:
-                self._send(action)
+                self._send(np.clip(action, -self._limit, self._limit))
                 rig.watchdog.feed()
         except RobotError as error:
             problem = str(error)
@@ -136,16 +143,27 @@ class RobotEnv(gym.Env):
             logging.debug("The arm held for a moment: an action came late.")
         try:
             verdict = self.person.look(self._last, self.render(), self._ticks, rig.ears.drop_outs)
+            if self.person.wants_pause:
+                self.hold()
+                self.person.pause()
+                self.go_on()
+        except RobotError as error:
+            return self._end(str(error))
         except StopPressedError:
             return self._end("You pressed Escape.")
         return self._outcome(verdict)
 
     def render(self) -> np.ndarray:
-        """All cameras side by side, (height, width, 3) uint8; the highest gives the height."""
+        """All cameras side by side, (side, side, 3) uint8: a square, as the window shows, of at most 720 pixels."""
         pictures = list(self._pictures.values()) or [np.zeros((64, 64, 3), np.uint8)]
-        height = max(picture.shape[0] for picture in pictures)
-        padded = [np.pad(p, ((0, height - p.shape[0]), (0, 0), (0, 0))) for p in pictures]
-        return np.ascontiguousarray(np.concatenate(padded, axis=1))
+        height, width = max(p.shape[0] for p in pictures), sum(p.shape[1] for p in pictures)
+        step, side = -(-max(height, width) // _MOST_SHOWN), max(height, width)
+        scene, left = np.zeros((side, side, 3), np.uint8), (side - width) // 2
+        for picture in pictures:
+            top = (side - picture.shape[0]) // 2
+            scene[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+            left += picture.shape[1]
+        return np.ascontiguousarray(scene[::step, ::step])
 
     def close(self) -> None:
         """The arm holds, and everything is let go."""
@@ -220,9 +238,8 @@ class RobotEnv(gym.Env):
     def _send(self, action: np.ndarray) -> None:
         if self._hand is None:
             self._rig.arm.send(action)
-        else:
-            assert self._last is not None
-            self._hand.send(action, dict(zip(self.state_names, self._last["agent_pos"].tolist(), strict=True)))
+        elif self._last is not None:
+            self._hand.send(action, self._last["agent_pos"])
 
     def _connect_or_ask(self) -> None:
         while True:
@@ -262,6 +279,7 @@ class RobotEnv(gym.Env):
 
     def _end(self, problem: str):
         """The attempt ends because something went wrong."""
+        problem = problem.rstrip(". ") + "."
         logging.error(f"{problem} The robot holds.")
         verdict = self.stop_and_ask(problem)
         if verdict is None:
@@ -273,8 +291,10 @@ class RobotEnv(gym.Env):
         info: dict[str, Any] = {"is_success": success}
         if verdict is not None:
             info["verdict"] = verdict.value
-            self._rig.watchdog.rest()
         is_over = self._ticks.n >= self._max_episode_steps
-        if is_over:
-            self._rig.watchdog.rest()
+        if (is_over or verdict is not None) and not is_problem:
+            try:
+                self.hold()
+            except RobotError as error:
+                logging.error(f"The robot cannot be told to hold: {error}")
         return self._last, float(success), verdict is not None and not is_problem, is_problem or is_over, info

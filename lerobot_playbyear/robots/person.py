@@ -8,8 +8,8 @@ import numpy as np
 
 from lerobot_playbyear.datasets.microphone import DropOut
 from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.robots.console import NoConsole
 from lerobot_playbyear.robots.ticks import Ticks
+from lerobot_playbyear.teleoperation.console import NoConsole
 from lerobot_playbyear.teleoperation.controls import FAILURE, LEAVE, PAUSE, RERECORD, SUCCESS, PersonLeftError
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.status import HISTORY_S, Control, Status
@@ -18,7 +18,13 @@ if TYPE_CHECKING:
     from lerobot_playbyear.robots.rig import Rig
 
 _LOOK_S = 0.05
-_KEYS = [("P", "begin"), ("S", "success: end"), ("Q", "end as failed"), ("R", "throw away"), ("Esc", "stop the arm")]
+_KEYS = [
+    ("P", "begin, pause"),
+    ("S", "success: end"),
+    ("Q", "end as failed"),
+    ("R", "throw away"),
+    ("Esc", "stop the arm"),
+]
 _VERDICTS = {SUCCESS: Verdict.SUCCESS, FAILURE: Verdict.FAILURE, RERECORD: Verdict.DISCARD}
 
 
@@ -31,27 +37,21 @@ class Person:
 
     Attributes:
         has_expert: Whether an expert reads the keys while the robot moves, and shows the scene.
+        wants_pause: Whether they pressed P at the last look.
     """
 
     def __init__(self, rig: "Rig", n_steps: int) -> None:
         self._rig, self._n_steps = rig, n_steps
         self.has_expert = False
+        self.wants_pause = False
 
     @property
     def is_there(self) -> bool:
         """Whether anybody can be asked."""
         return not isinstance(self._rig.console, NoConsole)
 
-    def begin(self, wait: bool, picture: Callable[[], np.ndarray]) -> None:
-        """An attempt is about to begin: waits until the person is ready.
-
-        Args:
-            wait: Whether to wait at all.
-            picture: What the cameras see.
-
-        Raises:
-            PersonLeftError: They leave.
-        """
+    def begin(self) -> None:
+        """An attempt is about to begin; what was pressed before was not meant for it."""
         config, console = self._rig.config, self._rig.console
         self._status = Status(
             control=Control.PAUSED,
@@ -61,12 +61,27 @@ class Person:
             fps=config.fps,
             keys=_KEYS,
             waiting="Please wait",
+            sound="the robot's microphones would hear it",
         )
         self._verdict: Verdict | None = None
         console.keys.look()
-        if wait and self.is_there:
-            self._status.note = "Set the scene up, then press P to begin"
+
+    def wait_for(self, note: str, picture: Callable[[], np.ndarray]) -> None:
+        """Waits until the person presses P, if anybody is there.
+
+        Args:
+            note: What they are told.
+            picture: What the cameras see.
+
+        Raises:
+            PersonLeftError: They leave.
+        """
+        if self.is_there:
+            self._status.note = note
             self._wait_for({PAUSE, "enter"}, picture)
+
+    def begins(self) -> None:
+        """From here on the arm moves."""
         self._status.note, self._status.control = "", Control.POLICY
 
     def look(
@@ -82,6 +97,7 @@ class Person:
             StopPressedError: They pressed Escape.
             PersonLeftError: They closed the window.
         """
+        self.wants_pause = False
         if self.has_expert:
             return None
         console, status = self._rig.console, self._status
@@ -97,7 +113,21 @@ class Person:
         console.keys.look()
         if LEAVE in console.keys.pressed:
             raise StopPressedError
+        self.wants_pause = PAUSE in console.keys.pressed
         return next((_VERDICTS[key] for key in console.keys.pressed if key in _VERDICTS), None)
+
+    def pause(self) -> None:
+        """The arm holds until the person goes on.
+
+        Raises:
+            StopPressedError: They pressed Escape.
+        """
+        self._status.control, self._status.note = Control.PAUSED, "Press P to go on"
+        try:
+            self._wait_for({PAUSE, "enter"}, None)
+        except PersonLeftError as error:
+            raise StopPressedError from error
+        self._status.control, self._status.note = Control.POLICY, ""
 
     def judge(self, reason: str, drop_outs: Mapping[str, list[DropOut]]) -> Verdict | None:
         """Something went wrong, and the arm holds: what becomes of the attempt. Without anybody there: thrown away.
@@ -109,7 +139,7 @@ class Person:
             return Verdict.DISCARD
         self._status.drop_outs = count(drop_outs)
         self._status.control = Control.PAUSED
-        self._status.note = f"{reason} R throws the attempt away, Q keeps it as failed, S as a success; Esc leaves."
+        self._status.note = f"{reason} R throws the attempt away, Q counts it as failed, S as a success; Esc leaves."
         try:
             key = self._wait_for(set(_VERDICTS), None)
         except PersonLeftError:

@@ -8,10 +8,10 @@ from typing import Any
 import draccus
 
 from lerobot_playbyear.microphones.ears import Ears
-from lerobot_playbyear.robots.arm import Arm, Watchdog
+from lerobot_playbyear.robots.arm import Arm, RobotError
 from lerobot_playbyear.robots.config import RobotEnvConfig
-from lerobot_playbyear.robots.console import Console, make_console
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.robots.watchdog import Watchdog
+from lerobot_playbyear.teleoperation.console import Console, make_console
 
 _HOLD_AFTER_TICKS = 2  # without an action
 

@@ -1,4 +1,4 @@
-"""playbyear-calibrate-latency: how much later sound arrives than pictures, from taps that are seen and heard.
+"""playbyear-calibrate-latency: how much later sound arrives than pictures, from taps seen and heard.
 
 Tap the table in view of the camera and near the microphone, and let the hand rest after each tap.
 Nothing else shall move in the picture. docs/microphones.md says more.

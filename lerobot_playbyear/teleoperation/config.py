@@ -5,7 +5,7 @@ import pkgutil
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 from lerobot import teleoperators
@@ -15,16 +15,14 @@ from lerobot.teleoperators.gamepad import GamepadTeleop
 from lerobot_playbyear.compat import has_gamepad
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import BASE_DIRECTIONS, DELTAS, KNOWN_DIRECTIONS, ActionMapping, Gripper
-from lerobot_playbyear.teleoperation.controls import OVERRIDE
+from lerobot_playbyear.teleoperation.console import Console
+from lerobot_playbyear.teleoperation.controls import OVERRIDE, TAKEN
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig
 from lerobot_playbyear.teleoperation.levels import microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.window import Window
-
-if TYPE_CHECKING:
-    from lerobot_playbyear.robots.console import Console
 
 for _module in pkgutil.iter_modules(
     teleoperators.__path__
@@ -57,7 +55,8 @@ class TeleopExpertConfig(ExpertConfig):
         takeover: How a person takes over from a policy: `hold` the key, or `toggle` it with one press, and hand back with
             another. `auto`: hold it where the keyboard says when a key is let go, as a window does and a terminal does not.
         takeover_key: The key, such as `space` or `b`; most pedals are keyboards with one key.
-        play_sound: Play the first microphone, if the package sounddevice is installed.
+        play_sound: Play the first microphone, if the package sounddevice is installed. None: only in simulation, for a
+            robot would hear it.
     """
 
     teleop: TeleoperatorConfig = field(default_factory=KeyboardWindowTeleopConfig)
@@ -68,7 +67,7 @@ class TeleopExpertConfig(ExpertConfig):
     begin_paused: bool = True
     takeover: str = "auto"
     takeover_key: str = OVERRIDE
-    play_sound: bool = True
+    play_sound: bool | None = None
 
     def make(self, env: gym.Env, demonstrates: bool = False) -> Expert:
         """The person, beside a policy or with nobody else at the controls."""
@@ -77,7 +76,7 @@ class TeleopExpertConfig(ExpertConfig):
         fps = self.steps_per_second or env_fps
         robot: Any = env.unwrapped if getattr(env.unwrapped, "is_real_time", False) else None
         with ExitStack() as stack:  # closes what was opened if a later part fails
-            window: Window | Console  # (an annotation of a local name is not evaluated)
+            window: Window | Console
             if robot is None:
                 window = Window(f"Play it by ear: {_title(env)}")
                 stack.callback(window.close)
@@ -121,6 +120,11 @@ class TeleopExpertConfig(ExpertConfig):
             raise ExpertError(f"--expert.gripper_cooldown_s={self.gripper_cooldown_s}: give 0 or more seconds.")
         if self.steps_per_second is not None and not self.steps_per_second > 0:
             raise ExpertError(f"--expert.steps_per_second={self.steps_per_second}: give a number above 0.")
+        if self.takeover_key in TAKEN or not self.takeover_key:
+            raise ExpertError(
+                f"--expert.takeover_key={self.takeover_key!r} means something else already: give another one than "
+                f"{', '.join(sorted(TAKEN))}, such as space or b."
+            )
         if self.takeover not in ("auto", "hold", "toggle"):
             raise ExpertError(f"--expert.takeover={self.takeover!r}: give auto, hold or toggle.")
         if getattr(env.unwrapped, "is_real_time", False) and self.steps_per_second is not None:
@@ -135,14 +139,17 @@ class TeleopExpertConfig(ExpertConfig):
         blocks = microphone_blocks(env.observation_space.sample())
         size = len(next(iter(blocks.values()), ()))
         reason = "" if blocks else "no microphone"
-        if not self.play_sound:
+        is_robot = getattr(env.unwrapped, "is_real_time", False)
+        if is_robot and self.play_sound is None:
+            reason = "the robot's microphones would hear it"
+        elif self.play_sound is False:
             reason = "--expert.play_sound=false"
         elif fps != env_fps:
             reason = "slow motion"
         return Speaker(round(size * env_fps), size, reason)
 
 
-def connect_teleoperator(config: TeleoperatorConfig, window: "Window | Console") -> Teleoperator:
+def connect_teleoperator(config: TeleoperatorConfig, window: Window | Console) -> Teleoperator:
     """Make and connect a LeRobot teleoperator.
 
     Args:

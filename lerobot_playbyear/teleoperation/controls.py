@@ -13,6 +13,9 @@ from lerobot_playbyear.teleoperation.actions import DELTAS, GRIPPER, STAY
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 
 OVERRIDE, GRIPPER_KEY, PAUSE, SUCCESS, RERECORD, FAILURE, LEAVE = "space", "g", "p", "s", "r", "q", "escape"
+TAKEN = frozenset({GRIPPER_KEY, PAUSE, SUCCESS, RERECORD, FAILURE, LEAVE})
+"""Keys that mean something."""
+
 _VERDICTS = {SUCCESS: Verdict.SUCCESS, RERECORD: Verdict.DISCARD, FAILURE: Verdict.FAILURE}
 _EVENTS = (
     (TeleopEvents.RERECORD_EPISODE, Verdict.DISCARD),

@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,6 +12,7 @@ from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.episode import Observation, Verdict
 from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
+from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import OVERRIDE, Controls, PersonLeftError, Wish
 from lerobot_playbyear.teleoperation.handover import hand_over
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
@@ -19,9 +20,6 @@ from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.status import HISTORY_S, Control, Status
 from lerobot_playbyear.teleoperation.window import Window
-
-if TYPE_CHECKING:
-    from lerobot_playbyear.robots.console import Console
 
 _BEGIN = "Press P to begin"
 _NOTES = {
@@ -50,7 +48,7 @@ class TeleopExpert(Expert):
         robot: The robot's environment, if it is one; its console is not closed here.
     """
 
-    window: "Window | Console"
+    window: Window | Console
     teleop: Teleoperator
     mapping: ActionMapping
     gripper: Gripper

@@ -14,16 +14,16 @@ class Pace:
 
     Args:
         fps: Steps per second.
-        waits: Whether it waits, and not only measures.
         clock, sleep: As in `time`.
+        waits: Whether it waits, and not only measures.
     """
 
     def __init__(
         self,
         fps: float,
-        waits: bool = True,
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
+        waits: bool = True,
     ) -> None:
         self.fps, self._waits = fps, waits
         self._clock, self._sleep = clock, sleep

@@ -30,11 +30,11 @@ class Status:
         gripper: `open`, `closed`, or nothing for an arm without one.
         cooldown_s: Until the gripper may change again [s].
         levels_db: Of each microphone over each of the last steps, the newest last [dB of full scale].
-        drop_outs: Places of this attempt at which sound is missing.
         sound: Why nothing is heard; empty if it is.
         keys: What to press, and what it does.
         note: What happened last.
         waiting: What goes on when no frame comes.
+        drop_outs: Places of this attempt at which sound is missing.
     """
 
     control: Control = Control.WAITING
@@ -47,11 +47,11 @@ class Status:
     gripper: str = ""
     cooldown_s: float = 0.0
     levels_db: dict[str, list[float]] = field(default_factory=dict)
-    drop_outs: int = 0
     sound: str = ""
     keys: list[tuple[str, str]] = field(default_factory=list)
     note: str = ""
     waiting: str = ""
+    drop_outs: int = 0
 
     @property
     def is_slow(self) -> bool:

@@ -8,7 +8,9 @@ end. The sound of a step is played while the next one is awaited, behind it by `
 
 import argparse
 import json
+import os
 import queue
+import sys
 import threading
 import time
 from multiprocessing.connection import Connection, Listener
@@ -57,6 +59,7 @@ class Simulation:
         self.speaker = Loudspeaker(fifo, sample_rate) if fifo else None
         self.requests: queue.Queue = queue.Queue()
         self.is_blind = False
+        self.heard_at_s: list[float] = []
         self._seed = 0
         self.reset(0)
 
@@ -98,7 +101,12 @@ class Simulation:
         rate = self.env.observation_space["audio.gripper"].shape[0] * 20
         wave = 20000 * np.exp(-np.arange(rate // 50) / (rate / 200)) * np.sin(np.arange(rate // 50) * 0.8)
         assert self.speaker is not None
-        return {"heard_at_s": self.speaker.play(wave.astype(np.int16))}
+        self.heard_at_s.append(self.speaker.play(wave.astype(np.int16)))
+        return {}
+
+    def taps(self) -> dict[str, Any]:
+        """When each was heard [s of time.perf_counter]."""
+        return {"heard_at_s": self.heard_at_s}
 
     def blind(self, is_blind: bool) -> dict[str, Any]:
         self.is_blind = is_blind
@@ -167,7 +175,12 @@ def main() -> None:
             connection = listener.accept()
             threading.Thread(target=answer, args=(connection, simulation), daemon=True).start()
 
-    threading.Thread(target=accept, daemon=True).start()
+    def end_with_parent() -> None:
+        sys.stdin.read()
+        os._exit(0)
+
+    for work in (accept, end_with_parent):
+        threading.Thread(target=work, daemon=True).start()
     print("ready", flush=True)
     simulation.run()
 

@@ -1,6 +1,7 @@
 """Where a person beside a robot sees what goes on, and presses keys: a window, a terminal, or nothing."""
 
 import os
+import re
 import sys
 import threading
 import time
@@ -8,11 +9,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lerobot_playbyear.robots.errors import RobotError
+from lerobot_playbyear.episodes.expert import ExpertError
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 from lerobot_playbyear.teleoperation.status import Status
 from lerobot_playbyear.teleoperation.window import Window
 
+_KEY = re.compile(r"\x1b\[[0-9;]*[ -/]*[@-~]|\x1bO.|[\s\S]")
 _ESCAPES = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[C": "right", "\x1b[D": "left"}
 _NAMES = {" ": "space", "\x1b": "escape", "\x03": "escape", "\r": "enter", "\n": "enter"}
 _LINE_EVERY_S = 0.2
@@ -42,7 +44,7 @@ class TerminalConsole:
     """The terminal that the program was started in: one line that tells how it goes, and keys without Enter.
 
     Raises:
-        RobotError: The program has no terminal.
+        ExpertError: The program has no terminal.
     """
 
     has_key_releases = False
@@ -52,9 +54,9 @@ class TerminalConsole:
             import termios
             import tty
         except ImportError as error:
-            raise RobotError("--env.console=terminal needs Linux or macOS: give window or none.") from error
+            raise ExpertError("--env.console=terminal needs Linux or macOS: give window or none.") from error
         if not (sys.stdin and sys.stdin.isatty()):
-            raise RobotError("--env.console=terminal, and the program has no terminal: give window or none.")
+            raise ExpertError("--env.console=terminal, and the program has no terminal: give window or none.")
         self.keys = WindowKeys()
         self.keys.has_focus = True
         self.is_open = True
@@ -138,12 +140,16 @@ def make_console(kind: str, title: str) -> Console:
     """A console of a kind: `window`, `terminal`, `none`, or `auto`: a window where there is a screen, else a terminal.
 
     Raises:
-        RobotError: There is no terminal.
-        ExpertError: There is no screen.
+        ExpertError: There is no screen, or no terminal.
     """
     if kind == "auto":
         screen = sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        kind = "window" if screen else "terminal" if sys.stdin and sys.stdin.isatty() else "none"
+        if not screen and not (sys.stdin and sys.stdin.isatty()):
+            raise ExpertError(
+                "There is neither a screen nor a terminal in which a person could say when an attempt begins: give "
+                "--env.console=none if all shall begin by themselves."
+            )
+        kind = "window" if screen else "terminal"
     if kind == "window":
         return Window(title)
     return TerminalConsole() if kind == "terminal" else NoConsole()
@@ -151,12 +157,9 @@ def make_console(kind: str, title: str) -> Console:
 
 def _names(text: str) -> list[str]:
     """The keys in what a terminal sends."""
-    names = []
-    while text:
-        escape = next((code for code in _ESCAPES if text.startswith(code)), "")
-        if escape:
-            names.append(_ESCAPES[escape])
-        else:
-            names.append(_NAMES.get(text[0], text[0].lower()))
-        text = text[len(escape) or 1 :]
-    return names
+    return [name for code in _KEY.findall(text) if (name := _ESCAPES.get(code) or _plain(code))]
+
+
+def _plain(code: str) -> str:
+    """The name of a key that sends one letter; none of those that send an escape sequence, such as F1 and Delete."""
+    return "" if len(code) > 1 else _NAMES.get(code, code.lower())
