@@ -11,7 +11,7 @@ from robot_factory import ScriptedConsole, joint_config, robot_env
 
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.robots.arm import RobotError
-from lerobot_playbyear.robots.end_effector import EndEffectorConfig
+from lerobot_playbyear.robots.end_effector_config import EndEffectorConfig
 
 needs_placo = pytest.mark.skipif(
     find_spec("placo") is None, reason='placo is not installed: pip install "lerobot[kinematics]"'
@@ -166,6 +166,21 @@ def test_what_cannot_be_reached_is_left_out(urdf):
         back = hand(env) - farthest
         assert -10 * STEP < back[0] < -5 * STEP  # slower than it is told, where the joints have to turn far
         np.testing.assert_allclose(back[1:], 0, atol=0.001)
+
+
+@needs_placo
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0.7, 0.7, 0), (0, 0, 1), (0.3, -0.3, 0.2)])
+@pytest.mark.parametrize("max_step", [2.0, 10.0, None])
+def test_the_hand_comes_back_from_wherever_it_got(urdf, direction, max_step):
+    with robot_env(config(urdf, max_step=max_step)) as env:
+        joints, action = env._hand, np.array([*direction, 0.0])
+        env.reset(seed=0)
+        for there in (action, -action):
+            begins = hand(env)
+            for _ in range(150):
+                joints.send(there, env._last["agent_pos"])
+                env.arm.robot.place = env.arm.robot.target
+        assert np.linalg.norm(hand(env) - begins) > 0.1
 
 
 @needs_placo

@@ -21,7 +21,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from lerobot_playbyear.microphones.config import MicrophoneConfig, register_microphone_plugins
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
 from lerobot_playbyear.robots import ENV_ID
-from lerobot_playbyear.robots.end_effector import EndEffectorConfig
+from lerobot_playbyear.robots.end_effector_config import EndEffectorConfig
 
 
 def register_devices() -> None:
