@@ -3,7 +3,7 @@
     python -m lerobot_robot_playbyear_sim.simulation --socket=PATH --fifo=PATH --task=OccludedGrasp-v0
 
 An action moves the arm for one control step; where none comes in time, it holds. The picture is that of the last step's
-end. The sound of a step is played while the next one is awaited, behind it by `LAG_S`.
+end. The sound of a step is played while it is made, behind it by `LAG_S`; between attempts the room is heard.
 """
 
 import argparse
@@ -22,7 +22,7 @@ import numpy as np
 from sound_server import Player
 
 STEP_S, GRACE_S = 0.05, 0.03
-LAG_S = 0.015
+LAG_S, JITTER_S = 0.01, 0.008
 
 
 class Loudspeaker:
@@ -34,13 +34,12 @@ class Loudspeaker:
         self._rate, self._end = sample_rate, 0.0
 
     def play(self, block: np.ndarray) -> float:
-        """Plays it after the one before, or soon. Returns when it begins [s of time.perf_counter]."""
-        soonest = time.perf_counter() + 0.003
-        if self._end < soonest:
-            self._end = soonest + LAG_S
-        begins = self._end
+        """Plays it now, as a contact is heard when it happens. Returns when it begins [s of time.perf_counter]."""
+        begins = time.perf_counter() + LAG_S
+        if abs(begins - self._end) < JITTER_S:  # joins the one before
+            begins = self._end
         self._player.play(block, begins)
-        self._end += len(block) / self._rate
+        self._end = begins + len(block) / self._rate
         return begins
 
 
@@ -66,11 +65,12 @@ class Simulation:
     def reset(self, seed: int | None) -> dict[str, Any]:
         self._seed = self._seed + 1 if seed is None else seed
         self.observation, _ = self.env.reset(seed=self._seed)
+        self.room = self.observation["audio.gripper"]
         self.success = self.failed = self.wants_control = False
         self.gate, self.demonstrator = self.env.intervention_gate(), self.env.scripted_expert()
         self.scripted: dict[tuple[int, bool], list[float]] = {}
         self.n_steps, self.last_grip, self.n_holds = 0, -1.0, 0
-        self.next_hold = time.perf_counter() + 1e9
+        self.next_hold, self.next_room = time.perf_counter() + 1e9, time.perf_counter()
         if self.speaker:
             self._hear()
         return {}
@@ -115,8 +115,11 @@ class Simulation:
     def run(self) -> None:
         while True:
             try:
-                request, answer = self.requests.get(timeout=max(min(self.next_hold - time.perf_counter(), 1), 0))
+                due = min(self.next_hold, self.next_room) - time.perf_counter()
+                request, answer = self.requests.get(timeout=max(min(due, 1), 0))
             except queue.Empty:
+                if time.perf_counter() > self.next_room:
+                    self._hear_the_room()
                 if time.perf_counter() > self.next_hold:
                     self.n_holds += 1
                     self._step(np.array([0, 0, 0, self.last_grip], np.float32))
@@ -136,6 +139,13 @@ class Simulation:
         self.failed = terminated and not self.success
         self._hear()
         self.next_hold = time.perf_counter() + STEP_S + GRACE_S
+
+    def _hear_the_room(self) -> None:
+        """Before the first step and after the last nothing touches anything."""
+        self.next_room = time.perf_counter() + STEP_S
+        is_moving = self.n_steps > 0 and not (self.success or self.failed)
+        if self.speaker and not is_moving:
+            self.speaker.play(self.room)
 
     def _hear(self) -> None:
         if self.speaker:
