@@ -15,6 +15,8 @@ from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from types import ModuleType
+
     from lerobot.datasets import LeRobotDatasetMetadata
     from lerobot.datasets.dataset_writer import DatasetWriter
     from lerobot.teleoperators.gamepad import GamepadTeleop
@@ -38,6 +40,7 @@ class CompatError(ImportError):
 
 _TRAINS = "playbyear-train and playbyear-dagger cannot"
 _ACTS = "no policy acts on a CPU"
+_LEADS = "nobody takes over with a leader arm"
 
 BORROWED = {
     "eval_policy_all": ("lerobot.scripts.lerobot_eval:eval_policy_all", f"{_TRAINS} evaluate"),
@@ -52,6 +55,9 @@ BORROWED = {
     "convolution_pointwise_binary": ("torch:ops.mkldnn._convolution_pointwise.binary", _ACTS),
     "BasicBlock": ("torchvision.models.resnet:BasicBlock", "the vision encoder cannot be built"),
     "encode_choice": ("draccus.parsers.encoding:encode_choice", "a policy's configuration cannot be saved"),
+    "follower_smooth_move_to": ("lerobot.common.control_utils:follower_smooth_move_to", "no arm goes to its rest"),
+    "teleop_smooth_move_to": ("lerobot.common.control_utils:teleop_smooth_move_to", _LEADS),
+    "teleop_supports_feedback": ("lerobot.common.control_utils:teleop_supports_feedback", _LEADS),
     "_GLOBAL_CLIENT_FACTORY": (
         "huggingface_hub.utils._http:_GLOBAL_CLIENT_FACTORY",
         "one lost request ends a download of hundreds",
@@ -115,6 +121,17 @@ def has_gamepad(teleop: "GamepadTeleop") -> bool:
 def n_changes(tensor: "Tensor") -> int:
     """How often a tensor was changed in place; -1 where torch does not count."""
     return -1 if tensor.is_inference() else tensor._version
+
+
+def look_for_cards_again(sounddevice: "ModuleType") -> None:
+    """Lets PortAudio see what was plugged in since its first look. It closes all streams."""
+    sounddevice._terminate()
+    sounddevice._initialize()
+
+
+def stream_kind(sounddevice: "ModuleType") -> type:
+    """What all streams of the package sounddevice are."""
+    return sounddevice._StreamBase
 
 
 def hub_client_factory() -> Any:

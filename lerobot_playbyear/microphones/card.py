@@ -1,7 +1,6 @@
 """The sound of one card, cut into the blocks of a control loop's ticks by the clock."""
 
 import threading
-import time
 from collections.abc import Mapping
 
 import numpy as np
@@ -104,6 +103,11 @@ class CardRecording:
             self._stop, self._tick = stop, self._tick + 1
         return dict(zip(self.channels, np.ascontiguousarray(block.T), strict=True))
 
+    def wait_for_sound(self, timeout_s: float) -> bool:
+        """Waits until the card's clock is known: whether a chunk has come in time [s]."""
+        with self._changed:
+            return self._changed.wait_for(lambda: self._clock.is_set, timeout_s)
+
     @property
     def silent_s(self) -> float:
         """For how long it has given nothing but zeros [s]; no microphone in a room does."""
@@ -150,13 +154,3 @@ class CardRecording:
     def _note(self, sample: int, n_samples: int, reason: str) -> None:
         if self._stop is not None:
             self.drop_outs.append(DropOut(self._tick + max(sample - self._stop, 0) // self._size, n_samples, reason))
-
-
-def wait_for_sound(recording: CardRecording, timeout_s: float) -> bool:
-    """Waits until the card's clock is known: whether a chunk has come in time."""
-    deadline = time.perf_counter() + timeout_s
-    while time.perf_counter() < deadline:
-        if recording._clock.is_set:
-            return True
-        time.sleep(0.005)
-    return False

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_playbyear.datasets.microphone import DropOut
-from lerobot_playbyear.microphones.card import CardRecording, wait_for_sound
+from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.config import MicrophoneConfig
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
 
@@ -60,7 +60,7 @@ class Ears:
                     card.recording.forget()
                     card.microphone.connect(card.recording.write)
             for card in self._cards:
-                if not wait_for_sound(card.recording, _FIRST_SOUND_S):
+                if not card.recording.wait_for_sound(_FIRST_SOUND_S):
                     raise MicrophoneError(
                         f"From {card.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s. Is it plugged in, and used by no "
                         "other program? `playbyear-find-microphones` shows whether it hears."

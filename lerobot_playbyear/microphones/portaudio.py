@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lerobot_playbyear.compat import look_for_cards_again, stream_kind
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
 
 if TYPE_CHECKING:
@@ -66,8 +67,7 @@ def sound_cards(fresh: bool = False) -> list[SoundCard]:
     sounddevice = load_sounddevice()
     try:
         if fresh:
-            sounddevice._terminate()
-            sounddevice._initialize()
+            look_for_cards_again(sounddevice)
         systems = sounddevice.query_hostapis()
         default = sounddevice.default.device[0]
         return [
@@ -142,7 +142,7 @@ def channels_to_open(card: SoundCard, needed: int, wanted: int | None = None) ->
 
 def _has_open_stream() -> bool:
     """Whether a stream of this process is open, anyone's; PortAudio would close it when it looks again."""
-    kind = load_sounddevice()._StreamBase
+    kind = stream_kind(load_sounddevice())
     return any(issubclass(type(thing), kind) and not thing.closed for thing in gc.get_objects())
 
 

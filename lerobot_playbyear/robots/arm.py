@@ -227,7 +227,7 @@ class Arm:
         Raises:
             RobotError: A name is none of its joints, or it does not answer.
         """
-        from lerobot.common.control_utils import follower_smooth_move_to
+        from lerobot_playbyear.compat import follower_smooth_move_to
 
         unknown = sorted(set(target) - set(self.action_names))
         if unknown or not self.has_positions:

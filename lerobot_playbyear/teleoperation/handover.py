@@ -23,7 +23,7 @@ def hand_over(env: gym.Env, teleop: Teleoperator, target: Mapping[str, float]) -
     Raises:
         RobotError: The robot does not answer.
     """
-    from lerobot.common.control_utils import teleop_smooth_move_to, teleop_supports_feedback  # seconds to import
+    from lerobot_playbyear.compat import teleop_smooth_move_to, teleop_supports_feedback  # seconds to import
 
     robot_env: Any = env.unwrapped
     robot_env.hold()
