@@ -124,8 +124,9 @@ def test_the_whole_path_with_a_kill_and_a_fault(bench, tmp_path):
     )
     status = person.run(calibrate, bench.environment, at_times=taps)
     assert status == 0, person.output[-3000:]
-    latency_ms = float(re.search(r"Sound arrives (\d+) ms later", person.output).group(1))
-    assert 0 <= latency_ms < 150
+    found = re.search(r"Sound arrives (\d+) ms (later|earlier) than the picture", person.output)
+    assert found is not None, person.output[-2000:]
+    assert int(found.group(1)) <= 10  # the lamp and the tap are at the same time, and the server takes a millisecond
 
     record = (program("playbyear-record"), *bench.env, *bench.leader, "--expert.teleop.demonstrates=true", *data)
     record = (*record, "--dataset.num_episodes=5")
