@@ -17,7 +17,7 @@ film            datasets episodes
 inspection      datasets film
 hub             datasets policy film inspection
 training        datasets policy hub
-teleoperation   episodes
+teleoperation   datasets episodes
 microphones     datasets
 calibration     datasets microphones
 robots          datasets policy episodes teleoperation microphones

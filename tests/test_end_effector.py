@@ -10,8 +10,8 @@ from draccus.utils import DecodingError
 from robot_factory import ScriptedConsole, joint_config, robot_env
 
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.robots.arm import RobotError
 from lerobot_playbyear.robots.end_effector_config import EndEffectorConfig
+from lerobot_playbyear.robots.parts import RobotError
 
 needs_placo = pytest.mark.skipif(
     find_spec("placo") is None, reason='placo is not installed: pip install "lerobot[kinematics]"'

@@ -29,6 +29,8 @@ def note_recording(root: Path, episode: int, facts: dict[str, Any]) -> None:
     """
     path = root / NOTES_PATH
     try:
+        if path.is_symlink() or path.parent.is_symlink():
+            raise OSError("it is a link; wanted a file of the dataset's own")
         with path.open("a+b") as file:
             torn = file.tell() > 0 and _last_byte(file) != b"\n"
             line = json.dumps({"episode": episode, **facts}) + "\n"

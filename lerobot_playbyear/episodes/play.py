@@ -78,7 +78,8 @@ def play(
 
     Args:
         env: The environment; `info["is_success"]` is there after every step, and `_max_episode_steps`, if it has that,
-            limits their number. `info["verdict"]`, if it is there, ends the episode as a `Verdict`'s value says.
+            limits their number. `info["verdict"]`, if it is there, ends the episode as a `Verdict`'s value says, and after
+            `info["was_stopped"]` the last action, which was not carried out, is the one before it.
         actor: Who acts.
         seed, options: For `env.reset`.
         expert: Who may take over.
@@ -96,7 +97,9 @@ def play(
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     limit = env.get_wrapper_attr("_max_episode_steps") if env.has_wrapper_attr("_max_episode_steps") else np.inf
-    observations, actions, rewards, successes, interventions = [observation] if sink is None else [], [], [], [], []
+    observations = [observation] if sink is None else []
+    actions: list[np.ndarray] = []
+    rewards, successes, interventions = [], [], []
     watched = [watch()] if watch else []
     verdict, ended = None, False
     while not ended:
@@ -111,6 +114,10 @@ def play(
             verdict = Verdict(info["verdict"]) if info.get("verdict") else None
             if expert is not None:
                 verdict = verdict or expert.verdict()
+        if info.get("was_stopped") and actions:
+            action = actions[-1]  # this one was not carried out
+        elif info.get("was_stopped"):
+            action = np.nan_to_num(action, nan=0.0, posinf=0.0, neginf=0.0)
         seen, observation = observation, after
         actions.append(action)
         rewards.append(float(reward))

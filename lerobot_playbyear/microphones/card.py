@@ -1,6 +1,7 @@
 """The sound of one card, cut into the blocks of a control loop's ticks by the clock."""
 
 import threading
+import time
 from collections.abc import Mapping
 
 import numpy as np
@@ -92,7 +93,9 @@ class CardRecording:
                 return {name: np.zeros(self._size, np.int16) for name in self.channels}
             if self._stop is None:
                 self._stop = self._place(until_s) - self._size
-            self._changed.wait_for(lambda: self._written >= self._span(until_s)[1], self._timeout)
+            self._changed.wait_for(
+                lambda: self._written >= self._span(until_s)[1], max(until_s - time.perf_counter(), 0) + self._timeout
+            )
             start, stop = self._span(until_s)
             if start > self._stop:
                 self._note(self._stop, start - self._stop, "skipped")

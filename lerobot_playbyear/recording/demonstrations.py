@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 
 import gymnasium as gym
@@ -51,7 +51,8 @@ class PersonRollouts:
             episode = play(self.env, Nobody(), seed, expert=self.expert, sink=stream)
             stream.finish()
         except BaseException:
-            stream.abandon()
+            with suppress(Exception):  # the first error says more
+                stream.abandon()
             raise
         if not episode.success:
             stream.abandon()

@@ -1,25 +1,22 @@
 """A LeRobot robot, as the environment needs it: vectors instead of names, limits, and a hold that is always possible."""
 
 import copy
+import inspect
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 
-from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.robots.parts import RobotError, close_parts, names_of
 
-_POSITION = ".pos"
-_MOVE_FPS = 30
+_VELOCITY = (".vel", "_vel")
+_MOVE_FPS, _PIECE_S = 30, 0.2
 _NEAR = 2.0  # degrees, or percent of a joint's range
 _GRIPPER = "gripper"
 _RECENT_S = 1.0  # for as long an arm that does not answer is taken to be where it was seen
-
-
-class RobotError(PlaybyearError, RuntimeError):
-    """A robot, or something on it, cannot be used; the message says what, and what to do. Nothing saved is lost."""
 
 
 class Arm:
@@ -58,21 +55,9 @@ class Arm:
         except Exception as error:  # whatever a maker's software may say
             raise RobotError(f"--env.robot.type={config.type} cannot be made: {error}") from error
         self._calibrate, self.max_step = calibrate, max_step
-        self.state_names = [name for name, kind in observations.items() if kind in (float, int)]
-        self.cameras = {name: tuple(kind) for name, kind in observations.items() if isinstance(kind, tuple | list)}
-        strange = [
-            f"{name}: {kind}"
-            for name, kind in observations.items()
-            if name not in self.state_names and not (name in self.cameras and self.cameras[name][2:] == (3,))
-        ]
-        if strange:
-            raise RobotError(
-                f"--env.robot.type={config.type} observes {', '.join(strange)}; wanted numbers and pictures (height, width, "
-                "3). Turn it off in the robot's options."
-            )
-        self.action_names = [name for name, kind in actions.items() if kind in (float, int)]
-        if not self.action_names or len(self.action_names) < len(actions):
-            raise RobotError(f"--env.robot.type={config.type} takes {actions}; wanted numbers by name.")
+        self.state_names, self.cameras, self.action_names = names_of(config.type, observations, actions)
+        # What is told and seen under one name is a place to be at, unless it is a velocity: it holds by being told where it is.
+        self._is_place = np.array([n in self.state_names and not n.endswith(_VELOCITY) for n in self.action_names])
         self._lock = threading.RLock()
         self._last: np.ndarray | None = None
         self.sent: np.ndarray | None = None
@@ -84,7 +69,7 @@ class Arm:
     @property
     def has_positions(self) -> bool:
         """Whether its actions are joint targets that are in its state, too: then it holds by being told where it is."""
-        return all(name.endswith(_POSITION) and name in self.state_names for name in self.action_names)
+        return bool(self._is_place.all())
 
     def connect(self) -> None:
         """Connects to robot and cameras; nothing if it is connected.
@@ -95,14 +80,17 @@ class Arm:
         if self.robot.is_connected:
             return
         try:
-            self.robot.connect(calibrate=self._calibrate)
+            takes = inspect.signature(self.robot.connect).parameters
+            self.robot.connect(**({"calibrate": self._calibrate} if "calibrate" in takes else {}))
         except Exception as error:
+            close_parts(self.robot)  # LeRobot leaves open what it had opened, and then refuses to connect again
             with_cameras = f" with the cameras {', '.join(self.cameras)}" if self.cameras else ""
             raise RobotError(
                 f"The robot {self.robot.name}{with_cameras} cannot be connected: {error} Look at its cable, its power and its "
                 "port (lerobot-find-port, lerobot-find-cameras)."
             ) from error
         self._break()
+        self._told = None
 
     def disconnect(self) -> None:
         """Lets go of it; errors are logged."""
@@ -166,23 +154,31 @@ class Arm:
         if not np.isfinite(action).all():
             raise ValueError("The action holds a value that is not finite.")
         with self._lock:
-            if self.max_step is not None and self._last is not None and self.has_positions:
-                action = action.clip(self._last - self.max_step, self._last + self.max_step)
+            if self.max_step is not None:
+                if self._last is None:
+                    self._last = self.resting_action()
+                near = action.clip(self._last - self.max_step, self._last + self.max_step)
+                action = np.where(self._is_place, near, action)
             sent = self._send(action)
             self._last = self._told = action
         return sent
 
-    def hold(self) -> None:
-        """Stops where it is: targets become where the joints are, displacements become none.
+    def hold(self) -> np.ndarray:
+        """Stops where it is: targets become where the joints are, displacements and velocities become none.
 
         A gripper goes on to do what it was told.
+
+        Returns:
+            What it was told (len(action_names),).
 
         Raises:
             RobotError: The robot does not answer.
         """
         with self._lock:
             self._break()
-            self._send(self.resting_action())
+            resting = self.resting_action()
+            self._send(resting)
+            return resting
 
     def resting_action(self) -> np.ndarray:
         """The action (len(action_names),) that moves nothing now; of an arm that does not answer: to where it was just seen.
@@ -190,13 +186,12 @@ class Arm:
         Raises:
             RobotError: It has not answered for long.
         """
-        if not self.has_positions:
+        if not self._is_place.any():
             return np.zeros(len(self.action_names))
         try:
             state, _ = self.observe()
-        except (
-            RobotError
-        ):  # LeRobot's robots read joints and cameras together: one camera that is gone hides the joints
+        except RobotError:
+            # LeRobot's robots read joints and cameras together: one camera that is gone hides the joints.
             if self._seen is None or time.perf_counter() - self._seen_s > _RECENT_S:
                 raise
             state = self._seen
@@ -204,45 +199,71 @@ class Arm:
         if self._told is not None:  # a gripper goes on to squeeze what it holds
             told = dict(zip(self.action_names, self._told, strict=True))
             by_name |= {name: value for name, value in told.items() if _GRIPPER in name}
-        return np.array([by_name[name] for name in self.action_names], np.float64)
+        places = [by_name.get(name, 0.0) for name in self.action_names]
+        return np.where(self._is_place, places, 0.0).astype(np.float64)
 
     def position(self) -> dict[str, float]:
         """Where each joint is that can be told where to go; none for robots that are moved by displacements."""
-        if not self.has_positions:
+        if not self._is_place.any():
             return {}
         state, _ = self.observe()
         by_name = dict(zip(self.state_names, state, strict=True))
-        return {name: float(by_name[name]) for name in self.action_names}
+        return {name: float(by_name[name]) for name, is_place in self._actions() if is_place}
 
     def is_away_from(self, target: Mapping[str, float]) -> bool:
         """Whether any of the joints named is elsewhere, by more than a small part of what a joint moves."""
         if not target:
             return False
         place = self.position()
-        return any(abs(place.get(name, np.inf) - value) > _NEAR for name, value in target.items())
+        return any(not abs(place.get(name, np.inf) - value) <= _NEAR for name, value in target.items())
 
-    def move_to(self, target: Mapping[str, float], duration_s: float) -> None:
-        """Moves there in a straight line, in as long a time as is given; joints that are not named stay.
+    def move_to(self, target: Mapping[str, float], duration_s: float, stop: Callable[[], bool] = lambda: False) -> bool:
+        """Moves there in a straight line; joints that are not named stay.
+
+        Args:
+            target: Where to, by joint.
+            duration_s: How long it takes [s]; longer where a joint would move faster than `max_step` allows.
+            stop: Asked several times a second: then the arm holds.
+
+        Returns:
+            Whether it got there.
 
         Raises:
-            RobotError: A name is none of its joints, or it does not answer.
+            RobotError: A name is none of its joints, a value is not finite, or it does not answer.
         """
         from lerobot_playbyear.compat import follower_smooth_move_to
 
-        unknown = sorted(set(target) - set(self.action_names))
-        if unknown or not self.has_positions:
+        places = [name for name, is_place in self._actions() if is_place]
+        if not set(target) <= set(places) or not np.isfinite(list(target.values())).all():
             raise RobotError(
-                f"The robot {self.robot.name} cannot be told to go to {dict(target)}: its joints are {self.action_names}."
+                f"The robot {self.robot.name} cannot be told to go to {dict(target)}: its joints are {places}, and their "
+                "values are finite numbers."
             )
-        with self._lock:
-            limited, self.max_step = self.max_step, None  # the line is smooth by itself
-            try:
-                follower_smooth_move_to(self.robot, self.position(), dict(target), duration_s, _MOVE_FPS)
-            except Exception as error:
-                raise RobotError(f"The robot {self.robot.name} does not answer: {error}") from error
-            finally:
-                self.max_step = limited
-                self._break()
+        start = self.by_name(self.resting_action()) | self.position()
+        furthest = max((abs(value - start[name]) for name, value in target.items()), default=0.0)
+        fastest_s = furthest / (self.max_step * _MOVE_FPS) if self.max_step else 0.0
+        n = max(round(max(duration_s, fastest_s) / _PIECE_S), 1)
+        try:
+            for piece in range(n):
+                ends = [
+                    {k: start[k] + (v - start[k]) * share / n for k, v in target.items()}
+                    for share in (piece, piece + 1)
+                ]
+                if stop():
+                    self.hold()
+                    return False
+                with self._lock:
+                    follower_smooth_move_to(
+                        self.robot, start | ends[0], ends[1], max(duration_s, fastest_s) / n, _MOVE_FPS
+                    )
+        except RobotError:
+            raise
+        except Exception as error:
+            raise RobotError(f"The robot {self.robot.name} does not answer: {error}") from error
+        finally:
+            self._break()
+            self._told = None  # a gripper is where it was moved to
+        return True
 
     def by_name(self, action: np.ndarray) -> dict[str, float]:
         """An action (len(action_names),) as LeRobot's robots take it."""
@@ -255,6 +276,9 @@ class Arm:
             raise RobotError(f"The robot {self.robot.name} does not take an action: {error}") from error
         self.sent = np.array([sent.get(name, value) for name, value in zip(self.action_names, action, strict=True)])
         return self.sent
+
+    def _actions(self) -> Iterator[tuple[str, bool]]:
+        return zip(self.action_names, self._is_place, strict=True)
 
     def _break(self) -> None:
         self._last = self.sent = None

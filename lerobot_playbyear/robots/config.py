@@ -99,6 +99,13 @@ class RobotEnvConfig(EnvConfig):
             if limit is not None and not limit > 0:
                 raise self._error(name, "give a number above 0, or null for none")
         for name, microphone in self.microphones.items():
+            if microphone.latency_s - self.camera_latency_s >= 1 / self.fps:
+                raise DecodingError(
+                    ("env", "microphones", name, "latency_s"),
+                    f"{microphone.latency_s} does not work: sound that comes so much later than pictures "
+                    f"(--env.camera_latency_s={self.camera_latency_s}) makes every tick wait for longer than its "
+                    f"{1 / self.fps:.3f} s. Give a smaller --env.fps, or take a card that is faster.",
+                )
             if microphone.sample_rate % self.fps:
                 nearest = max(round(microphone.sample_rate / self.fps), 1) * self.fps
                 raise DecodingError(

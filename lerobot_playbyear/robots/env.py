@@ -10,16 +10,17 @@ from gymnasium import spaces
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.robots.arm import Arm, RobotError
+from lerobot_playbyear.robots.arm import Arm
 from lerobot_playbyear.robots.config import RobotEnvConfig
 from lerobot_playbyear.robots.end_effector import EndEffector
+from lerobot_playbyear.robots.parts import RobotError
 from lerobot_playbyear.robots.person import Person, StopPressedError, count
+from lerobot_playbyear.robots.pictures import FrozenCameras, side_by_side
+from lerobot_playbyear.robots.preparing import ask_to_try_again, connect_or_ask, prepare
 from lerobot_playbyear.robots.rig import leave_rig, open_rig
 from lerobot_playbyear.robots.ticks import Ticks
 from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
-
-_MOST_SHOWN = 720  # pixels
 
 
 class RobotEnv(gym.Env):
@@ -70,7 +71,7 @@ class RobotEnv(gym.Env):
         self.action_space = spaces.Box(-self._limit, self._limit, (len(self.action_names),), np.float32)
         self.person = Person(self._rig, self._max_episode_steps)
         self._ticks = Ticks(config.fps)
-        self._same_picture: dict[str, tuple[int, float]] = {}
+        self._frozen = FrozenCameras(config.frozen_s)
         self._pictures: dict[str, np.ndarray] = {n: np.zeros(s, np.uint8) for n, s in arm.cameras.items()}
         self._last: dict[str, Any] | None = None
         self._began_at = 0.0
@@ -90,34 +91,31 @@ class RobotEnv(gym.Env):
         super().reset(seed=seed)
         rig, config = self._rig, self.config
         rig.watchdog.rest()
-        self._connect_or_ask()
         rig.attempt += 1
-        rest = config.rest if config.rest is not None else rig.home or {}
-        self.person.begin()
-        if rig.arm.is_away_from(rest):
-            if config.wait_for_person:
-                self.person.wait_for("Press P to let the arm go to its rest pose", self._look)
-            rig.arm.move_to(rest, config.rest_s)
-        rig.arm.begin_episode(seed)
-        if config.wait_for_person:
-            self.person.wait_for("Set the scene up, then press P to begin", self._look)
-        self.person.begins()
-        self._same_picture.clear()
-        self._stopped = None
-        self._began_at = time.time()
-        now = self._ticks.start()
-        rig.ears.restart(now - config.camera_latency_s)
-        rig.watchdog.feed()
-        self._last = self._observe(now)
-        return self._last, {"is_success": False}
+        while True:
+            connect_or_ask(rig, self.person)
+            try:
+                prepare(rig, self.person, seed, self._look)
+                self._stopped = None
+                self._frozen.restart()
+                now = self._begin()
+                rig.ears.restart(now - config.camera_latency_s)
+                rig.watchdog.feed()
+                self._last = self._observe(now)
+                return self._last, {"is_success": False}
+            except PlaybyearError as error:
+                rig.watchdog.rest()
+                ask_to_try_again(self.person, error)
 
     def step(self, action):
         if self._last is None:
             raise gym.error.ResetNeeded("step() was called before the first attempt: call reset() first.")
         if self._stopped is not None:  # by an expert, in this step
-            return self._outcome(self._stopped, is_problem=True)
-        rig, problem = self._rig, ""
+            return self._outcome(self._stopped, is_stopped=True, was_sent=False)
+        rig, problem, was_sent = self._rig, "", False
         n_holds = rig.watchdog.n_holds
+        if self._ticks.n == 0 and time.perf_counter() - self._tick_at > 1 / self.config.fps:
+            rig.ears.skip_to(self._begin() - self.config.camera_latency_s)  # a policy's first action takes long
         try:
             if self._ticks.n and time.perf_counter() - self._tick_at > self.config.stall_s:
                 problem = f"The loop stood still for {time.perf_counter() - self._tick_at:.1f} s."
@@ -126,6 +124,7 @@ class RobotEnv(gym.Env):
             else:
                 self._send(np.clip(action, -self._limit, self._limit))
                 rig.watchdog.feed()
+                was_sent = True
         except RobotError as error:
             problem = str(error)
         if not problem:
@@ -136,14 +135,14 @@ class RobotEnv(gym.Env):
                 problem = str(error)
             if not problem and self._ticks.lateness[-1] > self.config.stall_s:
                 problem = f"The program stood still for {self._ticks.lateness[-1]:.1f} s."
-        problem = problem or self._frozen_camera() or rig.ears.problem
+        problem = problem or self._frozen.problem(self._pictures) or rig.ears.problem
         if problem:
-            return self._end(problem)
+            return self._end(problem, was_sent)
         if rig.watchdog.n_holds > n_holds:
             logging.debug("The arm held for a moment: an action came late.")
         try:
             verdict = self.person.look(self._last, self.render(), self._ticks, rig.ears.drop_outs)
-            if self.person.wants_pause:
+            if self.person.wants_pause and verdict is None:
                 self.hold()
                 self.person.pause()
                 self.go_on()
@@ -155,15 +154,7 @@ class RobotEnv(gym.Env):
 
     def render(self) -> np.ndarray:
         """All cameras side by side, (side, side, 3) uint8: a square, as the window shows, of at most 720 pixels."""
-        pictures = list(self._pictures.values()) or [np.zeros((64, 64, 3), np.uint8)]
-        height, width = max(p.shape[0] for p in pictures), sum(p.shape[1] for p in pictures)
-        step, side = -(-max(height, width) // _MOST_SHOWN), max(height, width)
-        scene, left = np.zeros((side, side, 3), np.uint8), (side - width) // 2
-        for picture in pictures:
-            top = (side - picture.shape[0]) // 2
-            scene[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
-            left += picture.shape[1]
-        return np.ascontiguousarray(scene[::step, ::step])
+        return side_by_side(self._pictures)
 
     def close(self) -> None:
         """The arm holds, and everything is let go."""
@@ -194,32 +185,39 @@ class RobotEnv(gym.Env):
         self._rig.arm.hold()
 
     def go_on(self) -> None:
-        """After `hold`: what was heard meanwhile belongs to no frame."""
-        now = self._ticks.go_on()
+        """After `hold`: what was heard and seen meanwhile belongs to no frame, and the last observation becomes that of now.
+
+        Raises:
+            RobotError: The robot, or a camera, does not answer.
+        """
+        now = self._begin() if self._ticks.n == 0 else self._ticks.go_on()
+        self._rig.ears.skip_to(now - 1 / self.config.fps - self.config.camera_latency_s)
+        if self._last is not None:
+            seen = self._observe(now)
+            self._last.clear()  # whoever has the observation of this step has the new one
+            self._last.update(seen)
         self._tick_at = now
-        self._rig.ears.skip_to(now - self.config.camera_latency_s)
         self._rig.watchdog.feed()
 
+    def stop(self, verdict: Verdict) -> None:
+        """The arm holds, and the attempt ends as the verdict says: its next step is its last, and moves nothing."""
+        if self._stopped is None:
+            self._rig.watchdog.rest()
+            self._hold_now()
+        self._stopped = verdict
+
     def stop_and_ask(self, reason: str) -> Verdict | None:
-        """The arm holds, and the person says what becomes of the attempt; None: they leave. The attempt's next step is its
-        last, and moves nothing."""
+        """The arm holds, and the person says what becomes of the attempt, which ends as by `stop`; None: they leave."""
         self._rig.watchdog.rest()
-        try:
-            self._rig.arm.hold()
-        except RobotError as error:
-            logging.error(f"The robot cannot be told to hold: {error}")
+        self._hold_now()
         self._stopped = self.person.judge(reason, self._rig.ears.drop_outs)
         return self._stopped
 
     def episode_facts(self) -> dict[str, Any]:
         """Of the attempt so far: when it began [s since 1970], ticks per second, late ticks, drop-outs by microphone."""
-        lateness = sorted(self._ticks.lateness) or [0.0]
         return {
             "begun_at_s": round(self._began_at, 6),
-            "rate_hz": round(self._ticks.rate, 3),
-            "ticks": self._ticks.n,
-            "late_ticks": self._ticks.n_late,
-            "worst_lateness_s": round(lateness[-1], 4),
+            **self._ticks.facts(),
             "drop_outs": {
                 name: [[drop.frame, drop.n_samples, drop.reason] for drop in drops]
                 for name, drops in self._rig.ears.drop_outs.items()
@@ -241,14 +239,16 @@ class RobotEnv(gym.Env):
         elif self._last is not None:
             self._hand.send(action, self._last["agent_pos"])
 
-    def _connect_or_ask(self) -> None:
-        while True:
-            try:
-                self._rig.connect()
-                return
-            except PlaybyearError as error:
-                if not self.person.is_there or not self.person.wants_again(str(error)):
-                    raise
+    def _begin(self) -> float:
+        """The first tick is now: when that is [s of time.perf_counter]."""
+        self._began_at = time.time()
+        return self._ticks.start()
+
+    def _hold_now(self) -> None:
+        try:
+            self._rig.arm.hold()
+        except RobotError as error:
+            logging.error(f"The robot cannot be told to hold: {error}")
 
     def _look(self) -> np.ndarray:
         """What the cameras see between attempts."""
@@ -266,35 +266,24 @@ class RobotEnv(gym.Env):
             observation["agent_pos"] = state
         return observation | {f"audio.{name}": block for name, block in heard.items()}
 
-    def _frozen_camera(self) -> str:
-        """Why a camera is taken for dead, if one is."""
-        now, longest = time.perf_counter(), self.config.frozen_s
-        for name, picture in self._pictures.items() if longest else ():
-            print_ = hash(picture[::8, ::8].tobytes())
-            before, since = self._same_picture.get(name, (None, now))
-            self._same_picture[name] = (print_, since if print_ == before else now)
-            if now - self._same_picture[name][1] > longest:
-                return f"The camera {name} has given the same picture for {longest:.1f} s."
-        return ""
-
-    def _end(self, problem: str):
-        """The attempt ends because something went wrong."""
+    def _end(self, problem: str, was_sent: bool = True):
+        """The attempt ends because something went wrong, before or after its last action was sent."""
         problem = problem.rstrip(". ") + "."
         logging.error(f"{problem} The robot holds.")
         verdict = self.stop_and_ask(problem)
         if verdict is None:
             raise PersonLeftError
-        return self._outcome(verdict, is_problem=True)
+        return self._outcome(verdict, is_stopped=True, was_sent=was_sent)
 
-    def _outcome(self, verdict: Verdict | None, is_problem: bool = False):
-        success = verdict is Verdict.SUCCESS
-        info: dict[str, Any] = {"is_success": success}
+    def _outcome(self, verdict: Verdict | None, is_stopped: bool = False, was_sent: bool = True):
+        info: dict[str, Any] = {"is_success": verdict is Verdict.SUCCESS}
+        is_over = self._ticks.n >= self._max_episode_steps
         if verdict is not None:
             info["verdict"] = verdict.value
-        is_over = self._ticks.n >= self._max_episode_steps
-        if (is_over or verdict is not None) and not is_problem:
-            try:
-                self.hold()
-            except RobotError as error:
-                logging.error(f"The robot cannot be told to hold: {error}")
-        return self._last, float(success), verdict is not None and not is_problem, is_problem or is_over, info
+        if not was_sent:
+            info["was_stopped"] = True
+        if not is_stopped and (is_over or verdict is not None):
+            self._rig.watchdog.rest()
+            self._hold_now()
+        ends = verdict is not None and not is_stopped
+        return self._last, float(info["is_success"]), ends, is_stopped or is_over, info

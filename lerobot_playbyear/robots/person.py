@@ -51,8 +51,12 @@ class Person:
         return not isinstance(self._rig.console, NoConsole)
 
     def begin(self) -> None:
-        """An attempt is about to begin; what was pressed before was not meant for it."""
-        config, console = self._rig.config, self._rig.console
+        """An attempt is about to begin; what was pressed before was not meant for it.
+
+        Raises:
+            PersonLeftError: They had pressed Escape.
+        """
+        config = self._rig.config
         self._status = Status(
             control=Control.PAUSED,
             task=config.task or "",
@@ -64,7 +68,17 @@ class Person:
             sound="the robot's microphones would hear it",
         )
         self._verdict: Verdict | None = None
-        console.keys.look()
+        self._look_for_leaving()
+
+    def wants_to_stop(self) -> bool:
+        """Whether they pressed Escape since the last look, which stays to be seen."""
+        return self._rig.console.keys.was_pressed(LEAVE) or not self._rig.console.is_open
+
+    def _look_for_leaving(self) -> None:
+        """What was pressed before was not meant for now, but to leave."""
+        self._rig.console.keys.look()
+        if LEAVE in self._rig.console.keys.pressed and self.is_there:
+            raise PersonLeftError
 
     def wait_for(self, note: str, picture: Callable[[], np.ndarray]) -> None:
         """Waits until the person presses P, if anybody is there.
@@ -77,6 +91,7 @@ class Person:
             PersonLeftError: They leave.
         """
         if self.is_there:
+            self._look_for_leaving()
             self._status.note = note
             self._wait_for({PAUSE, "enter"}, picture)
 

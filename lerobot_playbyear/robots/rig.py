@@ -1,5 +1,6 @@
 """A robot with its microphones and its person: opened once in a program, however many environments use it."""
 
+import atexit
 import contextlib
 import json
 from dataclasses import dataclass, field
@@ -8,8 +9,9 @@ from typing import Any
 import draccus
 
 from lerobot_playbyear.microphones.ears import Ears
-from lerobot_playbyear.robots.arm import Arm, RobotError
+from lerobot_playbyear.robots.arm import Arm
 from lerobot_playbyear.robots.config import RobotEnvConfig
+from lerobot_playbyear.robots.parts import RobotError, reconnect_cameras
 from lerobot_playbyear.robots.watchdog import Watchdog
 from lerobot_playbyear.teleoperation.console import Console, make_console
 
@@ -34,6 +36,7 @@ class Rig:
     attempt: int = 0
     n_users: int = 0
     _console: Console | None = field(default=None)
+    _is_closed: bool = False
 
     @property
     def console(self) -> Console:
@@ -46,6 +49,15 @@ class Rig:
     def console(self, console: Console) -> None:
         self._console = console
 
+    def connect_anew(self) -> None:
+        """Lets go of the robot and connects to it again; its joints may fall meanwhile.
+
+        Raises:
+            RobotError, MicrophoneError: Something cannot be used.
+        """
+        self.arm.disconnect()
+        self.connect()
+
     def connect(self) -> None:
         """Connects to whatever is not connected, or no longer works.
 
@@ -55,16 +67,19 @@ class Rig:
         self.arm.connect()
         try:
             self.arm.observe()
-        except RobotError:  # once more from the beginning: a cable that was pulled and is back
-            self.arm.disconnect()
-            self.arm.connect()
+        except RobotError:
+            reconnect_cameras(self.arm.robot)
             self.arm.observe()
         self.ears.connect()
         if self.home is None:
             self.home = self.arm.position()
 
     def close(self) -> None:
-        """Lets go of everything; the arm holds before."""
+        """Lets go of everything; the arm holds before. Safe to call twice."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        atexit.unregister(self.close)
         self.watchdog.rest()
         self.watchdog.close()
         if self.arm.robot.is_connected:
@@ -96,6 +111,11 @@ def open_rig(config: RobotEnvConfig) -> Rig:
         arm = Arm(config.robot, config.max_relative_target, config.max_step, config.calibrate)
         ears = Ears(config.microphones, config.fps, stalled_s=config.stall_s, silent_s=config.silent_s)
         _rigs[key] = Rig(config, arm, ears, Watchdog(arm, _HOLD_AFTER_TICKS / config.fps))
+        atexit.register(_rigs[key].close)  # lerobot-eval closes nothing when something goes wrong
+    elif draccus.encode(_rigs[key].config) != draccus.encode(config):
+        raise RobotError(
+            "Another environment of this program uses the same robot with other options: give both the same."
+        )
     _rigs[key].n_users += 1
     return _rigs[key]
 

@@ -64,3 +64,12 @@ class Ticks:
         """Ticks per second since the start, without pauses; 0 before the first."""
         passed = self._due - self._began - self._paused
         return self.n / passed if passed > 0 else 0.0
+
+    def facts(self) -> dict[str, float]:
+        """Ticks and their rate since the start, how many were late, and by how much the worst [s]."""
+        return {
+            "rate_hz": round(self.rate, 3),
+            "ticks": self.n,
+            "late_ticks": self.n_late,
+            "worst_lateness_s": round(max(self.lateness, default=0.0), 4),
+        }

@@ -4,8 +4,9 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
-from lerobot_playbyear.robots.arm import Arm, RobotError
+from lerobot_playbyear.robots.arm import Arm
 from lerobot_playbyear.robots.end_effector_config import EndEffectorConfig
+from lerobot_playbyear.robots.parts import RobotError
 
 _OPTION = "--env.end_effector"
 _POSITION = ".pos"

@@ -4,7 +4,8 @@ import logging
 import threading
 import time
 
-from lerobot_playbyear.robots.arm import Arm, RobotError
+from lerobot_playbyear.robots.arm import Arm
+from lerobot_playbyear.robots.parts import RobotError
 
 
 class Watchdog:

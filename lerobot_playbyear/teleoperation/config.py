@@ -77,12 +77,15 @@ class TeleopExpertConfig(ExpertConfig):
         robot: Any = env.unwrapped if getattr(env.unwrapped, "is_real_time", False) else None
         with ExitStack() as stack:  # closes what was opened if a later part fails
             window: Window | Console
+            leader: Teleoperator | None = None
             if robot is None:
                 window = Window(f"Play it by ear: {_title(env)}")
                 stack.callback(window.close)
-            else:
+            else:  # a leader may ask for its calibration in the terminal, before keys are read from it
+                needs_window = isinstance(self.teleop, KeyboardWindowTeleopConfig)
+                leader = None if needs_window else connect_teleoperator(self.teleop)
                 window = robot.console
-            teleop = connect_teleoperator(self.teleop, window)
+            teleop = leader or connect_teleoperator(self.teleop, window)
             stack.callback(teleop.disconnect)
             names = getattr(robot, "action_names", None)
             known = BASE_DIRECTIONS if set(DELTAS) <= set(names or ()) else KNOWN_DIRECTIONS
@@ -149,7 +152,7 @@ class TeleopExpertConfig(ExpertConfig):
         return Speaker(round(size * env_fps), size, reason)
 
 
-def connect_teleoperator(config: TeleoperatorConfig, window: Window | Console) -> Teleoperator:
+def connect_teleoperator(config: TeleoperatorConfig, window: Window | Console | None = None) -> Teleoperator:
     """Make and connect a LeRobot teleoperator.
 
     Args:
@@ -162,7 +165,7 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window | Console) -
     option = f"--expert.teleop.type={config.type}"
     try:
         if isinstance(config, KeyboardWindowTeleopConfig):
-            teleop: Teleoperator = KeyboardWindowTeleop(config, window.keys)
+            teleop: Teleoperator = KeyboardWindowTeleop(config, window.keys if window is not None else None)
         else:
             teleop = make_teleoperator_from_config(config)
         teleop.connect()

@@ -60,6 +60,7 @@ class TerminalConsole:
         self.keys = WindowKeys()
         self.keys.has_focus = True
         self.is_open = True
+        self._out = sys.stderr  # also while somebody silences it
         self._file = sys.stdin.fileno()
         self._termios: Any = termios
         self._before = termios.tcgetattr(self._file)
@@ -99,8 +100,8 @@ class TerminalConsole:
             self._write("\n")
 
     def _write(self, text: str) -> None:
-        sys.stderr.write(text)
-        sys.stderr.flush()
+        self._out.write(text)
+        self._out.flush()
 
     def _read(self) -> None:
         import select

@@ -8,12 +8,13 @@ import gymnasium as gym
 import numpy as np
 from lerobot.teleoperators import Teleoperator
 
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.episode import Observation, Verdict
 from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.console import Console
-from lerobot_playbyear.teleoperation.controls import OVERRIDE, Controls, PersonLeftError, Wish
+from lerobot_playbyear.teleoperation.controls import LEAVE, OVERRIDE, Controls, PersonLeftError, Wish
 from lerobot_playbyear.teleoperation.handover import hand_over
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
@@ -89,6 +90,17 @@ class TeleopExpert(Expert):
         self.speaker.clear()
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        try:
+            return self._decide(observation, policy_action)
+        except PlaybyearError as error:
+            if self.robot is None:
+                raise
+            self._verdict = self.robot.stop_and_ask(str(error))
+            if self._verdict is None:
+                raise PersonLeftError from error
+            return False
+
+    def _decide(self, observation: Observation, policy_action: np.ndarray) -> bool:
         status = self._status
         status.step += 1
         if self._last_command is not None:
@@ -108,6 +120,9 @@ class TeleopExpert(Expert):
         acts = self.demonstrates or self._wish.overrides
         if acts and not self._acts and self.robot is not None and self.mapping.moves_joints and self._verdict is None:
             self._meet()
+        if self.robot is not None and self._verdict is not None:  # the arm holds at once; this step moves nothing
+            self.robot.stop(self._verdict)
+            return False
         self._acts = acts
         self._last_command = self._gripper_command() if acts else float(policy_action[-1])
         status.control = Control.PERSON if acts else Control.POLICY
@@ -132,11 +147,19 @@ class TeleopExpert(Expert):
         """What the person wants now."""
         if not self.window.is_open:
             raise PersonLeftError
-        self._wish = self._controls.read()
+        problem = ""
+        try:
+            self._wish = self._controls.read()
+        except Exception as error:  # a leader's cable
+            if self.robot is None:
+                raise
+            self._wish, problem = Wish({}), f"The leader does not answer: {error}"
+        if not problem and self._wish.leaves:
+            problem = "You pressed Escape." if self.teleop.is_connected else "The leader is no longer connected."
         verdict = self._wish.verdict
-        if self._wish.leaves and self.robot is not None:
-            verdict = self.robot.stop_and_ask("You pressed Escape.")
-        if self._wish.leaves and verdict is None:
+        if problem and self.robot is not None:
+            verdict = self.robot.stop_and_ask(problem)
+        if problem and verdict is None:
             raise PersonLeftError
         self._is_paused ^= self._wish.toggles_pause
         self._verdict = verdict
@@ -154,16 +177,18 @@ class TeleopExpert(Expert):
             self._read()
         status.note = note
         self.pace.start()
-        if self.robot is not None:
+        if self.robot is not None and self._verdict is None:
             self.robot.go_on()
+            self._acts = False  # a leader that was put down is elsewhere now
 
     def _meet(self) -> None:
         """Leader and follower come together before the person acts."""
         self._status.note = "The arms meet"
         self._show()
-        hand_over(self._env, self.teleop, self.robot.arm.by_name(self.mapping.vector(self._wish.action)))
+        target = self.robot.arm.by_name(self.mapping.vector(self._wish.action))
+        hand_over(self._env, self.teleop, target, lambda: self.window.keys.was_pressed(LEAVE))
         self._status.note = ""
-        self._wish = self._controls.read()
+        self._read()
         self.pace.start()
 
     def _gripper_command(self) -> float:

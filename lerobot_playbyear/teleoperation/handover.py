@@ -1,6 +1,6 @@
 """A leader arm and the arm that follows it meet, before a person takes over."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -9,7 +9,9 @@ from lerobot.teleoperators import Teleoperator
 _LEADER_S, _FOLLOWER_S = 2.0, 1.0  # as in LeRobot's own hand-over
 
 
-def hand_over(env: gym.Env, teleop: Teleoperator, target: Mapping[str, float]) -> None:
+def hand_over(
+    env: gym.Env, teleop: Teleoperator, target: Mapping[str, float], stop: Callable[[], bool] = lambda: False
+) -> None:
     """Brings leader and follower to the same pose, while the environment's time stands still.
 
     A leader with motors goes to where the follower is; otherwise the follower goes to where the leader is. LeRobot's own
@@ -19,6 +21,7 @@ def hand_over(env: gym.Env, teleop: Teleoperator, target: Mapping[str, float]) -
         env: A robot's environment.
         teleop: The leader.
         target: Where the leader is, by the robot's joints.
+        stop: Asked while the follower moves: then it holds.
 
     Raises:
         RobotError: The robot does not answer.
@@ -32,5 +35,6 @@ def hand_over(env: gym.Env, teleop: Teleoperator, target: Mapping[str, float]) -
         teleop_smooth_move_to(leader, robot_env.arm.position(), _LEADER_S)
         leader.disable_torque()  # the person moves it from here
     else:
-        robot_env.arm.move_to(target, _FOLLOWER_S)
-    robot_env.go_on()
+        robot_env.arm.move_to(target, _FOLLOWER_S, stop)
+    if not stop():
+        robot_env.go_on()
