@@ -161,7 +161,9 @@ def test_a_person_may_keep_an_attempt_that_ended_with_a_fault():
 
 
 ENDLESS = """
+import signal
 import sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it, and its children do
 sys.path.insert(0, {tests!r})
 import numpy as np
 from robot_factory import joint_config
@@ -185,8 +187,11 @@ def test_interrupting_the_program_makes_the_arm_hold_and_lets_go():
     code = ENDLESS.format(tests=str(Path(__file__).parent))
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout is not None
-    assert child.stdout.readline().strip() == "moving"
-    time.sleep(0.3)
-    child.send_signal(signal.SIGINT)
-    told, errors = child.communicate(timeout=60)
+    try:
+        assert child.stdout.readline().strip() == "moving"
+        time.sleep(0.3)
+        child.send_signal(signal.SIGINT)
+        told, errors = child.communicate(timeout=60)
+    finally:
+        child.kill()
     assert told.strip() == "True False", errors
