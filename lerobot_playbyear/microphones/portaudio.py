@@ -143,7 +143,9 @@ def channels_to_open(card: SoundCard, needed: int, wanted: int | None = None) ->
 def _has_open_stream() -> bool:
     """Whether a stream of this process is open, anyone's; PortAudio would close it when it looks again."""
     kind = stream_kind(load_sounddevice())
-    return any(issubclass(type(thing), kind) and not thing.closed for thing in gc.get_objects())
+    streams = [thing for thing in gc.get_objects() if issubclass(type(thing), kind)]
+    # One that could not be opened, and to which its error still refers, never got a rate.
+    return any(hasattr(stream, "samplerate") and not stream.closed for stream in streams)
 
 
 class PortAudioMicrophone(Microphone):
@@ -162,13 +164,20 @@ class PortAudioMicrophone(Microphone):
 
     def _open(self) -> None:
         """PortAudio knows the cards that were there when it looked; where none of these can be opened, it looks again."""
+        card: SoundCard | None = None
         try:
-            self._open_card(find_card(self._config.device, self.channels))
-        except MicrophoneError:
+            card = find_card(self._config.device, self.channels)
+            self._open_card(card)
+        except MicrophoneError as error:
             if _has_open_stream():
                 raise
             sound_cards(fresh=True)
-            self._open_card(find_card(self._config.device, self.channels))
+            try:
+                self._open_card(find_card(self._config.device, self.channels))
+            except MicrophoneError:
+                if card is not None:  # it was there, and why it cannot be opened says more
+                    raise error from None
+                raise
 
     def _open_card(self, card: SoundCard) -> None:
         sounddevice, config = load_sounddevice(), self._config
