@@ -29,7 +29,7 @@ from common import Row, machine, parser_for, report
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from robot_factory import joint_config, noise_file, robot_env
-from sound_server import Player, SoundServer, why_not
+from sound_server import SoundServer, playing_elsewhere, why_not
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.episodes.environment import env_facts
@@ -62,7 +62,10 @@ def microphones(names: tuple[str, ...], folder: Path) -> Iterator[dict[str, Any]
         path = noise_file(folder, RATE, channels=len(names))
         yield {name: FileMicrophoneConfig(path=str(path), channel=n) for n, name in enumerate(names)}
         return
-    with SoundServer(folder, {"bench": len(names)}, RATE) as server, Player(server.fifo("bench"), len(names), RATE):
+    with (
+        SoundServer(folder, {"bench": len(names)}, RATE) as server,
+        playing_elsewhere(server.fifo("bench"), len(names), RATE),
+    ):
         yield {name: PortAudioMicrophoneConfig(device="bench", channel=n) for n, name in enumerate(names)}
 
 
