@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,7 +132,7 @@ def scene(cfg: Options, stack: ExitStack) -> tuple[gym.Env, Any, Any]:
         console="none",
         frozen_s=0,  # a simulated camera without noise gives the same picture while nothing moves
     )
-    env = stack.enter_context(_closing(gym.make(config.gym_id, disable_env_checker=True, config=config)))
+    env = stack.enter_context(closing(gym.make(config.gym_id, disable_env_checker=True, config=config)))
     link = Link(socket)
     stack.callback(link.close)
     return env, config, link
@@ -185,12 +185,6 @@ def _described(env_cfg: Any, env: gym.Env) -> Any:
     if hasattr(env_cfg, "describe"):
         env_cfg.describe(env.observation_space, env.action_space)
     return env_cfg
-
-
-def _closing(env: gym.Env) -> Any:
-    from contextlib import closing
-
-    return closing(env)
 
 
 @parser.wrap()

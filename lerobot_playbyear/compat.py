@@ -10,8 +10,9 @@ What lives on other people's objects has a function of its own at the end; what 
 torch.
 """
 
-from importlib import metadata
-from pkgutil import resolve_name
+from contextlib import suppress
+from importlib import import_module, metadata
+from pkgutil import iter_modules, resolve_name
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -91,6 +92,17 @@ def __getattr__(name: str) -> Any:
     if name not in BORROWED:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return load(*BORROWED[name])
+
+
+def import_devices(package: "ModuleType") -> None:
+    """Imports a package's own packages, such as those of `lerobot.robots`, so that the types in them are registered.
+
+    One that cannot be imported, such as for want of its maker's software, is left out.
+    """
+    for module in iter_modules(package.__path__):
+        if module.ispkg:
+            with suppress(Exception):
+                import_module(f"{package.__name__}.{module.name}")
 
 
 def forget_unsaved_rows(meta: "LeRobotDatasetMetadata") -> None:

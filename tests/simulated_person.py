@@ -14,7 +14,7 @@ from lerobot_robot_playbyear_sim.link import Link
 
 
 class SimulatedPerson:
-    """Begins every attempt, ends it as it went, and takes over where the task's script would.
+    """Begins every attempt, ends it as it went, throws it away where the robot stopped, and takes over where the script would.
 
     Args:
         socket: Of the simulated arm.
@@ -27,7 +27,7 @@ class SimulatedPerson:
         self._most_steps, self._corrects = most_steps, corrects
         self.output = ""
         self.pressed: list[str] = []
-        self._acts, self._n_begun = False, 0
+        self._acts, self._n_begun, self._n_troubles = False, 0, 0
         self._judged = -1
         self.tapped = 0.0
 
@@ -41,7 +41,7 @@ class SimulatedPerson:
     ) -> int:
         """Runs a command in a terminal of its own and sits before it. Returns its exit status, -9 if it was killed."""
         self.output = ""
-        self._n_begun = self._judged = 0
+        self._n_begun = self._judged = self._n_troubles = 0
         ours, theirs = pty.openpty()
         process = subprocess.Popen(
             command, stdin=theirs, stdout=theirs, stderr=theirs, env=dict(environment), start_new_session=True
@@ -74,6 +74,10 @@ class SimulatedPerson:
         if n_asked > self._n_begun:
             self._n_begun, self._acts = n_asked, False
             return "p"
+        n_troubles = self.output.count("throws the attempt away")
+        if n_troubles > self._n_troubles:
+            self._n_troubles, self._judged = n_troubles, self._n_begun
+            return "r"
         if self._judged >= self._n_begun:
             return ""
         now = self._link.ask("status")

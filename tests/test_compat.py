@@ -96,6 +96,16 @@ def test_what_is_gone_is_missed_with_a_sentence(gone):
         compat.load(gone, "nothing works")
 
 
+def test_a_package_that_cannot_be_imported_does_not_keep_the_others_out(tmp_path, monkeypatch):
+    for name, text in {"broken": "raise RuntimeError('its licence has ended')", "whole": "is_there = True"}.items():
+        (tmp_path / "makers" / name).mkdir(parents=True)
+        (tmp_path / "makers" / name / "__init__.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    compat.import_devices(importlib.import_module("makers"))
+    assert sys.modules["makers.whole"].is_there
+    assert "makers.broken" not in sys.modules
+
+
 def test_functions_are_imported_by_their_name():
     from lerobot.common.train_utils import save_checkpoint
 

@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from sound_server import Player, started, why_not
+from sound_server import RATE, Player, started, why_not
 
 from lerobot_playbyear.datasets.audio_files import read_audio
 from lerobot_playbyear.datasets.errors import InputError
@@ -17,7 +17,7 @@ needs_server = pytest.mark.skipif(bool(why_not()), reason=why_not())
 
 @needs_server
 def test_each_card_is_listed_heard_and_written(tmp_path, capsys):
-    loud = np.full((96000, 2), [8000, 1], np.int16)
+    loud = np.full((20 * RATE, 2), [8000, 1], np.int16)  # for longer than a slow machine needs
     with (
         started(bench=2, table=1) as server,
         Player(server.fifo("bench"), 2) as bench,
@@ -32,7 +32,7 @@ def test_each_card_is_listed_heard_and_written(tmp_path, capsys):
     assert said.count("nothing but zeros") == 1
     samples, rate = read_audio(tmp_path / "microphone_0.wav")
     assert rate == 48000
-    assert 0.3 * rate < len(samples) <= 0.6 * rate
+    assert len(samples) == 0.5 * rate
     assert np.median(samples, axis=0).tolist() == pytest.approx([8000, 1], abs=3)
 
 

@@ -453,7 +453,7 @@ def test_every_first_action_is_limited_too():
         assert env.arm.robot.told[-1][1].max() <= 4.01
 
 
-def test_a_robot_that_mixes_places_and_velocities_holds_its_places(monkeypatch):
+def test_a_robot_that_mixes_places_and_velocities_gets_them_as_they_are_and_holds_its_places(monkeypatch):
     from lerobot_robot_playbyear_sim.joints import JointArm
 
     monkeypatch.setattr(JointArm, "action_features", property(lambda self: dict.fromkeys((*JOINTS, "base.vel"), float)))
@@ -472,10 +472,12 @@ def test_a_robot_that_mixes_places_and_velocities_holds_its_places(monkeypatch):
     monkeypatch.setattr(JointArm, "get_observation", lambda self: {**observe(self), "base.vel": 0.3})
     monkeypatch.setattr(JointArm, "send_action", send)
     with robot_env(joint_config(max_step=None, max_relative_target=None)) as env:
-        env.connect()
+        env.reset(seed=0)
+        env.step(env.action_space.high.clip(max=40))
+        assert told[-1] == pytest.approx(dict.fromkeys((*JOINTS, "base.vel"), 40))
         env.arm.robot.place = env.arm.robot.target = np.array([40.0, -30.0, 20.0])
         env.arm.hold()
-    assert told[0] == pytest.approx({"shoulder.pos": 40, "elbow.pos": -30, "gripper.pos": 20, "base.vel": 0})
+    assert told[-1] == pytest.approx({"shoulder.pos": 40, "elbow.pos": -30, "gripper.pos": 40, "base.vel": 0})
 
 
 JOINTS = ("shoulder.pos", "elbow.pos", "gripper.pos")
@@ -617,7 +619,8 @@ def test_after_a_pause_the_arms_meet_again_and_the_frame_is_that_of_then():
     assert far[7:14].max() < 3
 
 
-def test_a_leader_that_does_not_answer_is_asked_about():
+@pytest.mark.parametrize("first", [0, 4])
+def test_a_leader_that_does_not_answer_is_asked_about(first):
     from lerobot_robot_playbyear_sim import JointLeaderConfig
 
     console = ScriptedConsole(lambda s: "p" if "Set the scene" in s.note else "s" if "leader" in s.note else None)
@@ -625,9 +628,10 @@ def test_a_leader_that_does_not_answer_is_asked_about():
         expert, leader = teleop(env, JointLeaderConfig())
 
         def keys(n):
-            if n == 4:
+            if n == first:
                 leader.get_action = lambda: (_ for _ in ()).throw(ConnectionError("no status packet"))
 
+        keys(0)
         episode = play(env, acting(keys), seed=0, expert=expert)
         del leader.get_action
         expert.close()

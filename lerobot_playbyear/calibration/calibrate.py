@@ -1,8 +1,5 @@
 """`playbyear-calibrate-latency`: a person taps in view of a camera and near a microphone."""
 
-import contextlib
-import importlib
-import pkgutil
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -22,6 +19,7 @@ from lerobot_playbyear.calibration.estimator import (
 )
 from lerobot_playbyear.calibration.listening import Motion, SoundLevel
 from lerobot_playbyear.calibration.plot import write_plot
+from lerobot_playbyear.compat import import_devices
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.config import MicrophoneConfig, make_microphone
 
@@ -32,10 +30,7 @@ _ASKED = {
     "begins": "Make {n} sounds at which something in the picture begins to move or to shine, a second apart.",
 }
 
-for _module in pkgutil.iter_modules(lerobot.cameras.__path__):
-    if _module.ispkg:
-        with contextlib.suppress(ImportError):  # its maker's software is not installed
-            importlib.import_module(f"lerobot.cameras.{_module.name}")  # registers its type
+import_devices(lerobot.cameras)  # registers their types
 
 
 @dataclass

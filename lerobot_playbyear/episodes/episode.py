@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,26 @@ class Verdict(Enum):
     SUCCESS = "success"
     FAILURE = "failure"
     DISCARD = "discard"
+
+
+class Step(NamedTuple):
+    """One step of an episode: what was observed, what was done then, and what came of it.
+
+    Args:
+        observation: A raw observation.
+        action: (action dim,) float32.
+        reward: Of the action.
+        success: Whether the task was solved after it.
+        by_expert: Whether the expert beside the actor chose it.
+        is_last: Whether the episode ended with it.
+    """
+
+    observation: Observation
+    action: np.ndarray
+    reward: float
+    success: bool
+    by_expert: bool
+    is_last: bool
 
 
 @dataclass

@@ -21,7 +21,7 @@ from lerobot.utils.constants import (
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts
-from lerobot_playbyear.episodes.episode import Episode, Observation
+from lerobot_playbyear.episodes.episode import Episode, Observation, Step
 
 INTERVENTION = "intervention"
 SEED = "seed"
@@ -63,43 +63,24 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
         features: From `dataset_features`.
     """
     by_expert = np.ones(len(episode), bool) if episode.interventions is None else episode.interventions
+    steps = zip(episode.observations, episode.actions, episode.rewards, episode.successes, by_expert, strict=False)
     return [
-        make_frame(
-            features,
-            episode.observations[t],
-            episode.actions[t],
-            episode.rewards[t],
-            episode.successes[t],
-            by_expert[t],
-            t == len(episode) - 1,
-            episode.seed,
-            episode.task,
-        )
-        for t in range(len(episode))
+        make_frame(features, Step(*step, is_last=t == len(episode) - 1), episode.seed, episode.task)
+        for t, step in enumerate(steps)
     ]
 
 
-def make_frame(
-    features: dict[str, dict[str, Any]],
-    observation: Observation,
-    action: np.ndarray,
-    reward: float,
-    success: bool,
-    by_expert: bool,
-    is_last: bool,
-    seed: int,
-    task: str,
-) -> dict[str, Any]:
-    """One frame, as LeRobot's datasets take it: what was observed, the action taken then, and what came of it."""
-    frame: dict[str, Any] = dict(_flat_observation(observation))
+def make_frame(features: dict[str, dict[str, Any]], step: Step, seed: int, task: str) -> dict[str, Any]:
+    """A step as a frame of LeRobot's datasets; `seed` and `task` as of `Episode`."""
+    frame: dict[str, Any] = dict(_flat_observation(step.observation))
     for key, value in frame.items():
         if features[key]["dtype"] == "float32":
             frame[key] = np.asarray(value, np.float32)
-    frame[ACTION] = action
-    frame[INTERVENTION] = np.array([by_expert], bool)
-    frame[REWARD] = np.array([reward], np.float32)
-    frame[SUCCESS] = np.array([success], bool)
-    frame[DONE] = np.array([is_last])
+    frame[ACTION] = step.action
+    frame[INTERVENTION] = np.array([step.by_expert], bool)
+    frame[REWARD] = np.array([step.reward], np.float32)
+    frame[SUCCESS] = np.array([step.success], bool)
+    frame[DONE] = np.array([step.is_last])
     frame[SEED] = np.array([seed], np.int64)
     frame["task"] = task
     return frame

@@ -13,19 +13,10 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_playbyear.episodes.environment import task_description
-from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
+from lerobot_playbyear.episodes.episode import Episode, Observation, Step, Verdict
 
 if TYPE_CHECKING:
     from lerobot_playbyear.episodes.expert import Expert
-
-
-class Sink(Protocol):
-    """Who takes the steps of an episode as they come."""
-
-    def __call__(
-        self, observation: Observation, action: np.ndarray, reward: float, success: bool, by_expert: bool, is_last: bool
-    ) -> None:
-        """A step was made: what was observed, what was done then, and what came of it."""
 
 
 class Actor(Protocol):
@@ -69,7 +60,7 @@ def play(
     options: dict[str, Any] | None = None,
     watch: Callable[[], Any] | None = None,
     seconds: Seconds | None = None,
-    sink: Sink | None = None,
+    sink: Callable[[Step], None] | None = None,
 ) -> Episode:
     """Plays one episode until the environment or the expert ends it, or its steps are used up.
 
@@ -129,7 +120,7 @@ def play(
         if sink is None:
             observations.append(observation)
         else:
-            sink(seen, action, rewards[-1], successes[-1], by_expert, ended)
+            sink(Step(seen, action, rewards[-1], successes[-1], by_expert, ended))
     return Episode(
         seed=seed,
         task=task_description(env),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.episodes.episode import Observation
+from lerobot_playbyear.episodes.episode import Step
 from lerobot_playbyear.episodes.frames import make_frame
 
 _MOST_BYTES = 256 * 2**20  # that wait for the disk; a robot's loop that waits for more stands still, and holds
@@ -33,20 +33,10 @@ class FrameStream:
         self._thread = threading.Thread(target=self._write, name="frames", daemon=True)
         self._thread.start()
 
-    def __call__(
-        self,
-        observation: Observation,
-        action: np.ndarray,
-        reward: float,
-        success: bool,
-        by_expert: bool,
-        is_last: bool,
-    ) -> None:
+    def __call__(self, step: Step) -> None:
         """A step was made. Waits only where the disk is far behind."""
         self._check()
-        frame = make_frame(
-            self._writer.features, observation, action, reward, success, by_expert, is_last, self._seed, self._task
-        )
+        frame = make_frame(self._writer.features, step, self._seed, self._task)
         size = _size(frame)
         with self._room:
             self._room.wait_for(lambda: self._n_bytes + size <= _MOST_BYTES or self._n_bytes == 0 or self._error)

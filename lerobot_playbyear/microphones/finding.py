@@ -25,7 +25,7 @@ from lerobot_playbyear.microphones.portaudio import (
 _RATES = (8000, 16000, 32000, 44100, 48000, 96000)
 _LIKED_RATES = (48000, 16000, 44100)  # the first that a card takes is suggested
 _QUIETEST_DB, _BAR = -60, 20
-_LOOK_S = 0.1
+_LOOK_S, _PATIENCE_S = 0.1, 3.0
 _CLIPPED = 32700
 _NO_CARD = (
     "There is no sound card with an input. Plug a microphone in. On Linux `arecord -l` lists what the system sees, and you "
@@ -131,9 +131,10 @@ def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
     microphone = PortAudioMicrophone(config, channels)
     with _without_stderr():
         microphone.connect()
-    parts, end = [np.zeros((0, channels), np.int16)], time.perf_counter() + cfg.seconds
+    parts, wanted = [np.zeros((0, channels), np.int16)], round(cfg.seconds * rate)
+    end = time.perf_counter() + cfg.seconds + _PATIENCE_S  # a card may take its time to begin
     try:
-        while time.perf_counter() < end and not microphone.problem:
+        while sum(map(len, parts)) < wanted and time.perf_counter() < end and not microphone.problem:
             time.sleep(_LOOK_S)
             parts.append(microphone.read())
             if sys.stdout.isatty():
@@ -142,7 +143,7 @@ def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
         microphone.disconnect()
     if sys.stdout.isatty():
         print("\r\033[K", end="")
-    samples = np.concatenate(parts)
+    samples = np.concatenate(parts)[:wanted]
     if len(samples) == 0:
         raise MicrophoneError(microphone.problem or "nothing came from it")
     path = write_wav(cfg.output_dir / f"microphone_{card.number}.wav", samples, rate)

@@ -71,6 +71,11 @@ class Arm:
         """Whether its actions are joint targets that are in its state, too: then it holds by being told where it is."""
         return bool(self._is_place.all())
 
+    @property
+    def has_a_position(self) -> bool:
+        """Whether any of its actions is such a target, in the robot's own units."""
+        return bool(self._is_place.any())
+
     def connect(self) -> None:
         """Connects to robot and cameras; nothing if it is connected.
 
@@ -140,11 +145,8 @@ class Arm:
         self._seen, self._seen_s = state, time.perf_counter()
         return state, pictures
 
-    def send(self, action: np.ndarray) -> np.ndarray:
+    def send(self, action: np.ndarray) -> None:
         """Sends an action (len(action_names),), changed by no more than the limit per step since the last one.
-
-        Returns:
-            What was sent, as far as the robot says so.
 
         Raises:
             ValueError: It is not finite; nothing was sent.
@@ -159,17 +161,13 @@ class Arm:
                     self._last = self.resting_action()
                 near = action.clip(self._last - self.max_step, self._last + self.max_step)
                 action = np.where(self._is_place, near, action)
-            sent = self._send(action)
+            self._send(action)
             self._last = self._told = action
-        return sent
 
-    def hold(self) -> np.ndarray:
+    def hold(self) -> None:
         """Stops where it is: targets become where the joints are, displacements and velocities become none.
 
         A gripper goes on to do what it was told.
-
-        Returns:
-            What it was told (len(action_names),).
 
         Raises:
             RobotError: The robot does not answer.
@@ -178,7 +176,7 @@ class Arm:
             self._break()
             resting = self.resting_action()
             self._send(resting)
-            return resting
+            self._last = resting
 
     def resting_action(self) -> np.ndarray:
         """The action (len(action_names),) that moves nothing now; of an arm that does not answer: to where it was just seen.
@@ -186,7 +184,7 @@ class Arm:
         Raises:
             RobotError: It has not answered for long.
         """
-        if not self._is_place.any():
+        if not self.has_a_position:
             return np.zeros(len(self.action_names))
         try:
             state, _ = self.observe()
@@ -204,7 +202,7 @@ class Arm:
 
     def position(self) -> dict[str, float]:
         """Where each joint is that can be told where to go; none for robots that are moved by displacements."""
-        if not self._is_place.any():
+        if not self.has_a_position:
             return {}
         state, _ = self.observe()
         by_name = dict(zip(self.state_names, state, strict=True))
@@ -269,13 +267,12 @@ class Arm:
         """An action (len(action_names),) as LeRobot's robots take it."""
         return {name: float(value) for name, value in zip(self.action_names, action, strict=True)}
 
-    def _send(self, action: np.ndarray) -> np.ndarray:
+    def _send(self, action: np.ndarray) -> None:
         try:
             sent = self.robot.send_action(self.by_name(action)) or {}
         except Exception as error:
             raise RobotError(f"The robot {self.robot.name} does not take an action: {error}") from error
         self.sent = np.array([sent.get(name, value) for name, value in zip(self.action_names, action, strict=True)])
-        return self.sent
 
     def _actions(self) -> Iterator[tuple[str, bool]]:
         return zip(self.action_names, self._is_place, strict=True)

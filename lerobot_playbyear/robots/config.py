@@ -1,8 +1,5 @@
 """`--env.type=playbyear_robot`: its options."""
 
-import contextlib
-import importlib
-import pkgutil
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +15,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.robots import RobotConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from lerobot_playbyear.compat import import_devices
 from lerobot_playbyear.microphones.config import MicrophoneConfig, register_microphone_plugins
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
 from lerobot_playbyear.robots import ENV_ID
@@ -27,10 +25,7 @@ from lerobot_playbyear.robots.end_effector_config import EndEffectorConfig
 def register_devices() -> None:
     """Makes the robots and cameras that LeRobot brings known by their types, and other people's microphones."""
     for package in (lerobot.robots, lerobot.cameras):
-        for module in pkgutil.iter_modules(package.__path__):
-            if module.ispkg:
-                with contextlib.suppress(ImportError):  # its maker's software is not installed
-                    importlib.import_module(f"{package.__name__}.{module.name}")
+        import_devices(package)
     register_microphone_plugins()
 
 

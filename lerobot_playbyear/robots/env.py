@@ -67,7 +67,7 @@ class RobotEnv(gym.Env):
             shape = (microphone.sample_rate // config.fps,)
             observation[f"audio.{name}"] = spaces.Box(-32768, 32767, shape, np.int16)
         self.observation_space = spaces.Dict(observation)
-        self._limit = np.inf if arm.has_positions and self._hand is None else 1.0
+        self._limit = np.inf if arm.has_a_position and self._hand is None else 1.0
         self.action_space = spaces.Box(-self._limit, self._limit, (len(self.action_names),), np.float32)
         self.person = Person(self._rig, self._max_episode_steps)
         self._ticks = Ticks(config.fps)
@@ -141,7 +141,7 @@ class RobotEnv(gym.Env):
         if rig.watchdog.n_holds > n_holds:
             logging.debug("The arm held for a moment: an action came late.")
         try:
-            verdict = self.person.look(self._last, self.render(), self._ticks, rig.ears.drop_outs)
+            verdict = self.person.look(self._last, self.render, self._ticks, rig.ears.drop_outs)
             if self.person.wants_pause and verdict is None:
                 self.hold()
                 self.person.pause()

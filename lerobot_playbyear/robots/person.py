@@ -102,7 +102,7 @@ class Person:
     def look(
         self,
         observation: Mapping[str, Any],
-        picture: np.ndarray,
+        picture: Callable[[], np.ndarray],
         ticks: Ticks,
         drop_outs: Mapping[str, list[DropOut]],
     ) -> Verdict | None:
@@ -113,7 +113,7 @@ class Person:
             PersonLeftError: They closed the window.
         """
         self.wants_pause = False
-        if self.has_expert:
+        if self.has_expert or not self.is_there:
             return None
         console, status = self._rig.console, self._status
         status.step, status.achieved_fps = ticks.n, round(ticks.rate, 1)
@@ -122,7 +122,7 @@ class Person:
             levels = status.levels_db.setdefault(name, [])
             levels.append(round(level_db(block), 1))
             del levels[: -max(round(HISTORY_S * status.fps), 1)]
-        console.show(status, picture)
+        console.show(status, picture())
         if not console.is_open:
             raise PersonLeftError
         console.keys.look()

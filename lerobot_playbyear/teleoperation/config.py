@@ -1,9 +1,7 @@
 """`--expert.type=teleop`: its options, and how everything that a person needs is put together."""
 
-import importlib
-import pkgutil
 from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +10,7 @@ from lerobot import teleoperators
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, make_teleoperator_from_config
 from lerobot.teleoperators.gamepad import GamepadTeleop
 
-from lerobot_playbyear.compat import has_gamepad
+from lerobot_playbyear.compat import has_gamepad, import_devices
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.actions import BASE_DIRECTIONS, DELTAS, KNOWN_DIRECTIONS, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.console import Console
@@ -24,12 +22,7 @@ from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.window import Window
 
-for _module in pkgutil.iter_modules(
-    teleoperators.__path__
-):  # registers --expert.teleop.type=so101_leader and the others
-    if _module.ispkg:
-        with suppress(ImportError):  # its maker's software is not installed
-            importlib.import_module(f"{teleoperators.__name__}.{_module.name}")
+import_devices(teleoperators)  # registers --expert.teleop.type=so101_leader and the others
 
 _MOVING_KEYS: Mapping[str, list[tuple[str, str]]] = {
     "keyboard_window": [("Arrows", "right, left, away, near"), ("E  D", "up, down")],

@@ -81,7 +81,7 @@ class TeleopExpert(Expert):
         self._verdict, self._last_command, self._is_paused = None, None, self.begins_paused
         status.control = Control.PERSON if self.demonstrates else Control.POLICY
         self._controls.reset()
-        if self._controls.read().leaves:  # all else that was pressed meanwhile was not meant for this attempt
+        if self._look()[0].leaves:  # all else that was pressed meanwhile was not meant for this attempt
             raise PersonLeftError
         self._controls.reset()
         self._acts = False
@@ -147,13 +147,7 @@ class TeleopExpert(Expert):
         """What the person wants now."""
         if not self.window.is_open:
             raise PersonLeftError
-        problem = ""
-        try:
-            self._wish = self._controls.read()
-        except Exception as error:  # a leader's cable
-            if self.robot is None:
-                raise
-            self._wish, problem = Wish({}), f"The leader does not answer: {error}"
+        self._wish, problem = self._look()
         if not problem and self._wish.leaves:
             problem = "You pressed Escape." if self.teleop.is_connected else "The leader is no longer connected."
         verdict = self._wish.verdict
@@ -163,6 +157,15 @@ class TeleopExpert(Expert):
             raise PersonLeftError
         self._is_paused ^= self._wish.toggles_pause
         self._verdict = verdict
+
+    def _look(self) -> tuple[Wish, str]:
+        """What the person wants; on a robot, a leader that does not answer wants nothing, and why it does not is said."""
+        try:
+            return self._controls.read(), ""
+        except Exception as error:  # a leader's cable
+            if self.robot is None:
+                raise
+            return Wish({}), f"The leader does not answer: {error}"
 
     def _pause(self) -> None:
         """Nothing moves until the person goes on, or ends the attempt."""
