@@ -40,6 +40,7 @@ from lerobot_playbyear.microphones.config import FileMicrophoneConfig, PortAudio
 
 RATE = 48000
 LATE_PERCENT = 1.0
+CAMERA_LATENCY_S = 0.02  # as of a quick USB camera: sound that is as old has come already
 _LOOK_S = 1.0
 
 
@@ -85,7 +86,12 @@ def acting(seconds: float, folder: Path, image_size: int, threads: int) -> Row:
     torch.set_num_threads(threads)
     with microphones(("gripper",), folder) as ears:
         config = joint_config(
-            fps=20, robot=arm(front=(image_size, image_size)), microphones=ears, episode_s=seconds, max_step=None
+            fps=20,
+            robot=arm(front=(image_size, image_size)),
+            microphones=ears,
+            episode_s=seconds,
+            max_step=None,
+            camera_latency_s=CAMERA_LATENCY_S,
         )
         with robot_env(config) as env:
             config.describe(env.observation_space, env.action_space)

@@ -29,6 +29,7 @@ import numpy as np
 
 RATE = 48000
 _CHUNK_S = 0.002
+_COARSE_CHUNK_S = 0.01
 _ALSA = "/usr/share/alsa/alsa.conf"
 
 
@@ -169,11 +170,15 @@ class Player(threading.Thread):
         channels: Of the source.
         sample_rate: Of the source [Hz].
         noise: Its standard deviation, of 32,768; 0: zeros, which no microphone in a room gives.
+        chunk_s: How much is written at a time [s].
     """
 
-    def __init__(self, fifo: Path, channels: int, sample_rate: int = RATE, noise: float = 5.0) -> None:
+    def __init__(
+        self, fifo: Path, channels: int, sample_rate: int = RATE, noise: float = 5.0, chunk_s: float = _CHUNK_S
+    ) -> None:
         super().__init__(name="player", daemon=True)
         self._fifo, self._channels, self._rate, self._noise = fifo, channels, sample_rate, noise
+        self._chunk_s = chunk_s
         self._ended, self._lock = threading.Event(), threading.Lock()
         self._waiting: list[tuple[float, np.ndarray]] = []
         self._file: int | None = None
@@ -196,7 +201,7 @@ class Player(threading.Thread):
     def run(self) -> None:
         with contextlib.suppress(OSError):  # others than root may not
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), -10)
-        rng, n_done, size, start = np.random.default_rng(0), 0, round(_CHUNK_S * self._rate), time.perf_counter()
+        rng, n_done, size, start = np.random.default_rng(0), 0, round(self._chunk_s * self._rate), time.perf_counter()
         while not self._ended.wait(max(start + (n_done + size) / self._rate - time.perf_counter(), 0)):
             chunk = np.round(rng.normal(0, self._noise, (size, self._channels))).astype(np.int32)
             with self._lock:
@@ -230,12 +235,12 @@ class Player(threading.Thread):
 
 @contextlib.contextmanager
 def playing_elsewhere(fifo: Path, channels: int, sample_rate: int = RATE) -> Iterator[None]:
-    """Quiet noise from a process of its own, so that to make it costs this one nothing."""
+    """Quiet noise from a process of its own, a little at a time, so that to make it costs this one next to nothing."""
     lines = [
         "import sys",
         f"sys.path.insert(0, {str(Path(__file__).parent)!r})",
         "from pathlib import Path; from sound_server import Player",
-        f"with Player(Path({str(fifo)!r}), {channels}, {sample_rate}): sys.stdin.read()",
+        f"with Player(Path({str(fifo)!r}), {channels}, {sample_rate}, chunk_s={_COARSE_CHUNK_S}): sys.stdin.read()",
     ]
     process = subprocess.Popen([sys.executable, "-c", "\n".join(lines)], stdin=subprocess.PIPE)
     try:

@@ -1,7 +1,9 @@
 """What is borrowed from the inside of LeRobot and torch is there, and borrowed in one place: a new version fails here first."""
 
 import ast
+import importlib
 import inspect
+import sys
 from pathlib import Path
 from pkgutil import resolve_name
 

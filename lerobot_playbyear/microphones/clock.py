@@ -21,7 +21,9 @@ class CardClock:
 
     def __init__(self, sample_rate: int, tolerance_s: float) -> None:
         self._rate, self._tolerance = sample_rate, tolerance_s
-        self._offsets: deque[tuple[int, float]] = deque()  # last sample's number + 1, and when sample 0 came by it [s]
+        # Last sample's number + 1, and when sample 0 came by it [s]: only those that no later one undercuts, so the first is
+        # the earliest of the last second.
+        self._offsets: deque[tuple[int, float]] = deque()
         self._late: list[tuple[int, float]] = []  # those since the last one in time
         self._late_since_s = 0.0
 
@@ -35,7 +37,7 @@ class CardClock:
         if self._offsets and offset - self._start > self._tolerance:
             return self._note_late(n_written, offset, came_s)
         self._late = []
-        self._offsets.append((n_written, offset))
+        self._keep(n_written, offset)
         while self._offsets[0][0] < n_written - _STEADY_S * self._rate:
             self._offsets.popleft()
         return 0
@@ -48,9 +50,16 @@ class CardClock:
             return 0
         lost = round((min(late for _, late in self._late) - self._start) * self._rate)
         shift = lost / self._rate
-        self._offsets = deque((n + lost, late - shift) for n, late in self._late)
-        self._late = []
+        late, self._late = self._late, []
+        self._offsets.clear()
+        for n, offset_of_late in late:
+            self._keep(n + lost, offset_of_late - shift)
         return lost
+
+    def _keep(self, n_written: int, offset: float) -> None:
+        while self._offsets and self._offsets[-1][1] >= offset:
+            self._offsets.pop()
+        self._offsets.append((n_written, offset))
 
     def restart(self) -> None:
         """Forgets what was: the card begins anew."""
@@ -68,4 +77,4 @@ class CardClock:
 
     @property
     def _start(self) -> float:
-        return min(offset for _, offset in self._offsets)
+        return self._offsets[0][1]

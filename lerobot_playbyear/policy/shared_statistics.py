@@ -75,17 +75,18 @@ class _Normalised(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         input, weight, mean, variance = ctx.saved_tensors
-        # As if mean and variance were constants; what they owe to the values is taken off below.
-        of_input, of_weight, of_bias = torch.ops.aten.native_batch_norm_backward(
-            gradients[0], input, weight, mean, variance, None, None, False, ctx.eps, [True, True, True]
+        _, of_weight, of_bias = torch.ops.aten.native_batch_norm_backward(
+            gradients[0], input, weight, mean, variance, None, None, False, ctx.eps, [False, True, True]
         )
         per_value = torch.stack([of_weight, of_bias])
         distributed.all_reduce(per_value)
         through_deviation, through_mean = per_value * (input.shape[1] / (n_processes() * input.numel()))
-        scale = torch.rsqrt(variance + ctx.eps)
-        slope = weight * scale * scale * through_deviation
-        offset = weight * scale * through_mean - slope * mean
-        of_input -= torch.addcmul(offset[:, None, None], input, slope[:, None, None]).to(of_input.dtype)
+        slope = weight * torch.rsqrt(variance + ctx.eps)
+        # What mean and variance owe to the values is a batch norm of them; what the values owe to themselves comes on top.
+        of_input = functional.batch_norm(
+            input, mean, variance, -slope * through_deviation, -slope * through_mean, eps=ctx.eps
+        )
+        of_input.addcmul_(gradients[0], slope[:, None, None].to(of_input.dtype))
         return of_input, of_weight, of_bias, None
 
 

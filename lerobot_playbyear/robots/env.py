@@ -1,5 +1,6 @@
 """A real robot as a Gymnasium environment, in real time."""
 
+import gc
 import logging
 import time
 from typing import Any
@@ -92,6 +93,8 @@ class RobotEnv(gym.Env):
         rig, config = self._rig, self.config
         rig.watchdog.rest()
         rig.attempt += 1
+        gc.collect()  # takes a quarter of a second with all that LeRobot imports, which an attempt has not
+        gc.freeze()
         while True:
             connect_or_ask(rig, self.person)
             try:
@@ -160,6 +163,7 @@ class RobotEnv(gym.Env):
         """The arm holds, and everything is let go."""
         if not self._is_closed:
             self._is_closed = True
+            gc.unfreeze()
             leave_rig(self._rig)
 
     # For an expert beside a policy
