@@ -128,13 +128,18 @@ def two_fingers(
 
 def listen(
     scene: Scene, steps: list[Contacts], synth: ContactSynth | None = None, seed: int = 0,
-    finger_speed: float = 0.0, bending: dict[str, Bending] | None = None,
+    finger_speed: float | list[np.ndarray] = 0.0, bending: dict[str, Bending] | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
-    """What each microphone hears of some control steps, int16."""
+    """What each microphone hears of some control steps, int16; the fingers' speed [m/s] is one, or of every physics step."""
     synth = synth or scene.synth()
     synth.reset(np.random.default_rng(seed))
-    still, fingers = np.zeros(scene.n_substeps), np.full(scene.n_substeps, finger_speed)
-    blocks = [synth.step(contacts, still, fingers, scene.ears, bending) for contacts in steps]
+    still = np.zeros(scene.n_substeps)
+    if isinstance(finger_speed, float):
+        finger_speed = [still + finger_speed] * len(steps)
+    blocks = [
+        synth.step(contacts, still, fingers, scene.ears, bending)
+        for contacts, fingers in zip(steps, finger_speed, strict=True)
+    ]
     return {ear: np.concatenate([block[ear] for block in blocks]) for ear in scene.ears}
 
 

@@ -261,6 +261,35 @@ def test_randomised_noise_has_another_tilt_in_every_episode():
     assert -0.1 < min(tilts) < max(tilts) - 0.4 < 1.0
 
 
+def touched_things(seeds):
+    """Log spectrograms of a touch at random time and speed in random episodes, and what was touched."""
+    things = ("cube", "wall", "table")
+    pairs = [SoundingPair(("gripper", thing), ("gripper", thing)) for thing in things]
+    made = ContactSynth(pairs, ("gripper",), 16000, 20, 0.002)
+    features, labels = [], []
+    for seed in seeds:
+        rng = np.random.default_rng([9, seed])
+        made.reset(rng)
+        label, speed = int(rng.integers(len(things))), np.exp(rng.uniform(np.log(0.04), np.log(0.4)))
+        contacts = touch(nothing(0.1), label, rng.uniform(0, 0.045), speed)
+        cut = {f.name: getattr(contacts, f.name) for f in dataclasses.fields(contacts)}
+        three = Contacts(**{n: v[:3] if n == "mass" else v[:, :3] for n, v in cut.items()})
+        still, ears = np.zeros(25), {"gripper": np.array(EARS["gripper"])}
+        blocks = [made.step(part(three, slice(i, i + 25)), still, still, ears)["gripper"] for i in (0, 25)]
+        power = np.abs(np.fft.rfft(np.array(blocks) * np.hanning(800), n=1280)[:, :320:2]) ** 2  # up to 4 kHz
+        features.append(np.log10(power + 1.0).ravel())
+        labels.append(label)
+    return np.array(features), np.array(labels)
+
+
+def test_a_linear_classifier_tells_cube_wall_and_table_apart_in_episodes_that_it_has_not_heard():
+    (features, labels), (unseen, wanted) = touched_things(range(250)), touched_things(range(1000, 1100))
+    mean, scale = features.mean(axis=0), features.std(axis=0)
+    features, unseen = (features - mean) / scale, (unseen - mean) / scale
+    weights = features.T @ np.linalg.solve(features @ features.T + 100.0 * np.eye(250), np.eye(3)[labels] - 1 / 3)
+    assert np.mean((unseen @ weights).argmax(axis=1) == wanted) >= 0.9
+
+
 # Silence, background, seams
 
 

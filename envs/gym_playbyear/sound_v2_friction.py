@@ -105,13 +105,17 @@ class Friction:
         Returns:
             (n_ears, n_cells, n_modes) complex.
         """
-        on_modes = (weights * band_shape(frequencies, rubs.band[:, None])) ** 2  # (n_pairs, n_modes)
+        sliding = rubs.amplitude.any(axis=0)
+        modes = np.flatnonzero(weights[sliding].any(axis=0))  # of bodies that slide; the others need no noise
+        on_modes = (weights[:, modes] * band_shape(frequencies[modes], rubs.band[:, None])) ** 2  # (n_pairs, modes)
         strength = np.sqrt((gains * rubs.amplitude) ** 2 @ on_modes) * (_RUBBING * np.sqrt(cell))
         repeat = round(self._duration / cell / strength.shape[1])
         if repeat > 1:
             strength = np.repeat(strength, repeat, axis=1)
-        noise = self._rng.standard_normal((strength.shape[1], 2 * strength.shape[2])).view(complex)
-        return strength * noise
+        noise = self._rng.standard_normal((strength.shape[1], 2 * len(modes))).view(complex)
+        kicks = np.zeros((*strength.shape[:2], len(frequencies)), complex)
+        kicks[:, :, modes] = strength * noise
+        return kicks
 
     def hiss(self, rubs: Rubs | None, gains: np.ndarray | None) -> np.ndarray | None:
         """What is heard beside the modes, (n_ears, n_samples), or None; `gains` (n_ears, n_substeps, n_pairs)."""
