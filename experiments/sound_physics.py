@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.protocol import RESULTS, command_line
-from experiments.sound_scenes import Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
+from experiments.sound_scenes import CONTROL_HZ, Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
 from gym_playbyear.sound import ContactPair, ContactSound
+from gym_playbyear.sound_v2 import ContactSynth
 
 _STEPS = (0.002, 0.001)  # s: the physics steps that are compared
 _TOLERANCE_DB, _TOLERANCE = 1.5, 0.10
@@ -166,6 +167,23 @@ def _delay(first: np.ndarray, second: np.ndarray, finer: int = 16) -> float:
     return (place if place < len(correlation) // 2 else place - len(correlation)) / finer
 
 
+def cost() -> str:
+    """Processor time of a control step of 50 ms at 16 kHz [ms]: fingers that close on a cube, background and all."""
+    scene, figures = two_fingers(), []
+    contacts, still = scene.contacts(0.6), np.zeros(scene.n_substeps)
+    for count in (1, 2):
+        ears = dict(list(scene.ears.items())[:count])
+        synth = ContactSynth(scene.pairs, list(ears), 16000, CONTROL_HZ, scene.model.opt.timestep)
+        times = []
+        for _ in range(20):
+            start = time.thread_time()
+            for each in contacts:
+                synth.step(each, still, still, ears)
+            times.append((time.thread_time() - start) / len(contacts))
+        figures.append(f"{1000 * min(times):.2f} ms with {count} microphone{'s' * (count > 1)}")
+    return f"a control step costs {', '.join(figures)}"
+
+
 def _version_one(rise: int) -> np.ndarray:
     """A force of 0.6 N that is reached in some physics steps, as `gym_playbyear.sound` plays it."""
     sound = ContactSound([ContactPair("x", ("cube", "table"), ("cube", "table"))], ("table",), 16000, 20, 0.002, 0.0)
@@ -208,6 +226,7 @@ def main() -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(Row._fields)
         writer.writerows(rows)
+    print(cost())
     print(f"{path}: {len(rows)} rows in {time.perf_counter() - start:.1f} s")
 
 

@@ -151,9 +151,10 @@ class ContactSynth:
             position = np.concatenate([position, self._crackle.positions(bending, len(force))], axis=1)
         gains, delays = self._paths.gains(force, position, ears)
         blows = [each for each in found if each is not None]
-        arrivals = (
-            self._arrivals(Blows(*map(np.concatenate, zip(*blows, strict=True))), gains, delays) if blows else None
-        )
+        arrivals = None
+        if blows:
+            all_blows = blows[0] if len(blows) == 1 else Blows(*map(np.concatenate, zip(*blows, strict=True)))
+            arrivals = self._arrivals(all_blows, gains, delays)
         pair_gains = gains[:, :, : len(self.pairs)]
         kicks = None
         if rubs is not None:

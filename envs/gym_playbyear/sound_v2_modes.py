@@ -114,7 +114,7 @@ class ModeBank:
         self._late = None
         if not both:
             return None
-        known = Arrivals(*(np.concatenate(column) for column in zip(*both, strict=True)))
+        known = both[0] if len(both) == 1 else Arrivals(*(np.concatenate(column) for column in zip(*both, strict=True)))
         late = known.time >= self._duration
         if late.any():
             self._late = Arrivals(known.time[late] - self._duration, known.ear[late], known.amplitudes[late])
