@@ -1,0 +1,488 @@
+"""Sound, version 2: it follows physics and not the simulator, the same seed sounds the same, and nothing silent is heard."""
+
+import copy
+import dataclasses
+import pickle
+
+import mujoco
+import numpy as np
+import pytest
+from scipy import signal
+
+from experiments import sound_physics
+from experiments.sound_scenes import Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
+from gym_playbyear.contact_kinematics import ContactReader, Contacts, SoundingPair, add_sensors, read_contacts
+from gym_playbyear.materials_v2 import GLASS, MATERIALS, STEEL, bar, cup, plate
+from gym_playbyear.sound_v2 import MICROPHONES, Bending, ContactSynth
+from gym_playbyear.sound_v2_background import Noise
+from gym_playbyear.sound_v2_blows import hertz_duration, pulse_spectrum
+from gym_playbyear.sound_v2_friction import _band_filter
+
+PAIRS = [
+    SoundingPair(("left_finger", "cube"), ("gripper", "cube")),
+    SoundingPair(("right_finger", "cube"), ("gripper", "cube")),
+    SoundingPair(("cube", "table"), ("cube", "table")),
+    SoundingPair(("left_finger", "bag"), ("gripper", "bag")),
+]
+LEFT, RIGHT, RESTING, BAG = range(len(PAIRS))
+EARS = {"gripper": (0, 0, 0.1), "left_finger": (0, 0.03, 0.05), "right_finger": (0, -0.03, 0.05),
+        "table": (0.3, 0, 0), "room": (1.0, 0, 1.0)}  # fmt: skip
+
+
+def synth(microphones=("gripper",), sample_rate=16000, control_hz=20, dt=0.002, seed=0, **options) -> ContactSynth:
+    made = ContactSynth(PAIRS, microphones, sample_rate, control_hz, dt, **{"noise_level": 0.0, **options})
+    made.reset(np.random.default_rng(seed))
+    return made
+
+
+def nothing(seconds: float, dt: float = 0.002) -> Contacts:
+    shape = (round(seconds / dt), len(PAIRS))
+    return Contacts(*(np.zeros(shape) for _ in range(4)), np.zeros((*shape, 3)), np.full(len(PAIRS), 0.1))
+
+
+def touch(contacts: Contacts, pair: int, at: float, speed=0.1, force=2.0, dt=0.002, until=None) -> Contacts:
+    first, last = round(at / dt), None if until is None else round(until / dt)
+    contacts.normal_force[first:last, pair] = force
+    contacts.approach_speed[first, pair] = speed
+    return contacts
+
+
+def slide(contacts: Contacts, pair: int, at: float, speed=0.1, force=1.3, until=None, dt=0.002) -> Contacts:
+    steps = slice(round(at / dt), None if until is None else round(until / dt))
+    contacts.normal_force[steps, pair], contacts.slip_speed[steps, pair] = force, speed
+    return contacts
+
+
+def part(contacts: Contacts, steps: slice) -> Contacts:
+    values = {f.name: getattr(contacts, f.name) for f in dataclasses.fields(contacts)}
+    return Contacts(**{name: value if name == "mass" else value[steps] for name, value in values.items()})
+
+
+def hear(made: ContactSynth, contacts: Contacts, finger_speed=0.0, bending=None) -> dict[str, np.ndarray]:
+    n = made.n_substeps
+    still, fingers = np.zeros(n), np.full(n, finger_speed)
+    positions = {name: np.array(EARS[name]) for name in made.microphones}
+    blocks = [
+        made.step(part(contacts, slice(start, start + n)), still, fingers, positions, bending)
+        for start in range(0, len(contacts.normal_force), n)
+    ]
+    return {name: np.concatenate([block[name] for block in blocks]) for name in made.microphones}
+
+
+@pytest.mark.parametrize("measure", sound_physics.MEASUREMENTS, ids=lambda measure: measure.__name__)
+def test_sound_follows_physics(measure):
+    wrong = [row for row in measure() if not row.holds]
+    assert not wrong, wrong
+
+
+# What the sensors tell
+
+
+def tumbling_box() -> Scene:
+    scene = box_on_table(softness=0.02)
+    scene.data.qpos[2], scene.data.qvel[:] = 0.06, (0.4, -0.2, -0.5, 6.0, -4.0, 3.0)
+    return scene
+
+
+def test_speeds_are_those_of_the_bodies_at_the_contact():
+    scene = tumbling_box()
+    other = mujoco.MjData(scene.model)
+    other.qpos[:], other.qvel[:] = scene.data.qpos, scene.data.qvel
+    contacts = scene.contacts(0.3)
+    table = {name: np.concatenate([getattr(c, name) for c in contacts])[:, 0] for name in
+             ("approach_speed", "slip_speed", "normal_force", "tangential_force")}  # fmt: skip
+    places = np.concatenate([c.position for c in contacts])[:, 0]
+    compared = 0
+    for step in range(len(table["slip_speed"])):
+        mujoco.mj_forward(scene.model, other)
+        points = [other.contact[i] for i in range(other.ncon)]
+        near = [i for i, point in enumerate(points) if np.allclose(point.pos, places[step], atol=1e-6)]
+        if table["normal_force"][step] > 0.01 and near:
+            jacobian = np.zeros((3, scene.model.nv))
+            mujoco.mj_jac(scene.model, other, jacobian, None, places[step], scene.model.body("box").id)
+            velocity, force = jacobian @ other.qvel, np.zeros(6)
+            assert table["approach_speed"][step] == pytest.approx(-velocity[2], abs=1e-3)
+            assert table["slip_speed"][step] == pytest.approx(np.hypot(*velocity[:2]), abs=1e-3)
+            if other.ncon == 1:
+                mujoco.mj_contactForce(scene.model, other, near[0], force)
+                assert table["normal_force"][step] == pytest.approx(force[0], rel=1e-2, abs=1e-2)
+                assert table["tangential_force"][step] == pytest.approx(np.hypot(*force[1:3]), rel=1e-2, abs=1e-2)
+            compared += 1
+        mujoco.mj_step(scene.model, other)
+    assert compared > 10
+
+
+@pytest.mark.parametrize("timestep", [0.002, 0.0005])
+def test_the_first_step_of_a_contact_has_the_speed_of_the_impact(timestep):
+    contacts = box_on_table(timestep=timestep, speed=0.3).contacts(0.15)
+    force, speed = (np.concatenate([getattr(c, f) for c in contacts])[:, 0] for f in ("normal_force", "approach_speed"))
+    assert speed[np.flatnonzero(force)[0]] == pytest.approx(0.3, rel=1e-3)
+
+
+def test_a_resting_box_presses_with_its_weight_and_does_not_move():
+    last = box_on_table().contacts(0.5)[-1]
+    assert last.normal_force.mean() == pytest.approx(0.128 * 9.81, rel=0.01)
+    assert np.abs(last.slip_speed).max() < 1e-3
+    assert last.tangential_force.max() < 0.01
+
+
+def test_a_box_that_is_pulled_slips_with_the_speed_of_the_pull_and_feels_friction():
+    last = box_pulled(0.1, 3.0).contacts(0.5)[-1]
+    touching = last.normal_force[:, 0] > 0
+    assert last.normal_force.mean() == pytest.approx(3.0, rel=0.1)
+    np.testing.assert_allclose(last.slip_speed[touching, 0], 0.1, rtol=0.03)
+    ratio = last.tangential_force[touching, 0] / last.normal_force[touching, 0]
+    np.testing.assert_allclose(ratio, 0.4, rtol=0.02)
+
+
+def test_two_fingers_that_squeeze_are_two_forces():
+    scene = two_fingers()
+    last = scene.contacts(0.6)[-1]
+    np.testing.assert_allclose(last.normal_force[-1, 1:3], 5.0, rtol=0.05)
+    assert not last.normal_force[:, 0].any()  # they do not meet
+
+
+def test_fingers_that_meet_click_once_and_those_that_open_do_not():
+    scene = two_fingers(box=False)
+    contacts = scene.contacts(0.8)
+    pressing = np.concatenate([c.normal_force for c in contacts])[:, 0] > 0
+    speed = np.concatenate([c.approach_speed for c in contacts])[:, 0]
+    assert np.diff(pressing.astype(int)).tolist().count(1) == 1
+    assert speed[np.argmax(pressing)] == pytest.approx(0.1, rel=0.1)  # both at 5 cm/s
+    scene.data.ctrl[:] = 0.05
+    opening = scene.contacts(1.0)[2:]
+    assert not any(c.normal_force.any() for c in opening)
+
+
+def test_a_reader_and_its_copy_read_the_same():
+    scene = box_on_table()
+    reader = pickle.loads(pickle.dumps(ContactReader(scene.model, scene.pairs)))
+    data = np.random.default_rng(0).uniform(size=(25, scene.model.nsensordata))
+    for a, b in zip(
+        dataclasses.astuple(reader.read(data)),
+        dataclasses.astuple(read_contacts(scene.model, data, scene.pairs)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(a, b)
+    names = [scene.model.sensor(i).name for i in range(scene.model.nsensor)]
+    assert all(name.startswith("sound:") for name in names)
+
+
+def test_a_body_with_all_that_hangs_on_it_is_one_side():
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_body(name="table").add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1])
+    hand = spec.worldbody.add_body(name="hand", pos=[0, 0, 0.049])
+    hand.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
+    hand.add_body(name="finger", pos=[0, 0, -0.03]).add_geom(size=[0.02, 0, 0])
+    pairs = [SoundingPair(("hand", "table"), ("gripper", "table"), subtrees=(True, False))]
+    add_sensors(spec, pairs)
+    scene = Scene(spec.compile(), pairs)
+    assert scene.contacts(0.1)[0].normal_force.any()
+
+
+@pytest.mark.parametrize(
+    ("pairs", "message"),
+    [
+        ([SoundingPair(("box", "table"), ("cube", "table"))] * 2, r"same bodies: box\|table"),
+        ([SoundingPair(("box", "moon"), ("cube", "table"))], "'moon'"),
+        ([SoundingPair(("box", "table"), ("cube", "table"), stop="hinge")], "'hinge'"),
+    ],
+)
+def test_unusable_pairs_are_refused(pairs, message):
+    spec = mujoco.MjSpec()
+    for name in ("box", "table"):
+        spec.worldbody.add_body(name=name)
+    with pytest.raises(ValueError, match=message):
+        add_sensors(spec, pairs)
+
+
+# Episodes
+
+
+def busy() -> Contacts:
+    contacts = slide(touch(nothing(1.0), LEFT, 0.11), RESTING, 0.05, until=0.6)
+    return touch(touch(contacts, RIGHT, 0.23, until=0.4), BAG, 0.7)
+
+
+def test_same_seed_same_bytes_and_another_seed_another_sound():
+    first, again, other = (hear(synth(seed=seed, noise_level=1.0), busy())["gripper"] for seed in (5, 5, 6))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_reset_repeats_the_episode():
+    made = synth(noise_level=1.0)
+    first = hear(made, busy(), finger_speed=0.03)["gripper"]
+    made.reset(np.random.default_rng(0))
+    np.testing.assert_array_equal(hear(made, busy(), finger_speed=0.03)["gripper"], first)
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda made: pickle.loads(pickle.dumps(made))])
+def test_a_copy_goes_on_like_the_original(duplicate):
+    made = synth(noise_level=1.0)
+    hear(made, part(busy(), slice(0, 250)), finger_speed=0.03)
+    rest = part(busy(), slice(250, None))
+    other = duplicate(made)
+    np.testing.assert_array_equal(hear(made, rest)["gripper"], hear(other, rest)["gripper"])
+
+
+def test_the_number_of_blows_does_not_change_the_noise():
+    quiet, loud = (
+        hear(synth(noise_level=1.0, seed=3), contacts)["gripper"]
+        for contacts in (nothing(2.0), touch(touch(nothing(2.0), LEFT, 0.1, until=0.2), LEFT, 0.3, until=0.4))
+    )
+    assert not np.array_equal(quiet[:8000], loud[:8000])
+    np.testing.assert_array_equal(quiet[-8000:], loud[-8000:])
+
+
+def test_a_second_microphone_leaves_the_first_as_it_is():
+    alone, both = (hear(synth(ears, noise_level=1.0), busy()) for ears in (("gripper",), ("gripper", "room")))
+    np.testing.assert_array_equal(alone["gripper"], both["gripper"])
+
+
+@pytest.mark.parametrize(("randomise", "least", "most"), [(False, 0.0, 1.6), (True, 2.0, 20.0)])
+def test_episodes_differ_in_level_and_pitch_if_they_shall(randomise, least, most):
+    waves = [
+        hear(synth(seed=seed, randomise=randomise), touch(nothing(0.2), LEFT, 0.1))["gripper"] for seed in range(8)
+    ]
+    assert least <= np.std([level(wave) for wave in waves]) <= most
+    peaks = [np.argmax(np.abs(np.fft.rfft(wave))) for wave in waves]
+    assert (np.std(peaks) / np.mean(peaks) > 0.05) == randomise
+
+
+def test_randomised_noise_has_another_tilt_in_every_episode():
+    tilts = []
+    for seed in range(6):
+        power = signal.welch(
+            hear(synth(seed=seed, noise_level=20.0), nothing(2.0))["gripper"] / 32768.0, 16000, nperseg=2048
+        )
+        heard = (power[0] > 300) & (power[0] < 6000)
+        tilts.append(-np.polyfit(np.log10(power[0][heard]), np.log10(power[1][heard]), 1)[0])
+    assert -0.1 < min(tilts) < max(tilts) - 0.4 < 1.0
+
+
+def touched_things(seeds):
+    """Log spectrograms of a touch at random time and speed in random episodes, and what was touched."""
+    things = ("cube", "wall", "table")
+    pairs = [SoundingPair(("gripper", thing), ("gripper", thing)) for thing in things]
+    made = ContactSynth(pairs, ("gripper",), 16000, 20, 0.002)
+    features, labels = [], []
+    for seed in seeds:
+        rng = np.random.default_rng([9, seed])
+        made.reset(rng)
+        label, speed = int(rng.integers(len(things))), np.exp(rng.uniform(np.log(0.04), np.log(0.4)))
+        contacts = touch(nothing(0.1), label, rng.uniform(0, 0.045), speed)
+        cut = {f.name: getattr(contacts, f.name) for f in dataclasses.fields(contacts)}
+        three = Contacts(**{n: v[:3] if n == "mass" else v[:, :3] for n, v in cut.items()})
+        still, ears = np.zeros(25), {"gripper": np.array(EARS["gripper"])}
+        blocks = [made.step(part(three, slice(i, i + 25)), still, still, ears)["gripper"] for i in (0, 25)]
+        power = np.abs(np.fft.rfft(np.array(blocks) * np.hanning(800), n=1280)[:, :320:2]) ** 2  # up to 4 kHz
+        features.append(np.log10(power + 1.0).ravel())
+        labels.append(label)
+    return np.array(features), np.array(labels)
+
+
+def test_a_linear_classifier_tells_cube_wall_and_table_apart_in_episodes_that_it_has_not_heard():
+    (features, labels), (unseen, wanted) = touched_things(range(250)), touched_things(range(1000, 1100))
+    mean, scale = features.mean(axis=0), features.std(axis=0)
+    features, unseen = (features - mean) / scale, (unseen - mean) / scale
+    weights = features.T @ np.linalg.solve(features @ features.T + 100.0 * np.eye(250), np.eye(3)[labels] - 1 / 3)
+    assert np.mean((unseen @ weights).argmax(axis=1) == wanted) >= 0.9
+
+
+# Silence, background, seams
+
+
+@pytest.mark.parametrize("sample_rate", [8000, 16000, 44100, 48000])
+def test_nothing_silent_is_audible(sample_rate):
+    heard = hear(synth(tuple(EARS), sample_rate), touch(nothing(0.4), RESTING, 0.0, speed=0.0))
+    assert all(wave.dtype == np.int16 and not wave.any() for wave in heard.values())
+    assert all(len(wave) == 0.4 * sample_rate for wave in heard.values())
+
+
+def test_what_touches_already_makes_no_click_nor_does_the_jitter_of_a_solver():
+    rng = np.random.default_rng(0)
+    contacts = touch(nothing(1.0), RESTING, 0.0, speed=0.0)
+    contacts.normal_force[:, RESTING] += rng.uniform(-0.3, 0.3, 500)
+    contacts.approach_speed[:, RESTING] = rng.uniform(-0.0008, 0.0008, 500)
+    contacts.slip_speed[:, RESTING] = rng.uniform(0, 0.002, 500)
+    assert not hear(synth(), contacts)["gripper"].any()
+
+
+def test_a_sound_ends():
+    wave = hear(synth(), touch(slide(nothing(3.0), RESTING, 0.1, until=0.3), LEFT, 0.15))["gripper"]
+    assert wave[:8000].any()
+    assert not wave[-8000:].any()
+
+
+def test_a_body_that_hops_as_it_slides_does_not_rattle():
+    contacts = nothing(1.0)
+    for start in range(0, 500, 10):  # touches every 20 ms, and comes down with less than friction times slip speed
+        contacts.normal_force[start : start + 4, RESTING], contacts.slip_speed[:, RESTING] = 3.0, 0.2
+        contacts.approach_speed[start, RESTING] = 0.08
+    smooth = slide(nothing(1.0), RESTING, 0.0, speed=0.2, force=1.2)
+    hopping, sliding = (level(hear(synth(("table",)), each)["table"][4000:]) for each in (contacts, smooth))
+    assert hopping == pytest.approx(sliding, abs=1.5)
+
+
+@pytest.mark.parametrize("control_hz", [10, 100])
+def test_a_blow_does_not_depend_on_where_control_steps_begin(control_hz):
+    contacts = touch(touch(nothing(0.5), LEFT, 0.098), RESTING, 0.24, speed=0.4)
+    whole, split = (hear(synth(control_hz=hz), contacts)["gripper"].astype(int) for hz in (20, control_hz))
+    assert np.abs(whole).max() > 500
+    assert np.abs(whole - split).max() <= 1
+
+
+def test_the_same_spectrum_at_16_and_48_khz():
+    contacts = touch(nothing(0.3), LEFT, 0.05)
+    low, high = (hear(synth(sample_rate=rate), contacts)["gripper"] / 32768.0 for rate in (16000, 48000))
+    bins = slice(30, 1000)  # of 3.3 Hz: below 3.3 kHz
+    a, b = np.abs(np.fft.rfft(low))[bins], np.abs(np.fft.rfft(high))[bins] / 3
+    assert np.abs(20 * np.log10(a / b))[a > 0.05 * a.max()].max() < 1.0
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])
+@pytest.mark.parametrize("sample_rate", [16000, 48000])
+def test_noise_falls_with_its_tilt_at_the_same_level(tilt, sample_rate):
+    wave = Noise([np.random.default_rng(0)], sample_rate, tilt).next(4 * sample_rate)[0]
+    frequency, power = signal.welch(wave, sample_rate, nperseg=sample_rate // 10)
+    heard = (frequency > 100) & (frequency < 5000)
+    assert -np.polyfit(np.log10(frequency[heard]), np.log10(power[heard]), 1)[0] == pytest.approx(tilt, abs=0.15)
+    rms = np.sqrt(power[frequency < 8000].sum() * (frequency[1] - frequency[0]))
+    assert 20 * np.log10(rms) == pytest.approx(-61, abs=0.7)
+
+
+@pytest.mark.parametrize("band", [60.0, 900.0, 6000.0])
+def test_hiss_is_as_loud_in_every_band(band):
+    white = np.random.default_rng(0).standard_normal(200_000)
+    assert np.std(signal.lfilter(*_band_filter(band, 16000), white)) == pytest.approx(1.0, rel=0.1)
+
+
+def test_the_drive_whines_higher_the_faster_the_fingers_move():
+    slow, fast = (hear(synth(), nothing(0.5), finger_speed=speed)["gripper"] for speed in (0.02, 0.05))
+    assert centroid(fast) > 1.5 * centroid(slow)
+    assert level(fast) > -45
+
+
+# Paths
+
+
+def test_a_finger_that_holds_the_cube_hears_it_land():
+    def landing(force):
+        contacts = touch(nothing(0.6), LEFT, 0.0, speed=0.0, force=force) if force else nothing(0.6)
+        wave = hear(synth(("left_finger",)), touch(contacts, RESTING, 0.4, speed=0.2))["left_finger"]
+        return level(wave[6400:])
+
+    levels = [landing(force) for force in (0.0, 0.5, 20.0)]
+    assert levels[0] + 5 < levels[1] < levels[2]
+
+
+def test_a_sound_in_the_air_arrives_later_the_farther_it_comes():
+    made = ContactSynth(PAIRS, ("room",), 48000, 20, 0.002, 0.0, randomise=False)
+    onsets = []
+    for distance in (0.5, 1.5):
+        made.reset(np.random.default_rng(0))
+        contacts = touch(nothing(0.05), RESTING, 0.01, speed=0.5)
+        block = made.step(contacts, np.zeros(25), np.zeros(25), {"room": np.array([distance, 0, 0])})["room"]
+        onsets.append(np.argmax(np.abs(block) > 0.05 * np.abs(block).max()) / 48000)
+    assert onsets[1] - onsets[0] == pytest.approx(1 / 343, abs=2e-4)
+
+
+def test_a_blow_that_arrives_in_the_next_step_is_heard_there():
+    made = ContactSynth(PAIRS, ("room",), 16000, 100, 0.002, 0.0, randomise=False)
+    contacts, ear = touch(nothing(0.01), RESTING, 0.008, speed=0.5), {"room": np.array([3.0, 0, 0])}
+    blocks = [
+        made.step(each, np.zeros(5), np.zeros(5), ear)["room"] for each in (contacts, nothing(0.01), nothing(0.01))
+    ]
+    assert not blocks[0].any()
+    assert blocks[1].any()
+
+
+# Bags
+
+
+def bent(speed, seed=0):
+    bending = {"bag": Bending(np.full(25, speed), np.array([0, 0.03, 0]))}
+    return hear(synth(seed=seed, randomise=False), nothing(3.0), bending=bending)["gripper"]
+
+
+def test_a_bag_crackles_more_the_faster_it_bends_and_not_at_all_at_rest():
+    assert not bent(0.0).any()
+    levels = [level(bent(speed)) for speed in (0.3, 1.0, 4.0)]
+    assert levels[0] < levels[1] < levels[2]
+    frames = np.array([level(frame) for frame in bent(0.3).reshape(60, -1)])
+    assert frames.max() > np.median(frames) + 15  # clicks, not noise
+
+
+def test_what_does_not_crackle_cannot_bend():
+    with pytest.raises(ValueError, match=r"names cube; bodies that crackle: bag"):
+        hear(synth(), nothing(0.05), bending={"cube": Bending(np.zeros(25), np.zeros(3))})
+
+
+# Materials and formulas
+
+
+def test_textbook_modes():
+    free, clamped = bar(STEEL, 0.1, 0.001, 3), bar(STEEL, 0.1, 0.001, 2, clamped=True)
+    assert [f / free[0] for f in free] == pytest.approx([1, 2.756, 5.404], rel=1e-3)
+    assert clamped[1] / clamped[0] == pytest.approx(6.267, rel=1e-3)
+    rim = cup(GLASS, 0.035, 0.0015, (2, 3, 4))
+    assert [f / rim[0] for f in rim] == pytest.approx([1, 2.83, 5.42], rel=1e-2)
+    square = plate(STEEL, (0.2, 0.2), 0.001, "11 12 22")
+    assert [f / square[0] for f in square] == pytest.approx([1, 2.5, 4.0])
+
+
+def test_hertz_contact_is_shorter_for_what_is_fast_light_and_hard():
+    usual = hertz_duration(0.1, 1e9, 0.1)
+    assert hertz_duration(0.1, 1e9, 1.0) == pytest.approx(usual * 10**-0.2)
+    assert hertz_duration(0.01, 1e9, 0.1) == pytest.approx(usual * 10**-0.4)
+    assert hertz_duration(0.1, 1e10, 0.1) == pytest.approx(usual * 10**-0.4)
+
+
+def test_a_pulse_is_full_below_its_band_and_falls_by_12_db_per_octave_above():
+    assert pulse_spectrum(1.0, 0.001) == pytest.approx(1.0, abs=1e-3)
+    high = pulse_spectrum(np.array([8000.0, 16000.0]), 0.002)
+    assert 20 * np.log10(high[0] / high[1]) == pytest.approx(12, abs=1.5)
+
+
+def test_every_material_is_whole():
+    for name, material in MATERIALS.items():
+        assert len(material.frequencies) == len(material.decays) > 0, name
+        assert min(*material.frequencies, *material.decays) > 0, name
+    wanted = "cube wall table tray gripper peanuts screws keys pouch bag bottle chips pens candies cloth sponge"
+    assert set(wanted.split()) <= set(MATERIALS)
+    assert {"gripper", "left_finger", "right_finger", "room"} <= set(MICROPHONES)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sample_rate": 16001}, r"sample_rate 16001 is not a multiple of control_hz 20"),
+        ({"sample_rate": 4000}, "sample_rate is 4000.*at least 8000"),
+        ({"physics_dt": 0.003}, r"physics_dt 0\.003.*0\.002"),
+        ({"microphones": ("ceiling",)}, "ceiling.*gripper"),
+        ({"microphones": ()}, "at least one"),
+        ({"noise_level": -1.0}, "noise_level is -1.0"),
+        ({"pairs": [SoundingPair(("a", "b"), ("cube", "jelly"))]}, "'jelly'"),
+    ],
+)
+def test_unusable_options_are_refused(changes, message):
+    usual = {"pairs": PAIRS, "microphones": ("gripper",), "sample_rate": 16000, "control_hz": 20, "physics_dt": 0.002}
+    with pytest.raises(ValueError, match=message):
+        ContactSynth(**(usual | changes))
+
+
+def test_wrong_or_diverged_contacts_are_refused():
+    made, ear, still = synth(), {"gripper": np.zeros(3)}, np.zeros(25)
+    with pytest.raises(ValueError, match=r"\(10, 4\); wanted \(25, 4\)"):
+        made.step(nothing(0.02), still, still, ear)
+    with pytest.raises(ValueError, match="lacks gripper"):
+        made.step(nothing(0.05), still, still, {})
+    with pytest.raises(ValueError, match="not finite"):
+        made.step(touch(nothing(0.05), LEFT, 0.0, speed=np.nan), still, still, ear)
+
+
+def test_listening_to_scenes_leaves_them_as_they_are():
+    scene = box_on_table(speed=0.2)
+    contacts = scene.contacts(0.1)
+    np.testing.assert_array_equal(listen(scene, contacts)["table"], listen(scene, contacts)["table"])
