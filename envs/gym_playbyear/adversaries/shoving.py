@@ -44,12 +44,12 @@ SHOVES = {
     "shove": Shove(step=0.005, feels=True),
     "bat": Shove(step=0.025, closed=True, feels=True),
     "nudge": Shove(),
-    "nudge_beside": Shove(beside=True),
+    "nudge_beside": Shove(beside=True, spare=0.007),
 }
 _RUN_UP = 0.014  # m before the nearest possible cube
 _BACK_OFF = 0.004  # m
 _ASIDE = 0.055  # m: beside the line a hand passes the cube
-_SIDE_GRIP = 0.010  # m short of the line: that deep the fingers are around the cube
+_SIDE_GRIP = 0.020  # m short of the line: that deep the fingers are around the cube
 
 
 class ShovingScript(DeafScript):

@@ -4,17 +4,19 @@ A script keeps a belief about the cube's place, taps where a tap tells most, and
 fingers. If it holds nothing it goes on, as long as the attempt lasts.
 """
 
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 
 from gym_playbyear.adversaries.belief import CubeBelief
-from gym_playbyear.adversaries.script import GRASP_HEIGHT, TIP_BELOW_HAND, Actions, DeafScript
+from gym_playbyear.adversaries.script import GRASP_HEIGHT, TIP_BELOW_HAND, Actions, DeafScript, Verdict
 from gym_playbyear.adversaries.view import TaskFacts
 from gym_playbyear.arena import CUBE_HALF_SIZE
 from gym_playbyear.arm import ACTION_SCALE
 
 _TOP = 2 * CUBE_HALF_SIZE + TIP_BELOW_HAND  # m: the hand's height above the table when the tips rest on the cube
+_SLOW, _SURE_LAG = 0.002, 0.0007  # m: a hand that is lowered this slowly stops where the lag is that large
 _GRASP_STEPS = 22  # from a tap to a lifted cube, and one tap more
 _SPACING = 0.002  # m: between the places that are considered for a tap
 
@@ -29,7 +31,7 @@ class Tap:
         depth: How far below the cube's top the hand is sent; it stops there if nothing is in its way.
         clear: How far above the cube's top the hand travels.
         lag: The hand is this much higher than it was sent: blocked.
-        averaged: Measurements in a row whose mean has to say so.
+        averaged: Measurements whose mean has to say so; if they are many, what it is in the air is measured as well.
         aside: How far beside the line the hand taps, so that its fingers meet the cube's rim alone.
         scan: From one end of the range to the other in steps of this length; None: where a tap tells most.
         sure: The script closes the fingers where the cube is between them with this probability.
@@ -48,7 +50,8 @@ class Tap:
 
 TAPS = {
     "tap_fast": Tap(),
-    "tap_gentle": Tap(step=0.001, depth=0.005, clear=0.004, averaged=2),
+    "tap_gentle": Tap(step=0.001, depth=0.004, clear=0.003, lag=0.0005, averaged=2),
+    "tap_feather": Tap(step=0.004, depth=0.0012, clear=0.002, lag=0.00008, averaged=14),
     "tap_closed": Tap(closed=True),
     "tap_along": Tap(scan=0.012),
     "tap_across": Tap(aside=0.022),
@@ -115,7 +118,7 @@ class TappingScript(DeafScript):
         """Whether the time left is enough for one grasp alone."""
         return self.steps_left < _GRASP_STEPS
 
-    def _tap(self, place: float):
+    def _tap(self, place: float) -> Verdict:
         """Lowers the hand there. Whether something was in its way."""
         above = self._on_line(place, _TOP + self.tap.clear)
         above[0] -= self.tap.aside
@@ -123,18 +126,24 @@ class TappingScript(DeafScript):
             yield from self._rise(_TOP + self.tap.clear)
         yield from self._go(above, settle=2)
         self._recalibrate()
-        below = above - np.array([0, 0, self.tap.clear + self.tap.depth])
+        rest = (yield from self._mean_lag()) if self.tap.averaged > 2 else 0.0
+        below = above[2] - self.tap.clear - self.tap.depth
         recent: list[float] = []
-        while self._sent[2] > below[2] + 1e-4:
-            yield from self._step_down(below)
-            recent = [*recent, float(self.lag[2])][-self.tap.averaged :]
-            if len(recent) == self.tap.averaged and np.mean(recent) > self.tap.lag and self.tap.step < ACTION_SCALE:
+        while self._sent[2] > below + 1e-4:
+            yield self._move(np.array([0, 0, max(below - self._sent[2], -self.tap.step)]))
+            recent = [*recent, float(self.lag[2])][-2:]
+            if self.tap.step < _SLOW and len(recent) == 2 and np.mean(recent) > max(self.tap.lag, _SURE_LAG):
                 return True
-        yield from self._wait(self.tap.averaged)
-        return bool(self.lag[2] > self.tap.lag)
+        yield from self._wait(1)
+        return bool((yield from self._mean_lag()) - rest > self.tap.lag)
 
-    def _step_down(self, below: np.ndarray) -> Actions:
-        yield self._move(np.array([0, 0, max(below[2] - self._sent[2], -self.tap.step)]))
+    def _mean_lag(self) -> Generator[np.ndarray, None, float]:
+        """How much higher than it was sent the hand is [m], over as many measurements as the tap averages."""
+        lags = [float(self.lag[2])]
+        for _ in range(self.tap.averaged - 1):
+            yield self._move(np.zeros(3))
+            lags.append(float(self.lag[2]))
+        return float(np.mean(lags))
 
     def _try(self, place: float) -> Actions:
         """Closes the fingers around what should be between them."""

@@ -95,7 +95,7 @@ class Twins:
         for action in actions:
             view, done, _ = self.absent.advance(action)
             measured.append(view.agent_pos)
-            if done:
+            if done and not self._must_remove:  # a removed object is taken for one that was shoved
                 break
         return _Run(np.stack(measured), None)
 
@@ -132,10 +132,7 @@ def _digests(env: Any, seed: int, actions: list[np.ndarray], begun) -> list[dict
     observations = [env.reset(seed=seed)[0]]
     begun()
     for action in actions:
-        observation, _, terminated, truncated, _ = env.step(action)
-        observations.append(observation)
-        if terminated or truncated:
-            break
+        observations.append(env.step(action)[0])
     return [
         {key: hashlib.sha256(value.tobytes()).hexdigest() for key, value in _flat(seen) if not key.startswith("audio")}
         for seen in observations
