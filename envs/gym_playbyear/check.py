@@ -2,8 +2,9 @@
 
     python -m gym_playbyear.check OccludedGrasp-v0 --episodes=100 --output=check.json
 
-The expert must solve the task; blind scripts (they know what the camera shows and feel nothing) and deaf scripts (they feel with the
-arm) must not; and nothing but sound may tell that the hidden object was touched. The exit status is 1 where a limit is broken.
+The expert must solve the task. Blind scripts, which know what the camera shows and feel nothing, must not, nor must deaf
+scripts, which feel with the arm; and nothing but sound may tell that the hidden object was touched. The exit status is 1
+where a limit is broken.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players
+from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players, promised_limits
 from gym_playbyear.adversaries.twin import TwinResult, twin_test
 
 FIRST_SEED = 80000  # nothing was tuned on episodes from here on
@@ -100,14 +101,15 @@ def check(
         names: Of the players; all by default.
         twin: Whether to compare twin worlds.
         jobs: Processes side by side.
-        limits: What the task promises.
+        limits: What the task promises; by default what it says itself, or else `Limits()`.
         learned: Results of learned adversaries: `name`, `successes`, `n_episodes`, `hears`.
         options: For `gymnasium.make`.
 
     Raises:
         ValueError: A name is not among the task's players.
     """
-    options, limits = options or {}, limits or Limits()
+    options = options or {}
+    limits = limits or Limits(**promised_limits(task, **options))
     known = players(task, **options)
     for name in names or []:
         if name not in known:
@@ -218,12 +220,14 @@ def main() -> int:
     parser.add_argument("task", help="such as OccludedGrasp-v0")
     parser.add_argument("--episodes", type=int, default=100, help="of each player and of the twin test (default: 100)")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"of the first episode (default: {FIRST_SEED})")
-    parser.add_argument("--players", nargs="+", help=f"only these: {EXPERT}, or names of {' and '.join(KINDS[1:])} scripts")
+    parser.add_argument(
+        "--players", nargs="+", help=f"only these: {EXPERT}, or names of {' and '.join(KINDS[1:])} scripts"
+    )
     parser.add_argument("--no-twin", action="store_true", help="do not compare twin worlds")
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side (default: 1)")
     parser.add_argument("--variant", help="of the task")
     parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
-    parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments/adversaries.py to judge, too")
+    parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments.adversaries")
     parser.add_argument("--output", type=Path, help="a JSON file for the results")
     arguments = parser.parse_args()
     given = {"variant": arguments.variant, "horizon": arguments.horizon}

@@ -1,1 +1,1 @@
-"""Adversaries: scripts and learners that try to solve the tasks without hearing. A task is worth hearing for as far as they fail."""
+"""Adversaries: whoever tries to solve the tasks without hearing. A task is worth hearing for as far as they fail."""

@@ -41,7 +41,9 @@ class CubeBelief:
             hand: Along the line [m], one or (...,).
             opening: Between the fingers [m].
         """
-        offset = np.abs(np.asarray(hand)[..., None, None] - self.places[:, None])  # (..., places, 1): by symmetry one finger
+        offset = np.abs(
+            np.asarray(hand)[..., None, None] - self.places[:, None]
+        )  # (..., places, 1): by symmetry one finger
         inner, outer = opening / 2, opening / 2 + FINGER_THICKNESS
         gap = np.maximum(offset - outer, inner - offset) - self.extents + _SLIDES  # negative where it rests on the cube
         return _MISTAKE + (1 - 2 * _MISTAKE) / (1 + np.exp(np.clip(gap / _SOFTNESS, -50, 50)))

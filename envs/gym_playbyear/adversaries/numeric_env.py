@@ -1,7 +1,8 @@
 """A task in numbers, for learners: a deaf player's observation, a dense privileged reward, and nothing is rendered.
 
-What a learner sees has two parts. The first is the player's: what a deaf policy gets, and, if it hears, how hard the hand touches.
-The second is the truth behind the scenes, for a critic alone, which helps to train the player and is gone when it plays.
+What a learner sees has two parts. The first is the player's: what a deaf policy gets, and, if it hears, how hard the hand
+touches. The second is the truth behind the scenes, for a critic alone, which helps to train the player and is not there
+when it plays.
 """
 
 from typing import Any
@@ -44,6 +45,8 @@ class NumericTask(gym.Env):
         self.observation_space = spaces.Box(-np.inf, np.inf, (N_PLAYER + N_TRUTH,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._view: DeafView
+        self._sent: np.ndarray
+        self._touch: np.ndarray
         self._closes = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -51,7 +54,7 @@ class NumericTask(gym.Env):
         episode = int(self.np_random.integers(2**31)) if seed is None else seed
         self._view = self.task.begin(episode, **(options or {}))
         self._first_place = self._object()
-        self._last_action = np.zeros(4)
+        self._last_action: np.ndarray = np.zeros(4)
         self._closes, self._changed_at = False, -(10**6)
         self._sent = self._hand()
         self._touch = np.zeros(2)
@@ -60,14 +63,31 @@ class NumericTask(gym.Env):
 
     def step(self, action):
         control = self.control(action)
-        done, info = False, {}
-        self._touch = np.zeros(2)
+        done = False
+        info: dict[str, Any] = {}
+        self.begin_action()
         for _ in range(self.repeat):
             done, info = self.advance(control)
             if done:
                 break
+        reward = self.reward(done, info)
+        return self.end_action(action), reward, done, False, info
+
+    # The same in parts, for a teacher that acts in every step of the task
+
+    @property
+    def view(self) -> DeafView:
+        """What a deaf script gets."""
+        return self._view
+
+    def begin_action(self) -> None:
+        """A new action's touches are counted from here."""
+        self._touch = np.zeros(2)
+
+    def end_action(self, action: np.ndarray) -> np.ndarray:
+        """The observation after an action (4,) that was taken step by step."""
         self._last_action = np.append(action[:3], 1.0 if self._closes else -1.0)
-        return self._observe(), self.reward(done, info), done, False, info
+        return self._observe()
 
     def control(self, action: np.ndarray) -> np.ndarray:
         """The task's action (4,) for the learner's."""
@@ -87,7 +107,8 @@ class NumericTask(gym.Env):
         if np.abs(lag).max() < 0.001:
             self._sent = self._sent + 0.1 * lag
         forces = self.task.env.contact_forces
-        others = max((force for pair, force in forces.items() if pair.startswith("gripper-") and "cube" not in pair), default=0.0)
+        elsewhere = [force for pair, force in forces.items() if pair.startswith("gripper-") and "cube" not in pair]
+        others = max(elsewhere, default=0.0)
         self._touch = np.maximum(self._touch, [forces.get("gripper-cube", 0.0), others])
         return done, info
 

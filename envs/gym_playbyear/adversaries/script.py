@@ -34,11 +34,13 @@ class DeafScript:
 
     def __init__(self, facts: TaskFacts, rng: np.random.Generator):
         self.facts, self.rng = facts, rng
-        self.reach = facts.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE  # from hand to cube, when an open finger touches
+        self.reach = (
+            facts.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
+        )  # from hand to cube, when an open finger touches
         self.n_closings = 0
         self._closes = False
         self._last_change = -(10**6)  # step of the gripper's last change of command
-        self._sent = np.zeros(3)  # where the hand was sent [m, world], as the arm's controller reckons it
+        self._sent: np.ndarray = np.zeros(3)  # where the hand was sent [m, world], as the arm's controller reckons it
         self._hand_before = np.zeros(3)  # where it was a step ago
         self._actions = self._plan()
         self.view: DeafView | None = None

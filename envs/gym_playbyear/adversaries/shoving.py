@@ -1,9 +1,9 @@
 """Shoving and batting: a hand that sweeps through the range has the cube in front of it, if it met the cube at all.
 
 `nudge` feels nothing: a cube may be moved some way before the attempt has failed, so it sweeps just that far and grasps where a
-cube that it met must then be; then the next stretch. `nudge_beside` does not even come down from above, where the hand could land
-on the cube, but from beside the line. `shove` (open fingers, slow) and `bat` (closed fingers, fast) watch the arm's lag
-besides, and stop where it grows.
+cube that it met must then be; then the next stretch. `nudge_beside` does not even come down from above, where the hand
+could land on the cube, but from beside the line. `shove` (open fingers, slow) and `bat` (closed fingers, fast) watch the arm's
+lag besides, and stop where it grows.
 """
 
 from dataclasses import dataclass

@@ -99,7 +99,9 @@ class Twins:
                 break
         return _Run(np.stack(measured), None)
 
-    def differing_observations(self, seed: int, actions: list[np.ndarray], touched_at: int) -> tuple[list[str], list[bool]]:
+    def differing_observations(
+        self, seed: int, actions: list[np.ndarray], touched_at: int
+    ) -> tuple[list[str], list[bool]]:
         """Compares whole observations, pictures included.
 
         Returns:
@@ -131,8 +133,7 @@ def _digests(env: Any, seed: int, actions: list[np.ndarray], begun) -> list[dict
     """A digest of every observation but sound, for each step."""
     observations = [env.reset(seed=seed)[0]]
     begun()
-    for action in actions:
-        observations.append(env.step(action)[0])
+    observations += [env.step(action)[0] for action in actions]
     return [
         {key: hashlib.sha256(value.tobytes()).hexdigest() for key, value in _flat(seen) if not key.startswith("audio")}
         for seen in observations
@@ -140,7 +141,7 @@ def _digests(env: Any, seed: int, actions: list[np.ndarray], begun) -> list[dict
 
 
 def _flat(observation: dict[str, Any], prefix: str = "") -> list[tuple[str, np.ndarray]]:
-    parts = []
+    parts: list[tuple[str, np.ndarray]] = []
     for key, value in observation.items():
         parts += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, np.asarray(value))]
     return parts
@@ -210,9 +211,7 @@ def twin_test(task: str, seeds: range, *, n_pictured: int = 3, **options: Any) -
     )
 
 
-def _areas(
-    features: np.ndarray, labels: np.ndarray, episodes: np.ndarray, held_out: np.ndarray
-) -> dict[str, Spread]:
+def _areas(features: np.ndarray, labels: np.ndarray, episodes: np.ndarray, held_out: np.ndarray) -> dict[str, Spread]:
     """Each classifier's area under the curve on the held-out episodes."""
     rng = np.random.default_rng(0)
     rows = {episode: np.flatnonzero(episodes == episode) for episode in np.unique(episodes[held_out])}

@@ -86,21 +86,22 @@ class DeafTask:
     """
 
     def __init__(self, task: str, **options: Any):
-        made = gym.make(f"gym_playbyear/{task}", **{"sound": "none", "disable_env_checker": True, **options})
+        made: Any = gym.make(f"gym_playbyear/{task}", **{"sound": "none", "disable_env_checker": True, **options})
         self.env: Any = made.unwrapped
-        arm, hz = self.env.variant.arm, float(self.env.metadata["render_fps"])
+        variant, hz = self.env.variant, float(self.env.metadata["render_fps"])
+        arm = variant.arm
         self.facts = TaskFacts(
             horizon=int(self.env._max_episode_steps),
             base=np.array(arm.base, dtype=float),
-            line_x=float(np.mean(self.env.variant.cube_x)),
+            line_x=float(np.mean(getattr(variant, "cube_x", 0.0))),
             max_opening=float(arm.max_opening),
             cooldown=round(arm.gripper_cooldown * hz),
-            max_shove=float(self.env.variant.max_shove),
+            max_shove=float(getattr(variant, "max_shove", np.inf)),
             max_lead=float(arm.max_lead),
             workspace=np.array(arm.workspace, dtype=float),
             control_hz=hz,
         )
-        self._sensors = Proprioception(self.env.variant.sensors, hz)
+        self._sensors = Proprioception(variant.sensors, hz)
         self._rng = np.random.default_rng(0)
         self._n_steps = 0
         self.has_touched = False
@@ -131,8 +132,11 @@ class DeafTask:
 
     @property
     def touch_force(self) -> float:
-        """Largest force between gripper and hidden object in the last step [N]; for judges."""
-        return float(self.env.contact_forces.get("gripper-cube", 0.0))
+        """Largest force between gripper and hidden object in the last step [N]; for judges.
+
+        A task whose hidden object is no cube names the pair of bodies in its attribute `hidden_pair`.
+        """
+        return float(self.env.contact_forces.get(getattr(self.env, "hidden_pair", "gripper-cube"), 0.0))
 
     def close(self) -> None:
         self.env.close()
