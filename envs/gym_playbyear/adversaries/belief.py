@@ -7,7 +7,6 @@ from gym_playbyear.arm import FINGER_THICKNESS, FINGER_WIDTH
 
 _RESOLUTION = 0.001  # m
 _YAWS = np.deg2rad(np.linspace(0, 15, 4))  # either way is the same
-_SLIDES = 0.003  # m: a finger that meets no more of the cube's rim than this slides off and pushes the cube aside
 _SOFTNESS = 0.001  # m: edges are no sharper than this
 _MISTAKE = 0.01  # share of taps that lie
 _DRIFT = 0.001  # m: a blocked tap may move the cube that far
@@ -24,10 +23,12 @@ class CubeBelief:
 
     Args:
         lower, upper: Where the cube's centre may be [m].
+        slides: A finger that meets no more of the cube's rim than this slides off and pushes the cube aside [m].
         margin: How far outside it may be after a push [m].
     """
 
-    def __init__(self, lower: float, upper: float, margin: float = 0.01):
+    def __init__(self, lower: float, upper: float, slides: float = 0.003, margin: float = 0.01):
+        self.slides = slides
         self.places = np.arange(lower - margin, upper + margin, _RESOLUTION)
         self.extents = half_extents()
         inside = (self.places >= lower) & (self.places <= upper)
@@ -45,19 +46,27 @@ class CubeBelief:
             np.asarray(hand)[..., None, None] - self.places[:, None]
         )  # (..., places, 1): by symmetry one finger
         inner, outer = opening / 2, opening / 2 + FINGER_THICKNESS
-        gap = np.maximum(offset - outer, inner - offset) - self.extents + _SLIDES  # negative where it rests on the cube
+        gap = (
+            np.maximum(offset - outer, inner - offset) - self.extents + self.slides
+        )  # negative where it rests on the cube
         return _MISTAKE + (1 - 2 * _MISTAKE) / (1 + np.exp(np.clip(gap / _SOFTNESS, -50, 50)))
 
     def between(self, hand: float | np.ndarray, opening: float) -> np.ndarray:
         """The probability that the cube is between open fingers that come down at `hand` (...,)."""
         offset = np.abs(np.asarray(hand)[..., None, None] - self.places[:, None])
-        return np.sum((offset + self.extents < opening / 2 + _SLIDES) * self.probability, axis=(-2, -1))
+        return np.sum((offset + self.extents < opening / 2 + self.slides) * self.probability, axis=(-2, -1))
 
-    def update(self, hand: float, opening: float, was_blocked: bool) -> None:
-        """Learns from a tap."""
+    def update(self, hand: float, opening: float, was_blocked: float) -> None:
+        """Learns from a tap.
+
+        Args:
+            hand: Along the line [m].
+            opening: Between the fingers [m].
+            was_blocked: How sure it is that something was in the way, from 0 to 1.
+        """
         chance = self.blocked(hand, opening)
-        self.probability = self.probability * (chance if was_blocked else 1 - chance)
-        if was_blocked:
+        self.probability = self.probability * (chance * was_blocked + (1 - chance) * (1 - was_blocked))
+        if was_blocked > 0.5:
             kernel = np.exp(-0.5 * (np.arange(-3, 4) * _RESOLUTION / _DRIFT) ** 2)
             kernel /= kernel.sum()
             spread = [np.convolve(column, kernel, mode="same") for column in self.probability.T]

@@ -96,10 +96,10 @@ class DeafScript:
         """Of the hand above the table, as measured [m]."""
         return float(self.hand[2] - TABLE_TOP)
 
-    def _recalibrate(self) -> None:
-        """Believes the measured place of a hand that rests in the air a little more than the reckoned one."""
+    def _recalibrate(self, axes: slice = slice(0, 3)) -> None:
+        """Believes the measured place of a hand that rests in the air half, and half the reckoned one."""
         if np.abs(self.hand - self._hand_before).max() < _AT_REST:
-            self._sent = self._sent + 0.5 * self.lag
+            self._sent[axes] += 0.5 * self.lag[axes]
 
     # Motions: generators of actions
 

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gym_playbyear.adversaries.belief import CubeBelief
-from gym_playbyear.adversaries.script import GRASP_HEIGHT, TIP_BELOW_HAND, Actions, DeafScript, Verdict
+from gym_playbyear.adversaries.script import FAST, GRASP_HEIGHT, TIP_BELOW_HAND, Actions, DeafScript
 from gym_playbyear.adversaries.view import TaskFacts
 from gym_playbyear.arena import CUBE_HALF_SIZE
-from gym_playbyear.arm import ACTION_SCALE
 
 _TOP = 2 * CUBE_HALF_SIZE + TIP_BELOW_HAND  # m: the hand's height above the table when the tips rest on the cube
 _SLOW, _SURE_LAG = 0.002, 0.0007  # m: a hand that is lowered this slowly stops where the lag is that large
@@ -30,32 +29,37 @@ class Tap:
         step: How far the hand is lowered per control step.
         depth: How far below the cube's top the hand is sent; it stops there if nothing is in its way.
         clear: How far above the cube's top the hand travels.
-        lag: The hand is this much higher than it was sent: blocked.
-        averaged: Measurements whose mean has to say so; if they are many, what it is in the air is measured as well.
+        lag: A hand that is this much higher than it was sent is as likely blocked as not.
+        patience: So many measurements are weighed against each other at most; with one, a look decides.
         aside: How far beside the line the hand taps, so that its fingers meet the cube's rim alone.
         scan: From one end of the range to the other in steps of this length; None: where a tap tells most.
+        slides: A finger that meets no more of the cube's rim than this slides off.
         sure: The script closes the fingers where the cube is between them with this probability.
     """
 
     closed: bool = False
-    step: float = ACTION_SCALE
+    step: float = FAST
     depth: float = 0.010
     clear: float = 0.008
     lag: float = 0.0007
-    averaged: int = 1
+    patience: int = 1
     aside: float = 0.0
     scan: float | None = None
+    slides: float = 0.003
     sure: float = 0.5
 
 
 TAPS = {
     "tap_fast": Tap(),
-    "tap_gentle": Tap(step=0.001, depth=0.004, clear=0.003, lag=0.0005, averaged=2),
-    "tap_feather": Tap(step=0.004, depth=0.0012, clear=0.002, lag=0.00008, averaged=14),
+    "tap_gentle": Tap(step=0.001, depth=0.004, clear=0.003, lag=0.0005),
+    "tap_feather": Tap(step=0.004, depth=0.0012, clear=0.003, lag=0.0001, patience=20, slides=0.0, sure=0.8),
     "tap_closed": Tap(closed=True),
     "tap_along": Tap(scan=0.012),
     "tap_across": Tap(aside=0.022),
 }
+_NOISE = 0.0003  # m: of one measurement of the hand's place
+_DECIDED = 2.7  # log odds at which a patient script has seen enough
+_FIRST_LOOK = 30  # measurements from which a patient script learns its height
 
 
 class TappingScript(DeafScript):
@@ -71,8 +75,9 @@ class TappingScript(DeafScript):
         super().__init__(facts, rng)
 
     def _plan(self) -> Actions:
-        self.belief = CubeBelief(*self.hidden_range)
+        self.belief = CubeBelief(*self.hidden_range, self.tap.slides)
         self._scanned = self.hidden_range[0] - self.reach
+        self._knows_height = False
         if self.tap.closed:
             yield from self._set_grip(True)
         while True:
@@ -81,10 +86,10 @@ class TappingScript(DeafScript):
             place = self._choose()
             blocked = yield from self._tap(place)
             self.belief.update(place, self.opening, blocked)
-            if blocked:
+            if blocked > 0.5:
                 self._scanned = np.inf
             sure = self.belief.between(place, self.opening) > (0 if self._is_late() else self.tap.sure)
-            if not blocked and not self._closes and sure:
+            if blocked < 0.5 and not self._closes and sure:
                 yield from self._try(place)
             else:
                 yield from self._rise(_TOP + self.tap.clear)
@@ -118,32 +123,42 @@ class TappingScript(DeafScript):
         """Whether the time left is enough for one grasp alone."""
         return self.steps_left < _GRASP_STEPS
 
-    def _tap(self, place: float) -> Verdict:
-        """Lowers the hand there. Whether something was in its way."""
+    def _tap(self, place: float) -> Generator[np.ndarray, None, float]:
+        """Lowers the hand there. How sure it is that something was in its way, from 0 to 1."""
         above = self._on_line(place, _TOP + self.tap.clear)
         above[0] -= self.tap.aside
         if self.height() < _TOP:
             yield from self._rise(_TOP + self.tap.clear)
         yield from self._go(above, settle=2)
-        self._recalibrate()
-        rest = (yield from self._mean_lag()) if self.tap.averaged > 2 else 0.0
+        self._recalibrate(slice(0, 2) if self.tap.patience > 1 else slice(0, 3))
+        if self.tap.patience > 1 and not self._knows_height:
+            lags = []
+            for _ in range(_FIRST_LOOK):
+                lags.append(float(self.lag[2]))
+                yield self._move(np.zeros(3))
+            self._sent[2] += np.mean(lags)
+            self._knows_height = True
         below = above[2] - self.tap.clear - self.tap.depth
         recent: list[float] = []
         while self._sent[2] > below + 1e-4:
             yield self._move(np.array([0, 0, max(below - self._sent[2], -self.tap.step)]))
             recent = [*recent, float(self.lag[2])][-2:]
             if self.tap.step < _SLOW and len(recent) == 2 and np.mean(recent) > max(self.tap.lag, _SURE_LAG):
-                return True
+                return 1.0
         yield from self._wait(1)
-        return bool((yield from self._mean_lag()) - rest > self.tap.lag)
+        return (yield from self._weigh())
 
-    def _mean_lag(self) -> Generator[np.ndarray, None, float]:
-        """How much higher than it was sent the hand is [m], over as many measurements as the tap averages."""
-        lags = [float(self.lag[2])]
-        for _ in range(self.tap.averaged - 1):
+    def _weigh(self) -> Generator[np.ndarray, None, float]:
+        """How sure it is that the lowered hand is blocked, from 0 to 1."""
+        if self.tap.patience == 1:
+            return float(self.lag[2] > self.tap.lag)
+        odds = 0.0
+        for _ in range(self.tap.patience):
+            odds += 2 * self.tap.lag * (float(self.lag[2]) - self.tap.lag) / _NOISE**2
+            if abs(odds) > _DECIDED:
+                break
             yield self._move(np.zeros(3))
-            lags.append(float(self.lag[2]))
-        return float(np.mean(lags))
+        return float(1 / (1 + np.exp(-odds)))
 
     def _try(self, place: float) -> Actions:
         """Closes the fingers around what should be between them."""
@@ -152,7 +167,7 @@ class TappingScript(DeafScript):
         yield from self._grasp()
         self.belief.rule_out(place, opening)
         if self._dropped_something():
-            self.belief = CubeBelief(*self.hidden_range)
+            self.belief = CubeBelief(*self.hidden_range, self.tap.slides)
 
     def _dropped_something(self) -> bool:
         """Whether what was held is gone: the hand is high, and the fingers are closed on nothing."""
