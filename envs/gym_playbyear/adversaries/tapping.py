@@ -52,14 +52,17 @@ class Tap:
 TAPS = {
     "tap_fast": Tap(),
     "tap_gentle": Tap(step=0.001, depth=0.004, clear=0.003, lag=0.0005),
-    "tap_feather": Tap(step=0.004, depth=0.0012, clear=0.003, lag=0.0001, patience=20, slides=0.0, sure=0.8),
+    "tap_feather": Tap(step=0.01, depth=0.0014, clear=0.003, lag=0.00013, patience=14, slides=0.0),
+    "tap_breath": Tap(step=0.01, depth=0.0004, clear=0.003, lag=0.0001, patience=20, slides=0.0),
     "tap_closed": Tap(closed=True),
     "tap_along": Tap(scan=0.012),
     "tap_across": Tap(aside=0.022),
 }
+_WORTH_A_TAP = 0.3  # probability that the cube is between the fingers there
+_NOTHING_TOLD = 0.15  # bit
 _NOISE = 0.0003  # m: of one measurement of the hand's place
-_DECIDED = 2.7  # log odds at which a patient script has seen enough
-_FIRST_LOOK = 30  # measurements from which a patient script learns its height
+_DECIDED = 2.0  # log odds at which a patient script has seen enough
+_FIRST_LOOK = 16  # measurements from which a patient script learns its height
 
 
 class TappingScript(DeafScript):
@@ -77,7 +80,7 @@ class TappingScript(DeafScript):
     def _plan(self) -> Actions:
         self.belief = CubeBelief(*self.hidden_range, self.tap.slides)
         self._scanned = self.hidden_range[0] - self.reach
-        self._knows_height = False
+        self._knows_height = self._must_dare = False
         if self.tap.closed:
             yield from self._set_grip(True)
         while True:
@@ -88,7 +91,7 @@ class TappingScript(DeafScript):
             self.belief.update(place, self.opening, blocked)
             if blocked > 0.5:
                 self._scanned = np.inf
-            sure = self.belief.between(place, self.opening) > (0 if self._is_late() else self.tap.sure)
+            sure = self.belief.between(place, self.opening) > (0 if self._must_dare else self.tap.sure)
             if blocked < 0.5 and not self._closes and sure:
                 yield from self._try(place)
             else:
@@ -110,14 +113,16 @@ class TappingScript(DeafScript):
     def _choose(self) -> float:
         """Where to tap next [m]."""
         hands, opening = self._places(), self.opening
-        if not self._closes:
-            chance = self.belief.between(hands, opening)
-            if chance.max() > 0.3 or self._is_late():
-                return float(hands[chance.argmax()])
+        told = self.belief.information(hands, opening)
+        chance = self.belief.between(hands, opening)
+        best = int(chance.argmax())
+        self._must_dare = self._is_late() or bool(told.max() < _NOTHING_TOLD)
+        if not self._closes and (self._must_dare or (chance[best] > _WORTH_A_TAP and told[best] > _NOTHING_TOLD)):
+            return float(hands[best])
         if self.tap.scan and self._scanned < self.hidden_range[1]:
             self._scanned += self.tap.scan
             return self._scanned
-        return float(hands[self.belief.information(hands, opening).argmax()])
+        return float(hands[told.argmax()])
 
     def _is_late(self) -> bool:
         """Whether the time left is enough for one grasp alone."""
