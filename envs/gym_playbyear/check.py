@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players, promised_limits
+from gym_playbyear.adversaries.scripts import Outcome
 from gym_playbyear.adversaries.twin import TwinResult, twin_test
 
 FIRST_SEED = 80000  # nothing was tuned on episodes from here on
@@ -121,10 +122,10 @@ def check(
     if jobs > 1:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             pending = pool.submit(partial(twin_test, task, seeds, **options)) if twin else None
-            played = list(pool.map(play, chosen))
+            played = [_told(name, attempts) for name, attempts in zip(chosen, pool.map(play, chosen), strict=True)]
             found = pending.result() if pending else None
     else:
-        played = [play(name) for name in chosen]
+        played = [_told(name, play(name)) for name in chosen]
         found = twin_test(task, seeds, **options) if twin else None
     rows = []
     for (name, kind), attempts in zip(chosen.items(), played, strict=True):
@@ -136,6 +137,12 @@ def check(
     judged = judge(rows, limits)
     broken = [describe(row) for row in judged if not row.holds] + twin_faults(found, limits)
     return Report(task, options, first_seed, judged, found, limits, broken)
+
+
+def _told(name: str, attempts: list[Outcome]) -> list[Outcome]:
+    """Says how far the check is."""
+    print(f"{name}: {sum(attempt.success for attempt in attempts)} of {len(attempts)}", file=sys.stderr, flush=True)
+    return attempts
 
 
 def judge(rows: list[Row], limits: Limits) -> list[Row]:

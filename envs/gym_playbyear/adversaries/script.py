@@ -37,7 +37,6 @@ class DeafScript:
         self.reach = (
             facts.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
         )  # from hand to cube, when an open finger touches
-        self.n_closings = 0
         self._closes = False
         self._last_change = -(10**6)  # step of the gripper's last change of command
         self._sent: np.ndarray = np.zeros(3)  # where the hand was sent [m, world], as the arm's controller reckons it
@@ -136,7 +135,6 @@ class DeafScript:
         while not self.may_change_grip:
             yield self._move(np.zeros(3))
         self._closes, self._last_change = closes, self._seen.step
-        self.n_closings += closes
         before = np.inf
         for _ in range(16):
             yield self._move(np.zeros(3))
@@ -144,17 +142,16 @@ class DeafScript:
                 break
             before = self.opening
 
-    def _grasp(self) -> Verdict:
-        """Closes where the hand is, lifts what it holds, and places it if there is a tray. Whether it held something."""
+    def _grasp(self) -> Actions:
+        """Closes where the hand is, lifts what it holds, and places it if there is a tray. Ends when it holds nothing."""
         yield from self._set_grip(True)
         if not self.holds:
-            return False
+            return
         yield from self._rise(CARRY_HEIGHT, 0.02)
         if "bin_position" in self._seen.shown and self.holds:
             yield from self._place()
         while self.holds:  # success is for the environment to see
             yield self._move(np.zeros(3))
-        return False
 
     def _place(self) -> Actions:
         tray = self._seen.shown["bin_position"]
