@@ -5,13 +5,14 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 TEST_JOBS ?= 2
+TASK ?= OccludedGrasp-v0
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
 
-.PHONY: help install demo test test-slow lint bench lock clean
+.PHONY: help install demo test test-slow lint bench adversaries lock clean
 
 help:  ## Says what there is
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-11s %s\n", $$1, $$2}'
 
 install: .venv/.installed  ## Makes .venv with pinned versions (PYTHON=... to choose the Python)
 
@@ -36,6 +37,10 @@ test-slow: install  ## The tests that take minutes, side by side like the others
 
 bench: install  ## Measures speed and memory, beside alternatives, in a quarter of an hour
 	$(BIN)/python benchmarks/run.py
+
+adversaries: install  ## Trains the learned adversary, deaf and hearing, some hours in all (TASK=OccludedGrasp-v0)
+	for hears in false true; do \
+	  OMP_NUM_THREADS=1 $(BIN)/python -m experiments.adversaries --task=$(TASK) --hears=$$hears --steps=2000000; done
 
 lock: install  ## Writes the versions in .venv to constraints.txt
 	VIRTUAL_ENV=$(CURDIR)/.venv $$(command -v $(BIN)/uv || command -v uv) pip freeze --exclude-editable \

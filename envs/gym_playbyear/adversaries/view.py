@@ -1,0 +1,148 @@
+"""What a deaf policy gets of an episode, and nothing else.
+
+An environment knows where the hidden object is. A script that held the environment could look; therefore a script gets numbers
+only: what the arm measures of itself, with its noise, and what the camera shows. No object behind the scenes can be reached
+from them.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+import gym_playbyear  # noqa: F401 (registers the tasks)
+from gym_playbyear.proprioception import Proprioception
+
+_NOISE_STREAM = 7  # tells the sensors' random numbers from those of a script with the same seed
+_FINGER_JOINTS = slice(7, 9)
+_UNTOUCHED = 1e-9  # N
+
+
+@dataclass(frozen=True)
+class TaskFacts:
+    """What anyone may know of a task before an episode begins.
+
+    Attributes:
+        horizon: Steps of an episode.
+        base: The robot's base (3,) [m, world]; `agent_pos` counts from it.
+        line_x: Where the hidden object's range lies across [m, world].
+        max_opening: Distance between the open fingers [m].
+        cooldown: Steps for which a change of the gripper's command blocks the next one.
+        max_shove: How far the hidden object may be moved along the table before the attempt has failed [m].
+        max_lead: How far the commanded point may run ahead of the measured one [m].
+        workspace: Lower and upper corner of where the commanded point may be (2, 3) [m, world].
+        control_hz: Steps per second.
+    """
+
+    horizon: int
+    base: np.ndarray
+    line_x: float
+    max_opening: float
+    cooldown: int
+    max_shove: float
+    max_lead: float
+    workspace: np.ndarray
+    control_hz: float
+
+
+@dataclass(frozen=True)
+class DeafView:
+    """One observation.
+
+    Attributes:
+        agent_pos: (7,) float32 as the policy gets it: hand x, y, z [m, from the robot's base], two finger positions [m], two
+            finger velocities [m/s].
+        shown: What the camera shows, in numbers [m, world]: `hidden_range` (2,), and `bin_position` (3,) where there is a tray.
+        step: Steps since the episode began.
+    """
+
+    agent_pos: np.ndarray
+    shown: dict[str, np.ndarray]
+    step: int
+
+
+def camera_numbers(env: Any) -> dict[str, np.ndarray]:
+    """What the camera shows of the episode, in numbers.
+
+    Args:
+        env: The unwrapped environment, after its reset. A task with something else to show has a method `camera_numbers`.
+    """
+    if hasattr(env, "camera_numbers"):
+        return {name: np.array(value, dtype=float) for name, value in env.camera_numbers().items()}
+    names = [name for name in ("hidden_range", "bin_position") if hasattr(env, name)]
+    return {name: np.array(getattr(env, name), dtype=float) for name in names}
+
+
+class DeafTask:
+    """A task as a deaf player meets it: nothing is rendered, nothing is heard.
+
+    Args:
+        task: Its name, such as `OccludedGrasp-v0`.
+        options: For `gymnasium.make`.
+
+    Attributes:
+        env: The unwrapped environment, for whoever judges. Never hand it to a script.
+    """
+
+    def __init__(self, task: str, **options: Any):
+        made: Any = gym.make(f"gym_playbyear/{task}", **{"sound": "none", "disable_env_checker": True, **options})
+        self.env: Any = made.unwrapped
+        variant, hz = self.env.variant, float(self.env.metadata["render_fps"])
+        arm = variant.arm
+        self.facts = TaskFacts(
+            horizon=int(self.env._max_episode_steps),
+            base=np.array(arm.base, dtype=float),
+            line_x=float(np.mean(getattr(variant, "cube_x", 0.0))),
+            max_opening=float(arm.max_opening),
+            cooldown=round(arm.gripper_cooldown * hz),
+            max_shove=float(getattr(variant, "max_shove", np.inf)),
+            max_lead=float(arm.max_lead),
+            workspace=np.array(arm.workspace, dtype=float),
+            control_hz=hz,
+        )
+        self._sensors = Proprioception(variant.sensors, hz)
+        self._rng = np.random.default_rng(0)
+        self._n_steps = 0
+        self.has_touched = False
+
+    def begin(self, seed: int, **options: Any) -> DeafView:
+        """Begins an episode. The sensors' noise follows from the seed.
+
+        Args:
+            seed: Of the episode.
+            options: Of the environment's reset.
+        """
+        self.env.begin_episode(seed=seed, options=options)
+        self._rng = np.random.default_rng([seed, _NOISE_STREAM])
+        self._sensors.reset()
+        self._n_steps = 0
+        self.has_touched = False
+        return self._view()
+
+    def advance(self, action: np.ndarray) -> tuple[DeafView, bool, dict[str, Any]]:
+        """One step. Returns the view, whether the episode is over, and the environment's `info` with how it ended in `end`."""
+        _, terminated, truncated, info = self.env.advance(action)
+        self._n_steps += 1
+        self.has_touched |= self.touch_force > _UNTOUCHED
+        if terminated or truncated:
+            ended = "success" if info["is_success"] else "time" if truncated else "failed"
+            info = {"end": ended, **{key: value for key, value in info.items() if value is not None}}
+        return self._view(), terminated or truncated, info
+
+    @property
+    def touch_force(self) -> float:
+        """Largest force between gripper and hidden object in the last step [N]; for judges.
+
+        A task whose hidden object is no cube names the pair of bodies in its attribute `hidden_pair`.
+        """
+        return float(self.env.contact_forces.get(getattr(self.env, "hidden_pair", "gripper-cube"), 0.0))
+
+    def close(self) -> None:
+        self.env.close()
+
+    def _view(self) -> DeafView:
+        env = self.env
+        hand = env.eef_position - self.facts.base
+        true = np.concatenate([hand, env.finger_positions, env.data.qvel[_FINGER_JOINTS]])
+        return DeafView(self._sensors.measure(true, self._rng), camera_numbers(env), self._n_steps)

@@ -1,0 +1,258 @@
+"""Whether a task needs hearing: its expert, everyone who plays it deaf, and what twin worlds give away, in one table.
+
+    python -m gym_playbyear.check OccludedGrasp-v0 --episodes=100 --output=check.json
+
+The expert must solve the task. Blind scripts, which know what the camera shows and feel nothing, must not, nor must deaf
+scripts, which feel with the arm; and nothing but sound may tell that the hidden object was touched. The exit status is 1
+where a limit is broken.
+"""
+
+import argparse
+import json
+import math
+import sys
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players, promised_limits
+from gym_playbyear.adversaries.scripts import Outcome
+from gym_playbyear.adversaries.twin import TwinResult, twin_test
+
+FIRST_SEED = 80000  # nothing was tuned on episodes from here on
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a task promises. Shares of episodes; areas under curves.
+
+    Attributes:
+        expert: The expert solves at least this share.
+        blind: No blind script solves more.
+        deaf_margin: Nobody deaf solves more than this above the best blind script.
+        auc: No classifier tells twin worlds apart better.
+    """
+
+    expert: float = 0.95
+    blind: float = 0.25
+    deaf_margin: float = 0.10
+    auc: float = 0.6
+
+
+@dataclass(frozen=True)
+class Row:
+    """One player's result.
+
+    Attributes:
+        name, kind: Who played; `expert`, `blind`, `deaf`, or `learned`.
+        successes, n_episodes: How often it solved the task.
+        ends: How its attempts ended, and how often.
+        limit: What it must reach (expert) or must not exceed, as a share; None if nothing is promised of it.
+        holds: Whether it keeps to the limit.
+    """
+
+    name: str
+    kind: str
+    successes: int
+    n_episodes: int
+    ends: dict[str, int]
+    limit: float | None = None
+    holds: bool = True
+
+    @property
+    def rate(self) -> float:
+        return self.successes / self.n_episodes
+
+
+@dataclass(frozen=True)
+class Report:
+    """All of a task's results, and the limits that are broken, in words."""
+
+    task: str
+    options: dict[str, Any]
+    first_seed: int
+    rows: list[Row]
+    twin: TwinResult | None
+    limits: Limits
+    broken: list[str]
+
+
+def check(
+    task: str,
+    n_episodes: int = 100,
+    *,
+    first_seed: int = FIRST_SEED,
+    names: list[str] | None = None,
+    twin: bool = True,
+    jobs: int = 1,
+    limits: Limits | None = None,
+    learned: list[dict[str, Any]] | None = None,
+    options: dict[str, Any] | None = None,
+) -> Report:
+    """Plays a task with everyone, and compares twin worlds.
+
+    Args:
+        task: Its name, such as `OccludedGrasp-v0`.
+        n_episodes: Of each player, and of the twin test.
+        first_seed: Of the episodes; they count up.
+        names: Of the players; all by default.
+        twin: Whether to compare twin worlds.
+        jobs: Processes side by side.
+        limits: What the task promises; by default what it says itself, or else `Limits()`.
+        learned: Results of learned adversaries: `name`, `successes`, `n_episodes`, `hears`.
+        options: For `gymnasium.make`.
+
+    Raises:
+        ValueError: A name is not among the task's players.
+    """
+    options = options or {}
+    limits = limits or Limits(**promised_limits(task, **options))
+    known = players(task, **options)
+    for name in names or []:
+        if name not in known:
+            raise ValueError(f"player={name!r} is not known: choose from {', '.join(map(repr, known))}.")
+    chosen = {name: kind for name, kind in known.items() if not names or name in names}
+    seeds = range(first_seed, first_seed + n_episodes)
+    play = partial(outcomes, task, seeds=seeds, options=options)
+    found: TwinResult | None
+    if jobs > 1:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            pending = pool.submit(partial(twin_test, task, seeds, **options)) if twin else None
+            played = [_told(name, attempts) for name, attempts in zip(chosen, pool.map(play, chosen), strict=True)]
+            found = pending.result() if pending else None
+    else:
+        played = [_told(name, play(name)) for name in chosen]
+        found = twin_test(task, seeds, **options) if twin else None
+    rows = []
+    for (name, kind), attempts in zip(chosen.items(), played, strict=True):
+        ends = dict(Counter(attempt.end for attempt in attempts).most_common())
+        rows.append(Row(name, kind, sum(attempt.success for attempt in attempts), n_episodes, ends))
+    for result in learned or []:
+        kind = "learned, hears" if result["hears"] else "learned, deaf"
+        rows.append(Row(result["name"], kind, result["successes"], result["n_episodes"], {}))
+    judged = judge(rows, limits)
+    broken = [describe(row) for row in judged if not row.holds] + twin_faults(found, limits)
+    return Report(task, options, first_seed, judged, found, limits, broken)
+
+
+def _told(name: str, attempts: list[Outcome]) -> list[Outcome]:
+    """Says how far the check is."""
+    print(f"{name}: {sum(attempt.success for attempt in attempts)} of {len(attempts)}", file=sys.stderr, flush=True)
+    return attempts
+
+
+def judge(rows: list[Row], limits: Limits) -> list[Row]:
+    """Each row with its limit, and whether it keeps to it.
+
+    A learned adversary that hears must exceed what nobody deaf may; else the deaf one's failure proves nothing.
+    """
+    blind = [row.rate for row in rows if row.kind == "blind"]
+    above_blind = max(blind) + limits.deaf_margin if blind else None
+    wanted = {
+        "expert": limits.expert,
+        "blind": limits.blind,
+        "deaf": above_blind,
+        "learned, deaf": above_blind,
+        "learned, hears": above_blind,
+    }
+    judged = []
+    for row in rows:
+        limit, must_reach = wanted[row.kind], row.kind in ("expert", "learned, hears")
+        holds = limit is None or (row.rate >= limit - 1e-9 if must_reach else row.rate <= limit + 1e-9)
+        judged.append(Row(row.name, row.kind, row.successes, row.n_episodes, row.ends, limit, holds))
+    return judged
+
+
+def describe(row: Row) -> str:
+    """A broken limit in words."""
+    wanted = "at least" if row.kind in ("expert", "learned, hears") else "at most"
+    return f"{row.name} ({row.kind}) solves {_percent(row.rate)}, {wanted} {_percent(row.limit)} was promised"
+
+
+def twin_faults(twin: TwinResult | None, limits: Limits) -> list[str]:
+    """What twin worlds give away and should not."""
+    if twin is None:
+        return []
+    faults = [
+        f"twin worlds: {name} tells them apart with an area of {spread.value:.2f}, at most {limits.auc:.2f} was promised"
+        for name, spread in twin.auc.items()
+        if spread.value > limits.auc
+    ]
+    if not twin.equal_until_touch:
+        faults.append(f"twin worlds differ before the touch: {twin.first_difference}")
+    return faults
+
+
+def as_text(report: Report) -> str:
+    """The table for people."""
+    lines = [f"{report.task} {report.options or ''}".rstrip()]
+    lines.append(f"{'player':<16}{'kind':<16}{'success':>16}{'limit':>8}  ends")
+    for row in report.rows:
+        low, high = interval(row.successes, row.n_episodes)
+        success = f"{_percent(row.rate)} ({100 * low:.0f}-{100 * high:.0f})"
+        limit = "" if row.limit is None else _percent(row.limit)
+        ends = ", ".join(f"{count} {end}" for end, count in row.ends.items())
+        lines.append(f"{row.name:<16}{row.kind:<16}{success:>16}{limit:>8}  {ends}{'' if row.holds else '   BROKEN'}")
+    if report.twin is not None:
+        twin = report.twin
+        same = "every observation but sound is the same" if twin.equal_until_touch else "OBSERVATIONS DIFFER"
+        lines.append(f"twin worlds, {twin.n_episodes} episodes: until the touch {same};")
+        for name, spread in twin.auc.items():
+            lines.append(f"  after it, {name}: area {spread.value:.3f} ({spread.low:.3f}-{spread.high:.3f})")
+        lines.append(f"  pictures that differ after it: {100 * twin.pictures_after_touch:.0f} %")
+    lines += [f"broken: {fault}" for fault in report.broken] or ["all limits hold"]
+    return "\n".join(lines)
+
+
+def interval(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    rate, scale = successes / n, 1 + z * z / n
+    centre = (rate + z * z / (2 * n)) / scale
+    half = z / scale * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    return max(0.0, centre - half), min(1.0, centre + half)
+
+
+def _percent(share: float | None) -> str:
+    return "" if share is None else f"{100 * share:.0f} %"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m gym_playbyear.check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("task", help="such as OccludedGrasp-v0")
+    parser.add_argument("--episodes", type=int, default=100, help="of each player and of the twin test (default: 100)")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"of the first episode (default: {FIRST_SEED})")
+    parser.add_argument(
+        "--players", nargs="+", help=f"only these: {EXPERT}, or names of {' and '.join(KINDS[1:])} scripts"
+    )
+    parser.add_argument("--no-twin", action="store_true", help="do not compare twin worlds")
+    parser.add_argument("--jobs", type=int, default=1, help="processes side by side (default: 1)")
+    parser.add_argument("--variant", help="of the task")
+    parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
+    parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments.adversaries")
+    parser.add_argument("--output", type=Path, help="a JSON file for the results")
+    arguments = parser.parse_args()
+    given = {"variant": arguments.variant, "horizon": arguments.horizon}
+    report = check(
+        arguments.task,
+        arguments.episodes,
+        first_seed=arguments.seed,
+        names=arguments.players,
+        twin=not arguments.no_twin,
+        jobs=arguments.jobs,
+        learned=[json.loads(path.read_text()) for path in arguments.learned],
+        options={name: value for name, value in given.items() if value is not None},
+    )
+    print(as_text(report))
+    if arguments.output:
+        arguments.output.write_text(json.dumps(asdict(report), indent=1) + "\n")
+    return 1 if report.broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
