@@ -92,14 +92,16 @@ class GraspExpert:
 
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
-        if self.phase in ("lift", "carry") and self._dropped():
+        if self.phase in ("lift", "hold", "carry") and self._dropped():
             self._begin()
             displacement, close = np.zeros(3), False
         else:
             displacement, close = getattr(self, f"_{self.phase}")()
-        noise = self.rng.uniform(-self.config.noise, self.config.noise, 3)
-        move = (displacement + noise) / ACTION_SCALE
+        move = (displacement + self._noise()) / ACTION_SCALE
         return np.append(np.clip(move, -1, 1), 1.0 if close else -1.0).astype(np.float32)
+
+    def _noise(self) -> np.ndarray:
+        return self.rng.uniform(-self.config.noise, self.config.noise, 3)
 
     # One method per phase: it returns the displacement (3,) [m] and whether the fingers shall close.
 
@@ -210,6 +212,27 @@ class GraspExpert:
         length = float(np.linalg.norm(displacement))
         limit = max_step or self.config.max_step
         return displacement * min(1.0, limit / length) if length > 0 else displacement
+
+
+class Steady(GraspExpert):
+    """Lifts, and holds still up there. For a script to inherit before its own."""
+
+    hold_height = 0.085  # m above the table
+
+    def _lift(self):
+        if self.env.eef_position[2] > TABLE_TOP + self.hold_height:
+            self.phase = "hold"
+        return super()._lift()
+
+    def _hold(self):
+        return np.zeros(3), True
+
+    def _noise(self) -> np.ndarray:
+        return np.zeros(3) if self.phase == "hold" else super()._noise()
+
+
+class SteadyGraspExpert(Steady):
+    """Grasps the hidden cube by touch, lifts it and holds it still."""
 
 
 class PickPlaceExpert(GraspExpert):

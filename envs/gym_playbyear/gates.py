@@ -22,7 +22,7 @@ SEARCH, GRASP, LIFT, CARRY = range(4)
 _STAGES = {
     **dict.fromkeys(("retreat", "approach", "lower", "sweep"), SEARCH),
     **dict.fromkeys(("dwell", "rise", "hover", "hop", "descend", "grasp"), GRASP),
-    "lift": LIFT,
+    **dict.fromkeys(("lift", "hold"), LIFT),
     **dict.fromkeys(("carry", "release"), CARRY),
 }
 
