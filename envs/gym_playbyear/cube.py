@@ -16,6 +16,7 @@ from gym_playbyear.variant import Variant
 
 CUBE = "cube"
 _CARRIED_HEIGHT = TABLE_TOP + CUBE_HALF_SIZE + 0.015  # m: the cube's centre is this high only when it was picked up
+_RAIL_GAP, _RAIL_HEIGHT, _RAIL_THICKNESS = 0.06, 0.02, 0.01  # m
 _STILL = 0.015  # m: how far a cube that is held still, or lies still, may move meanwhile
 
 
@@ -33,6 +34,17 @@ def cube(variant: Variant, material: str) -> Prop:
     )
 
 
+def rails(lower: float, upper: float) -> Prop:
+    """Two low rails beside the line of the cube, from y to y [m]: a hand comes to it from above or along them, never across."""
+    half_size = f"{_RAIL_THICKNESS / 2} {(upper - lower) / 2} {_RAIL_HEIGHT / 2}"
+    geoms = "".join(
+        f'<geom type="box" size="{half_size}" pos="{side * (_RAIL_GAP + _RAIL_THICKNESS) / 2} 0 0" rgba="0.62 0.5 0.36 1"/>'
+        for side in (-1, 1)
+    )
+    middle = f"0 {(lower + upper) / 2} {TABLE_TOP + _RAIL_HEIGHT / 2}"
+    return Prop("rails", f'<body name="rails" pos="{middle}">{geoms}</body>', material="table")
+
+
 def place_cube(env: Any, options: dict[str, Any]) -> float:
     """Puts the cube where it is drawn to be, or where `options` want it. Returns its y [m]."""
     variant: Variant = env.variant
@@ -45,7 +57,7 @@ def place_cube(env: Any, options: dict[str, Any]) -> float:
 
 def cube_task(variant: Variant, condition: Callable[[Any], bool]) -> dict[str, Any]:
     """What such tasks have in common, as arguments of `Task`: they are solved when `condition(env)` has lasted long enough."""
-    ends: list[Rule] = [Shoved(CUBE, variant.max_shove, _CARRIED_HEIGHT)]
+    ends: list[Rule] = [Shoved(CUBE, variant.max_shove, _CARRIED_HEIGHT, variant.squeeze)]
     if np.isfinite(variant.max_press):
         ends.append(Pressed(CUBE, variant.max_press, FINGER_FRICTION))
     if np.isfinite(variant.closings):

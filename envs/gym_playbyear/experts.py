@@ -6,7 +6,7 @@ every episode, so that neither the time since contact nor the time since the sta
 is when the sound comes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class ExpertConfig:
     noise: float = 0.0025
     contact_force: float = 0.2  # N
     squeeze_force: float = 20.0  # N, both fingers together: they hold
-    sweep_step: tuple[float, float] = (0.005, 0.011)
+    sweep_step: tuple[float, float] | None = None  # None: the task's
     pause_probability: float = 0.04
     pause: tuple[int, int] = (2, 8)
     dwell: tuple[int, int] = (0, 10)
@@ -51,6 +51,9 @@ CORRECTING_EXPERT = ExpertConfig(
     hover=(0, 1),
 )
 """An expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
+
+PATIENT_EXPERT = replace(CORRECTING_EXPERT, sweep_step=None)
+"""Where there is time, it corrects without haste: it sweeps as one that demonstrates."""
 
 
 class GraspExpert:
@@ -79,7 +82,7 @@ class GraspExpert:
         lower, upper = self.env.hidden_range
         self.sweep_start = lower - self.reach - (config.margin + rng.uniform(0, 0.02))
         self.sweep_end = upper - self.reach + 0.02
-        self.sweep_step = rng.uniform(*config.sweep_step)
+        self.sweep_step = rng.uniform(*(config.sweep_step or self.env.variant.sweep_step))
         self.rise_step = rng.uniform(*config.rise_step)
         self.phase = "approach"
 

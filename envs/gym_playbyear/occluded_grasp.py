@@ -7,10 +7,10 @@ import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp, SteadyBlindGrasp
-from gym_playbyear.cube import cube, cube_task, place_cube
-from gym_playbyear.experts import CORRECTING_EXPERT, GraspExpert, SteadyGraspExpert
+from gym_playbyear.cube import cube, cube_task, place_cube, rails
+from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, GraspExpert, SteadyGraspExpert
 from gym_playbyear.options import check_option
-from gym_playbyear.task import Task
+from gym_playbyear.task import Prop, Task
 from gym_playbyear.variant import OLD, PAPER, Variant
 
 WALL_HALF_SIZE = (0.02, 0.40, 0.30)  # m
@@ -31,6 +31,10 @@ NUMBERS = Variant(
     max_press=10.0,
     closings=3,
     hold_s=0.5,
+    max_shove=0.02,
+    squeeze=20.0,
+    panels=2,
+    sweep_step=(0.005, 0.009),
 )
 
 
@@ -91,8 +95,9 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
         "OccludedGrasp-v1",
         NUMBERS,
         cube_material,
+        (rails(-0.38, 0.38),),
         expert=SteadyGraspExpert,
-        correcting_expert=partial(SteadyGraspExpert, config=CORRECTING_EXPERT),
+        correcting_expert=partial(SteadyGraspExpert, config=PATIENT_EXPERT),
         blind={name: partial(SteadyBlindGrasp, strategy=name) for name in BLIND_STRATEGIES},
     )
 
@@ -117,13 +122,13 @@ def occluded_grasp_v0(*, variant: str = "default", cube_material: str = "cube") 
     )
 
 
-def _task(name: str, numbers: Variant, cube_material: str, **scripts: Any) -> Task:
+def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **scripts: Any) -> Task:
     wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall")
     panel = box("indicator", INDICATOR_HALF_SIZE, (INDICATOR_X, 0, INDICATOR_Z), "0.1 0.2 0.9 1")
     return Task(
         name=name,
         description="Find the cube behind the wall by touch and sound, grasp it and lift it.",
-        props=(wall, panel, cube(numbers, cube_material)),
+        props=(wall, panel, *more, cube(numbers, cube_material)),
         place=_place,
         **cube_task(numbers, _is_lifted),
         **scripts,
@@ -133,11 +138,12 @@ def _task(name: str, numbers: Variant, cube_material: str, **scripts: Any) -> Ta
 def _place(env: Any, options: dict[str, Any]) -> dict[str, Any]:
     y = place_cube(env, options)
     lower, upper = env.variant.cube_y
-    quarter = int(np.clip(4 * (y - lower) / (upper - lower), 0, 3))
-    width = (upper - lower) / 4
-    shown = (lower + quarter * width, lower + (quarter + 1) * width)
+    n_parts = env.variant.panels
+    part = int(np.clip(n_parts * (y - lower) / (upper - lower), 0, n_parts - 1))
+    width = (upper - lower) / n_parts
+    shown = (lower + part * width, lower + (part + 1) * width)
     env.put("indicator", (INDICATOR_X, np.mean(shown), INDICATOR_Z))
-    return {"hidden_range": shown, "quarter": quarter}
+    return {"hidden_range": shown}
 
 
 def _is_lifted(env: Any) -> bool:

@@ -7,10 +7,10 @@ import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
-from gym_playbyear.cube import cube, cube_task, place_cube
-from gym_playbyear.experts import CORRECTING_EXPERT, PickPlaceExpert
+from gym_playbyear.cube import cube, cube_task, place_cube, rails
+from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, PickPlaceExpert
 from gym_playbyear.options import check_option
-from gym_playbyear.task import Task
+from gym_playbyear.task import Prop, Task
 from gym_playbyear.variant import OLD, PAPER, Variant
 
 WALL_HALF_SIZE = (0.02, 0.20, 0.18)  # m
@@ -27,12 +27,15 @@ VARIANTS = {
 }
 NUMBERS = Variant(
     cube_x=(-0.001, 0.001),
-    cube_y=(0.11, 0.31),
+    cube_y=(0.06, 0.34),
     cube_density=3000,
     horizon=400,
     max_press=10.0,
     closings=3,
     hold_s=0.5,
+    max_shove=0.02,
+    squeeze=20.0,
+    sweep_step=(0.005, 0.009),
 )
 
 
@@ -90,7 +93,8 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     - v1: ends attempts that press or grope, wants the cube to stay where it belongs, leaves time for a second search.
     - v0: first version.
     """
-    return _task("OccludedPickPlace-v1", NUMBERS, cube_material)
+    correcting = partial(PickPlaceExpert, config=PATIENT_EXPERT)
+    return _task("OccludedPickPlace-v1", NUMBERS, cube_material, (rails(0.0, 0.38),), correcting_expert=correcting)
 
 
 def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cube") -> Task:
@@ -101,21 +105,21 @@ def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cu
     `variant="paper"` has the numbers of the paper and its code, in which a blind gripper mostly succeeds.
     """
     check_option("variant", variant, tuple(VARIANTS))
-    return _task("OccludedPickPlace-v0", VARIANTS[variant], cube_material, is_old=True)
+    correcting = partial(PickPlaceExpert, config=CORRECTING_EXPERT)
+    return _task("OccludedPickPlace-v0", VARIANTS[variant], cube_material, correcting_expert=correcting, is_old=True)
 
 
-def _task(name: str, numbers: Variant, cube_material: str, is_old: bool = False) -> Task:
+def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **traits: Any) -> Task:
     wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall")
     return Task(
         name=name,
         description="Find the cube behind the wall by touch and sound, grasp it and put it into the tray.",
-        props=(wall, tray("bin", BIN_HALF_WIDTH, BIN_WALL_HALF_HEIGHT), cube(numbers, cube_material)),
+        props=(wall, tray("bin", BIN_HALF_WIDTH, BIN_WALL_HALF_HEIGHT), *more, cube(numbers, cube_material)),
         place=_place,
         expert=PickPlaceExpert,
-        correcting_expert=partial(PickPlaceExpert, config=CORRECTING_EXPERT),
         blind={name: partial(BlindPickPlace, strategy=name) for name in BLIND_STRATEGIES},
-        is_old=is_old,
         **cube_task(numbers, _is_in_the_tray),
+        **traits,
     )
 
 

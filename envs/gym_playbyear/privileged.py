@@ -49,6 +49,11 @@ class PrivilegedState:
         return self.definition.control_hz
 
     @property
+    def is_as_wanted(self) -> bool:
+        """Whether all is as the task wants it, though perhaps not for long enough yet."""
+        return self.definition.success.condition(self)
+
+    @property
     def expert_rng(self) -> np.random.Generator:
         """What the episode's experts draw from.
 

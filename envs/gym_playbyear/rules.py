@@ -62,25 +62,27 @@ class Solved(Rule):
 
 
 class Shoved(Rule):
-    """A thing was moved along the table before it was ever lifted.
+    """A thing was moved along the table before it was ever lifted or held.
 
     Args:
         prop: What must not be shoved.
         distance: How far it may move [m].
         carried_height: Its own height above which it counts as lifted [m, world].
+        squeeze: Force of the hand from which on it counts as held [N].
     """
 
     name = "shoved"
 
-    def __init__(self, prop: str, distance: float, carried_height: float):
-        self.prop, self.distance, self.carried_height = prop, distance, carried_height
+    def __init__(self, prop: str, distance: float, carried_height: float = np.inf, squeeze: float = np.inf):
+        self.prop, self.distance, self.carried_height, self.squeeze = prop, distance, carried_height, squeeze
 
     def begin(self, env: Any) -> None:
         self._first, self._was_carried = env.position(self.prop), False
 
     def applies(self, env: Any) -> bool:
         place = env.position(self.prop)
-        self._was_carried |= bool(place[2] > self.carried_height)
+        is_held = env.contact_forces[f"gripper-{self.prop}"] > self.squeeze
+        self._was_carried |= bool(place[2] > self.carried_height or is_held)
         return not self._was_carried and bool(np.linalg.norm((place - self._first)[:2]) > self.distance)
 
 

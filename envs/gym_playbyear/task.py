@@ -9,7 +9,7 @@ import numpy as np
 
 from gym_playbyear.ears import Ears, HeardPair, contact_sound
 from gym_playbyear.proprioception import SensorNoise
-from gym_playbyear.rules import Rule
+from gym_playbyear.rules import Rule, Solved
 
 PHYSICS_DT = 0.002  # s
 
@@ -158,7 +158,7 @@ class Task:
     arena: Prop
     props: tuple[Prop, ...]
     place: Callable[[Any, dict[str, Any]], dict[str, Any]]
-    success: Rule
+    success: Solved
     expert: Callable[[Any], Any]
     horizon: int
     ends: tuple[Rule, ...] = ()
