@@ -19,12 +19,15 @@ class HeardPair:
         materials: Of the two, in the same order.
         loudness: Factors on their shares of the sound.
         loose: Which of the two move freely: they carry sound to what they press against.
+        sensed: The model's bodies that stand for the first thing, each with whether all that hangs on it counts; a hand that
+            squeezes is several, since in one the forces would cancel. The second thing is the body of its name, with all of it.
     """
 
     bodies: tuple[str, str]
     materials: tuple[str, str]
     loudness: tuple[float, float] = (1.0, 1.0)
     loose: frozenset[str] = frozenset()
+    sensed: tuple[tuple[str, bool], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -36,14 +39,16 @@ class Moment:
         sensordata: All that the model's sensors measured (T, nsensordata).
         joint_speed: Mean absolute speed of the arm's joints (T,) [rad/s].
         finger_speed: Mean absolute speed of the fingers (T,) [m/s].
-        microphone_positions: Where the microphones are at the end of the step (n_microphones, 3) [m, world].
+        states: Full state of the physics (T, size of `mjSTATE_FULLPHYSICS`).
+        microphone_positions: Where each microphone is at the end of the step (3,) [m, world].
     """
 
     forces: np.ndarray
     sensordata: np.ndarray
     joint_speed: np.ndarray
     finger_speed: np.ndarray
-    microphone_positions: np.ndarray
+    states: np.ndarray
+    microphone_positions: dict[str, np.ndarray]
 
 
 class Ears(Protocol):

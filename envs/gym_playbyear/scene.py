@@ -120,6 +120,7 @@ class Contacts:
                 (self._material(a), self._material(b)),
                 (self._loudness(a), self._loudness(b)),
                 self._loose & {a, b},
+                self._sensed(a, b),
             )
             for a, b in self.pairs
         ]
@@ -127,14 +128,10 @@ class Contacts:
     def add_sensors(self, spec: mujoco.MjSpec, felt: str | None) -> None:
         """Adds the sensors; those of `felt`, its net force and torque, come last."""
         for a, b in self.pairs:
-            if self._is_grip((a, b)):
-                for part in self._arm.touching:
-                    _add_sensor(spec, f"{part}-{b}", (part, False), (b, False))
-            else:
-                first = (self._arm.root, True) if a == GRIPPER else (a, False)
-                _add_sensor(spec, f"{a}-{b}", first, (b, False))
+            for part in self._sensed(a, b):
+                _add_sensor(spec, f"force:{part[0]}-{b}", part, (b, True))
         if felt is not None:
-            _add_sensor(spec, felt, (felt, False), None)
+            _add_sensor(spec, f"force:{felt}", (felt, True), None)
 
     def magnitudes(self, sensordata: np.ndarray) -> np.ndarray:
         """Force of each pair (T, n_pairs) [N], from sensor readings (T, nsensordata)."""
@@ -154,6 +151,12 @@ class Contacts:
 
     def _is_grip(self, pair: tuple[str, str]) -> bool:
         return pair[0] == GRIPPER and pair[1] in self._loose
+
+    def _sensed(self, a: str, b: str) -> tuple[tuple[str, bool], ...]:
+        """The bodies that stand for the first of a pair; True: with all that hangs on them."""
+        if self._is_grip((a, b)):
+            return tuple((part, False) for part in self._arm.touching)
+        return ((self._arm.root, True),) if a == GRIPPER else ((a, True),)
 
     def _material(self, name: str) -> str:
         material = GRIPPER if name == GRIPPER else self._props[name].material

@@ -280,7 +280,8 @@ class TaskEnv(PrivilegedState, gym.Env):
             sensors,
             speeds[:, : self._fingers.start].mean(axis=1),
             speeds[:, self._fingers].mean(axis=1),
-            np.array([self._place_of(links.get(microphone)) for microphone in self._microphones]),
+            self._rollout_state[0],
+            {microphone: self._place_of(links.get(microphone)) for microphone in self._microphones},
         )
 
     def _place_of(self, body: str | None) -> np.ndarray:

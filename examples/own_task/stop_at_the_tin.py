@@ -16,9 +16,9 @@ from gym_playbyear.rules import Shoved, Solved
 from gym_playbyear.task import Prop, Task
 
 TIN_CAN = Material((930.0, 1480.0, 2210.0, 3050.0), (35.0, 45.0, 60.0, 80.0), (1.0, 0.8, 0.7, 0.4))
-RADIUS, HALF_HEIGHT = 0.025, 0.04  # m
+RADIUS, HALF_HEIGHT = 0.025, 0.025  # m
 RANGE = (-0.1, 0.25)  # m: where along the wall it may stand
-SWEEP_HEIGHT = 0.04  # m
+SWEEP_HEIGHT = 0.03  # m
 NEAR = 0.01  # m
 TIN = Prop(
     "tin",
