@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from gym_playbyear.plugins import Registry
 from gym_playbyear.task import Camera, Prop
 
 TABLE_TOP = 0.80  # m, world frame
@@ -24,6 +25,9 @@ TABLE = Prop(
     material="table",
 )
 """A table of 0.8 x 0.8 m, and the light above it."""
+
+ALL_PROPS = Registry("props", {"table": TABLE})
+"""Ours, and those of other distributions, for tasks that choose among them."""
 
 
 def box(name: str, half_size, position, rgba: str, *, material: str | None = None, **traits: Any) -> Prop:

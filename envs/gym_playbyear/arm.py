@@ -12,6 +12,8 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
+from gym_playbyear.plugins import Registry
+
 N_JOINTS = 7
 PHYSICS_TIMESTEP = 0.002  # s
 ACTION_SCALE = 0.05  # m of displacement per unit of action and step (the authors' code)
@@ -171,6 +173,9 @@ def arm_actuator_xml(config: ArmConfig) -> str:
               forcerange="{-config.grip_force} {config.grip_force}"/>
   </actuator>"""
 
+
+ALL_ARMS = Registry("arms", {"panda": ArmConfig})
+"""Ours, and those of other distributions: each makes an arm (`gym_playbyear.task.Arm`)."""
 
 ARM_DEFAULT_XML = (
     '<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>'
