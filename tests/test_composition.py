@@ -83,6 +83,25 @@ def test_rates_are_the_tasks():
     env.close()
 
 
+def place_one_of_two(env, options) -> dict:
+    here, away = ("a", "b") if options["is_a"] else ("b", "a")
+    env.put(here, (0.0, 0.1, TABLE_TOP + 0.02), yaw=0.0)
+    env.take_away(away)
+    return {}
+
+
+def test_a_thing_may_be_left_out_of_an_episode():
+    env = TaskEnv(replace(task(block("a"), block("b")), place=place_one_of_two), sound="none")
+    for is_a in (True, False):
+        env.begin_episode(seed=0, options={"is_a": is_a})
+        here, away = (env.a_position, env.b_position) if is_a else (env.b_position, env.a_position)
+        for _ in range(20):
+            env.advance(STAY)
+        assert here[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
+        assert env.contact_forces["a-table" if is_a else "b-table"] > 0.3
+        np.testing.assert_allclose(away, env.b_position if is_a else env.a_position, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("prop", "message"),
     [

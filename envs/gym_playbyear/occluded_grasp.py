@@ -72,7 +72,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
 
     ## Episode Termination
     Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 3 cm along the table;
-    "pressed", when the hand came down on the cube with more than 10 N, which stops an arm for people (a squeeze between the
+    "pressed", when the hand came down on the cube with more than 5 N, which stops an arm for people (a squeeze between the
     fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
     `horizon` steps (250): enough for a second search after a failed grasp.
 

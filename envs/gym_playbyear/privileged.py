@@ -9,6 +9,8 @@ from gymnasium.error import ResetNeeded
 from gym_playbyear.scene import Contacts
 from gym_playbyear.task import Controller, Task
 
+_FAR_BELOW = -10.0  # m
+
 
 class PrivilegedState:
     """The true state behind the observations, for an environment to inherit.
@@ -109,6 +111,7 @@ class PrivilegedState:
         turn = None if yaw is None else (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
         body = self.model.body(name)
         if next(prop for prop in self.definition.props if prop.name == name).loose:
+            self._weigh(name, True)
             address = self.model.joint(name).qposadr[0]
             self.data.qpos[address : address + 3] = position
             if turn is not None:
@@ -117,3 +120,12 @@ class PrivilegedState:
             body.pos[:] = position
             if turn is not None:
                 body.quat[:] = turn
+
+    def take_away(self, name: str) -> None:
+        """Leaves a loose prop out of the episode, for a task's `place`: it floats far below until `put` fetches it."""
+        self.put(name, (0.0, 0.0, _FAR_BELOW - self.model.body(name).id))
+        self._weigh(name, False)
+
+    def _weigh(self, name: str, falls: bool) -> None:
+        root = self.model.body(name).id
+        self.model.body_gravcomp[self.model.body_rootid == root] = 0.0 if falls else 1.0
