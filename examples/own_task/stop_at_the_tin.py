@@ -49,8 +49,7 @@ def stop_at_the_tin() -> Task:
 
 def place(env, options) -> dict:
     """Stands the tin somewhere in its range; what the camera shows of the episode is that range."""
-    y = options.get("tin_y", env.np_random.uniform(*RANGE))
-    env.put("tin", (0.0, y, TABLE_TOP + HALF_HEIGHT))
+    env.put("tin", (0.0, env.np_random.uniform(*RANGE), TABLE_TOP + HALF_HEIGHT))
     return {"hidden_range": RANGE}
 
 
@@ -61,8 +60,7 @@ def gap(env) -> float:
 
 
 def is_near(env) -> bool:
-    low = env.eef_position[2] < TABLE_TOP + 2 * HALF_HEIGHT
-    return low and gap(env) < NEAR
+    return env.eef_position[2] < TABLE_TOP + 2 * HALF_HEIGHT and gap(env) < NEAR
 
 
 class Expert:
