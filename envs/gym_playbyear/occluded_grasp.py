@@ -31,10 +31,10 @@ NUMBERS = Variant(
     max_press=5.0,
     closings=3,
     hold_s=0.5,
-    max_shove=0.02,
+    max_shove=0.022,
     squeeze=20.0,
     panels=2,
-    sweep_step=(0.005, 0.009),
+    sweep_step=(0.005, 0.008),
 )
 
 
@@ -71,7 +71,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
     random; `reset(options={"cube_position": (x, y), "cube_yaw": yaw})` sets them.
 
     ## Episode Termination
-    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 3 cm along the table;
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 2.2 cm along the table;
     "pressed", when the hand came down on the cube with more than 5 N, which stops an arm for people (a squeeze between the
     fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
     `horizon` steps (250): enough for a second search after a failed grasp.

@@ -33,9 +33,9 @@ NUMBERS = Variant(
     max_press=5.0,
     closings=3,
     hold_s=0.5,
-    max_shove=0.02,
+    max_shove=0.022,
     squeeze=20.0,
-    sweep_step=(0.005, 0.009),
+    sweep_step=(0.005, 0.008),
 )
 
 
@@ -73,7 +73,7 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     them.
 
     ## Episode Termination
-    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 3 cm along the table;
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 2.2 cm along the table;
     "pressed", when the hand came down on the cube with more than 5 N, which stops an arm for people (a squeeze between the
     fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
     `horizon` steps (400): enough for a second search after a failed grasp.
