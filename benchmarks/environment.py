@@ -88,14 +88,11 @@ def parts_of_a_step(task: str) -> dict[str, Callable[[], object]]:
     env = gym.make(f"gym_playbyear/{task}").unwrapped
     env.reset(seed=0)
     hold = np.repeat(env.data.ctrl[None].copy(), env._controller.n_substeps, axis=0)
-    camera, sensors = env._cameras["front"], env._rollout_sensors[0]
-    from gym_playbyear.arena import pair_forces
-
-    forces, speed = pair_forces(sensors, len(env.pairs)), np.zeros(len(sensors))
+    camera, moment = env._cameras["front"], env.moment()
     return {
         "physics": lambda: env._advance(hold),
         "picture": lambda: camera.render(env.data, "front"),
-        "sound": lambda: env._sound.step(forces, speed),
+        "sound": lambda: env._sound.step(env.model, moment),
         "inverse kinematics": lambda: env._controller.command(np.zeros(4), env.eef_position),
     }
 
@@ -161,7 +158,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
 
 if __name__ == "__main__":
     parser = parser_for(__doc__, turns=5)
-    parser.add_argument("--task", default="OccludedGrasp-v0")
+    parser.add_argument("--task", default="OccludedGrasp-v1")
     parser.add_argument("--steps", type=int, default=500, help="of a turn")
     parser.add_argument("--peers", default=",".join(_PEERS), help="which of them to measure beside it")
     run("environment", parser, measure)

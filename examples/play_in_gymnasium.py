@@ -1,6 +1,6 @@
 """The tasks in plain Gymnasium, without LeRobot and torch: the expert acts, and the frame in which it touches is printed.
 
-MUJOCO_GL=egl python examples/play_in_gymnasium.py --task=OccludedGrasp-v0
+MUJOCO_GL=egl python examples/play_in_gymnasium.py --task=OccludedGrasp-v1
 """
 
 import argparse
@@ -14,7 +14,7 @@ import gym_playbyear  # noqa: F401  (registers the tasks)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", default="OccludedGrasp-v0")
+    parser.add_argument("--task", default="OccludedGrasp-v1")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
 

@@ -54,7 +54,7 @@ def twin_sweeps(sensors: SensorNoise, seeds: range) -> tuple[np.ndarray, np.ndar
     """
     env = gym.make(f"gym_playbyear:gym_playbyear/{TASK}", image_size=8, sound="none", disable_env_checker=True)
     task = env.unwrapped
-    task.variant = replace(task.variant, sensors=sensors)
+    task.definition = replace(task.definition, sensors=sensors)
     windows, labels = [], []
     for seed in seeds:
         states, contacts = _sweep(env, seed, None)

@@ -91,9 +91,9 @@ def test_without_an_environment_or_a_policy(tmp_path):
 
 
 def test_an_environment_without_a_gate(tmp_path, monkeypatch):
-    from gym_playbyear.occluded_grasp import OccludedGraspEnv
+    from gym_playbyear.task_env import TaskEnv
 
-    monkeypatch.setattr(OccludedGraspEnv, "intervention_gate", None)
+    monkeypatch.setattr(TaskEnv, "intervention_gate", None)
     with pytest.raises(PlaybyearError, match=r"needs an environment with `intervention_gate\(\)`.*own_expert.py"):
         dagger(tmp_path)
 

@@ -1,5 +1,7 @@
 """`--env.type=playbyear`: what LeRobot's commands get from the environments."""
 
+from dataclasses import replace
+
 import draccus
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from lerobot.processor import PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
+from gym_playbyear import ALL_TASKS
+from gym_playbyear.options import make_definition
 from lerobot_env_playbyear import PcmToFloatProcessorStep, PlaybyearEnvConfig
 from lerobot_playbyear.recording.record import RecordConfig
 
@@ -133,6 +137,17 @@ def test_options_reach_the_environment():
     assert vec.call("render")[0].shape == (96, 96, 3)
     assert vec.single_observation_space["pixels"]["front"].shape == (32, 32, 3)
     vec.close()
+
+
+def test_rates_and_microphones_that_are_not_given_are_the_tasks(monkeypatch):
+    usual = make_definition("OccludedGrasp-v1", {})
+    slow = replace(usual, name="Slow-v1", control_hz=5, sample_rate=48000, microphones=("gripper", "table"))
+    monkeypatch.setitem(ALL_TASKS._own, "Slow-v1", slow)
+    config = PlaybyearEnvConfig(task="Slow-v1")
+    assert (config.fps, config.sample_rate, config.microphones) == (5, 48000, ["gripper", "table"])
+    assert config.features["audio.table"].shape == (9600,)
+    with pytest.raises(DecodingError, match="5 Hz"):
+        PlaybyearEnvConfig(task="Slow-v1", fps=20)
 
 
 @pytest.mark.parametrize(

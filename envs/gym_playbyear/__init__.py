@@ -1,10 +1,36 @@
 """Manipulation tasks in which the target is hidden from every camera and only contact sound reveals it."""
 
-from gymnasium.envs.registration import register
+import warnings
+
+from gymnasium.envs.registration import register, registry
+
+from gym_playbyear.plugins import Registry
 
 __version__ = "0.1.0"
 
-TASKS = ("OccludedGrasp-v0", "OccludedPickPlace-v0")
+_OWN = {
+    "OccludedGrasp-v0": "gym_playbyear.occluded_grasp:occluded_grasp_v0",
+    "OccludedPickPlace-v0": "gym_playbyear.occluded_pick_place:occluded_pick_place_v0",
+    "OccludedGrasp-v1": "gym_playbyear.occluded_grasp:occluded_grasp",
+    "OccludedPickPlace-v1": "gym_playbyear.occluded_pick_place:occluded_pick_place",
+}
+TASKS = tuple(_OWN)
+"""Our own."""
 
-register("gym_playbyear/OccludedGrasp-v0", "gym_playbyear.occluded_grasp:OccludedGraspEnv")
-register("gym_playbyear/OccludedPickPlace-v0", "gym_playbyear.occluded_pick_place:OccludedPickPlaceEnv")
+ALL_TASKS = Registry("tasks", _OWN)
+"""Ours, and those that other distributions bring (`gym_playbyear.plugins`)."""
+
+
+def register_tasks() -> None:
+    """Registers every task with Gymnasium as `gym_playbyear/<name>`. Importing this package does it; call it again when a
+    distribution with tasks was installed since then."""
+    for name in ALL_TASKS:
+        if f"gym_playbyear/{name}" in registry:
+            continue
+        try:
+            register(f"gym_playbyear/{name}", "gym_playbyear.task_env:TaskEnv", kwargs={"task": name})
+        except Exception as error:  # whatever another distribution calls its task: the others go on
+            warnings.warn(f"Another distribution's task {name!r} is left out: {error}", stacklevel=2)
+
+
+register_tasks()

@@ -5,10 +5,14 @@ by Gaz et al., "Dynamic Identification of the Franka Emika Panda Robot with Retr
 Shapes are boxes and capsules: at 84 pixels meshes add nothing and cost tens of milliseconds a frame.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import mujoco
 import numpy as np
+
+from gym_playbyear.plugins import Registry
 
 N_JOINTS = 7
 PHYSICS_TIMESTEP = 0.002  # s
@@ -33,7 +37,7 @@ _FINGER_SPEED = 0.05  # m/s per finger, the real hand's maximum
 
 @dataclass(frozen=True)
 class ArmConfig:
-    """What is ours to tune about the arm.
+    """What is ours to tune about the arm; and the arm itself, as tasks want one (`gym_playbyear.task.Arm`).
 
     base: position of the robot's base in the world [m].
     max_opening: distance between the fingers' inner faces when open [m]; the real hand opens 0.08.
@@ -41,7 +45,17 @@ class ArmConfig:
     gripper_cooldown: seconds for which a change of the gripper command blocks the next one (the paper's appendix: 2 s).
     workspace: lower and upper corner of the box that the commanded tool centre point stays in, world frame [m].
     max_lead: how far the commanded point may run ahead of the measured one [m]; bounds the force on an obstacle.
+    touching: the parts of the hand whose contacts with loose things are measured, one by one.
     """
+
+    n_joints: ClassVar[int] = N_JOINTS
+    root: ClassVar[str] = "link5"  # from here on outward a contact is the gripper's
+    tool: ClassVar[str] = "tcp"
+    links: ClassVar[Mapping[str, str]] = {
+        "gripper": "hand",
+        "left_finger": "left_finger",
+        "right_finger": "right_finger",
+    }
 
     base: tuple[float, float, float] = (-0.5, 0.0, 0.80)
     max_opening: float = 0.054
@@ -52,6 +66,18 @@ class ArmConfig:
         (0.155, 0.40, 1.15),
     )
     max_lead: float = 0.06
+    touching: tuple[str, ...] = ("left_finger", "right_finger", "hand")
+
+    def spec(self) -> mujoco.MjSpec:
+        """The arm alone, with its servos."""
+        return mujoco.MjSpec.from_string(
+            f"""<mujoco><compiler angle="radian" autolimits="true"/><default>{ARM_DEFAULT_XML}</default>
+            <worldbody>{arm_body_xml(self)}</worldbody>{arm_actuator_xml(self)}</mujoco>"""
+        )
+
+    def controller(self, control_hz: int, physics_dt: float) -> "CartesianController":
+        """What moves it, for so many control steps per second and physics steps of so many seconds."""
+        return CartesianController(self, control_hz, physics_dt)
 
 
 _R = 2**-0.5
@@ -148,6 +174,9 @@ def arm_actuator_xml(config: ArmConfig) -> str:
   </actuator>"""
 
 
+ALL_ARMS = Registry("arms", {"panda": ArmConfig})
+"""Ours, and those of other distributions: each makes an arm (`gym_playbyear.task.Arm`)."""
+
 ARM_DEFAULT_XML = (
     '<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>'
 )
@@ -160,9 +189,9 @@ class CartesianController:
     kinematics run on a copy of the arm alone.
     """
 
-    def __init__(self, config: ArmConfig, control_hz: int):
-        self.config = config
-        self.n_substeps = round(1 / (control_hz * PHYSICS_TIMESTEP))
+    def __init__(self, config: ArmConfig, control_hz: int, physics_dt: float = PHYSICS_TIMESTEP):
+        self.config, self._physics_dt = config, physics_dt
+        self.n_substeps = round(1 / (control_hz * physics_dt))
         self._cooldown_steps = round(config.gripper_cooldown * control_hz)
         xml = f"""<mujoco><compiler angle="radian"/><default>{ARM_DEFAULT_XML}</default>
             <worldbody>{arm_body_xml(config)}</worldbody></mujoco>"""
@@ -184,6 +213,10 @@ class CartesianController:
         self._closed = False
         self._steps_since_change = self._cooldown_steps
         return np.concatenate([self.joints, [self.finger_target] * 2])
+
+    def hold(self) -> np.ndarray:
+        """(8,) the servo targets that keep it where it is told to be: seven joints [rad], finger position [m]."""
+        return np.append(self.joints, self.finger_target)
 
     def command(self, action: np.ndarray, measured: np.ndarray) -> np.ndarray:
         """One control step.
@@ -209,7 +242,7 @@ class CartesianController:
         controls = np.empty((self.n_substeps, N_JOINTS + 1))
         controls[:, :N_JOINTS] = before + ramp * (self.joints - before)
         goal = 0.0 if self._closed else self.config.max_opening / 2
-        travel = _FINGER_SPEED * PHYSICS_TIMESTEP * np.arange(1, self.n_substeps + 1)
+        travel = _FINGER_SPEED * self._physics_dt * np.arange(1, self.n_substeps + 1)
         sign = np.sign(goal - self.finger_target)
         fingers = self.finger_target + sign * np.minimum(travel, abs(goal - self.finger_target))
         controls[:, N_JOINTS] = fingers

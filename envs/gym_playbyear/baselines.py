@@ -1,4 +1,4 @@
-"""How often the expert and the blind baselines succeed: `python -m gym_playbyear.baselines --task OccludedGrasp-v0`."""
+"""How often the expert and the blind baselines succeed: `python -m gym_playbyear.baselines --task OccludedGrasp-v1`."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ def success_rates(task: str, strategies: tuple[str, ...], seeds: range, **option
     """Share of the seeds' episodes that each strategy solves.
 
     Args:
-        task: Name of the task, such as `OccludedGrasp-v0`.
+        task: Name of the task, such as `OccludedGrasp-v1`.
         strategies: `"expert"` and names of blind baselines.
         seeds: One episode each.
         options: For `gymnasium.make`.
@@ -53,9 +53,8 @@ def main() -> None:
     seeds = range(arguments.seed, arguments.seed + arguments.n_episodes)
     results = []
     for task in arguments.task:
-        rates = success_rates(
-            task, (EXPERT, *BLIND_STRATEGIES), seeds, variant=arguments.variant, horizon=arguments.horizon
-        )
+        own = {} if arguments.variant == "default" else {"variant": arguments.variant}
+        rates = success_rates(task, (EXPERT, *BLIND_STRATEGIES), seeds, horizon=arguments.horizon, **own)
         options = {"variant": arguments.variant, "horizon": arguments.horizon}
         results.append({"task": task, **options, "seeds": [seeds[0], seeds[-1]], "success": rates})
         print(json.dumps(results[-1]), flush=True)

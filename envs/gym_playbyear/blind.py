@@ -13,7 +13,7 @@ They may look at the fingers' position, as any robot may: fully closed fingers h
 import numpy as np
 
 from gym_playbyear.arena import CUBE_HALF_SIZE
-from gym_playbyear.experts import GraspExpert, PickPlaceExpert
+from gym_playbyear.experts import GraspExpert, PickPlaceExpert, Steady
 
 BLIND_STRATEGIES = ("middle", "random", "search", "push")
 _CLOSING_STEPS = 14  # after which fingers that are not closed are taken to hold something
@@ -66,6 +66,10 @@ class BlindGrasp(GraspExpert):
 
     def _dropped(self) -> bool:
         return self._fingers_met()
+
+
+class SteadyBlindGrasp(Steady, BlindGrasp):
+    """A grasp without any sense of contact that holds still what it lifted."""
 
 
 class BlindPickPlace(BlindGrasp, PickPlaceExpert):

@@ -6,7 +6,7 @@ every episode, so that neither the time since contact nor the time since the sta
 is when the sound comes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class ExpertConfig:
     noise: float = 0.0025
     contact_force: float = 0.2  # N
     squeeze_force: float = 20.0  # N, both fingers together: they hold
-    sweep_step: tuple[float, float] = (0.005, 0.011)
+    sweep_step: tuple[float, float] | None = None  # None: the task's
     pause_probability: float = 0.04
     pause: tuple[int, int] = (2, 8)
     dwell: tuple[int, int] = (0, 10)
@@ -51,6 +51,9 @@ CORRECTING_EXPERT = ExpertConfig(
     hover=(0, 1),
 )
 """An expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
+
+PATIENT_EXPERT = replace(CORRECTING_EXPERT, sweep_step=None)
+"""Where there is time, it corrects without haste: it sweeps as one that demonstrates."""
 
 
 class GraspExpert:
@@ -79,7 +82,7 @@ class GraspExpert:
         lower, upper = self.env.hidden_range
         self.sweep_start = lower - self.reach - (config.margin + rng.uniform(0, 0.02))
         self.sweep_end = upper - self.reach + 0.02
-        self.sweep_step = rng.uniform(*config.sweep_step)
+        self.sweep_step = rng.uniform(*(config.sweep_step or self.env.variant.sweep_step))
         self.rise_step = rng.uniform(*config.rise_step)
         self.phase = "approach"
 
@@ -92,14 +95,16 @@ class GraspExpert:
 
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
-        if self.phase in ("lift", "carry") and self._dropped():
+        if self.phase in ("lift", "hold", "carry") and self._dropped():
             self._begin()
             displacement, close = np.zeros(3), False
         else:
             displacement, close = getattr(self, f"_{self.phase}")()
-        noise = self.rng.uniform(-self.config.noise, self.config.noise, 3)
-        move = (displacement + noise) / ACTION_SCALE
+        move = (displacement + self._noise()) / ACTION_SCALE
         return np.append(np.clip(move, -1, 1), 1.0 if close else -1.0).astype(np.float32)
+
+    def _noise(self) -> np.ndarray:
+        return self.rng.uniform(-self.config.noise, self.config.noise, 3)
 
     # One method per phase: it returns the displacement (3,) [m] and whether the fingers shall close.
 
@@ -210,6 +215,27 @@ class GraspExpert:
         length = float(np.linalg.norm(displacement))
         limit = max_step or self.config.max_step
         return displacement * min(1.0, limit / length) if length > 0 else displacement
+
+
+class Steady(GraspExpert):
+    """Lifts, and holds still up there. For a script to inherit before its own."""
+
+    hold_height = 0.085  # m above the table
+
+    def _lift(self):
+        if self.env.eef_position[2] > TABLE_TOP + self.hold_height:
+            self.phase = "hold"
+        return super()._lift()
+
+    def _hold(self):
+        return np.zeros(3), True
+
+    def _noise(self) -> np.ndarray:
+        return np.zeros(3) if self.phase == "hold" else super()._noise()
+
+
+class SteadyGraspExpert(Steady):
+    """Grasps the hidden cube by touch, lifts it and holds it still."""
 
 
 class PickPlaceExpert(GraspExpert):

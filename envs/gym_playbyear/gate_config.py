@@ -18,6 +18,8 @@ class GateConfig:
         grasp_reach, grasp_height: The cube is between the fingers when it is this near to their middle along the table, and
             their tips are this low.
         landed_steps: The hand touched the cube from above for so long.
+        land_x, land_height, land_margin: Where coming down on the cube ends an attempt: the hand is about to when it is this
+            near to the cube's middle across the line, and at most the margin, and one step, above where it lands.
         empty_opening: Fingers that were closed, and are this near to each other, hold nothing.
         release_reach: Fingers may open when the held cube is this near to the tray's middle.
         drop_distance: A cube that was held and is this far from the hand was dropped.
@@ -41,6 +43,9 @@ class GateConfig:
     grasp_reach: float = 0.012
     grasp_height: float = 0.034
     landed_steps: int = 8
+    land_x: float = 0.035
+    land_height: float = 0.044
+    land_margin: float = 0.012
     empty_opening: float = 0.03
     release_reach: float = 0.02
     drop_distance: float = 0.04

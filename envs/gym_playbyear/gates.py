@@ -13,7 +13,7 @@ from collections import deque
 
 import numpy as np
 
-from gym_playbyear.arena import TABLE_TOP
+from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP
 from gym_playbyear.arm import ACTION_SCALE
 from gym_playbyear.experts import GraspExpert
 from gym_playbyear.gate_config import GateConfig
@@ -22,7 +22,7 @@ SEARCH, GRASP, LIFT, CARRY = range(4)
 _STAGES = {
     **dict.fromkeys(("retreat", "approach", "lower", "sweep"), SEARCH),
     **dict.fromkeys(("dwell", "rise", "hover", "hop", "descend", "grasp"), GRASP),
-    "lift": LIFT,
+    **dict.fromkeys(("lift", "hold"), LIFT),
     **dict.fromkeys(("carry", "release"), CARRY),
 }
 
@@ -129,10 +129,11 @@ class InterventionGate:
 
     def _find_reason(self, action: np.ndarray) -> str | None:
         if self._was_held and self._is_over_tray():
-            return "still" if self._is_still() else None
+            return "still" if self._is_still() and not self.env.is_as_wanted else None
         holds = self._holds()
         checks = {
             "pushes": self._drags(action) if holds else self._pushes(action),
+            "lands": not holds and self._lands(action),
             "landed": self._on_top_for > self.config.landed_steps,
             "empty": not holds and self.env.finger_positions.sum() < self.config.empty_opening,
             "opens": holds and action[3] <= 0 and self.env.gripper_obeys,
@@ -165,6 +166,16 @@ class InterventionGate:
         over = np.abs(self._offset()[:2]).max() < self.expert.reach - 0.01
         too_high = self.config.grasp_height < self._height() < self.expert.config.clear_height - 0.01
         return bool(over and too_high and self._touches() and not self._holds())
+
+    def _lands(self, action: np.ndarray) -> bool:
+        """Is about to come down on the cube where that ends the attempt."""
+        if not np.isfinite(self.env.variant.max_press) or action[2] >= 0:
+            return False
+        across, along = np.abs(self._offset()[:2])
+        fits = self.env.finger_positions.sum() / 2 - CUBE_HALF_SIZE
+        is_over = across < self.config.land_x and fits < along < self.expert.reach
+        above = self._height() - self.config.land_height
+        return bool(is_over and 0 <= above < self.config.land_margin - action[2] * ACTION_SCALE)
 
     def _missed(self) -> bool:
         """High above the table without the cube, although it was touched or should have been."""

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gym_playbyear.plugins import Registry
+
 
 @dataclass(frozen=True)
 class Material:
@@ -54,8 +56,8 @@ MATERIALS: dict[str, Material] = {
 
 CUBE_MATERIALS = ("cube", "glass", "tin", "cardboard", "rubber")
 
-# Bodies that move freely. They carry sound to whatever they press against.
-LOOSE_BODIES = frozenset({"cube"})
+ALL_MATERIALS = Registry("materials", MATERIALS)
+"""Ours, and those of other distributions (`gym_playbyear.plugins`)."""
 
 
 @dataclass(frozen=True)
@@ -66,17 +68,19 @@ class ContactPair:
         name: What the pair is called, for messages.
         materials: Names in `MATERIALS` of what the two bodies are made of.
         bodies: The two bodies, such as `("gripper", "cube")`, in the same order.
+        loose: Bodies that move freely. They carry sound to whatever they press against.
     """
 
     name: str
     materials: tuple[str, str]
     bodies: tuple[str, str]
+    loose: frozenset[str] = frozenset({"cube"})
 
     def __post_init__(self) -> None:
         for material in self.materials:
-            if material not in MATERIALS:
+            if material not in ALL_MATERIALS:
                 raise ValueError(
-                    f"Contact pair '{self.name}' names material '{material}'; known are {sorted(MATERIALS)}."
+                    f"Contact pair '{self.name}' names material '{material}'; known are {sorted(ALL_MATERIALS)}."
                 )
 
 
@@ -107,7 +111,7 @@ class Microphone:
             if self.structure & {*pair.bodies}:
                 links.append(None)
                 continue
-            loose = LOOSE_BODIES & {*pair.bodies}
+            loose = pair.loose & {*pair.bodies}
             touching = [loose & {*p.bodies} and self.structure & {*p.bodies} for p in pairs]
             links.append(np.flatnonzero([bool(touches) for touches in touching]))
         return links
@@ -117,3 +121,6 @@ MICROPHONES: dict[str, Microphone] = {
     "gripper": Microphone("gripper", frozenset({"gripper"}), 1.0),
     "table": Microphone("table", frozenset({"table", "wall", "bin"}), 0.3),
 }
+
+ALL_MICROPHONES = Registry("microphones", MICROPHONES)
+"""Ours, and those of other distributions."""

@@ -1,14 +1,17 @@
 """Occluded Grasp with Visual Indicator (paper, section "Simulated Domain and Tasks")."""
 
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from gym_playbyear.arena import TABLE_TOP, box_xml
-from gym_playbyear.base import PlayByEarEnv
-from gym_playbyear.blind import BlindGrasp
-from gym_playbyear.experts import GraspExpert
-from gym_playbyear.variant import PAPER, Variant
+from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box
+from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp, SteadyBlindGrasp
+from gym_playbyear.cube import cube, cube_task, place_cube, rails
+from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, GraspExpert, SteadyGraspExpert
+from gym_playbyear.options import check_option
+from gym_playbyear.task import Prop, Task
+from gym_playbyear.variant import OLD, PAPER, Variant
 
 WALL_HALF_SIZE = (0.02, 0.40, 0.30)  # m
 WALL_CENTRE = (0.20, 0.0, 0.775)  # m: its top is 0.275 m above the table
@@ -16,13 +19,32 @@ INDICATOR_HALF_SIZE = (0.02, 0.1, 0.1)  # m
 INDICATOR_X, INDICATOR_Z = 0.25, 0.95  # m
 LIFT_HEIGHT = 0.04  # m above the table
 
+VARIANTS = {
+    "default": Variant(cube_x=(0.0, 0.0), cube_y=(-0.28, 0.28), cube_density=2000, horizon=102, **OLD),
+    "paper": Variant(cube_x=(0.0, 0.0), cube_y=(-0.17, 0.17), cube_density=2000, horizon=250, **PAPER),
+}
+NUMBERS = Variant(
+    cube_x=(0.0, 0.0),
+    cube_y=(-0.28, 0.28),
+    cube_density=2000,
+    horizon=250,
+    max_press=5.0,
+    closings=3,
+    hold_s=0.5,
+    max_shove=0.022,
+    squeeze=20.0,
+    panels=2,
+    sweep_step=(0.005, 0.008),
+)
 
-class OccludedGraspEnv(PlayByEarEnv):
+
+def occluded_grasp(*, cube_material: str = "cube") -> Task:
     """
     ## Description
     A red cube lies somewhere behind a wall that hides it from the camera. A blue panel in front of the wall shows which
     quarter of the table's width holds the cube, not where in the quarter. The arm has to go behind that quarter, sweep until
-    it hears itself touch the cube, hop over it, grasp it and lift it. After Du et al., "Play it by Ear" (RSS 2022).
+    it hears itself touch the cube, hop over it, grasp it, lift it and hold it still. After Du et al., "Play it by Ear"
+    (RSS 2022).
 
     ## Action Space
     `Box(-1, 1, (4,), float32)`: displacement of the end effector along x, y, z in units of 0.05 m per step, and the gripper
@@ -41,15 +63,18 @@ class OccludedGraspEnv(PlayByEarEnv):
     1 at the step that solves the task, otherwise 0.
 
     ## Success Criteria
-    The cube's centre is more than 0.04 m above the table. `info["is_success"]` says so at every step.
+    The cube's centre is more than 0.04 m above the table for half a second, and moves less than 1.5 cm meanwhile.
+    `info["is_success"]` says so at every step.
 
     ## Starting State
-    The gripper is open above the table, within 2 cm of the same point. The cube's place along the wall and its yaw are
-    random. `reset(options={"cube_position": (x, y), "cube_yaw": yaw})` sets them.
+    The gripper is open above the table, within 2 cm of the same point. The cube's place and yaw are
+    random; `reset(options={"cube_position": (x, y), "cube_yaw": yaw})` sets them.
 
     ## Episode Termination
-    Terminated at success, and as failed when the cube was shoved more than 3 cm along the table (not in the paper's variant);
-    truncated after `horizon` steps.
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 2.2 cm along the table;
+    "pressed", when the hand came down on the cube with more than 5 N, which stops an arm for people (a squeeze between the
+    fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
+    `horizon` steps (250): enough for a second search after a failed grasp.
 
     ## Arguments
     - `image_size=84`: pixels of the square picture.
@@ -58,42 +83,68 @@ class OccludedGraspEnv(PlayByEarEnv):
     - `noise_level=1.0`: scales background noise and motor hum.
     - `cube_material="cube"`: what the cube sounds like: wood, or `"glass"`, `"tin"`, `"cardboard"`, `"rubber"`.
     - `microphones=("gripper",)`: `"table"` is the other one.
-    - `horizon=None`: steps of an episode; None is the variant's.
-    - `variant="default"`: or `"paper"`, the numbers of the paper and its code, in which a blind gripper often succeeds.
+    - `horizon=None`: steps of an episode; None is the task's.
+    - `hidden_object=True`: False is the twin world, in which the hand passes through the cube, and nothing else differs.
     - `render_mode=None`: or `"rgb_array"`, `"human"`; `render_size=480`: pixels of the picture that `render()` returns.
 
     ## Version History
+    - v1: ends attempts that press or grope, wants the cube to stay where it belongs, leaves time for a second search.
     - v0: first version.
     """
+    return _task(
+        "OccludedGrasp-v1",
+        NUMBERS,
+        cube_material,
+        (rails(-0.38, 0.38),),
+        expert=SteadyGraspExpert,
+        correcting_expert=partial(SteadyGraspExpert, config=PATIENT_EXPERT),
+        blind={name: partial(SteadyBlindGrasp, strategy=name) for name in BLIND_STRATEGIES},
+    )
 
-    task = "OccludedGrasp-v0"
-    task_description = "Find the cube behind the wall by touch and sound, grasp it and lift it."
-    _expert, _blind = GraspExpert, BlindGrasp
-    _scene_bodies = ("table", "wall")
-    VARIANTS: ClassVar[dict[str, Variant]] = {
-        "default": Variant(cube_x=(0.0, 0.0), cube_y=(-0.28, 0.28), cube_density=2000, horizon=102),
-        "paper": Variant(cube_x=(0.0, 0.0), cube_y=(-0.17, 0.17), cube_density=2000, horizon=250, **PAPER),
-    }
 
-    def _scene_xml(self) -> str:
-        wall = box_xml("wall", WALL_HALF_SIZE, WALL_CENTRE, "0.55 0.57 0.62 1")
-        indicator = box_xml(
-            "indicator", INDICATOR_HALF_SIZE, (INDICATOR_X, 0, INDICATOR_Z), "0.1 0.2 0.9 1", solid=False
-        )
-        return wall + indicator
+def occluded_grasp_v0(*, variant: str = "default", cube_material: str = "cube") -> Task:
+    """
+    Version 0, for old results: `OccludedGrasp-v1` (`occluded_grasp`), except that a cube higher than 0.04 m solves it at once,
+    that only shoving and time end an attempt, and that the time is 102 steps. A script that cannot hear solves most
+    episodes by tapping: the arm's own position tells where it came down on the cube.
 
-    def _place(self, options: dict[str, Any]) -> None:
-        y = self._place_cube(options)
-        lower, upper = self.variant.cube_y
-        self.quarter = int(np.clip(4 * (y - lower) / (upper - lower), 0, 3))
-        self.model.body("indicator").pos[:] = (INDICATOR_X, np.mean(self.hidden_range), INDICATOR_Z)
+    `variant="paper"` has the numbers of the paper and its code, in which a blind gripper often succeeds.
+    """
+    check_option("variant", variant, tuple(VARIANTS))
+    return _task(
+        "OccludedGrasp-v0",
+        VARIANTS[variant],
+        cube_material,
+        expert=GraspExpert,
+        correcting_expert=partial(GraspExpert, config=CORRECTING_EXPERT),
+        blind={name: partial(BlindGrasp, strategy=name) for name in BLIND_STRATEGIES},
+        is_old=True,
+    )
 
-    def _is_success(self) -> bool:
-        return bool(self.cube_position[2] > TABLE_TOP + LIFT_HEIGHT)
 
-    @property
-    def hidden_range(self) -> tuple[float, float]:
-        """Where along y the cube may be, as far as the camera tells: the indicated quarter [m]."""
-        lower, upper = self.variant.cube_y
-        width = (upper - lower) / 4
-        return lower + self.quarter * width, lower + (self.quarter + 1) * width
+def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **scripts: Any) -> Task:
+    wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall")
+    panel = box("indicator", INDICATOR_HALF_SIZE, (INDICATOR_X, 0, INDICATOR_Z), "0.1 0.2 0.9 1")
+    return Task(
+        name=name,
+        description="Find the cube behind the wall by touch and sound, grasp it and lift it.",
+        props=(wall, panel, *more, cube(numbers, cube_material)),
+        place=_place,
+        **cube_task(numbers, _is_lifted),
+        **scripts,
+    )
+
+
+def _place(env: Any, options: dict[str, Any]) -> dict[str, Any]:
+    y = place_cube(env, options)
+    lower, upper = env.variant.cube_y
+    n_parts = env.variant.panels
+    part = int(np.clip(n_parts * (y - lower) / (upper - lower), 0, n_parts - 1))
+    width = (upper - lower) / n_parts
+    shown = (lower + part * width, lower + (part + 1) * width)
+    env.put("indicator", (INDICATOR_X, np.mean(shown), INDICATOR_Z))
+    return {"hidden_range": shown}
+
+
+def _is_lifted(env: Any) -> bool:
+    return bool(env.cube_position[2] > TABLE_TOP + LIFT_HEIGHT)

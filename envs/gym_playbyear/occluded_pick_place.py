@@ -1,14 +1,17 @@
 """Occluded Pick and Place (paper, section "Simulated Domain and Tasks")."""
 
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from gym_playbyear.arena import TABLE_TOP, box_xml, tray_xml
-from gym_playbyear.base import PlayByEarEnv
-from gym_playbyear.blind import BlindPickPlace
-from gym_playbyear.experts import PickPlaceExpert
-from gym_playbyear.variant import PAPER, Variant
+from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
+from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
+from gym_playbyear.cube import cube, cube_task, place_cube, rails
+from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, PickPlaceExpert
+from gym_playbyear.options import check_option
+from gym_playbyear.task import Prop, Task
+from gym_playbyear.variant import OLD, PAPER, Variant
 
 WALL_HALF_SIZE = (0.02, 0.20, 0.18)  # m
 WALL_CENTRE = (0.10, 0.20, 0.80)  # m
@@ -18,8 +21,25 @@ BIN_Y, BIN_Y_RANGE = -0.15, 0.1  # m: the bin stands at y = -0.15 - U(0, 0.1)
 PLACE_TOLERANCE = 0.025  # m
 PLACE_HEIGHT = 0.85  # m, world frame
 
+VARIANTS = {
+    "default": Variant(cube_x=(-0.001, 0.001), cube_y=(0.11, 0.31), cube_density=3000, horizon=220, **OLD),
+    "paper": Variant(cube_x=(-0.001, 0.001), cube_y=(0.15, 0.179), cube_density=3000, horizon=400, **PAPER),
+}
+NUMBERS = Variant(
+    cube_x=(-0.001, 0.001),
+    cube_y=(0.06, 0.34),
+    cube_density=3000,
+    horizon=400,
+    max_press=5.0,
+    closings=3,
+    hold_s=0.5,
+    max_shove=0.022,
+    squeeze=20.0,
+    sweep_step=(0.005, 0.008),
+)
 
-class OccludedPickPlaceEnv(PlayByEarEnv):
+
+def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     """
     ## Description
     A red cube lies behind a half wall that hides it from the camera; beside the wall, in plain view, stands a tray. The arm
@@ -43,16 +63,20 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
     1 at the step that solves the task, otherwise 0.
 
     ## Success Criteria
-    The cube's centre is within 0.025 m of the tray's in x and in y, and lower than z = 0.85 m, while the fingers do not hold
-    it. `info["is_success"]` says so at every step.
+    The cube's centre is within 0.025 m of the tray's in x and in y, and lower than z = 0.85 m, while no finger touches it, for
+    half a second, and moves less than 1.5 cm meanwhile.
+    `info["is_success"]` says so at every step.
 
     ## Starting State
-    The gripper is open above the table, within 2 cm of the same point. The cube's place behind the wall, its yaw and the
-    tray's place are random. `reset(options={"cube_position": (x, y), "cube_yaw": yaw, "bin_position": (x, y)})` sets them.
+    The gripper is open above the table, within 2 cm of the same point. The cube's place behind the wall, its yaw
+    and the tray's place are random. `reset(options={"cube_position": (x, y), "cube_yaw": yaw, "bin_position": (x, y)})` sets
+    them.
 
     ## Episode Termination
-    Terminated at success, and as failed when the cube was shoved more than 3 cm along the table (not in the paper's variant);
-    truncated after `horizon` steps.
+    Terminated, and `info["end"]` says why: "success"; "shoved", when the cube was shoved more than 2.2 cm along the table;
+    "pressed", when the hand came down on the cube with more than 5 N, which stops an arm for people (a squeeze between the
+    fingers may be harder); "groped", when the fingers closed on nothing for the third time. Truncated, as "time", after
+    `horizon` steps (400): enough for a second search after a failed grasp.
 
     ## Arguments
     - `image_size=84`: pixels of the square picture.
@@ -61,40 +85,53 @@ class OccludedPickPlaceEnv(PlayByEarEnv):
     - `noise_level=1.0`: scales background noise and motor hum.
     - `cube_material="cube"`: what the cube sounds like: wood, or `"glass"`, `"tin"`, `"cardboard"`, `"rubber"`.
     - `microphones=("gripper",)`: `"table"` is the other one.
-    - `horizon=None`: steps of an episode; None is the variant's.
-    - `variant="default"`: or `"paper"`, the numbers of the paper and its code, in which a blind gripper mostly succeeds.
+    - `horizon=None`: steps of an episode; None is the task's.
+    - `hidden_object=True`: False is the twin world, in which the hand passes through the cube, and nothing else differs.
     - `render_mode=None`: or `"rgb_array"`, `"human"`; `render_size=480`: pixels of the picture that `render()` returns.
 
     ## Version History
+    - v1: ends attempts that press or grope, wants the cube to stay where it belongs, leaves time for a second search.
     - v0: first version.
     """
+    correcting = partial(PickPlaceExpert, config=PATIENT_EXPERT)
+    return _task("OccludedPickPlace-v1", NUMBERS, cube_material, (rails(0.0, 0.38),), correcting_expert=correcting)
 
-    task = "OccludedPickPlace-v0"
-    task_description = "Find the cube behind the wall by touch and sound, grasp it and put it into the tray."
-    _expert, _blind = PickPlaceExpert, BlindPickPlace
-    _scene_bodies = ("table", "wall", "bin")
-    VARIANTS: ClassVar[dict[str, Variant]] = {
-        "default": Variant(cube_x=(-0.001, 0.001), cube_y=(0.11, 0.31), cube_density=3000, horizon=220),
-        "paper": Variant(cube_x=(-0.001, 0.001), cube_y=(0.15, 0.179), cube_density=3000, horizon=400, **PAPER),
-    }
 
-    def _scene_xml(self) -> str:
-        return box_xml("wall", WALL_HALF_SIZE, WALL_CENTRE, "0.55 0.57 0.62 1") + tray_xml(
-            "bin", BIN_HALF_WIDTH, BIN_WALL_HALF_HEIGHT
-        )
+def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cube") -> Task:
+    """
+    Version 0, for old results: `OccludedPickPlace-v1` (`occluded_pick_place`), except that a cube in the tray solves it at
+    once, that only shoving and time end an attempt, and that the time is 220 steps.
 
-    def _place(self, options: dict[str, Any]) -> None:
-        self._place_cube(options)
-        bin_position = (0.0, BIN_Y - self.np_random.uniform(0, BIN_Y_RANGE))
-        self.bin_position = np.array([*options.get("bin_position", bin_position), TABLE_TOP])
-        self.model.body("bin").pos[:] = self.bin_position
+    `variant="paper"` has the numbers of the paper and its code, in which a blind gripper mostly succeeds.
+    """
+    check_option("variant", variant, tuple(VARIANTS))
+    correcting = partial(PickPlaceExpert, config=CORRECTING_EXPERT)
+    return _task("OccludedPickPlace-v0", VARIANTS[variant], cube_material, correcting_expert=correcting, is_old=True)
 
-    def _is_success(self) -> bool:
-        offset = np.abs(self.cube_position - self.bin_position)
-        inside = (offset[:2] < PLACE_TOLERANCE).all() and self.cube_position[2] < PLACE_HEIGHT
-        return bool(inside and self.contact_forces["gripper-cube"] == 0)
 
-    @property
-    def hidden_range(self) -> tuple[float, float]:
-        """Where along y the cube may be, as far as the camera tells [m]."""
-        return self.variant.cube_y
+def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **traits: Any) -> Task:
+    wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall")
+    return Task(
+        name=name,
+        description="Find the cube behind the wall by touch and sound, grasp it and put it into the tray.",
+        props=(wall, tray("bin", BIN_HALF_WIDTH, BIN_WALL_HALF_HEIGHT), *more, cube(numbers, cube_material)),
+        place=_place,
+        expert=PickPlaceExpert,
+        blind={name: partial(BlindPickPlace, strategy=name) for name in BLIND_STRATEGIES},
+        **cube_task(numbers, _is_in_the_tray),
+        **traits,
+    )
+
+
+def _place(env: Any, options: dict[str, Any]) -> dict[str, Any]:
+    place_cube(env, options)
+    place = (0.0, BIN_Y - env.np_random.uniform(0, BIN_Y_RANGE))
+    bin_position = np.array([*options.get("bin_position", place), TABLE_TOP])
+    env.put("bin", bin_position)
+    return {"hidden_range": env.variant.cube_y, "bin_position": bin_position}
+
+
+def _is_in_the_tray(env: Any) -> bool:
+    offset = np.abs(env.cube_position - env.bin_position)
+    inside = (offset[:2] < PLACE_TOLERANCE).all() and env.cube_position[2] < PLACE_HEIGHT
+    return bool(inside and env.contact_forces["gripper-cube"] == 0)

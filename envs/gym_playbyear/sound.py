@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import signal
 
+from gym_playbyear import materials
 from gym_playbyear.materials import MATERIALS, MICROPHONES, ContactPair, Material, Microphone
 
 __all__ = ["MATERIALS", "MICROPHONES", "ContactPair", "ContactSound", "Material", "Microphone", "pcm16"]
@@ -189,16 +190,16 @@ class ContactSound:
         """One bank of modes per body, which all the pairs of that body strike."""
         sides = [tuple(zip(pair.bodies, pair.materials, strict=True)) for pair in self.pairs]
         banks = list(dict.fromkeys(side for pair in sides for side in pair))
-        materials = [MATERIALS[material] for _, material in banks]
-        self._bank_of_mode = np.repeat(np.arange(len(banks)), [len(m.frequencies) for m in materials])
+        made_of = [materials.ALL_MATERIALS[material] for _, material in banks]
+        self._bank_of_mode = np.repeat(np.arange(len(banks)), [len(m.frequencies) for m in made_of])
         self._pair_modes = [
             np.flatnonzero(np.isin(self._bank_of_mode, [banks.index(side) for side in pair])) for pair in sides
         ]
-        self._frequencies = np.array([f for material in materials for f in material.frequencies])
-        self._decays = np.array([d for material in materials for d in material.decays])
+        self._frequencies = np.array([f for material in made_of for f in material.frequencies])
+        self._decays = np.array([d for material in made_of for d in material.decays])
         # Each partner gives half the energy of a touch.
         loudness = _TOUCH_RMS * np.sqrt(_TOUCH_SECONDS / 2.0)
-        self._amplitudes = loudness * np.array([a for material in materials for a in material.amplitudes()])
+        self._amplitudes = loudness * np.array([a for material in made_of for a in material.amplitudes()])
 
     def _lay_out_samples(self) -> None:
         """Which samples lie in which physics step: a step need not hold a whole number of samples."""
@@ -269,9 +270,11 @@ def _pink_filter(sample_rate: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _microphones(names: Sequence[str]) -> tuple[Microphone, ...]:
-    if not names or len(set(names)) != len(names) or not set(names) <= set(MICROPHONES):
-        raise ValueError(f"microphones is {names!r}; name at least one of {sorted(MICROPHONES)}, each only once.")
-    return tuple(MICROPHONES[name] for name in names)
+    if not names or len(set(names)) != len(names) or not all(name in materials.ALL_MICROPHONES for name in names):
+        raise ValueError(
+            f"microphones is {names!r}; name at least one of {sorted(materials.ALL_MICROPHONES)}, each only once."
+        )
+    return tuple(materials.ALL_MICROPHONES[name] for name in names)
 
 
 def _samples_per_step(sample_rate: int, control_hz: int) -> int:

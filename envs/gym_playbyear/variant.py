@@ -1,4 +1,4 @@
-"""The numbers of a task that decide whether it can be solved without hearing."""
+"""The numbers of the tasks with a hidden cube, which decide whether they can be solved without hearing."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,7 +15,11 @@ class Variant:
 
     cube_y, cube_x: ranges of the hidden cube's position [m]; cube_yaw: largest yaw, either way [rad];
     cube_density [kg/m3]; cube_friction: sliding friction; max_shove: how far the cube may be shoved along the table before
-    the attempt has failed [m]; horizon: steps of an episode; arm, sensors: their numbers.
+    the attempt has failed [m]; squeeze: force of the hand from which on the cube counts as held, not shoved [N]; max_press:
+    largest force with which the hand may come down on it [N]; closings: the how-manieth closing on nothing ends the attempt;
+    hold_s: for how long the cube has to stay where it is wanted [s]; horizon: steps of an episode; panels: in how many parts of
+    the range a panel may show the cube; sweep_step: range of what the expert covers per step of its sweep [m]; arm, sensors:
+    their numbers.
     """
 
     cube_x: tuple[float, float]
@@ -25,15 +29,26 @@ class Variant:
     cube_yaw: float = np.pi / 12
     cube_friction: float = 0.4
     max_shove: float = 0.03
+    squeeze: float = np.inf
+    max_press: float = np.inf
+    closings: float = np.inf
+    hold_s: float = 0.0
+    panels: int = 4
+    sweep_step: tuple[float, float] = (0.005, 0.011)
     arm: ArmConfig = field(default_factory=ArmConfig)
     sensors: SensorNoise = field(default_factory=SensorNoise)
 
+
+_OLD_TOUCHING = ("left_finger", "right_finger")  # version 0 does not count what the palm touches
+
+OLD: dict[str, Any] = {"arm": ArmConfig(touching=_OLD_TOUCHING)}
+"""Version 0's arm."""
 
 PAPER: dict[str, Any] = {
     "cube_yaw": np.pi,
     "cube_friction": 5,
     "max_shove": np.inf,
-    "arm": ArmConfig(max_opening=0.08, gripper_cooldown=0.0),
+    "arm": ArmConfig(max_opening=0.08, gripper_cooldown=0.0, touching=_OLD_TOUCHING),
     "sensors": NO_SENSOR_NOISE,
 }
 """What the paper's tasks have in common, and ours have not."""

@@ -13,13 +13,13 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
-from gym_playbyear import TASKS
-from gym_playbyear.materials import CUBE_MATERIALS
+from gym_playbyear import register_tasks
+from gym_playbyear.options import OptionError, make_definition
+from gym_playbyear.plugins import PluginError
+from gym_playbyear.task import Task
 from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
 SOUND_MODES = ("waveform", "contact_force", "none")
-VARIANTS = ("default", "paper")
-CONTROL_HZ = 20  # the tasks' control rate; `fps` has to be the same
 _STATE_DIM, _ACTION_DIM, _FORCE_DIM = 7, 4, 6
 
 
@@ -29,16 +29,19 @@ class PlaybyearEnvConfig(EnvConfig):
     """The tasks that contact sound solves and a camera does not.
 
     Args:
-        task: `OccludedGrasp-v0` or `OccludedPickPlace-v0` (any task that `gym_playbyear` registers).
-        fps: Control steps, pictures and sound blocks per second; the tasks run at 20.
+        task: `OccludedGrasp-v1`, or any other task that `gym_playbyear` knows, those of other distributions among them.
+        fps: Control steps, pictures and sound blocks per second. 0: the task's own rate, the only one that it runs at.
         episode_length: Steps after which an episode is cut off. None: the task's own horizon.
-        image_size: Height and width of the `front` camera's picture [pixels].
-        sample_rate: Of every microphone [Hz]; divisible by `fps`, so that each frame has the same number of samples.
+        image_size: Height and width of a camera's picture [pixels].
+        sample_rate: Of every microphone [Hz]; divisible by `fps`, so that each frame has the same number of samples. 0: the
+            task's own.
         sound: `waveform` (int16 PCM per microphone), `contact_force` (the paper's proxy, 6 numbers), or `none`.
-        microphones: Names of the microphones that are on, with `sound=waveform`: `gripper`, `table`.
+        microphones: Names of the microphones that are on, with `sound=waveform`: `gripper`, `table`. None: the task's own.
         noise_level: Multiplies the background noise and the arm's own hum. 1 is the task as published, 0 silence.
-        cube_material: What the cube sounds like: `cube` (wood), `glass`, `tin`, `cardboard` or `rubber`.
-        variant: `default`, or `paper` for the paper's values where ours differ.
+        cube_material: What the cube sounds like: `cube` (wood), `glass`, `tin`, `cardboard`, `rubber`; for tasks with a cube.
+        variant: `default`, or `paper` for the paper's values where ours differ; for version 0 of the tasks.
+        task_options: More options of the task, by name.
+        hidden_object: False: the hand passes through what is hidden; all else is the same world.
         visualization_width, visualization_height: Of the picture that `render()` gives people; the same number twice [pixels].
         render_mode: `rgb_array` (for videos), or `human` for a window.
 
@@ -47,17 +50,19 @@ class PlaybyearEnvConfig(EnvConfig):
     """
 
     task: str | None = "OccludedGrasp-v0"
-    fps: int = CONTROL_HZ
+    fps: int = 0
     episode_length: int | None = None
     # Observations
     image_size: int = 84
-    sample_rate: int = 16000
+    sample_rate: int = 0
     sound: str = "waveform"
-    microphones: list[str] = field(default_factory=lambda: ["gripper"])
+    microphones: list[str] | None = None
     noise_level: float = 1.0
     # Task
     cube_material: str = "cube"
     variant: str = "default"
+    task_options: dict[str, str] = field(default_factory=dict)
+    hidden_object: bool = True
     # For people
     visualization_width: int = 480
     visualization_height: int = 480
@@ -68,13 +73,15 @@ class PlaybyearEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         self._check()
+        cameras = [camera.name for camera in self._definition().cameras]
+        picture = (FeatureType.VISUAL, (self.image_size, self.image_size, 3))
         entries: dict[str, tuple[FeatureType, tuple[int, ...], str]] = {
             ACTION: (FeatureType.ACTION, (_ACTION_DIM,), ACTION),
-            "pixels/front": (FeatureType.VISUAL, (self.image_size, self.image_size, 3), f"{OBS_IMAGES}.front"),
+            **{f"pixels/{camera}": (*picture, f"{OBS_IMAGES}.{camera}") for camera in cameras},
             "agent_pos": (FeatureType.STATE, (_STATE_DIM,), OBS_STATE),
         }
         if self.sound == "waveform":
-            for mic in self.microphones:
+            for mic in self.microphones or []:
                 entries[f"audio.{mic}"] = (FeatureType.STATE, (self.samples_per_frame,), f"{OBS_STR}.audio.{mic}")
         elif self.sound == "contact_force":
             entries["contact_force"] = (FeatureType.STATE, (_FORCE_DIM,), f"{OBS_STR}.contact_force")
@@ -94,12 +101,12 @@ class PlaybyearEnvConfig(EnvConfig):
             "sample_rate": self.sample_rate,
             "sound": self.sound,
             "noise_level": self.noise_level,
-            "microphones": tuple(self.microphones),
+            "microphones": tuple(self.microphones or ()),
             "horizon": self.episode_length,
-            "cube_material": self.cube_material,
-            "variant": self.variant,
+            "hidden_object": self.hidden_object,
             "render_mode": self.render_mode,
             "render_size": self.visualization_width,
+            **self._own_options(),
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
@@ -120,6 +127,7 @@ class PlaybyearEnvConfig(EnvConfig):
             DecodingError: `task` is none that `gym_playbyear` registers.
         """
         self._check()
+        register_tasks()  # those of distributions that were installed since gym_playbyear was imported
         make = partial(
             gym.make,
             f"{self.package_name}:{self.gym_id}",
@@ -138,13 +146,31 @@ class PlaybyearEnvConfig(EnvConfig):
         """What LeRobot runs on each observation before, and on each action after, the policy's own processors."""
         return PolicyProcessorPipeline(steps=[PcmToFloatProcessorStep()]), PolicyProcessorPipeline(steps=[])
 
+    def _own_options(self) -> dict[str, str]:
+        """Those that belong to the task. What has its default is left out: not every task knows it."""
+        defaults = {"cube_material": "cube", "variant": "default"}
+        changed = {name: getattr(self, name) for name, value in defaults.items() if getattr(self, name) != value}
+        return {**self.task_options, **changed}
+
+    def _definition(self) -> Task:
+        try:
+            return make_definition(self.task or "", self._own_options(), warn=False)
+        except OptionError as error:
+            name = error.option if hasattr(self, error.option) else "task_options"
+            raise self._error(name, error.wanted) from error
+        except PluginError as error:
+            raise self._error("task", str(error).rstrip(".")) from error
+
     def _check(self) -> None:
-        known = {"task": TASKS, "sound": SOUND_MODES, "variant": VARIANTS, "cube_material": CUBE_MATERIALS}
-        for name, choices in known.items():
-            if getattr(self, name) not in choices:
-                raise self._error(name, f"choose one of {', '.join(choices)}")
-        if self.fps != CONTROL_HZ:
-            raise self._error("fps", f"the tasks are controlled at {CONTROL_HZ} Hz, give {CONTROL_HZ}")
+        definition = self._definition()
+        hz = definition.control_hz
+        self.fps, self.sample_rate = self.fps or hz, self.sample_rate or definition.sample_rate
+        if self.microphones is None:
+            self.microphones = list(definition.microphones)
+        if self.sound not in SOUND_MODES:
+            raise self._error("sound", f"choose one of {', '.join(SOUND_MODES)}")
+        if self.fps != hz:
+            raise self._error("fps", f"{self.task} is controlled at {hz} Hz, give {hz}, or leave it out")
         if self.sample_rate <= 0 or self.sample_rate % self.fps:
             raise self._error(
                 "sample_rate",

@@ -1,0 +1,108 @@
+"""Between physics and sound: what a synthesiser is told of a control step, and the one of contact forces alone."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import mujoco
+import numpy as np
+
+from gym_playbyear.materials import ContactPair
+
+
+@dataclass(frozen=True)
+class HeardPair:
+    """Two things whose contact can be heard.
+
+    Attributes:
+        bodies: Their names; "gripper" is the hand with its fingers.
+        materials: Of the two, in the same order.
+        loudness: Factors on their shares of the sound.
+        loose: Which of the two move freely: they carry sound to what they press against.
+        sensed: The model's bodies that stand for the first thing, each with whether all that hangs on it counts; a hand that
+            squeezes is several, since in one the forces would cancel. The second thing is the body of its name, with all of it.
+    """
+
+    bodies: tuple[str, str]
+    materials: tuple[str, str]
+    loudness: tuple[float, float] = (1.0, 1.0)
+    loose: frozenset[str] = frozenset()
+    sensed: tuple[tuple[str, bool], ...] = ()
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One control step, T physics steps, as far as it can be heard.
+
+    Attributes:
+        forces: Magnitude of each pair's contact force (T, n_pairs) [N].
+        sensordata: All that the model's sensors measured (T, nsensordata).
+        joint_speed: Mean absolute speed of the arm's joints (T,) [rad/s].
+        finger_speed: Mean absolute speed of the fingers (T,) [m/s].
+        states: Full state of the physics (T, size of `mjSTATE_FULLPHYSICS`).
+        microphone_positions: Where each microphone is at the end of the step (3,) [m, world].
+    """
+
+    forces: np.ndarray
+    sensordata: np.ndarray
+    joint_speed: np.ndarray
+    finger_speed: np.ndarray
+    states: np.ndarray
+    microphone_positions: dict[str, np.ndarray]
+
+
+class Ears(Protocol):
+    """What an environment needs of a synthesiser. It is copied and pickled with its environment."""
+
+    def add_sensors(self, spec: mujoco.MjSpec) -> None:
+        """Adds to the scene, before it is compiled, what has to be measured for the sound."""
+        ...
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """An episode begins."""
+        ...
+
+    def step(self, model: mujoco.MjModel, moment: Moment) -> dict[str, np.ndarray]:
+        """The samples of each microphone, int16, (sample_rate / control_hz,)."""
+        ...
+
+
+class ForceEars:
+    """`ContactSound`: the force between two bodies is all that it hears of their contact.
+
+    Args:
+        pairs: What can be heard, in the order of `Moment.forces`.
+        microphones: Names in `gym_playbyear.materials.MICROPHONES`.
+        sample_rate: Samples per second.
+        control_hz: Control steps per second.
+        physics_dt: Duration of a physics step [s].
+        noise_level: Factor on noise and hum.
+    """
+
+    def __init__(
+        self,
+        pairs: list[HeardPair],
+        microphones: tuple[str, ...],
+        sample_rate: int,
+        control_hz: int,
+        physics_dt: float,
+        noise_level: float,
+    ):
+        # Here, since it takes a second: whoever only asks what a task observes does not need it.
+        from gym_playbyear.sound import ContactSound
+
+        named = [
+            ContactPair(name="-".join(p.bodies), materials=p.materials, bodies=p.bodies, loose=p.loose) for p in pairs
+        ]
+        self.synthesis = ContactSound(named, microphones, sample_rate, control_hz, physics_dt, noise_level)
+
+    def add_sensors(self, spec: mujoco.MjSpec) -> None:
+        """Nothing: the forces are measured anyway."""
+
+    def reset(self, rng: np.random.Generator) -> None:
+        self.synthesis.reset(rng)
+
+    def step(self, model: mujoco.MjModel, moment: Moment) -> dict[str, np.ndarray]:
+        return self.synthesis.step(moment.forces, moment.joint_speed)
+
+
+contact_sound = ForceEars

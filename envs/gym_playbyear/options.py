@@ -1,0 +1,73 @@
+"""From a task's name and options to the task."""
+
+import inspect
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from gym_playbyear import ALL_TASKS
+from gym_playbyear.task import Task
+
+
+class OldTaskWarning(FutureWarning):
+    """A task has a later version, which is better. Shown once per process and task."""
+
+
+class OptionError(ValueError):
+    """An option is unknown, or has a value that cannot be used.
+
+    Attributes:
+        option: Its name.
+        wanted: What would work, for messages that name option and value themselves.
+    """
+
+    def __init__(self, option: str, value: Any, wanted: str):
+        super().__init__(f"{option}={value!r} is not known: {wanted}.")
+        self.option, self.wanted = option, wanted
+
+
+_WARNED: set[str] = set()
+
+
+def check_option(name: str, value: Any, allowed: Iterable) -> None:
+    """Raises OptionError if an option has none of the values that it may have."""
+    allowed = tuple(allowed)
+    if value not in allowed:
+        raise OptionError(name, value, f"choose one of {', '.join(map(str, allowed))}")
+
+
+def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str, Any], *, warn: bool = True) -> Task:
+    """The task that a name, or a function, and options stand for.
+
+    Args:
+        task: A name, a task, or a function that makes one of its options.
+        options: For that function.
+        warn: Whether to say that a task is old.
+
+    Raises:
+        OptionError: No task has this name, or the task no such option, or not with this value.
+        PluginError: The task belongs to another distribution, which cannot be loaded.
+    """
+    if isinstance(task, str) and task not in ALL_TASKS:
+        raise OptionError("task", task, f"choose one of {', '.join(ALL_TASKS)}")
+    named = ALL_TASKS[task] if isinstance(task, str) else task
+    known = () if isinstance(named, Task) else tuple(inspect.signature(named).parameters)
+    for name, value in options.items():
+        if name not in known:
+            has = f"its own options are {', '.join(known)}" if known else "it has none of its own"
+            raise OptionError(name, value, f"{task if isinstance(task, str) else 'the task'} has no such option, {has}")
+    definition = named if isinstance(named, Task) else named(**options)
+    if warn and definition.is_old and definition.name not in _WARNED:
+        _WARNED.add(definition.name)
+        _warn(definition.name)
+    return definition
+
+
+def _warn(name: str) -> None:
+    warnings.warn(
+        f"{name} stays as it is, for old results: scripts that cannot hear solve it by tapping, and one failed grasp takes its "
+        f"time. {name.replace('-v0', '-v1')} stops a hand that presses, wants the cube held still, and leaves time for a "
+        "second search.",
+        OldTaskWarning,
+        stacklevel=4,
+    )

@@ -1,0 +1,179 @@
+"""What a task is made of: parts that attach to one scene, and what is particular to it in a few functions."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from gym_playbyear.ears import Ears, HeardPair, contact_sound
+from gym_playbyear.proprioception import SensorNoise
+from gym_playbyear.rules import Rule, Solved
+
+PHYSICS_DT = 0.002  # s
+
+
+class Controller(Protocol):
+    """Turns actions into the servo targets of one control step. It has a state, and is copied with its environment.
+
+    Attributes:
+        n_substeps: Physics steps in a control step.
+        gripper_obeys: Whether a change of the gripper's command takes effect in the next step.
+    """
+
+    n_substeps: int
+
+    @property
+    def gripper_obeys(self) -> bool: ...
+
+    def reset(self, position: np.ndarray) -> np.ndarray:
+        """Puts the tool at a point (3,) [m, world], fingers open. Returns the positions of the arm's joints and fingers."""
+        ...
+
+    def hold(self) -> np.ndarray:
+        """(nu,) the servo targets that keep the arm where it is told to be."""
+        ...
+
+    def command(self, action: np.ndarray, measured: np.ndarray) -> np.ndarray:
+        """(n_substeps, nu) servo targets for an action, while the tool is at `measured` (3,) [m, world]."""
+        ...
+
+
+class Arm(Protocol):
+    """An arm with a hand; its joints, then its fingers, come first in the model.
+
+    Attributes:
+        base: Where it stands (3,) [m, world]; `agent_pos` counts from there.
+        max_opening: Between the open fingers [m].
+        n_joints: Of the arm; two finger joints follow.
+        root: Body from which on outward all counts as "gripper" where contacts are named.
+        touching: The parts of the hand, bodies, whose contacts with loose things are measured one by one.
+        tool: Site between the fingertips.
+        links: Bodies of the hand by what is mounted there: `gripper`, `left_finger`, `right_finger`.
+    """
+
+    @property
+    def base(self) -> tuple[float, float, float]: ...
+    @property
+    def max_opening(self) -> float: ...
+    @property
+    def n_joints(self) -> int: ...
+    @property
+    def root(self) -> str: ...
+    @property
+    def touching(self) -> tuple[str, ...]: ...
+    @property
+    def tool(self) -> str: ...
+    @property
+    def links(self) -> Mapping[str, str]: ...
+
+    def spec(self) -> mujoco.MjSpec:
+        """The arm alone, with its actuators."""
+        ...
+
+    def controller(self, control_hz: int, physics_dt: float) -> Controller: ...
+
+
+@dataclass(frozen=True)
+class Prop:
+    """A thing in the scene.
+
+    Attributes:
+        name: Of its outermost body. Contacts (`gripper-can`), `env.position("can")` and `env.can_position` go by it.
+        spec: That body as MJCF, `<body name=...>...</body>` or a whole `<mujoco>`, or as an `MjSpec` (kept as MJCF, so that
+            tasks can be copied). Angles are in radians unless the `<mujoco>` says otherwise. Geoms that leave `contype` and
+            `conaffinity` alone touch what a thing of this kind touches; zero for both means that one only sees them.
+        material: Name in `gym_playbyear.materials`. None: its contacts make no sound and are not measured.
+        loudness: Factor on its own share of a contact's sound.
+        loose: It moves freely, by a free joint that has the prop's name, and may touch whatever is there.
+        hidden: What no camera sees and hearing has to find. With `hidden_object=False` the hand passes through it.
+    """
+
+    name: str
+    spec: str | mujoco.MjSpec
+    material: str | None = None
+    loudness: float = 1.0
+    loose: bool = False
+    hidden: bool = False
+
+    def __post_init__(self) -> None:
+        if isinstance(self.spec, mujoco.MjSpec):
+            object.__setattr__(self, "spec", self.spec.to_xml())
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera that the policy sees through, as `pixels.<name>`.
+
+    Attributes:
+        name: What it is called.
+        attributes: The rest of MuJoCo's `<camera>`, such as `pos="0.5 0 1.35" euler="0 0.6 1.57" fovy="45"`.
+    """
+
+    name: str
+    attributes: str
+
+
+SoundFactory = Callable[[list[HeardPair], tuple[str, ...], int, int, float, float], Ears]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task, complete. `TaskEnv` plays it; a function that returns one may take options of its own (`contents="bottle"`).
+
+    `env` stands for the environment: see `TaskEnv` and `PrivilegedState` for what functions and scripts may ask it.
+
+    Attributes:
+        name: With its version, such as `OccludedGrasp-v1`; observed as `env.task`.
+        description: One sentence of what to do, as LeRobot passes it to policies.
+        arm: The arm.
+        arena: What all stands on; a prop that is not loose.
+        props: What else is there. Which contacts are measured and heard follows from arena and props.
+        place: `place(env, options)` begins an episode: it draws places from `env.np_random`, sets them with `env.put`, and
+            returns what the camera shows of the episode, in numbers by name (`hidden_range`, ...). They become attributes of
+            `env`.
+        success: The rule that the task is solved.
+        ends: Rules by which an attempt fails, in order; their names appear in `info["end"]`.
+        expert: `expert(env)` makes the scripted expert: `act()` gives the next action.
+        horizon: Steps after which an attempt is cut off.
+        correcting_expert: An expert that corrects, where that differs from one that demonstrates.
+        gate: `gate(env, expert)` makes the intervention gate; None: there is none.
+        blind: Scripts without any sense of contact, by name; each is `script(env)`.
+        control_hz, sample_rate: Steps, and samples of a microphone, per second.
+        physics_dt: Duration of a physics step [s].
+        microphones: Those that are on unless the environment is asked for others.
+        cameras: What the policy sees through; a square picture each.
+        start, start_spread: Where the tool is before an episode [m, world], and how far it may be off along each axis.
+        sensors: What is wrong with what the arm measures of itself.
+        felt: Prop whose contact force stands in for sound with `sound="contact_force"`.
+        sound: What synthesises the sound; see `gym_playbyear.ears`.
+        numbers: The task's own numbers, for its functions and scripts: `env.variant`.
+        is_old: A later version is better; a warning says so when an environment is made.
+    """
+
+    name: str
+    description: str
+    arm: Arm
+    arena: Prop
+    props: tuple[Prop, ...]
+    place: Callable[[Any, dict[str, Any]], dict[str, Any]]
+    success: Solved
+    expert: Callable[[Any], Any]
+    horizon: int
+    ends: tuple[Rule, ...] = ()
+    correcting_expert: Callable[[Any], Any] | None = None
+    gate: Callable[[Any, Any], Any] | None = None
+    blind: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
+    control_hz: int = 20
+    sample_rate: int = 16000
+    physics_dt: float = PHYSICS_DT
+    microphones: tuple[str, ...] = ("gripper",)
+    cameras: tuple[Camera, ...] = ()
+    start: tuple[float, float, float] = (-0.12, 0.0, 0.98)
+    start_spread: float = 0.02
+    sensors: SensorNoise = field(default_factory=SensorNoise)
+    felt: str | None = None
+    sound: SoundFactory = contact_sound
+    numbers: Any = None
+    is_old: bool = False

@@ -1,0 +1,82 @@
+"""A task of your own: behind the wall stands a tin. Sweep along until you hear that you touch it, and stop there.
+
+    pip install ./examples/own_task
+    playbyear-record --env.type=playbyear --env.task=StopAtTheTin-v1 --dataset.repo_id=me/tin --dataset.num_episodes=50
+    lerobot-eval --env.type=playbyear --env.task=StopAtTheTin-v1 --policy.path=...
+
+`pyproject.toml` names task and material as entry points; nothing else has to know of them.
+"""
+
+import numpy as np
+
+from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP, WALL_COLOUR, box
+from gym_playbyear.arm import ACTION_SCALE, ArmConfig
+from gym_playbyear.materials import Material
+from gym_playbyear.rules import Shoved, Solved
+from gym_playbyear.task import Prop, Task
+
+TIN_CAN = Material((930.0, 1480.0, 2210.0, 3050.0), (35.0, 45.0, 60.0, 80.0), (1.0, 0.8, 0.7, 0.4))
+RADIUS, HALF_HEIGHT = 0.025, 0.025  # m
+RANGE = (-0.1, 0.25)  # m: where along the wall it may stand
+SWEEP_HEIGHT = 0.03  # m
+NEAR = 0.01  # m
+TIN = Prop(
+    "tin",
+    f"""<body name="tin"><freejoint name="tin"/>
+    <geom type="cylinder" size="{RADIUS} {HALF_HEIGHT}" density="900" friction="0.4" rgba="0.8 0.8 0.85 1"/></body>""",
+    material="tin_can",
+    loose=True,
+    hidden=True,
+)
+
+
+def stop_at_the_tin() -> Task:
+    return Task(
+        name="StopAtTheTin-v1",
+        description="Find the tin behind the wall by sound, and stop there.",
+        arm=ArmConfig(),
+        arena=TABLE,
+        props=(box("wall", (0.02, 0.4, 0.3), (0.2, 0.0, 0.775), WALL_COLOUR, material="wall"), TIN),
+        cameras=(FRONT_CAMERA,),
+        place=place,
+        success=Solved(is_near, "tin", seconds=0.5, tolerance=0.003),
+        ends=(Shoved("tin", distance=0.03),),
+        expert=Expert,
+        horizon=200,
+        start=(0.0, -0.25, 0.9),
+    )
+
+
+def place(env, options) -> dict:
+    """Stands the tin somewhere in its range; what the camera shows of the episode is that range."""
+    env.put("tin", (0.0, env.np_random.uniform(*RANGE), TABLE_TOP + HALF_HEIGHT))
+    return {"hidden_range": RANGE}
+
+
+def gap(env) -> float:
+    """Between finger and tin [m]."""
+    reach = env.definition.arm.max_opening / 2 + 0.01 + RADIUS
+    return float(env.tin_position[1] - env.eef_position[1] - reach)
+
+
+def is_near(env) -> bool:
+    return env.eef_position[2] < TABLE_TOP + 2 * HALF_HEIGHT and gap(env) < NEAR
+
+
+class Expert:
+    """Comes down beside the range, sweeps, and stops when it feels the tin."""
+
+    def __init__(self, env):
+        self.env, self.phase = env, "lower"
+
+    def act(self) -> np.ndarray:
+        x, _, z = self.env.eef_position
+        back = np.array([-x, 0.0, TABLE_TOP + SWEEP_HEIGHT - z])
+        if self.phase == "lower" and abs(back[2]) < 0.005:
+            self.phase = "sweep"
+        if self.env.contact_forces["gripper-tin"] > 0.1:
+            self.phase = "stop"
+        move = np.clip(0.5 * back, -0.02, 0.02) + np.array([0, 0.008 if self.phase == "sweep" else 0, 0])
+        if self.phase != "stop":
+            move += self.env.expert_rng.uniform(-0.002, 0.002, 3)
+        return np.append(move / ACTION_SCALE, -1.0).astype(np.float32)

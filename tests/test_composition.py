@@ -1,0 +1,137 @@
+"""Tasks put together from parts: what follows from the parts, rates of their own, two loose things, and what is refused."""
+
+import os
+import pickle
+from dataclasses import replace
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+from gym_playbyear.arena import TABLE_TOP, loose_box
+from gym_playbyear.options import make_definition
+from gym_playbyear.rules import Solved
+from gym_playbyear.task import Prop, Task
+from gym_playbyear.task_env import TaskEnv
+
+STAY = np.array([0, 0, 0, -1.0])
+
+
+def never(env) -> bool:
+    return False
+
+
+def put_on_table(env, options) -> dict:
+    for number, prop in enumerate(prop for prop in env.definition.props if prop.loose):
+        env.put(prop.name, (0.0, 0.1, TABLE_TOP + 0.03 + 0.05 * number), yaw=0.0)
+    return {}
+
+
+def block(name: str) -> Prop:
+    return loose_box(name, (0.02,) * 3, density=1000, friction=0.4, rgba="1 0 0 1", material="cube")
+
+
+def task(*props: Prop, **traits) -> Task:
+    """A table with some things on it."""
+    cube_task = make_definition("OccludedGrasp-v1", {})
+    return replace(
+        cube_task, props=props, place=put_on_table, success=Solved(never), ends=(), felt=None, numbers=None, **traits
+    )
+
+
+def test_which_contacts_are_measured_follows_from_the_parts():
+    env = TaskEnv(task(block("a"), block("b")), sound="none")
+    env.begin_episode(seed=0)
+    pairs = [("gripper", "a"), ("gripper", "b"), ("a", "b"), ("gripper", "table"), ("a", "table"), ("b", "table")]
+    assert list(env.pairs) == pairs
+    assert list(env.contact_forces) == ["-".join(pair) for pair in pairs]
+
+
+@pytest.mark.parametrize("bits", ["", 'contype="2" conaffinity="3"'])
+def test_loose_things_may_lie_on_each_other(bits):
+    body = '<body name="{0}"><freejoint name="{0}"/><geom type="box" size=".02 .02 .02" mass=".1" {1}/></body>'
+    env = TaskEnv(task(*(Prop(name, body.format(name, bits), "cube", loose=True) for name in "ab")), sound="none")
+    env.begin_episode(seed=0)
+    for _ in range(10):
+        env.advance(STAY)
+    assert env.b_position[2] > env.a_position[2] + 0.035
+    assert env.contact_forces["a-b"] > 0.5
+
+
+def test_a_prop_may_be_an_mjspec():
+    spec = mujoco.MjSpec()
+    body = spec.worldbody.add_body(name="ball")
+    body.add_freejoint(name="ball")
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], density=500)
+    env = pickle.loads(pickle.dumps(TaskEnv(task(Prop("ball", spec, "cube", loose=True)), sound="none")))
+    env.begin_episode(seed=0)
+    for _ in range(10):
+        env.advance(STAY)
+    assert env.ball_position[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
+
+
+def test_rates_are_the_tasks():
+    env = TaskEnv(task(block("a"), control_hz=5, sample_rate=48000, horizon=7), image_size=16)
+    observation, _ = env.reset(seed=0)
+    assert observation["audio.gripper"].shape == (9600,)
+    assert env.metadata["render_fps"] == 5
+    before = env.data.time
+    flags = [env.advance(STAY)[2] for _ in range(7)]
+    assert env.data.time - before == pytest.approx(7 / 5)
+    assert flags == [False] * 6 + [True]
+    env.close()
+
+
+def place_one_of_two(env, options) -> dict:
+    here, away = ("a", "b") if options["is_a"] else ("b", "a")
+    env.put(here, (0.0, 0.1, TABLE_TOP + 0.02), yaw=0.0)
+    env.take_away(away)
+    return {}
+
+
+def test_a_thing_may_be_left_out_of_an_episode():
+    env = TaskEnv(replace(task(block("a"), block("b")), place=place_one_of_two), sound="none")
+    for is_a in (True, False):
+        env.begin_episode(seed=0, options={"is_a": is_a})
+        here, away = (env.a_position, env.b_position) if is_a else (env.b_position, env.a_position)
+        for _ in range(20):
+            env.advance(STAY)
+        assert here[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
+        assert env.contact_forces["a-table" if is_a else "b-table"] > 0.3
+        np.testing.assert_allclose(away, env.b_position if is_a else env.a_position, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("prop", "message"),
+    [
+        (Prop("a", '<body name="b"><geom size=".1"/></body>', "cube"), "no body of that name"),
+        (Prop("a", '<body name="a"><geom size=".1"/></body>', "cube", loose=True), "no <freejoint"),
+    ],
+)
+def test_a_prop_that_lacks_its_name_is_refused(prop, message):
+    with pytest.raises(ValueError, match=message):
+        TaskEnv(task(prop), sound="none")
+
+
+def test_unknown_things_of_an_episode_are_no_attributes():
+    env = TaskEnv(task(block("a")), sound="none")
+    with pytest.raises(AttributeError, match="bin_position"):
+        _ = env.bin_position
+
+
+@pytest.mark.parametrize("n_environments", [6, pytest.param(40, marks=pytest.mark.slow)])
+def test_environments_that_are_closed_leave_nothing_open(n_environments):
+    def n_open() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    def use() -> None:
+        env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", image_size=8, render_size=8)
+        env.reset(seed=0)
+        env.close()
+
+    use()
+    before = n_open()
+    for _ in range(n_environments):
+        use()
+    assert n_open() == before

@@ -1,0 +1,120 @@
+"""Tasks, materials and the rest from other distributions: found by their names, and harmless when they are broken."""
+
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from draccus.utils import DecodingError
+from lerobot.scripts import lerobot_eval
+from lerobot.utils.import_utils import register_third_party_plugins
+
+import gym_playbyear
+from gym_playbyear.plugins import PluginError
+from gym_playbyear.task_env import TaskEnv
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.scripts import record, train
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "own_task"
+BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+ENV = ["--env.type=playbyear", "--env.task=StopAtTheTin-v1", "--env.image_size=16"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def installed(tmp_path_factory):
+    """Builds the example's wheel and unpacks it where Python finds distributions; beside it lies a broken distribution."""
+    folder = tmp_path_factory.mktemp("own_task")
+    shutil.copytree(EXAMPLE, folder / "source")
+    subprocess.run([sys.executable, "-c", BUILD, str(folder)], cwd=folder / "source", check=True, capture_output=True)
+    with zipfile.ZipFile(next(folder.glob("*.whl"))) as wheel:
+        wheel.extractall(folder / "site")
+    broken = folder / "site" / "broken-1.0.dist-info"
+    broken.mkdir()
+    (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
+    (broken / "entry_points.txt").write_text(
+        "[gym_playbyear.tasks]\nBroken-v1 = module_that_is_not_there:task\nno name at all! = json:dumps\n"
+        "OccludedGrasp-v1 = json:dumps\n"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder / "site")
+        with pytest.warns(UserWarning, match="'no name at all!' is left out"):
+            gym_playbyear.register_tasks()
+        register_third_party_plugins()
+        yield
+
+
+def call(command, *arguments: str | Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
+        command.main()
+
+
+def test_the_example_is_short():
+    assert (
+        sum(len((EXAMPLE / name).read_text().splitlines()) for name in ("stop_at_the_tin.py", "pyproject.toml")) < 100
+    )
+
+
+def test_its_expert_solves_it_and_its_material_is_heard():
+    env = gym.make("gym_playbyear/StopAtTheTin-v1")
+    for seed in range(4):
+        env.reset(seed=seed)
+        expert, loudest, done = env.unwrapped.scripted_expert(), 0, False
+        while not done:
+            observation, _, terminated, truncated, info = env.step(expert.act())
+            loudest = max(loudest, int(np.abs(observation["audio.gripper"]).max()))
+            done = terminated or truncated
+        assert info["end"] == "success"
+        assert loudest > 500
+    env.close()
+
+
+def test_lerobot_records_trains_and_evaluates_it_without_a_change_here(tmp_path):
+    data = ["--dataset.repo_id=me/tin", f"--dataset.root={tmp_path / 'dataset'}"]
+    call(record, *ENV, *data, "--dataset.num_episodes=1", "--num_workers=0")
+    policy = ["--policy.type=playbyear", "--policy.push_to_hub=false", "--policy.device=cpu", "--policy.image_size=16"]
+    call(
+        train,
+        *policy,
+        "--policy.vision_width=4",
+        *data,
+        "--steps=1",
+        "--batch_size=2",
+        f"--output_dir={tmp_path / 't'}",
+    )
+    call(
+        lerobot_eval,
+        f"--policy.path={tmp_path / 't/checkpoints/last/pretrained_model'}",
+        *ENV,
+        "--env.episode_length=5",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
+
+
+def test_a_broken_distribution_says_so_and_breaks_nothing_else():
+    assert "Broken-v1" in gym_playbyear.ALL_TASKS
+    with pytest.raises(PluginError, match=r"'Broken-v1' of broken .*module_that_is_not_there"):
+        TaskEnv("Broken-v1")
+    with pytest.raises(DecodingError, match="Broken-v1"):
+        PlaybyearEnvConfig(task="Broken-v1")
+    assert TaskEnv("OccludedGrasp-v1", sound="none").task == "OccludedGrasp-v1"  # ours: nobody replaces it
+
+
+def test_an_unknown_task_is_told_which_there_are():
+    with pytest.raises(DecodingError, match=r"OccludedGrasp-v1.*StopAtTheTin-v1"):
+        PlaybyearEnvConfig(task="Nope-v1")
+
+
+def test_an_option_of_no_task_is_named():
+    with pytest.raises(DecodingError, match="StopAtTheTin-v1 has no such option"):
+        PlaybyearEnvConfig(task="StopAtTheTin-v1", task_options={"colour": "blue"})
+    with pytest.raises(ValueError, match=r"variant='paper' is not known: OccludedGrasp-v1 has no such option"):
+        TaskEnv("OccludedGrasp-v1", variant="paper")
