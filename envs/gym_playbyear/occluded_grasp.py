@@ -8,6 +8,7 @@ import numpy as np
 from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp, SteadyBlindGrasp
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
+from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, GraspExpert, SteadyGraspExpert
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
@@ -82,7 +83,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
     - `sound="waveform"`: or `"contact_force"` (the paper's stand-in for sound), or `"none"`.
     - `noise_level=1.0`: scales background noise and motor hum.
     - `cube_material="cube"`: what the cube sounds like: wood, or `"glass"`, `"tin"`, `"cardboard"`, `"rubber"`.
-    - `microphones=("gripper",)`: `"table"` is the other one.
+    - `microphones=("gripper",)`: or two ears, `"left_finger"` and `"right_finger"`, `"table"`, `"room"`.
     - `horizon=None`: steps of an episode; None is the task's.
     - `hidden_object=True`: False is the twin world, in which the hand passes through the cube, and nothing else differs.
     - `render_mode=None`: or `"rgb_array"`, `"human"`; `render_size=480`: pixels of the picture that `render()` returns.
@@ -97,6 +98,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
         cube_material,
         (rails(-0.38, 0.38),),
         expert=SteadyGraspExpert,
+        sound=SyntheticEars,
         correcting_expert=partial(SteadyGraspExpert, config=PATIENT_EXPERT),
         blind={name: partial(SteadyBlindGrasp, strategy=name) for name in BLIND_STRATEGIES},
     )

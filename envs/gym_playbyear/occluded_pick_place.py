@@ -8,6 +8,7 @@ import numpy as np
 from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
+from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, PickPlaceExpert
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
@@ -84,7 +85,7 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     - `sound="waveform"`: or `"contact_force"` (the paper's stand-in for sound), or `"none"`.
     - `noise_level=1.0`: scales background noise and motor hum.
     - `cube_material="cube"`: what the cube sounds like: wood, or `"glass"`, `"tin"`, `"cardboard"`, `"rubber"`.
-    - `microphones=("gripper",)`: `"table"` is the other one.
+    - `microphones=("gripper",)`: or two ears, `"left_finger"` and `"right_finger"`, `"table"`, `"room"`.
     - `horizon=None`: steps of an episode; None is the task's.
     - `hidden_object=True`: False is the twin world, in which the hand passes through the cube, and nothing else differs.
     - `render_mode=None`: or `"rgb_array"`, `"human"`; `render_size=480`: pixels of the picture that `render()` returns.
@@ -94,7 +95,8 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     - v0: first version.
     """
     correcting = partial(PickPlaceExpert, config=PATIENT_EXPERT)
-    return _task("OccludedPickPlace-v1", NUMBERS, cube_material, (rails(0.0, 0.38),), correcting_expert=correcting)
+    traits: dict[str, Any] = {"correcting_expert": correcting, "sound": SyntheticEars}
+    return _task("OccludedPickPlace-v1", NUMBERS, cube_material, (rails(0.0, 0.38),), **traits)
 
 
 def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cube") -> Task:
