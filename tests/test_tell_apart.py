@@ -1,5 +1,7 @@
 """Screws or peanuts: only sound tells, and what is done after the drop decides."""
 
+import copy
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -101,12 +103,20 @@ def test_the_expert_lifts_screws_and_leaves_peanuts(contents):
         assert expert.phase == {"screws": "keep", "peanuts": "rest"}[contents]
 
 
-@pytest.mark.parametrize(("strategy", "contents"), [("lift", "peanuts"), ("leave", "screws")])
-def test_the_wrong_answer_ends_the_attempt(strategy, contents):
+@pytest.mark.parametrize("contents", CONTENTS)
+def test_what_is_done_after_the_drop_decides(contents):
+    """A copy of the episode does the other thing; nothing of it reaches the original."""
     env = make(contents=contents)
     env.begin_episode(seed=1)
-    _, info = finish(env, env.blind_baselines()[strategy])
-    assert info == {"is_success": False, "end": "wrong", "contents": contents}
+    script = env.blind_baselines()["lift"]
+    while not script.was_dropped:
+        env.advance(script.act())
+    other, other_script = copy.deepcopy((env, script))
+    other_script.strategy = "leave"
+    ends = {one.strategy: finish(world, one)[1] for world, one in ((other, other_script), (env, script))}
+    right, wrong = {"screws": ("lift", "leave"), "peanuts": ("leave", "lift")}[contents]
+    assert ends[right] == {"is_success": True, "end": "success", "contents": contents}
+    assert ends[wrong] == {"is_success": False, "end": "wrong", "contents": contents}
 
 
 def test_leaving_without_having_lifted_and_dropped_counts_for_nothing():

@@ -15,12 +15,12 @@ PIECES = tuple(f"piece{number}" for number in range(N_PIECES))
 _WALL = 0.004  # m, thickness: more than a piece covers in a physics step
 _POUCH_MASS, _PIECE_MASS = 0.04, 0.015  # kg
 _PIECE_RADIUS, _PIECE_HALF_LENGTH = 0.0045, 0.007  # m
-_COLOUR, _DARK = "0.80 0.66 0.42 1", "0.45 0.30 0.16 1"
+_COLOUR, _SEAM = "0.15 0.35 0.65 1", "0.9 0.9 0.85 1"
 _BOUNCE = 'priority="1" solref="0.02 0.25"'  # a piece comes back from the wall with two fifths of its speed
 
 
 def pouch() -> Prop:
-    """The closed pouch: stiff walls, a dark seam on top."""
+    """The closed pouch: stiff walls, a light seam on top."""
     walls = ""
     for axis in range(3):
         for sign in (1, -1):
@@ -32,7 +32,7 @@ def pouch() -> Prop:
     return Prop(
         POUCH,
         f"""<body name="{POUCH}"><freejoint name="{POUCH}"/>{walls}
-        <geom type="box" size="{seam}" pos="0 0 {HALF_SIZE[2]}" mass="0" contype="0" conaffinity="0" rgba="{_DARK}"/>
+        <geom type="box" size="{seam}" pos="0 0 {HALF_SIZE[2]}" mass="0" contype="0" conaffinity="0" rgba="{_SEAM}"/>
         </body>""",
         material=POUCH,
         loose=True,
