@@ -150,6 +150,21 @@ def test_rates_and_microphones_that_are_not_given_are_the_tasks(monkeypatch):
         PlaybyearEnvConfig(task="Slow-v1", fps=20)
 
 
+def test_the_pouch_is_found_with_its_own_rate_and_options():
+    config = draccus.parse(
+        RecordConfig,
+        args=["--env.type=playbyear", "--env.task=TellApart-v1", "--env.task_options={contents: peanuts}",
+              "--env.image_size=16", "--env.episode_length=1", "--dataset.repo_id=a/b"],
+    ).env  # fmt: skip
+    assert (config.fps, config.features["audio.gripper"].shape) == (5, (3200,))
+    vec = vector_env(config)
+    observation, _ = vec.reset(seed=[0])
+    assert observation["audio.gripper"].shape == (1, 3200)
+    *_, infos = vec.step(np.zeros((1, 4), np.float32))
+    assert infos["final_info"]["contents"][0] == "peanuts"
+    vec.close()
+
+
 @pytest.mark.parametrize(
     ("argument", "wanted"),
     [

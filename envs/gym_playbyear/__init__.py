@@ -13,6 +13,7 @@ _OWN = {
     "OccludedPickPlace-v0": "gym_playbyear.occluded_pick_place:occluded_pick_place_v0",
     "OccludedGrasp-v1": "gym_playbyear.occluded_grasp:occluded_grasp",
     "OccludedPickPlace-v1": "gym_playbyear.occluded_pick_place:occluded_pick_place",
+    "TellApart-v1": "gym_playbyear.tell_apart:tell_apart",
 }
 TASKS = tuple(_OWN)
 """Our own."""

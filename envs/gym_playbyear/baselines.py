@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 import gym_playbyear
-from gym_playbyear.blind import BLIND_STRATEGIES
+from gym_playbyear.options import make_definition
 
 EXPERT = "expert"
 
@@ -54,7 +54,8 @@ def main() -> None:
     results = []
     for task in arguments.task:
         own = {} if arguments.variant == "default" else {"variant": arguments.variant}
-        rates = success_rates(task, (EXPERT, *BLIND_STRATEGIES), seeds, horizon=arguments.horizon, **own)
+        blind = make_definition(task, own, warn=False).blind
+        rates = success_rates(task, (EXPERT, *blind), seeds, horizon=arguments.horizon, **own)
         options = {"variant": arguments.variant, "horizon": arguments.horizon}
         results.append({"task": task, **options, "seeds": [seeds[0], seeds[-1]], "success": rates})
         print(json.dumps(results[-1]), flush=True)

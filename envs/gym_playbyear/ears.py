@@ -1,7 +1,8 @@
 """Between physics and sound: what a synthesiser is told of a control step, and the one of contact forces alone."""
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -106,3 +107,39 @@ class ForceEars:
 
 
 contact_sound = ForceEars
+
+
+class MaterialEars:
+    """Ears for things that are made of something else from episode to episode: a synthesiser for each choice of materials.
+
+    Args:
+        make: `make(pairs, *rest)` makes a synthesiser. What it measures must not depend on materials.
+        pairs: What can be heard, of the usual materials.
+        rest: Its other arguments.
+    """
+
+    def __init__(self, make: Callable[..., Ears], pairs: list[HeardPair], *rest: Any):
+        self._make, self._pairs, self._rest = make, pairs, rest
+        self._made: dict[tuple[tuple[str, str], ...], Ears] = {}
+        self.choose({})
+
+    def choose(self, materials: Mapping[str, str]) -> None:
+        """What bodies are made of from now on, where that is not the usual."""
+        key = tuple(sorted(materials.items()))
+        if key not in self._made:
+            self._made[key] = self._make([_made_of(pair, materials) for pair in self._pairs], *self._rest)
+        self._chosen = self._made[key]
+
+    def add_sensors(self, spec: mujoco.MjSpec) -> None:
+        self._chosen.add_sensors(spec)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        self._chosen.reset(rng)
+
+    def step(self, model: mujoco.MjModel, moment: Moment) -> dict[str, np.ndarray]:
+        return self._chosen.step(model, moment)
+
+
+def _made_of(pair: HeardPair, materials: Mapping[str, str]) -> HeardPair:
+    first, second = (materials.get(body, usual) for body, usual in zip(pair.bodies, pair.materials, strict=True))
+    return replace(pair, materials=(first, second))

@@ -21,17 +21,19 @@ class Material:
         frequencies: Frequency of each mode [Hz].
         decays: Decay rate of each mode's amplitude [1/s]; it falls to 1/e in `1 / decay` seconds.
         gains: Relative amplitude of each mode. Only ratios count: equal blows are equally loud.
+        loudness: Factor on all its sound.
     """
 
     frequencies: tuple[float, ...]
     decays: tuple[float, ...]
     gains: tuple[float, ...]
+    loudness: float = 1.0
 
     def amplitudes(self) -> np.ndarray:
-        """The gains, scaled so that the square of the whole ring, integrated over time, is 1 second."""
+        """The gains, scaled so that the square of the whole ring, integrated over time, is `loudness` squared seconds."""
         gains = np.array(self.gains)
         # A damped sine of amplitude g and decay d has energy g^2 / 4d (for d far below its frequency).
-        return gains / np.sqrt(np.sum(gains**2 / (4.0 * np.array(self.decays))))
+        return self.loudness * (gains / np.sqrt(np.sum(gains**2 / (4.0 * np.array(self.decays)))))
 
 
 MATERIALS: dict[str, Material] = {
@@ -51,6 +53,10 @@ MATERIALS: dict[str, Material] = {
         (850.0, 1370.0, 2050.0, 2760.0, 3480.0), (50.0, 60.0, 70.0, 90.0, 110.0), (0.7, 1.0, 0.9, 0.7, 0.5)
     ),
     "cardboard": Material((210.0, 340.0, 560.0), (220.0, 260.0, 320.0), (1.0, 0.8, 0.4)),
+    # A closed bag, and what may be in it: steel screws, or foam, which is nearly mute.
+    "pouch": Material((210.0, 390.0, 620.0, 980.0), (300.0, 340.0, 380.0, 420.0), (1.0, 0.8, 0.6, 0.4), loudness=0.5),
+    "screws": Material((1650.0, 2450.0, 3050.0, 3600.0), (60.0, 75.0, 90.0, 110.0), (0.8, 1.0, 0.9, 0.7), loudness=2.0),
+    "peanuts": Material((180.0, 320.0, 540.0, 800.0), (350.0, 400.0, 450.0, 500.0), (1.0, 0.7, 0.4, 0.2), loudness=0.1),
     "rubber": Material((90.0, 150.0, 260.0), (160.0, 200.0, 260.0), (1.0, 0.6, 0.3)),
 }
 

@@ -17,6 +17,11 @@ class PrivilegedState:
 
     What the task's `place` returned is here by its names (`env.hidden_range`), and so is where each prop is
     (`env.cube_position` for a prop named `cube`).
+
+    Attributes:
+        shown: What the camera shows of the episode, in numbers by name.
+        secrets: What nothing but sound tells of it, by name; `info` says it when the episode is over.
+        materials: What props are made of in this episode, where that is not their usual material.
     """
 
     model: mujoco.MjModel
@@ -24,6 +29,8 @@ class PrivilegedState:
     definition: Task
     contacts: Contacts
     shown: dict[str, Any]
+    secrets: dict[str, Any]
+    materials: dict[str, str]
     _controller: Controller
     _tool: int
     _fingers: slice
@@ -32,9 +39,9 @@ class PrivilegedState:
     _rollout_sensors: np.ndarray
 
     def __getattr__(self, name: str) -> Any:
-        shown = self.__dict__.get("shown", {})
-        if name in shown:
-            return shown[name]
+        for known in (self.__dict__.get("shown", {}), self.__dict__.get("secrets", {})):
+            if name in known:
+                return known[name]
         definition = self.__dict__.get("definition")
         prop = name.removesuffix("_position")
         if definition is not None and prop != name and prop in {prop.name for prop in definition.props}:
@@ -44,6 +51,11 @@ class PrivilegedState:
     def camera_numbers(self) -> dict[str, Any]:
         """What the camera shows of the episode, in numbers: scripts that do not hear may know it."""
         return dict(self.shown)
+
+    @property
+    def check_limits(self) -> dict[str, float]:
+        """What the task promises of those who play it, where that differs from other tasks."""
+        return dict(self.definition.limits)
 
     @property
     def control_hz(self) -> int:

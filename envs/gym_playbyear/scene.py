@@ -94,7 +94,8 @@ class Contacts:
     every other pair has one.
 
     Attributes:
-        pairs: Two names each: the hand ("gripper") and everything loose with each other and with all that stands still.
+        pairs: Two names each: the hand ("gripper") and everything loose with each other and with all that stands still, except
+            what is shut in with what is outside.
     """
 
     def __init__(self, task: Task):
@@ -106,7 +107,7 @@ class Contacts:
         pairs = [(GRIPPER, name) for name in loose] + list(combinations(loose, 2))
         for name in still:
             pairs += [(other, name) for other in (GRIPPER, *loose)]
-        self.pairs: tuple[tuple[str, str], ...] = tuple(pairs)
+        self.pairs: tuple[tuple[str, str], ...] = tuple(pair for pair in pairs if self._can_touch(*pair))
         self._loose = frozenset(loose)
         n_parts = [len(self._arm.touching) if self._is_grip(pair) else 1 for pair in self.pairs]
         self._first_part = np.concatenate([[0], np.cumsum(n_parts)[:-1]]).astype(int)
@@ -148,6 +149,10 @@ class Contacts:
         """Net force [N] and torque [Nm] on the thing that is felt (T, 6)."""
         first = 3 * self._n_parts
         return sensordata[:, first : first + 6]
+
+    def _can_touch(self, a: str, b: str) -> bool:
+        rooms = [self._props[name].inside if name in self._props else None for name in (a, b)]
+        return rooms[0] == rooms[1] or rooms == [b, None] or rooms == [None, a]
 
     def _is_grip(self, pair: tuple[str, str]) -> bool:
         return pair[0] == GRIPPER and pair[1] in self._loose

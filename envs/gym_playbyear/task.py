@@ -88,6 +88,7 @@ class Prop:
         loudness: Factor on its own share of a contact's sound.
         loose: It moves freely, by a free joint that has the prop's name, and may touch whatever is there.
         hidden: What no camera sees and hearing has to find. With `hidden_object=False` the hand passes through it.
+        inside: Name of the prop that it is shut in: it touches nothing but that and what else is in there.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Prop:
     loudness: float = 1.0
     loose: bool = False
     hidden: bool = False
+    inside: str | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.spec, mujoco.MjSpec):
@@ -132,7 +134,7 @@ class Task:
         props: What else is there. Which contacts are measured and heard follows from arena and props.
         place: `place(env, options)` begins an episode: it draws places from `env.np_random`, sets them with `env.put`, and
             returns what the camera shows of the episode, in numbers by name (`hidden_range`, ...). They become attributes of
-            `env`.
+            `env`. What only sound tells it puts into `env.secrets`, and what props are made of this time into `env.materials`.
         success: The rule that the task is solved.
         ends: Rules by which an attempt fails, in order; their names appear in `info["end"]`.
         expert: `expert(env)` makes the scripted expert: `act()` gives the next action.
@@ -149,6 +151,7 @@ class Task:
         felt: Prop whose contact force stands in for sound with `sound="contact_force"`.
         sound: What synthesises the sound; see `gym_playbyear.ears`.
         numbers: The task's own numbers, for its functions and scripts: `env.variant`.
+        limits: What the task promises of those who play it, where that differs from other tasks (`env.check_limits`).
         is_old: A later version is better; a warning says so when an environment is made.
     """
 
@@ -176,4 +179,5 @@ class Task:
     felt: str | None = None
     sound: SoundFactory = contact_sound
     numbers: Any = None
+    limits: Mapping[str, float] = field(default_factory=dict)
     is_old: bool = False

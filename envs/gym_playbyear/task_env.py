@@ -13,7 +13,7 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from mujoco import rollout
 
 from gym_playbyear.arena import TABLE_TOP
-from gym_playbyear.ears import Ears, Moment
+from gym_playbyear.ears import MaterialEars, Moment
 from gym_playbyear.options import check_option, make_definition
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
@@ -82,21 +82,17 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._microphones = tuple(microphones or definition.microphones)
         self._sample_rate = int(sample_rate or definition.sample_rate)
         self.shown: dict[str, Any] = {}
+        self.secrets: dict[str, Any] = {}
+        self.materials: dict[str, str] = {}
         # Rules remember things of an episode.
         self._success, self._ends = copy.deepcopy((definition.success, definition.ends))
 
         arm = definition.arm
         self.contacts = Contacts(definition)
-        self._sound: Ears | None = None
+        self._sound: MaterialEars | None = None
         if sound == "waveform":
-            self._sound = definition.sound(
-                self.contacts.heard(),
-                self._microphones,
-                self._sample_rate,
-                definition.control_hz,
-                definition.physics_dt,
-                noise_level,
-            )
+            rates = (self._sample_rate, definition.control_hz, definition.physics_dt)
+            self._sound = MaterialEars(definition.sound, self.contacts.heard(), self._microphones, *rates, noise_level)
         spec = compose(definition, max(render_size, image_size), hidden_object)
         self.contacts.add_sensors(spec, definition.felt)
         if self._sound is not None:
@@ -167,9 +163,11 @@ class TaskEnv(PrivilegedState, gym.Env):
         joints = self._controller.reset(start + self.np_random.uniform(-spread, spread, 3))
         self.data.qpos[: len(joints)] = joints
         self.data.ctrl[:] = self._controller.hold()
+        self.secrets, self.materials = {}, {}
         self.shown = self.definition.place(self, dict(options or {}))
         self._expert_rng = np.random.default_rng(self.np_random.integers(2**63))
         if self._sound is not None:
+            self._sound.choose(self.materials)
             self._sound.reset(np.random.default_rng(self.np_random.integers(2**63)))
         self._sensors = Proprioception(self.definition.sensors, self.control_hz)
         self._n_steps = 0
@@ -188,7 +186,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise.
 
         `info["is_success"]` says whether the task is solved, and `info["end"]`, at the last step, how the attempt ended:
-        "success", the name of one of the task's rules, or "time".
+        "success", the name of one of the task's rules, or "time". What the task kept secret is there, too, by then.
         """
         self._check_is_running("step")
         action = np.asarray(action, dtype=float)
@@ -200,7 +198,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         truncated = end is None and self._n_steps >= self._max_episode_steps
         info: dict[str, Any] = {"is_success": end == self._success.name}
         if end is not None or truncated:
-            info["end"] = end or "time"
+            info |= {"end": end or "time", **self.secrets}
         return float(info["is_success"]), end is not None, truncated, info
 
     def render(self):
