@@ -13,6 +13,8 @@ _OWN = {
     "OccludedPickPlace-v0": "gym_playbyear.occluded_pick_place:occluded_pick_place_v0",
     "OccludedGrasp-v1": "gym_playbyear.occluded_grasp:occluded_grasp",
     "OccludedPickPlace-v1": "gym_playbyear.occluded_pick_place:occluded_pick_place",
+    "KeyBag-Easy-v1": "gym_playbyear.key_bag:key_bag_easy",
+    "KeyBag-Hard-v1": "gym_playbyear.key_bag:key_bag_hard",
 }
 TASKS = tuple(_OWN)
 """Our own."""

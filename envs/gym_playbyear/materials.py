@@ -52,7 +52,21 @@ MATERIALS: dict[str, Material] = {
     ),
     "cardboard": Material((210.0, 340.0, 560.0), (220.0, 260.0, 320.0), (1.0, 0.8, 0.4)),
     "rubber": Material((90.0, 150.0, 260.0), (160.0, 200.0, 260.0), (1.0, 0.6, 0.3)),
+    # A ring of steel and brass keys: high, clear, and it rings on.
+    "keys": Material((2150.0, 2690.0, 3310.0, 3790.0, 5600.0), (35.0, 45.0, 40.0, 60.0, 80.0), (0.8, 1.0, 0.9, 0.7, 0.4)),
+    # A paper bag: noise without a pitch.
+    "bag": Material((420.0, 760.0, 1250.0, 1900.0, 2500.0), (500.0, 600.0, 700.0, 800.0, 900.0), (0.8, 1.0, 1.0, 0.8, 0.6)),
+    # What else can be in it.
+    "bottle": Material((510.0, 980.0, 1640.0, 2380.0), (90.0, 110.0, 140.0, 180.0), (1.0, 0.9, 0.6, 0.4)),
+    "chips": Material((1100.0, 2000.0, 3300.0), (500.0, 600.0, 700.0), (0.8, 1.0, 0.8)),
+    "pens": Material((1020.0, 1830.0, 2810.0, 3650.0), (70.0, 90.0, 120.0, 150.0), (0.8, 1.0, 0.8, 0.5)),
+    "candies": Material((1900.0, 2750.0, 3600.0), (300.0, 350.0, 400.0), (1.0, 0.9, 0.6)),
+    "cloth": Material((150.0, 300.0, 600.0), (500.0, 500.0, 500.0), (1.0, 0.7, 0.3)),
+    "sponge": Material((120.0, 220.0, 400.0), (500.0, 500.0, 500.0), (1.0, 0.7, 0.3)),
 }
+
+CRACKLE = {"bag": 40.0, "chips": 60.0}
+"""Clicks per radian of what crackles when it bends."""
 
 CUBE_MATERIALS = ("cube", "glass", "tin", "cardboard", "rubber")
 

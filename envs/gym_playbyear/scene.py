@@ -94,7 +94,8 @@ class Contacts:
     every other pair has one.
 
     Attributes:
-        pairs: Two names each: the hand ("gripper") and everything loose with each other and with all that stands still.
+        pairs: Two names each: the hand ("gripper") and everything loose with each other and with all that stands still. A
+            thing whose parts are heard has a pair with itself.
     """
 
     def __init__(self, task: Task):
@@ -104,6 +105,7 @@ class Contacts:
         loose = [prop.name for prop in props if prop.loose]
         still = [prop.name for prop in props if not prop.loose]
         pairs = [(GRIPPER, name) for name in loose] + list(combinations(loose, 2))
+        pairs += [(prop.name, prop.name) for prop in props if prop.jingles]
         for name in still:
             pairs += [(other, name) for other in (GRIPPER, *loose)]
         self.pairs: tuple[tuple[str, str], ...] = tuple(pairs)

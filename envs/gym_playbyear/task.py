@@ -88,6 +88,8 @@ class Prop:
         loudness: Factor on its own share of a contact's sound.
         loose: It moves freely, by a free joint that has the prop's name, and may touch whatever is there.
         hidden: What no camera sees and hearing has to find. With `hidden_object=False` the hand passes through it.
+        jingles: It has parts, bodies within that one, which are heard when they knock against each other.
+        bends: Joints within it whose motion crackles, each with a factor from its speed to that of bending in rad/s.
     """
 
     name: str
@@ -96,6 +98,8 @@ class Prop:
     loudness: float = 1.0
     loose: bool = False
     hidden: bool = False
+    jingles: bool = False
+    bends: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if isinstance(self.spec, mujoco.MjSpec):

@@ -13,7 +13,7 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from mujoco import rollout
 
 from gym_playbyear.arena import TABLE_TOP
-from gym_playbyear.ears import Ears, Moment
+from gym_playbyear.ears import Bending, Ears, Moment
 from gym_playbyear.options import check_option, make_definition
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
@@ -106,6 +106,14 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._controller = arm.controller(definition.control_hz, definition.physics_dt)
         self._fingers = slice(arm.n_joints, arm.n_joints + 2)
         self._tool = self.model.site(arm.tool).id
+        self._bends = {
+            prop.name: (
+                np.array([self.model.joint(joint).dofadr[0] for joint, _ in prop.bends]),
+                np.array([factor for _, factor in prop.bends]),
+            )
+            for prop in (definition.arena, *definition.props)
+            if prop.bends
+        }
         self._state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._rollout_state = np.empty((1, self._controller.n_substeps, len(self._state)))
         self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
@@ -282,6 +290,7 @@ class TaskEnv(PrivilegedState, gym.Env):
             speeds[:, self._fingers].mean(axis=1),
             self._rollout_state[0],
             {microphone: self._place_of(links.get(microphone)) for microphone in self._microphones},
+            {name: Bending(speeds[:, dofs] @ factors, self.position(name)) for name, (dofs, factors) in self._bends.items()},
         )
 
     def _place_of(self, body: str | None) -> np.ndarray:
