@@ -62,7 +62,7 @@ def roll_out(env, seed: int, name: str):
     return info["is_success"], np.array(by_expert), reasons
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [task for task in TASKS if task.startswith("Occluded")])
 def test_a_policy_as_good_as_the_expert_is_left_alone(task):
     env = make(task)
     episodes = [roll_out(env, seed, "expert") for seed in range(3000, 3014)]

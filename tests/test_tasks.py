@@ -14,6 +14,8 @@ from gym_playbyear import TASKS
 from gym_playbyear.baselines import EXPERT, success_rates
 from gym_playbyear.blind import BLIND_STRATEGIES
 
+CUBE_TASKS = tuple(task for task in TASKS if task.startswith("Occluded"))
+
 
 def make(task: str, **options):
     return gym.make(f"gym_playbyear:gym_playbyear/{task}", **options)
@@ -57,7 +59,7 @@ def test_observation_contract(task):
     assert observation["agent_pos"].shape == (7,)
     assert observation["agent_pos"].dtype == np.float32
     for microphone in ("gripper", "table"):
-        assert observation[f"audio.{microphone}"].shape == (2400,)
+        assert observation[f"audio.{microphone}"].shape == (48000 // env.unwrapped.control_hz,)
         assert observation[f"audio.{microphone}"].dtype == np.int16
     assert info["is_success"] is False
     env.close()
@@ -118,7 +120,7 @@ def cube_pixels(env):
     return int((shown == env.model.geom("cube").id).sum())
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", CUBE_TASKS)
 def test_camera_never_sees_the_resting_cube(task):
     env = make(task)
     for seed in range(3):
@@ -132,13 +134,13 @@ def test_camera_never_sees_the_resting_cube(task):
     env.close()
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", CUBE_TASKS)
 def test_expert_succeeds(task):
     assert success_rates(task, (EXPERT,), range(10))[EXPERT] == 1.0
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", CUBE_TASKS)
 def test_expert_succeeds_and_the_blind_fail_over_100_seeds(task):
     rates = success_rates(task, (EXPERT, *BLIND_STRATEGIES), range(1000, 1100))
     assert rates[EXPERT] >= 0.95

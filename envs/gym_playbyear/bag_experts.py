@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP
-from gym_playbyear.arm import ACTION_SCALE
+from gym_playbyear.arm import ACTION_SCALE, FINGER_THICKNESS, FINGER_WIDTH
 from gym_playbyear.bag import BAG, RIM, bottom_height
-from gym_playbyear.bag_contents import CONTENTS, middle_of
+from gym_playbyear.bag_contents import CONTENTS, points_of
 
 TIP_BELOW_HAND = 0.0086  # m: how far the fingers' tips are below the point that is controlled
 _GRIP, _ON_BAG = f"gripper-{CONTENTS}", f"gripper-{BAG}"
-_TALLEST = 0.035  # m: nothing in the bag is higher above its bottom
+_OFFSETS = np.stack(np.meshgrid(*[np.arange(-0.04, 0.041, 0.005)] * 2), axis=-1).reshape(-1, 2)  # m, places to close at
+_TALLEST = 0.03  # m: nothing in the bag is higher above its bottom
 
 
 @dataclass(frozen=True)
@@ -25,15 +26,17 @@ class BagExpertConfig:
     The pairs are ranges of uniform draws. fast, slow: displacement per step; pause_probability: per step of descent and search.
     """
 
-    fast: tuple[float, float] = (0.016, 0.024)
-    slow: tuple[float, float] = (0.006, 0.009)
+    fast: tuple[float, float] = (0.020, 0.030)
+    slow: tuple[float, float] = (0.005, 0.008)
     search_step: tuple[float, float] = (0.010, 0.014)
     pause_probability: float = 0.04
     pause: tuple[int, int] = (1, 2)
-    dwell: tuple[int, int] = (0, 2)
+    dwell: tuple[int, int] = (0, 1)
     noise: float = 0.001
     contact_force: float = 0.15  # N
     bottom_force: float = 0.3  # N
+    low: float = 0.008  # the tips above the bottom: fingers that close there take hold, too
+    landed: float = 2.0  # N: the fingers came down on a thing, not around it
     aim: float = 0.005  # how far from the bag's middle it goes in
     hover: float = 0.030  # the tips above the bottom, on the way to a grasp
     above_bottom: float = 0.003  # the tips, in a search
@@ -61,6 +64,12 @@ class BagExpert:
         self.turn = 1 if draw() < 0.5 else -1
         self.phase, self._wait, self._closed_for = "enter", 0, 0
         self._way: list[np.ndarray] = []
+        self._aim, self._n_landed = self.entry, 0
+
+    def begin_at(self, phase: str) -> None:
+        """Goes on in the middle of an attempt: from where the hand is now, in `phase`."""
+        self.phase, self._wait, self._closed_for = phase, 0, 0
+        self.entry = self.env.eef_position[:2]
 
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
@@ -85,8 +94,7 @@ class BagExpert:
         if self._feels_contents():
             return self._touched()
         if self._feels_bottom():
-            on_it = np.abs(self._middle()[:2] - self.env.eef_position[:2]).max() < 0.012
-            if on_it and self._fits():
+            if self._worth(self.env.eef_position[None, :2])[0] > 0.15:
                 return self._begin_grasp()
             self._plan_search()
             return self._search()
@@ -129,7 +137,7 @@ class BagExpert:
     def _rise(self):
         height = bottom_height(self.env) + TIP_BELOW_HAND + self.config.hover
         if self.env.eef_position[2] > height - 0.004:
-            self.phase = "centre"
+            self.phase, self._aim = "centre", self._best_place()
         return np.array([*self.env.eef_position[:2], height]), self.fast, False
 
     def _centre(self):
@@ -140,9 +148,13 @@ class BagExpert:
 
     def _lower(self):
         goal = self._above(0.001)
+        if self.env.contact_forces[_GRIP] > self.config.landed:
+            self._n_landed += 1
+            low = self.env.eef_position[2] < self._above(self.config.low)[2]
+            return self._begin_grasp() if low else self._touched()
         if self._feels_bottom() or self.env.eef_position[2] < goal[2] + 0.002:
             return self._begin_grasp()
-        return goal, 0.010, False
+        return goal, 0.012, False
 
     def _begin_grasp(self):
         self.phase, self._closed_for = "grasp", 0
@@ -175,14 +187,26 @@ class BagExpert:
         low = self.env.eef_position[2] < bottom_height(self.env) + TIP_BELOW_HAND + 0.002
         return low and self.env.contact_forces[_ON_BAG] > self.config.bottom_force
 
-    def _middle(self) -> np.ndarray:
-        return middle_of(self.env)
-
-    def _fits(self) -> bool:
-        return True
-
     def _above(self, height: float) -> np.ndarray:
-        return np.array([*self._middle()[:2], bottom_height(self.env) + TIP_BELOW_HAND + height])
+        return np.array([*self._aim, bottom_height(self.env) + TIP_BELOW_HAND + height])
+
+    def _best_place(self) -> np.ndarray:
+        """Where fingers that come down land on nothing, and most lies between them (2,) [m, world]."""
+        middle = points_of(self.env)[:, :2].mean(axis=0)
+        (low, high) = (np.array(corner)[:2] for corner in self.env.variant.arm.workspace)
+        places = np.clip(middle + _OFFSETS, low, high)
+        worth = self._worth(places) - 0.5 * np.linalg.norm(_OFFSETS, axis=1)
+        worth += min(self._n_landed, 5) * 0.1 * self.rng.uniform(size=len(worth))  # elsewhere, after a bad landing
+        return places[np.argmax(worth)]
+
+    def _worth(self, places: np.ndarray) -> np.ndarray:
+        """How good it is to close at some places (N, 2) [m, world]: the share of the things that is between the fingers,
+        less what is under them (N,)."""
+        across, along = np.abs(points_of(self.env)[:, None, :2] - places).transpose(2, 0, 1)  # (P, N) each: x, y
+        inner = self.env.variant.arm.max_opening / 2
+        between = (across < 0.007) & (along < inner - 0.004)
+        under = (across < FINGER_WIDTH / 2 + 0.002) & (along > inner - 0.003) & (along < inner + FINGER_THICKNESS + 0.003)
+        return np.asarray(between.mean(axis=0) - 5.0 * under.mean(axis=0))
 
     def _is_open(self) -> bool:
         return bool(self.env.finger_positions.sum() > self.env.variant.arm.max_opening - 0.002)

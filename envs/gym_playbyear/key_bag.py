@@ -9,14 +9,14 @@ import numpy as np
 from gym_playbyear.arena import TABLE
 from gym_playbyear.arm import FINGER_FRICTION, ArmConfig
 from gym_playbyear.bag import BAG, BOTTOM_THICKNESS, RIM, Torn, bag, set_bottom
-from gym_playbyear.bag_contents import CONTENTS, contents_prop, middle_of
+from gym_playbyear.bag_contents import CONTENTS, contents_prop, drop, middle_of
 from gym_playbyear.bag_experts import STRATEGIES, BagExpert, BlindBag
+from gym_playbyear.bag_gate import BagGate
 from gym_playbyear.proprioception import SensorNoise
 from gym_playbyear.rules import Groped, Pressed, Solved
 from gym_playbyear.task import Camera, Task
 
 CAMERA = Camera("front", 'pos="0.75 0 1.16" xyaxes="0 1 0 -0.22 0 0.975" fovy="40"')
-DROOP = (1.0, 1.3)
 _VISIBLE = RIM + 0.01
 
 
@@ -26,12 +26,12 @@ class BagNumbers:
     bottom: tuple[float, float]
     horizon: int = 75
     max_press: float = 25.0
-    max_tear: float = 15.0
+    max_tear: float = 11.0
     closings: int = 2
     hold_s: float = 0.4
     arm: ArmConfig = field(
         default_factory=lambda: ArmConfig(
-            max_opening=0.065, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
+            max_opening=0.07, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
         )
     )
     sensors: SensorNoise = field(default_factory=SensorNoise)
@@ -64,6 +64,7 @@ def _task(name: str, numbers: BagNumbers, contents: str, **scripts: Any) -> Task
             Groped(numbers.closings),
         ),
         expert=BagExpert,
+        gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},
         horizon=numbers.horizon,
         control_hz=5,
@@ -84,13 +85,8 @@ def _place(env: Any, options: dict[str, Any]) -> dict[str, Any]:
     set_bottom(env, height)
     radius, angle = np.sqrt(rng.uniform(*np.square(numbers.offset))), rng.uniform(-np.pi, np.pi)
     x, y = radius * np.cos(angle), radius * np.sin(angle)
-    drop = 0.07
-    env.put(CONTENTS, (x, y, env.model.body(BAG).pos[2] + height + BOTTOM_THICKNESS + drop), rng.uniform(-np.pi, np.pi))
-    for name, u in (("lever", (1, 0, 0)), ("opener", (-1, 0, 0)), ("medallion", (0, 1, 0)), ("whistle", (0, -1, 0))):
-        q = env.model.joint(name).qposadr[0]
-        axis = np.cross(u, (0, 0, -1))
-        a = rng.uniform(*DROOP)
-        env.data.qpos[q : q + 4] = (np.cos(a / 2), *(np.sin(a / 2) * axis))
+    height = env.model.body(BAG).pos[2] + height + BOTTOM_THICKNESS
+    drop(env, np.array([x, y]), rng.uniform(-np.pi, np.pi), height, rng)
     return {}
 
 

@@ -1,0 +1,108 @@
+"""Keys in a bag: hidden from the camera, found by touch, heard; what ends an attempt, and what else can be in the bag."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from gym_playbyear.bag import BAG, RIM
+from gym_playbyear.bag_contents import CONTENTS, CONTENTS_KINDS, middle_of, points_of
+from lerobot_env_playbyear import PlaybyearEnvConfig
+
+EASY, HARD = "KeyBag-Easy-v1", "KeyBag-Hard-v1"
+STILL = np.array([0.0, 0.0, 0.0, -1.0])
+
+
+def make(task: str, **options):
+    return gym.make(f"gym_playbyear/{task}", **options).unwrapped
+
+
+def play(env, seed: int):
+    """The expert's episode without observations: how it ended, and its number of steps."""
+    env.begin_episode(seed=seed)
+    expert, steps, done = env.scripted_expert(), 0, False
+    while not done:
+        _, terminated, truncated, info = env.advance(expert.act())
+        steps, done = steps + 1, terminated or truncated
+    return info, steps
+
+
+def test_the_camera_sees_no_keys_before_they_are_lifted():
+    world, twin = make(HARD, sound="none"), make(HARD, sound="none", hidden_object=False)
+    for seed in (0, 1):
+        first, second = world.reset(seed=seed)[0], twin.reset(seed=seed)[0]
+        expert = world.scripted_expert()
+        for _ in range(25):
+            np.testing.assert_array_equal(first["pixels"]["front"], second["pixels"]["front"])
+            np.testing.assert_array_equal(first["agent_pos"], second["agent_pos"])
+            action = expert.act()
+            first, second = world.step(action)[0], twin.step(action)[0]
+            if world.contact_forces[f"gripper-{CONTENTS}"] > 0:
+                break
+        else:
+            raise AssertionError("the expert touched nothing")
+    world.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("kind", CONTENTS_KINDS)
+def test_whatever_lies_in_the_bag_is_below_what_the_camera_sees(kind):
+    env = make(EASY, sound="none", contents=kind)
+    eye = env.model.camera("front").pos
+    x, y = 0.085, 0.14  # the bag's inner sides [m]
+    for seed in range(3):
+        env.begin_episode(seed=seed, options={"bottom": env.variant.bottom[1]})
+        points = points_of(env)
+        assert (np.abs(points[:, 0]) < x).all()
+        assert (np.abs(points[:, 1]) < y).all()
+        share = (eye[0] - x) / (eye[0] - points[:, 0])  # of the way from the eye to a point, where the front wall is
+        assert (eye[2] + share * (points[:, 2] - eye[2]) < RIM).all()
+
+
+@pytest.mark.parametrize("task", [EASY, HARD])
+def test_the_expert_takes_the_keys_out(task):
+    env = make(task, sound="none")
+    for seed in range(3):
+        info, _ = play(env, seed)
+        assert info["end"] == "success"
+        assert middle_of(env)[2] > RIM
+
+
+def test_what_ends_an_attempt():
+    env = make(EASY, sound="none")
+    for expected, options, actions in (
+        ("torn", {"bottom": 0.06}, [(0, 0, -0.4, -1)]),
+        ("groped", {}, [(0, 0, 0, 1), (0, 0, 0, -1)]),
+        ("time", {}, [(0, 0, 0, -1)]),
+    ):
+        env.begin_episode(seed=0, options={"keys": (0.0, 0.2), **options})
+        done, steps = False, 0
+        while not done:
+            _, terminated, truncated, info = env.advance(actions[steps // 11 % len(actions)])
+            steps, done = steps + 1, terminated or truncated
+        assert info["end"] == expected
+
+
+def test_walls_bend_visibly_and_crackle():
+    env = make(EASY, noise_level=0.0, hidden_object=False)
+    picture = env.reset(seed=0)[0]["pixels"]["front"].astype(int)
+    for _ in range(4):
+        env.step(np.array([0, 0, -0.4, -1.0]))
+    still = env.step(STILL)[0]["audio.gripper"]
+    louder, bent = 0.0, 0.0
+    for _ in range(6):
+        observation = env.step(np.array([0, 0.6, 0, -1.0]))[0]
+        louder = max(louder, float(np.abs(observation["audio.gripper"].astype(float)).mean()))
+        bent = max(bent, float(abs(env.data.joint("left_foot").qpos[0])))
+    assert bent > 0.05
+    assert louder > 10 * np.abs(still.astype(float)).mean() + 10
+    changed = np.abs(observation["pixels"]["front"].astype(int) - picture).max(axis=-1) > 20
+    assert changed[45:, 60:].sum() > 10  # below the hand, where only the bag is
+    env.close()
+
+
+def centroid(samples: np.ndarray, rate: int) -> float:
+    """Middle of the spectrum up to 4 kHz [Hz]."""
+    power = np.abs(np.fft.rfft(samples * np.hanning(len(samples)))) ** 2
+    frequencies = np.fft.rfftfreq(len(samples), 1 / rate)
+    heard = frequencies < 4000
+    return float((frequencies[heard] * power[heard]).sum() / power[heard].sum())
