@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from gym_playbyear.bag import BAG, RIM
+from gym_playbyear.bag import BAG, HALF_SIZE, RIM
 from gym_playbyear.bag_contents import CONTENTS, CONTENTS_KINDS, middle_of, points_of
 from lerobot_env_playbyear import PlaybyearEnvConfig
 
@@ -48,7 +48,7 @@ def test_the_camera_sees_no_keys_before_they_are_lifted():
 def test_whatever_lies_in_the_bag_is_below_what_the_camera_sees(kind):
     env = make(EASY, sound="none", contents=kind)
     eye = env.model.camera("front").pos
-    x, y = 0.085, 0.14  # the bag's inner sides [m]
+    x, y = HALF_SIZE
     for seed in range(3):
         env.begin_episode(seed=seed, options={"bottom": env.variant.bottom[1]})
         points = points_of(env)
@@ -74,7 +74,7 @@ def test_what_ends_an_attempt():
         ("groped", {}, [(0, 0, 0, 1), (0, 0, 0, -1)]),
         ("time", {}, [(0, 0, 0, -1)]),
     ):
-        env.begin_episode(seed=0, options={"keys": (0.0, 0.2), **options})
+        env.begin_episode(seed=0, options={"contents_position": (0.04, 0.09), **options})
         done, steps = False, 0
         while not done:
             _, terminated, truncated, info = env.advance(actions[steps // 11 % len(actions)])
@@ -106,3 +106,74 @@ def centroid(samples: np.ndarray, rate: int) -> float:
     frequencies = np.fft.rfftfreq(len(samples), 1 / rate)
     heard = frequencies < 4000
     return float((frequencies[heard] * power[heard]).sum() / power[heard].sum())
+
+
+def test_keys_sound_other_than_the_bag():
+    env = make(HARD, noise_level=0.0, image_size=8)
+    bag, keys = [], []
+    for seed in range(2):
+        env.reset(seed=seed)
+        expert, done = env.scripted_expert(), False
+        while not done and len(keys) < 4 * (seed + 1):
+            observation, _, terminated, truncated, _ = env.step(expert.act())
+            done = terminated or truncated
+            if env.contact_forces[f"gripper-{CONTENTS}"] > 1.0:
+                keys.append(observation["audio.gripper"].astype(float))
+        env.reset(seed=seed, options={"contents_position": (0.04, 0.09)})
+        for _ in range(8):
+            observation = env.step(np.array([-0.3, -0.3, -0.3, -1.0]))[0]
+            if env.contact_forces[f"gripper-{BAG}"] > 0.1:
+                bag.append(observation["audio.gripper"].astype(float))
+    env.close()
+    assert len(bag) > 2
+    heard_keys, heard_bag = ([centroid(block, 48000) for block in blocks] for blocks in (keys, bag))
+    assert np.median(heard_keys) > np.median(heard_bag) + 300
+
+
+def test_a_cloth_is_mute():
+    """Closing on it is much quieter than closing on keys."""
+    levels = {}
+    for kind in ("keys", "cloth"):
+        env = make(EASY, noise_level=0.0, image_size=8, contents=kind)
+        env.reset(seed=1)
+        expert, heard = env.scripted_expert(), []
+        while expert.phase not in ("lift", "hold"):
+            observation = env.step(expert.act())[0]
+            if env.contact_forces[f"gripper-{CONTENTS}"] > 0:
+                heard.append(np.square(observation["audio.gripper"].astype(float)).mean())
+        levels[kind] = np.mean(heard)
+        env.close()
+    assert levels["cloth"] < 0.1 * levels["keys"]
+
+
+def test_a_bad_policy_is_corrected():
+    """Someone who closes far above the keys, and waits."""
+    env = make(EASY, sound="none")
+    rescued = 0
+    for seed in range(3):
+        env.begin_episode(seed=seed)
+        gate, done, info = env.intervention_gate(), False, {}
+        while not done:
+            action = gate.act() if gate.wants_control(STILL) else STILL
+            _, terminated, truncated, info = env.advance(action)
+            done = terminated or truncated
+        rescued += info["is_success"]
+    assert rescued >= 2
+
+
+def test_a_policy_as_good_as_the_expert_is_left_alone():
+    env = make(EASY, sound="none")
+    env.begin_episode(seed=2)
+    policy, gate, by_expert, done = env.scripted_expert(), env.intervention_gate(), [], False
+    while not done:
+        action = policy.act()
+        by_expert.append(gate.wants_control(action))
+        _, terminated, truncated, _ = env.advance(gate.act() if by_expert[-1] else action)
+        done = terminated or truncated
+    assert np.mean(by_expert) < 0.2
+
+
+def test_lerobot_takes_the_tasks_own_rates():
+    config = PlaybyearEnvConfig(task=HARD, task_options={"contents": "pens"})
+    assert (config.fps, config.sample_rate, config.samples_per_frame) == (5, 48000, 9600)
+    assert config.features["audio.gripper"].shape == (9600,)

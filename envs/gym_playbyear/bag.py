@@ -12,6 +12,7 @@ from gym_playbyear.rules import Rule
 from gym_playbyear.task import Prop
 
 BAG = "bag"
+BAG_MIDDLE = (0.0, 0.0)  # m, world
 HALF_SIZE = (0.085, 0.14)  # m, along x and y
 HEIGHT = 0.18  # m
 RIM = TABLE_TOP + HEIGHT  # m, world
@@ -39,7 +40,7 @@ def bag() -> Prop:
         <geom type="box" size="{x - 0.003} {y - 0.003} {half}" pos="0 0 {half}" mass="0.05" friction="0.6 0.005 0.0001"
               rgba="{_COLOURS[0]}"/>
       </body>"""
-    body = f'<body name="{BAG}" pos="0 0 {TABLE_TOP}">{bottom}{walls}</body>'
+    body = f'<body name="{BAG}" pos="{BAG_MIDDLE[0]} {BAG_MIDDLE[1]} {TABLE_TOP}">{bottom}{walls}</body>'
     return Prop(BAG, body, material="bag", bends=tuple(bends))
 
 

@@ -1,5 +1,6 @@
 """What can be in the bag: the key ring of the paper's robot, and the unseen objects of its table I."""
 
+import itertools
 from typing import Any
 
 import mujoco
@@ -10,11 +11,17 @@ from gym_playbyear.task import Prop
 
 CONTENTS = "contents"
 # Light things between hard fingers: stiff, short contacts, and their own friction on whatever they touch (priority).
-_TOUCH = 'priority="2" condim="4" friction="0.5 0.005 0.0002" solref="0.005 1" solimp="0.95 0.99 0.0005"'
+FRICTION = 0.5
+_TOUCH = f'priority="2" condim="4" friction="{FRICTION} 0.005 0.0002" solref="0.005 1" solimp="0.95 0.99 0.0005"'
 _STEEL, _BRASS = "0.75 0.77 0.80 1", "0.80 0.65 0.30 1"
-_SOFT = 'priority="2" condim="4" friction="1.0 0.005 0.0002" solref="0.02 1" solimp="0.9 0.95 0.003"'
+_SOFT = 'priority="2" condim="4" friction="0.5 0.005 0.0002" solref="0.02 1" solimp="0.9 0.95 0.003"'
 _WHITE, _PENS = "0.95 0.95 0.95 1", ("0.15 0.25 0.75 1", "0.1 0.1 0.1 1", "0.7 0.15 0.15 1")
-_HANG = {"lever": (1, 0, 0), "opener": (-1, 0, 0), "medallion": (0, 1, 0), "whistle": (0, -1, 0)}  # where each sits on the ring
+_HANG = {
+    "lever": (1, 0, 0),
+    "opener": (-1, 0, 0),
+    "medallion": (0, 1, 0),
+    "whistle": (0, -1, 0),
+}  # where each sits on the ring
 _DROOP = (0.0, 0.6)  # rad: how far they hang down when the ring falls; a right angle is straight down
 _RING_HEIGHT, _DROP_HEIGHT = 0.07, 0.045  # m
 _GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)  # (P, 3)
@@ -42,7 +49,7 @@ def _keys() -> str:
     corners = [(d, d), (-d, d), (-d, -d), (d, -d), (d, d)]
     wire = "".join(
         _geom("capsule", (_WIRE,), 0.002, _STEEL, f'fromto="{a} {b} 0 {c} {e} 0"')
-        for (a, b), (c, e) in zip(corners, corners[1:], strict=False)
+        for (a, b), (c, e) in itertools.pairwise(corners)
     )
     lever = _geom("box", (0.030, 0.007, 0.0025), 0.025, _STEEL, 'pos="0.034 0 0"')
     opener = _geom("box", (0.019, 0.014, 0.0025), 0.020, _STEEL, 'pos="-0.023 0 0"')
@@ -61,7 +68,8 @@ def _keys() -> str:
 def _bottle() -> str:
     """A pill bottle of 0.04 kg."""
     return _body(
-        _geom("cylinder", (0.018, 0.026), 0.035, "0.95 0.6 0.2 1") + _geom("cylinder", (0.016, 0.006), 0.005, _WHITE, 'pos="0 0 0.031"')
+        _geom("cylinder", (0.018, 0.026), 0.035, "0.95 0.6 0.2 1")
+        + _geom("cylinder", (0.016, 0.006), 0.005, _WHITE, 'pos="0 0 0.031"')
     )
 
 

@@ -15,7 +15,7 @@ from gym_playbyear.bag_contents import CONTENTS, points_of
 
 TIP_BELOW_HAND = 0.0086  # m: how far the fingers' tips are below the point that is controlled
 _GRIP, _ON_BAG = f"gripper-{CONTENTS}", f"gripper-{BAG}"
-_OFFSETS = np.stack(np.meshgrid(*[np.arange(-0.04, 0.041, 0.005)] * 2), axis=-1).reshape(-1, 2)  # m, places to close at
+_OFFSETS = np.stack(np.meshgrid(*[np.arange(-0.04, 0.041, 0.005)] * 2), axis=-1).reshape(-1, 2)  # m: places to close at
 _TALLEST = 0.03  # m: nothing in the bag is higher above its bottom
 
 
@@ -36,7 +36,7 @@ class BagExpertConfig:
     contact_force: float = 0.15  # N
     bottom_force: float = 0.3  # N
     low: float = 0.008  # the tips above the bottom: fingers that close there take hold, too
-    landed: float = 2.0  # N: the fingers came down on a thing, not around it
+    landed: float = 6.0  # N: the fingers came down on a thing, not around it
     aim: float = 0.005  # how far from the bag's middle it goes in
     hover: float = 0.030  # the tips above the bottom, on the way to a grasp
     above_bottom: float = 0.003  # the tips, in a search
@@ -94,7 +94,7 @@ class BagExpert:
         if self._feels_contents():
             return self._touched()
         if self._feels_bottom():
-            if self._worth(self.env.eef_position[None, :2])[0] > 0.15:
+            if self._worth(self.env.eef_position[None, :2])[0] > 0.1:
                 return self._begin_grasp()
             self._plan_search()
             return self._search()
@@ -147,12 +147,12 @@ class BagExpert:
         return goal, self.fast, False
 
     def _lower(self):
-        goal = self._above(0.001)
+        goal = self._above(-0.002)
         if self.env.contact_forces[_GRIP] > self.config.landed:
             self._n_landed += 1
             low = self.env.eef_position[2] < self._above(self.config.low)[2]
             return self._begin_grasp() if low else self._touched()
-        if self._feels_bottom() or self.env.eef_position[2] < goal[2] + 0.002:
+        if self._feels_bottom() or self.env.eef_position[2] < goal[2] + 0.0015:
             return self._begin_grasp()
         return goal, 0.012, False
 
@@ -164,7 +164,8 @@ class BagExpert:
         self._closed_for += 1
         if self._closed_for > self.config.closing:
             self.phase = "rise" if self._is_empty() else "lift"
-        return None, 0.0, True
+        height = bottom_height(self.env) + TIP_BELOW_HAND + 0.001  # less pressure on the bag, step by step
+        return np.array([*self.env.eef_position[:2], height]), 0.002, True
 
     def _lift(self):
         if self._is_empty():
@@ -202,11 +203,15 @@ class BagExpert:
     def _worth(self, places: np.ndarray) -> np.ndarray:
         """How good it is to close at some places (N, 2) [m, world]: the share of the things that is between the fingers,
         less what is under them (N,)."""
-        across, along = np.abs(points_of(self.env)[:, None, :2] - places).transpose(2, 0, 1)  # (P, N) each: x, y
+        points = points_of(self.env)
+        across, along = np.abs(points[:, None, :2] - places).transpose(2, 0, 1)  # (P, N) each: x, y
+        thick = np.clip((points[:, 2] - bottom_height(self.env)) / 0.01, 0.2, 1.0)[:, None]  # what is flat slips away
         inner = self.env.variant.arm.max_opening / 2
         between = (across < 0.007) & (along < inner - 0.004)
-        under = (across < FINGER_WIDTH / 2 + 0.002) & (along > inner - 0.003) & (along < inner + FINGER_THICKNESS + 0.003)
-        return np.asarray(between.mean(axis=0) - 5.0 * under.mean(axis=0))
+        under = (
+            (across < FINGER_WIDTH / 2 + 0.002) & (along > inner - 0.003) & (along < inner + FINGER_THICKNESS + 0.003)
+        )
+        return np.asarray((between * thick).mean(axis=0) - 5.0 * under.mean(axis=0))
 
     def _is_open(self) -> bool:
         return bool(self.env.finger_positions.sum() > self.env.variant.arm.max_opening - 0.002)

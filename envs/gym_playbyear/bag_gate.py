@@ -1,7 +1,7 @@
 """When the expert takes over from a policy that takes things out of a bag, and when it hands back.
 
-As for the other tasks (`gym_playbyear.gates`), a gate waits until a mistake can be noticed, and hands back when the expert's own
-phase changes: from searching to grasping, and from grasping to lifting.
+As for the other tasks (`gym_playbyear.gates`), a gate waits until a mistake can be noticed, and hands back when the
+expert's own phase changes: from searching to grasping, and from grasping to lifting.
 """
 
 from dataclasses import dataclass

@@ -290,7 +290,10 @@ class TaskEnv(PrivilegedState, gym.Env):
             speeds[:, self._fingers].mean(axis=1),
             self._rollout_state[0],
             {microphone: self._place_of(links.get(microphone)) for microphone in self._microphones},
-            {name: Bending(speeds[:, dofs] @ factors, self.position(name)) for name, (dofs, factors) in self._bends.items()},
+            {
+                name: Bending(speeds[:, dofs] @ factors, self.position(name))
+                for name, (dofs, factors) in self._bends.items()
+            },
         )
 
     def _place_of(self, body: str | None) -> np.ndarray:
