@@ -21,7 +21,7 @@ _WALL = 0.0015  # m, half its thickness
 _STIFFNESS = (2.0, 0.8)  # Nm/rad of the hinges at the foot and halfway up
 _DAMPING = (0.06, 0.02)  # Nms/rad
 _COLOURS = ("0.70 0.52 0.33 1", "0.75 0.57 0.38 1")  # of the lower and the upper halves: brown paper
-_BOTTOM_STIFFNESS, _BOTTOM_DAMPING = 1000.0, 40.0  # N/m, Ns/m
+_BOTTOM_STIFFNESS, _BOTTOM_DAMPING = 1500.0, 40.0  # N/m, Ns/m
 _BOTTOM_PRESSED = 0.05  # m: so far down it crackles as a wall that bends by one radian
 
 

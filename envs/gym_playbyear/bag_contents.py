@@ -25,7 +25,7 @@ _HANG = {
 _DROOP = (0.0, 0.6)  # rad: how far they hang down when the ring falls; a right angle is straight down
 _RING_HEIGHT, _DROP_HEIGHT = 0.07, 0.045  # m
 _GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)  # (P, 3)
-_RING_RADIUS, _WIRE = 0.010, 0.0015  # m
+_RING_RADIUS, _WIRE = 0.008, 0.0013  # m
 
 
 def _geom(kind: str, size, mass: float, rgba: str, where: str = "", touch: str = _TOUCH) -> str:
@@ -44,17 +44,17 @@ def _hanging(name: str, at: str, inside: str) -> str:
 
 
 def _keys() -> str:
-    """A ring with a lever opener, a cap opener, a medallion and a whistle (the paper's, appendix A), about 0.1 kg."""
+    """A ring with a lever opener, a cap opener, a medallion and a whistle (the paper's, appendix A), about 0.08 kg."""
     d = 0.7071 * _RING_RADIUS * 1.3
     corners = [(d, d), (-d, d), (-d, -d), (d, -d), (d, d)]
     wire = "".join(
         _geom("capsule", (_WIRE,), 0.002, _STEEL, f'fromto="{a} {b} 0 {c} {e} 0"')
         for (a, b), (c, e) in itertools.pairwise(corners)
     )
-    lever = _geom("box", (0.030, 0.007, 0.0025), 0.025, _STEEL, 'pos="0.034 0 0"')
-    opener = _geom("box", (0.019, 0.014, 0.0025), 0.020, _STEEL, 'pos="-0.023 0 0"')
-    medallion = _geom("cylinder", (0.016, 0.002), 0.020, _BRASS, 'pos="0 0.020 0"')
-    whistle = _geom("cylinder", (0.009, 0.019), 0.025, _STEEL, 'pos="0 -0.024 0" euler="1.5708 0 0"')
+    lever = _geom("box", (0.022, 0.006, 0.0025), 0.020, _STEEL, 'pos="0.025 0 0"')
+    opener = _geom("box", (0.015, 0.011, 0.0025), 0.017, _STEEL, 'pos="-0.018 0 0"')
+    medallion = _geom("cylinder", (0.012, 0.002), 0.015, _BRASS, 'pos="0 0.015 0"')
+    whistle = _geom("cylinder", (0.0075, 0.015), 0.020, _STEEL, 'pos="0 -0.019 0" euler="1.5708 0 0"')
     r = _RING_RADIUS
     hung = (
         _hanging("lever", f"{r} 0 0", lever)
@@ -66,11 +66,10 @@ def _keys() -> str:
 
 
 def _bottle() -> str:
-    """A pill bottle of 0.04 kg."""
-    return _body(
-        _geom("cylinder", (0.018, 0.026), 0.035, "0.95 0.6 0.2 1")
-        + _geom("cylinder", (0.016, 0.006), 0.005, _WHITE, 'pos="0 0 0.031"')
-    )
+    """A pill bottle of 0.04 kg, on its side."""
+    lying = 'euler="0 1.5708 0"'
+    cap = _geom("cylinder", (0.016, 0.006), 0.005, _WHITE, f'pos="0.031 0 0" {lying}')
+    return _body(_geom("cylinder", (0.018, 0.026), 0.035, "0.95 0.6 0.2 1", lying) + cap)
 
 
 def _chips() -> str:
@@ -88,12 +87,10 @@ def _pens() -> str:
 
 
 def _candies() -> str:
-    """Six wrapped sweets on a strip."""
-    sweet = _geom("ellipsoid", (0.011, 0.009, 0.008), 0.006, "0.9 0.3 0.5 1", 'pos="0.012 0 0"')
-    strip = ""
-    for k in reversed(range(5)):
-        strip = _hanging(f"sweet_{k}", "0.024 0 0", sweet + strip)
-    return _body(sweet + strip)
+    """Five wrapped sweets that hang together."""
+    sweet = _geom("ellipsoid", (0.011, 0.009, 0.008), 0.006, "0.9 0.3 0.5 1")
+    around = ("0.021 0.006 0", "-0.021 -0.006 0", "0.006 -0.019 0", "-0.006 0.019 0")
+    return _body(sweet + "".join(_hanging(f"sweet_{k}", at, sweet) for k, at in enumerate(around)))
 
 
 def _cloth() -> str:

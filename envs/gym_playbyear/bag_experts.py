@@ -16,7 +16,7 @@ from gym_playbyear.bag_contents import CONTENTS, points_of
 TIP_BELOW_HAND = 0.0086  # m: how far the fingers' tips are below the point that is controlled
 _GRIP, _ON_BAG = f"gripper-{CONTENTS}", f"gripper-{BAG}"
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-0.04, 0.041, 0.005)] * 2), axis=-1).reshape(-1, 2)  # m: places to close at
-_TALLEST = 0.03  # m: nothing in the bag is higher above its bottom
+_TALLEST = 0.02  # m: nothing in the bag is higher above its bottom
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class BagExpertConfig:
     """
 
     fast: tuple[float, float] = (0.020, 0.030)
-    slow: tuple[float, float] = (0.005, 0.008)
+    slow: tuple[float, float] = (0.0045, 0.0065)
     search_step: tuple[float, float] = (0.010, 0.014)
     pause_probability: float = 0.04
     pause: tuple[int, int] = (1, 2)
@@ -38,7 +38,7 @@ class BagExpertConfig:
     low: float = 0.008  # the tips above the bottom: fingers that close there take hold, too
     landed: float = 6.0  # N: the fingers came down on a thing, not around it
     aim: float = 0.005  # how far from the bag's middle it goes in
-    hover: float = 0.030  # the tips above the bottom, on the way to a grasp
+    hover: float = 0.025  # the tips above the bottom, on the way to a grasp
     above_bottom: float = 0.003  # the tips, in a search
     closing: int = 5
     empty: float = 0.004  # opening of fingers that hold nothing
@@ -148,7 +148,7 @@ class BagExpert:
 
     def _lower(self):
         goal = self._above(-0.002)
-        if self.env.contact_forces[_GRIP] > self.config.landed:
+        if self.env.contact_forces[_GRIP] > self.config.landed + min(self._n_landed, 4):  # with more force, if it must
             self._n_landed += 1
             low = self.env.eef_position[2] < self._above(self.config.low)[2]
             return self._begin_grasp() if low else self._touched()

@@ -40,14 +40,14 @@ class BagNumbers:
     horizon: int = 75
     arm: ArmConfig = field(
         default_factory=lambda: ArmConfig(
-            max_opening=0.07, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
+            max_opening=0.056, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
         )
     )
     sensors: SensorNoise = field(default_factory=SensorNoise)
 
 
 EASY = BagNumbers(offset=(0.0, 0.008), bottom=(0.025, 0.10))
-HARD = BagNumbers(offset=(0.02, 0.03), bottom=(0.025, 0.085))
+HARD = BagNumbers(offset=(0.02, 0.03), bottom=(0.025, 0.10))
 
 
 def key_bag_easy(*, contents: str = "keys") -> Task:
@@ -107,9 +107,8 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
 
 def key_bag_hard(*, contents: str = "keys") -> Task:
     """
-    As `KeyBag-Easy-v1` (`key_bag_easy`), except that the keys fell 2 to 3 cm beside the bag's middle, and the bag's bottom is
-    2.5 to 8.5 cm above the table: the arm has to move around in the bag until it touches them, and to tell their sound from
-    the bag's.
+    As `KeyBag-Easy-v1` (`key_bag_easy`), except that the keys fell 2 to 3 cm beside the bag's middle: the arm has to
+    move around in the bag until it touches them, and to tell their sound from the bag's.
     """
     return _task("KeyBag-Hard-v1", HARD, contents)
 
