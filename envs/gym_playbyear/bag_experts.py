@@ -154,7 +154,7 @@ class BagExpert:
             return self._begin_grasp() if low else self._touched()
         if self._feels_bottom() or self.env.eef_position[2] < goal[2] + 0.0015:
             return self._begin_grasp()
-        return goal, 0.012, False
+        return goal, float(np.clip(0.6 * (self.env.eef_position[2] - goal[2]), 0.004, 0.012)), False
 
     def _begin_grasp(self):
         self.phase, self._closed_for = "grasp", 0

@@ -33,7 +33,7 @@ class BagNumbers:
 
     offset: tuple[float, float]
     bottom: tuple[float, float]
-    max_press: float = 25.0
+    max_press: float = 30.0
     max_tear: float = 12.0
     closings: int = 2
     hold_s: float = 0.4
@@ -84,7 +84,7 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
     its bottom is 2.5 to 10 cm above the table. `reset(options={"contents_position": (x, y), "bottom": height})` sets them.
 
     ## Episode Termination
-    Terminated, and `info["end"]` says why: "success"; "pressed", when the hand came down on the keys with more than 25 N;
+    Terminated, and `info["end"]` says why: "success"; "pressed", when the hand came down on the keys with more than 30 N;
     "torn", when it pushed the bag with more than 12 N; "groped", when the fingers closed on nothing for the second time.
     Truncated, as "time", after `horizon` steps (75).
 
