@@ -24,6 +24,7 @@ _HANG = {
 }  # where each sits on the ring
 _DROOP = (0.0, 0.6)  # rad: how far they hang down when the ring falls; a right angle is straight down
 _RING_HEIGHT, _DROP_HEIGHT = 0.07, 0.045  # m
+_TURN = 0.15  # of a whole turn either way, for what is longer than the fingers open: it lies across them
 _GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)  # (P, 3)
 _RING_RADIUS, _WIRE = 0.008, 0.0013  # m
 
@@ -68,15 +69,15 @@ def _keys() -> str:
 def _bottle() -> str:
     """A pill bottle of 0.04 kg, on its side."""
     lying = 'euler="0 1.5708 0"'
-    cap = _geom("cylinder", (0.016, 0.006), 0.005, _WHITE, f'pos="0.031 0 0" {lying}')
-    return _body(_geom("cylinder", (0.018, 0.026), 0.035, "0.95 0.6 0.2 1", lying) + cap)
+    cap = _geom("cylinder", (0.012, 0.006), 0.005, _WHITE, f'pos="0.029 0 0" {lying}')
+    return _body(_geom("cylinder", (0.014, 0.024), 0.035, "0.95 0.6 0.2 1", lying) + cap)
 
 
 def _chips() -> str:
     """A small bag of chips, thick in the middle."""
     return _body(
-        _geom("box", (0.024, 0.020, 0.011), 0.014, "0.85 0.2 0.15 1")
-        + _geom("box", (0.038, 0.022, 0.004), 0.008, "0.95 0.75 0.2 1")
+        _geom("box", (0.022, 0.014, 0.010), 0.014, "0.85 0.2 0.15 1")
+        + _geom("box", (0.032, 0.016, 0.004), 0.008, "0.95 0.75 0.2 1")
     )
 
 
@@ -136,7 +137,7 @@ def drop(env: Any, place: np.ndarray, yaw: float, height: float, rng: np.random.
     Args:
         env: The environment, at the beginning of an episode.
         place: (2,) above which point [m, world].
-        yaw: Turn about the vertical [rad].
+        yaw: Turn about the vertical [rad]; what is longer than the fingers open turns less.
         height: Of what they fall on [m, world].
         rng: How far the keys hang is drawn from it.
     """

@@ -31,12 +31,12 @@ class BagGateConfig:
     touch; grasp_steps: left without a grasp.
     """
 
-    push_force: float = 4.0
+    push_force: float = 12.0
     push_step: float = 0.003
     empty_steps: int = 2
     memory_steps: int = 10
     missed_height: float = 0.07
-    still_steps: int = 12
+    still_steps: int = 18
     still_distance: float = 0.01
     search_steps: int = 45
     grasp_steps: int = 27
