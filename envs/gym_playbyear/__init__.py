@@ -14,6 +14,8 @@ _OWN = {
     "OccludedGrasp-v1": "gym_playbyear.occluded_grasp:occluded_grasp",
     "OccludedPickPlace-v1": "gym_playbyear.occluded_pick_place:occluded_pick_place",
     "TellApart-v1": "gym_playbyear.tell_apart:tell_apart",
+    "KeyBag-Easy-v1": "gym_playbyear.key_bag:key_bag_easy",
+    "KeyBag-Hard-v1": "gym_playbyear.key_bag:key_bag_hard",
 }
 TASKS = tuple(_OWN)
 """Our own."""

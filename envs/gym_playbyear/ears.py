@@ -1,13 +1,15 @@
 """Between physics and sound: what a synthesiser is told of a control step, and the one of contact forces alone."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 import mujoco
 import numpy as np
 
+from gym_playbyear.crackle import Crackle
 from gym_playbyear.materials import ContactPair
+from gym_playbyear.sound_v2_crackle import Bending
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Moment:
         finger_speed: Mean absolute speed of the fingers (T,) [m/s].
         states: Full state of the physics (T, size of `mjSTATE_FULLPHYSICS`).
         microphone_positions: Where each microphone is at the end of the step (3,) [m, world].
+        bending: Of the things that crackle when they bend, by name.
     """
 
     forces: np.ndarray
@@ -49,6 +52,7 @@ class Moment:
     finger_speed: np.ndarray
     states: np.ndarray
     microphone_positions: dict[str, np.ndarray]
+    bending: Mapping[str, Bending] = field(default_factory=dict)
 
 
 class Ears(Protocol):
@@ -68,7 +72,7 @@ class Ears(Protocol):
 
 
 class ForceEars:
-    """`ContactSound`: the force between two bodies is all that it hears of their contact.
+    """`ContactSound`: the force between two bodies is all that it hears of their contact, and clicks of what bends.
 
     Args:
         pairs: What can be heard, in the order of `Moment.forces`.
@@ -94,6 +98,10 @@ class ForceEars:
         named = [
             ContactPair(name="-".join(p.bodies), materials=p.materials, bodies=p.bodies, loose=p.loose) for p in pairs
         ]
+        # The quieter of the two decides; a blow is as loud as the square root of its force.
+        self._loudness = np.array([min(pair.loudness) ** 2 for pair in pairs])
+        self._crackle = Crackle([side for pair in pairs for side in zip(pair.bodies, pair.materials, strict=True)])
+        named += self._crackle.pairs
         self.synthesis = ContactSound(named, microphones, sample_rate, control_hz, physics_dt, noise_level)
 
     def add_sensors(self, spec: mujoco.MjSpec) -> None:
@@ -101,9 +109,14 @@ class ForceEars:
 
     def reset(self, rng: np.random.Generator) -> None:
         self.synthesis.reset(rng)
+        self._crackle.reset(rng)
 
     def step(self, model: mujoco.MjModel, moment: Moment) -> dict[str, np.ndarray]:
-        return self.synthesis.step(moment.forces, moment.joint_speed)
+        forces = moment.forces if (self._loudness == 1.0).all() else moment.forces * self._loudness
+        if self._crackle.pairs:
+            speeds = {name: bending.speed for name, bending in moment.bending.items()}
+            forces = np.hstack([forces, self._crackle.step(speeds, len(forces), self.synthesis.physics_dt)])
+        return self.synthesis.step(forces, moment.joint_speed)
 
 
 contact_sound = ForceEars

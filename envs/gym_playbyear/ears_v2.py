@@ -49,7 +49,9 @@ class SyntheticEars:
         if self._reader is None:
             self._reader = ContactReader(model, self.pairs)
         contacts = self._reader.read(moment.sensordata)
-        return self.synthesis.step(contacts, moment.joint_speed, moment.finger_speed, moment.microphone_positions)
+        return self.synthesis.step(
+            contacts, moment.joint_speed, moment.finger_speed, moment.microphone_positions, moment.bending
+        )
 
 
 def _sounding_pairs(pair: HeardPair) -> list[SoundingPair]:

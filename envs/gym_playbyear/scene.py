@@ -87,6 +87,18 @@ def _of_prop(prop: Prop, is_there: bool) -> mujoco.MjSpec:
     return spec
 
 
+def bending_joints(model: mujoco.MjModel, task: Task) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Of each prop that crackles when it bends: where its joints' velocities stand, and their factors; both (n_joints,)."""
+    return {
+        prop.name: (
+            np.array([model.joint(joint).dofadr[0] for joint, _ in prop.bends]),
+            np.array([factor for _, factor in prop.bends]),
+        )
+        for prop in (task.arena, *task.props)
+        if prop.bends
+    }
+
+
 class Contacts:
     """The contacts that are measured in a task: their sensors, and the forces of each.
 
@@ -95,7 +107,7 @@ class Contacts:
 
     Attributes:
         pairs: Two names each: the hand ("gripper") and everything loose with each other and with all that stands still, except
-            what is shut in with what is outside.
+            what is shut in with what is outside. A thing whose parts are heard has a pair with itself.
     """
 
     def __init__(self, task: Task):
@@ -105,6 +117,7 @@ class Contacts:
         loose = [prop.name for prop in props if prop.loose]
         still = [prop.name for prop in props if not prop.loose]
         pairs = [(GRIPPER, name) for name in loose] + list(combinations(loose, 2))
+        pairs += [(prop.name, prop.name) for prop in props if prop.jingles]
         for name in still:
             pairs += [(other, name) for other in (GRIPPER, *loose)]
         self.pairs: tuple[tuple[str, str], ...] = tuple(pair for pair in pairs if self._can_touch(*pair))

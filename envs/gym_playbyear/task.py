@@ -89,6 +89,8 @@ class Prop:
         loose: It moves freely, by a free joint that has the prop's name, and may touch whatever is there.
         hidden: What no camera sees and hearing has to find. With `hidden_object=False` the hand passes through it.
         inside: Name of the prop that it is shut in: it touches nothing but that and what else is in there.
+        jingles: It has parts, bodies within that one, which are heard when they knock against each other.
+        bends: Joints within it whose motion crackles, each with a factor from its speed to that of bending in rad/s.
     """
 
     name: str
@@ -98,6 +100,8 @@ class Prop:
     loose: bool = False
     hidden: bool = False
     inside: str | None = None
+    jingles: bool = False
+    bends: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if isinstance(self.spec, mujoco.MjSpec):

@@ -18,7 +18,8 @@ from gym_playbyear.options import check_option, make_definition
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
 from gym_playbyear.rendering import SceneRenderer, Window
-from gym_playbyear.scene import Contacts, compose
+from gym_playbyear.scene import Contacts, bending_joints, compose
+from gym_playbyear.sound_v2_crackle import Bending
 from gym_playbyear.task import Task
 
 SOUND_MODES = ("waveform", "contact_force", "none")
@@ -102,6 +103,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._controller = arm.controller(definition.control_hz, definition.physics_dt)
         self._fingers = slice(arm.n_joints, arm.n_joints + 2)
         self._tool = self.model.site(arm.tool).id
+        self._bends = bending_joints(self.model, definition)
         self._state = np.empty(mujoco.mj_stateSize(self.model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
         self._rollout_state = np.empty((1, self._controller.n_substeps, len(self._state)))
         self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
@@ -280,6 +282,7 @@ class TaskEnv(PrivilegedState, gym.Env):
             speeds[:, self._fingers].mean(axis=1),
             self._rollout_state[0],
             {microphone: self._place_of(links.get(microphone)) for microphone in self._microphones},
+            {n: Bending(speeds[:, dofs] @ factors, self.position(n)) for n, (dofs, factors) in self._bends.items()},
         )
 
     def _place_of(self, body: str | None) -> np.ndarray:

@@ -1,0 +1,131 @@
+"""When the expert takes over from a policy that takes things out of a bag, and when it hands back.
+
+As for the other tasks (`gym_playbyear.gates`), a gate waits until a mistake can be noticed, and hands back when the
+expert's own phase changes: from searching to grasping, and from grasping to lifting.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gym_playbyear.arm import ACTION_SCALE
+from gym_playbyear.bag import BAG, RIM, bottom_height
+from gym_playbyear.bag_contents import CONTENTS
+from gym_playbyear.bag_experts import TIP_BELOW_HAND, BagExpert
+
+SEARCH, GRASP, LIFT = range(3)
+_STAGES = {
+    **dict.fromkeys(("enter", "descend", "search"), SEARCH),
+    **dict.fromkeys(("dwell", "rise", "centre", "lower", "grasp"), GRASP),
+    **dict.fromkeys(("lift", "hold"), LIFT),
+}
+
+
+@dataclass(frozen=True)
+class BagGateConfig:
+    """Thresholds. Lengths in metres, durations in control steps, forces in newtons.
+
+    push_force, push_step: the hand presses this hard, and would go on by at least so much; empty_steps: for so long the
+    fingers hold nothing; memory_steps: how long a touch is heard; missed_height: the hand is so far above the bag's bottom
+    after it; still_steps, still_distance: the hand moved less in so many steps; search_steps: left of the episode without a
+    touch; grasp_steps: left without a grasp.
+    """
+
+    push_force: float = 12.0
+    push_step: float = 0.003
+    empty_steps: int = 2
+    memory_steps: int = 10
+    missed_height: float = 0.07
+    still_steps: int = 18
+    still_distance: float = 0.01
+    search_steps: int = 45
+    grasp_steps: int = 27
+
+
+class BagGate:
+    """The scripted expert beside a policy: says at every step who acts, and acts.
+
+    Args:
+        env: The unwrapped environment, after `reset`.
+        expert: Made for this episode; its phase is set anew whenever it takes over.
+        config: The thresholds.
+
+    Attributes:
+        reason: Why the expert is in control, in one word; None while the policy is.
+    """
+
+    def __init__(self, env, expert: BagExpert, config: BagGateConfig | None = None):
+        self.env, self.expert, self.config = env, expert, config or BagGateConfig()
+        self.reason: str | None = None
+        self._n_steps, self._empty_for = 0, 0
+        self._touched_at: int | None = None
+        self._hands_back_at = LIFT
+        self._places: list[np.ndarray] = []
+
+    def wants_control(self, policy_action: np.ndarray) -> bool:
+        """Whether the expert acts in this step. Call it once per step, before the step.
+
+        Args:
+            policy_action: (4,) what the policy would do.
+        """
+        self._look()
+        if self.reason is not None and _STAGES[self.expert.phase] >= self._hands_back_at:
+            self.reason = None
+        if self.reason is None:
+            self.reason = self._find_reason(np.asarray(policy_action, dtype=float))
+            if self.reason is not None:
+                self._take_over()
+        self._n_steps += 1
+        return self.reason is not None
+
+    def act(self) -> np.ndarray:
+        """The expert's action (4,) for the present state."""
+        return self.expert.act()
+
+    def _look(self) -> None:
+        if self.env.contact_forces[f"gripper-{CONTENTS}"] > self.expert.config.contact_force:
+            self._touched_at = self._n_steps
+        empty = self.env.finger_positions.sum() < self.expert.config.empty
+        self._empty_for = self._empty_for + 1 if empty else 0
+        self._places = [*self._places[-self.config.still_steps :], self.env.eef_position]
+
+    def _height(self) -> float:
+        """Of the fingers' tips above the bag's bottom [m]."""
+        return float(self.env.eef_position[2] - TIP_BELOW_HAND - bottom_height(self.env))
+
+    def _holds(self) -> bool:
+        closed = self.env.finger_positions.sum() < self.env.variant.arm.max_opening - 0.006
+        return bool(closed and self.env.contact_forces[f"gripper-{CONTENTS}"] > 2.0 and not self._empty_for)
+
+    def _find_reason(self, action: np.ndarray) -> str | None:
+        left, forces = self.env._max_episode_steps - self._n_steps, self.env.contact_forces
+        touched = None if self._touched_at is None else self._n_steps - self._touched_at
+        if self._holds():
+            opens = action[3] <= 0 and self.env.gripper_obeys
+            return "opens" if opens else "still" if self._is_still() else None
+        pressed = max(forces[f"gripper-{CONTENTS}"], forces[f"gripper-{BAG}"]) > self.config.push_force
+        checks = {
+            "pushes": pressed and action[2] * ACTION_SCALE < -self.config.push_step,
+            "empty": self._empty_for > self.config.empty_steps,
+            "missed": touched is not None and touched > 3 and self._height() > self.config.missed_height,
+            "still": self._is_still(),
+            "late": left <= (self.config.search_steps if touched is None else self.config.grasp_steps),
+        }
+        return next((reason for reason, applies in checks.items() if applies), None)
+
+    def _is_still(self) -> bool:
+        is_full = len(self._places) > self.config.still_steps
+        return is_full and bool(np.linalg.norm(self._places[-1] - self._places[0]) < self.config.still_distance)
+
+    def _take_over(self) -> None:
+        """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
+        self._places = []
+        heard = self._touched_at is not None and self._n_steps - self._touched_at <= self.config.memory_steps
+        if self._holds():
+            phase = "lift"
+        elif heard or self._empty_for:
+            phase = "rise"
+        else:
+            phase = "enter" if self.env.eef_position[2] > RIM else "descend"
+        self.expert.begin_at(phase)
+        self._hands_back_at = LIFT + 1 if self.reason == "opens" else _STAGES[phase] + 1

@@ -1,0 +1,158 @@
+"""Keys in a bag (paper, section "Real Robot Key Extraction Environment", table I and appendix A)."""
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from gym_playbyear.arena import TABLE, TABLE_TOP
+from gym_playbyear.arm import ArmConfig
+from gym_playbyear.bag import BAG_MIDDLE, BOTTOM_THICKNESS, RIM, Torn, bag, set_bottom
+from gym_playbyear.bag_contents import CONTENTS, FRICTION, contents_prop, drop, middle_of
+from gym_playbyear.bag_experts import STRATEGIES, BagExpert, BlindBag
+from gym_playbyear.bag_gate import BagGate
+from gym_playbyear.proprioception import SensorNoise
+from gym_playbyear.rules import Groped, Pressed, Solved
+from gym_playbyear.task import Camera, Task
+
+CAMERA = Camera("front", 'pos="0.75 0 1.16" xyaxes="0 1 0 -0.22 0 0.975" fovy="40"')
+_OUT = RIM + 0.01  # m, world: what is in the middle of the bag and higher than this is seen
+_HOLDS = 0.5  # N
+
+
+@dataclass(frozen=True)
+class BagNumbers:
+    """A bag task's numbers, which decide whether it can be solved without hearing.
+
+    offset: how far from the bag's middle the things are dropped, least and most [m]; bottom: height of the bag's bottom above
+    the table, least and most [m]; max_press: largest force with which the hand may come down on the things [N]; max_tear:
+    largest force on the bag [N]; closings: the how-manieth closing on nothing ends the attempt; hold_s: for how long the
+    things have to be held in sight [s]; horizon: steps of an episode; arm, sensors: their numbers.
+    """
+
+    offset: tuple[float, float]
+    bottom: tuple[float, float]
+    max_press: float = 30.0
+    max_tear: float = 12.0
+    closings: int = 2
+    hold_s: float = 0.4
+    horizon: int = 75
+    arm: ArmConfig = field(
+        default_factory=lambda: ArmConfig(
+            max_opening=0.056, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
+        )
+    )
+    sensors: SensorNoise = field(default_factory=SensorNoise)
+
+
+EASY = BagNumbers(offset=(0.0, 0.008), bottom=(0.025, 0.10))
+HARD = BagNumbers(offset=(0.02, 0.03), bottom=(0.025, 0.10))
+
+
+def key_bag_easy(*, contents: str = "keys") -> Task:
+    """
+    ## Description
+    An opaque bag stands on the table, and in it lies a ring with four metal things: a lever opener, a cap opener, a
+    medallion and a whistle. The camera sees the arm and the bag's outside. The keys lie below the gripper, but how high they
+    lie nobody sees: the bag's bottom rests on a springy heap of paper. The arm has to go down until it hears that it touches
+    them, grasp them, and lift them out. After Du et al., "Play it by Ear" (RSS 2022), who did it with a real robot.
+
+    ## Action Space
+    `Box(-1, 1, (4,), float32)`: displacement of the end effector along x, y, z in units of 0.05 m per step, and the gripper
+    (> 0 closes). The hand's orientation is fixed. 5 steps per second. After a change of the gripper command the next one is
+    ignored for ten steps, as on the authors' robot.
+
+    ## Observation Space
+    A dictionary:
+    - `pixels.front`: `(image_size, image_size, 3)` uint8, the camera in front of the bag. Its walls bend;
+    - `agent_pos`: `(7,)` float32, end effector x, y, z [m, from the robot's base], two finger positions [m], two finger
+      velocities [m/s], with the noise and resolution of a real arm's encoders;
+    - `audio.<microphone>`: `(sample_rate / 5,)` int16, what the microphone heard during the last step (`sound="waveform"`):
+      keys that knock on each other, the bag and the hand, the bag that crackles while it bends;
+    - `contact_force`: `(6,)` float32, mean net contact force [N] and torque [Nm] on the keys (`sound="contact_force"`).
+
+    ## Rewards
+    1 at the step that solves the task, otherwise 0.
+
+    ## Success Criteria
+    The keys' centre of mass is more than 1 cm above the bag's rim, where the camera sees them, and the fingers hold them, for
+    0.4 s. `info["is_success"]` says so at every step.
+
+    ## Starting State
+    The gripper is open above the bag, within 1 cm of the same point. The keys fell into the bag, up to 8 mm from its middle;
+    its bottom is 2.5 to 10 cm above the table. `reset(options={"contents_position": (x, y), "bottom": height})` sets them.
+
+    ## Episode Termination
+    Terminated, and `info["end"]` says why: "success"; "pressed", when the hand came down on the keys with more than 30 N;
+    "torn", when it pushed the bag with more than 12 N; "groped", when the fingers closed on nothing for the second time.
+    Truncated, as "time", after `horizon` steps (75).
+
+    ## Arguments
+    - `contents="keys"`: or `"bottle"`, `"chips"`, `"pens"`, `"candies"`, `"cloth"` (nearly mute), `"sponge"` (nearly mute).
+    - `image_size=84`: pixels of the square picture.
+    - `sample_rate=48000`: samples per second; a multiple of 5.
+    - `sound="waveform"`: or `"contact_force"` (the paper's stand-in for sound), or `"none"`.
+    - `noise_level=1.0`: scales background noise and motor hum.
+    - `microphones=("gripper",)`: `"table"` is the other one.
+    - `horizon=None`: steps of an episode; None is the task's.
+    - `hidden_object=True`: False is the twin world, in which the hand passes through the keys, and nothing else differs.
+    - `render_mode=None`: or `"rgb_array"`, `"human"`; `render_size=480`: pixels of the picture that `render()` returns.
+
+    ## Version History
+    - v1: first version.
+    """
+    return _task("KeyBag-Easy-v1", EASY, contents)
+
+
+def key_bag_hard(*, contents: str = "keys") -> Task:
+    """
+    As `KeyBag-Easy-v1` (`key_bag_easy`), except that the keys fell 2 to 3 cm beside the bag's middle: the arm has to
+    move around in the bag until it touches them, and to tell their sound from the bag's.
+    """
+    return _task("KeyBag-Hard-v1", HARD, contents)
+
+
+def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
+    return Task(
+        name=name,
+        description="Find the keys in the bag by touch and sound, grasp them and lift them out.",
+        arm=numbers.arm,
+        arena=TABLE,
+        props=(bag(), contents_prop(contents)),
+        place=_place,
+        success=Solved(_is_out, CONTENTS, numbers.hold_s),
+        ends=(
+            Pressed(CONTENTS, numbers.max_press, FRICTION),
+            Torn(numbers.max_tear),
+            Groped(numbers.closings),
+        ),
+        expert=BagExpert,
+        gate=BagGate,
+        blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},
+        horizon=numbers.horizon,
+        control_hz=5,
+        sample_rate=48000,
+        cameras=(CAMERA,),
+        start=(*BAG_MIDDLE, RIM + 0.07),
+        start_spread=0.01,
+        sensors=numbers.sensors,
+        felt=CONTENTS,
+        numbers=numbers,
+    )
+
+
+def _place(env: Any, options: dict[str, Any]) -> dict[str, Any]:
+    """Sets the bag's bottom and drops the things into the bag, uniformly in a ring around its middle."""
+    numbers, rng = env.variant, env.np_random
+    bottom = rng.uniform(*numbers.bottom)
+    radius, angle = np.sqrt(rng.uniform(*np.square(numbers.offset))), rng.uniform(-np.pi, np.pi)
+    place = np.array(BAG_MIDDLE) + radius * np.array([np.cos(angle), np.sin(angle)])
+    bottom, place = options.get("bottom", bottom), np.array(options.get("contents_position", place), dtype=float)
+    set_bottom(env, bottom)
+    drop(env, place, rng.uniform(-np.pi, np.pi), TABLE_TOP + bottom + BOTTOM_THICKNESS, rng)
+    return {"bag_middle": BAG_MIDDLE}
+
+
+def _is_out(env: Any) -> bool:
+    return bool(middle_of(env)[2] > _OUT and env.contact_forces[f"gripper-{CONTENTS}"] > _HOLDS)

@@ -1,0 +1,179 @@
+"""Keys in a bag: hidden from the camera, found by touch, heard; what ends an attempt, and what else can be in the bag."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from gym_playbyear.bag import BAG, HALF_SIZE, RIM
+from gym_playbyear.bag_contents import CONTENTS, CONTENTS_KINDS, middle_of, points_of
+from lerobot_env_playbyear import PlaybyearEnvConfig
+
+EASY, HARD = "KeyBag-Easy-v1", "KeyBag-Hard-v1"
+STILL = np.array([0.0, 0.0, 0.0, -1.0])
+
+
+def make(task: str, **options):
+    return gym.make(f"gym_playbyear/{task}", **options).unwrapped
+
+
+def play(env, seed: int):
+    """The expert's episode without observations: how it ended, and its number of steps."""
+    env.begin_episode(seed=seed)
+    expert, steps, done = env.scripted_expert(), 0, False
+    while not done:
+        _, terminated, truncated, info = env.advance(expert.act())
+        steps, done = steps + 1, terminated or truncated
+    return info, steps
+
+
+def test_the_camera_sees_no_keys_before_they_are_lifted():
+    world, twin = make(HARD, sound="none"), make(HARD, sound="none", hidden_object=False)
+    for seed in (0, 1):
+        first, second = world.reset(seed=seed)[0], twin.reset(seed=seed)[0]
+        expert = world.scripted_expert()
+        for _ in range(25):
+            np.testing.assert_array_equal(first["pixels"]["front"], second["pixels"]["front"])
+            np.testing.assert_array_equal(first["agent_pos"], second["agent_pos"])
+            action = expert.act()
+            first, second = world.step(action)[0], twin.step(action)[0]
+            if world.contact_forces[f"gripper-{CONTENTS}"] > 0:
+                break
+        else:
+            raise AssertionError("the expert touched nothing")
+    world.close()
+    twin.close()
+
+
+@pytest.mark.parametrize("kind", CONTENTS_KINDS)
+def test_whatever_lies_in_the_bag_is_below_what_the_camera_sees(kind):
+    env = make(EASY, sound="none", contents=kind)
+    eye = env.model.camera("front").pos
+    x, y = HALF_SIZE
+    for seed in range(2):
+        env.begin_episode(seed=seed, options={"bottom": env.variant.bottom[1]})
+        points = points_of(env)
+        assert (np.abs(points[:, 0]) < x).all()
+        assert (np.abs(points[:, 1]) < y).all()
+        share = (eye[0] - x) / (eye[0] - points[:, 0])  # of the way from the eye to a point, where the front wall is
+        assert (eye[2] + share * (points[:, 2] - eye[2]) < RIM).all()
+
+
+@pytest.mark.parametrize("task", [EASY, HARD])
+def test_the_expert_takes_the_keys_out(task):
+    env = make(task, sound="none")
+    for seed in range(2):
+        info, _ = play(env, seed)
+        assert info["end"] == "success"
+        assert middle_of(env)[2] > RIM
+
+
+def test_what_ends_an_attempt():
+    env = make(EASY, sound="none")
+    for expected, options, actions in (
+        ("torn", {"bottom": 0.06}, [(0, 0, -0.4, -1)]),
+        ("groped", {}, [(0, 0, 0, 1), (0, 0, 0, -1)]),
+        ("time", {}, [(0, 0, 0, -1)]),
+    ):
+        env.begin_episode(seed=0, options={"contents_position": (0.04, 0.09), **options})
+        done, steps = False, 0
+        while not done:
+            _, terminated, truncated, info = env.advance(actions[steps // 11 % len(actions)])
+            steps, done = steps + 1, terminated or truncated
+        assert info["end"] == expected
+
+
+def test_walls_bend_visibly_and_crackle():
+    env = make(EASY, noise_level=0.0, hidden_object=False)
+    picture = env.reset(seed=0, options={"bottom": 0.03})[0]["pixels"]["front"].astype(int)
+    for _ in range(8):
+        env.advance(np.array([0, 0, -0.4, -1.0]))
+    still = env.step(STILL)[0]["audio.gripper"]
+    louder, bent = 0.0, 0.0
+    for _ in range(6):
+        observation = env.step(np.array([0, 0.6, 0, -1.0]))[0]
+        louder = max(louder, float(np.abs(observation["audio.gripper"].astype(float)).mean()))
+        bent = max(bent, float(abs(env.data.joint("left_foot").qpos[0])))
+    assert bent > 0.05
+    assert louder > 10 * np.abs(still.astype(float)).mean() + 10
+    changed = np.abs(observation["pixels"]["front"].astype(int) - picture).max(axis=-1) > 20
+    assert changed[45:, 60:].sum() > 10  # below the hand, where only the bag is
+    env.close()
+
+
+def centroid(samples: np.ndarray, rate: int) -> float:
+    """Middle of the spectrum up to 4 kHz [Hz]."""
+    power = np.abs(np.fft.rfft(samples * np.hanning(len(samples)))) ** 2
+    frequencies = np.fft.rfftfreq(len(samples), 1 / rate)
+    heard = frequencies < 4000
+    return float((frequencies[heard] * power[heard]).sum() / power[heard].sum())
+
+
+def test_keys_sound_other_than_the_bag():
+    env = make(HARD, noise_level=0.0, image_size=8)
+    bag, keys = [], []
+    for seed in range(2):
+        env.reset(seed=seed)
+        expert, done = env.scripted_expert(), False
+        while not done and len(keys) < 4 * (seed + 1):
+            observation, _, terminated, truncated, _ = env.step(expert.act())
+            done = terminated or truncated
+            if env.contact_forces[f"gripper-{CONTENTS}"] > 1.0:
+                keys.append(observation["audio.gripper"].astype(float))
+        env.reset(seed=seed, options={"contents_position": (0.04, 0.09)})
+        for _ in range(8):
+            observation = env.step(np.array([-0.3, -0.3, -0.3, -1.0]))[0]
+            if env.contact_forces[f"gripper-{BAG}"] > 0.1:
+                bag.append(observation["audio.gripper"].astype(float))
+    env.close()
+    assert len(bag) > 2
+    heard_keys, heard_bag = ([centroid(block, 48000) for block in blocks] for blocks in (keys, bag))
+    assert np.median(heard_keys) > np.median(heard_bag) + 300
+
+
+def test_a_cloth_is_mute():
+    """Closing on it is much quieter than closing on keys."""
+    levels = {}
+    for kind in ("keys", "cloth"):
+        env = make(EASY, noise_level=0.0, image_size=8, contents=kind)
+        env.reset(seed=1)
+        expert, heard = env.scripted_expert(), []
+        while expert.phase not in ("lift", "hold"):
+            observation = env.step(expert.act())[0]
+            if env.contact_forces[f"gripper-{CONTENTS}"] > 0:
+                heard.append(np.square(observation["audio.gripper"].astype(float)).mean())
+        levels[kind] = np.mean(heard)
+        env.close()
+    assert levels["cloth"] < 0.2 * levels["keys"]
+
+
+def test_a_bad_policy_is_corrected():
+    """Someone who closes far above the keys, and waits."""
+    env = make(EASY, sound="none")
+    rescued = 0
+    for seed in range(2):
+        env.begin_episode(seed=seed)
+        gate, done, info = env.intervention_gate(), False, {}
+        while not done:
+            action = gate.act() if gate.wants_control(STILL) else STILL
+            _, terminated, truncated, info = env.advance(action)
+            done = terminated or truncated
+        rescued += info["is_success"]
+    assert rescued >= 1
+
+
+def test_a_policy_as_good_as_the_expert_is_left_alone():
+    env = make(EASY, sound="none")
+    env.begin_episode(seed=2)
+    policy, gate, by_expert, done = env.scripted_expert(), env.intervention_gate(), [], False
+    while not done:
+        action = policy.act()
+        by_expert.append(gate.wants_control(action))
+        _, terminated, truncated, _ = env.advance(gate.act() if by_expert[-1] else action)
+        done = terminated or truncated
+    assert np.mean(by_expert) < 0.2
+
+
+def test_lerobot_takes_the_tasks_own_rates():
+    config = PlaybyearEnvConfig(task=HARD, task_options={"contents": "pens"})
+    assert (config.fps, config.sample_rate, config.samples_per_frame) == (5, 48000, 9600)
+    assert config.features["audio.gripper"].shape == (9600,)
