@@ -131,15 +131,17 @@ def test_keys_sound_other_than_the_bag():
 
 
 def test_a_cloth_is_mute():
-    """Closing on it is much quieter than closing on keys."""
+    """To touch it is much quieter than to touch keys; the hand's own drive is as loud with both, and left out."""
     levels = {}
     for kind in ("keys", "cloth"):
         env = make(EASY, noise_level=0.0, image_size=8, contents=kind)
-        env.reset(seed=1)
+        env.reset(seed=2)
         expert, heard = env.scripted_expert(), []
-        while expert.phase not in ("lift", "hold"):
+        is_open = env.finger_positions.sum()
+        while expert.phase not in ("grasp", "lift", "hold"):
             observation = env.step(expert.act())[0]
-            if env.contact_forces[f"gripper-{CONTENTS}"] > 0:
+            fingers_rest = abs(env.finger_positions.sum() - is_open) < 0.001
+            if fingers_rest and env.contact_forces[f"gripper-{CONTENTS}"] > 0:
                 heard.append(np.square(observation["audio.gripper"].astype(float)).mean())
         levels[kind] = np.mean(heard)
         env.close()

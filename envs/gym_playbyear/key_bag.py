@@ -12,6 +12,7 @@ from gym_playbyear.bag import BAG_MIDDLE, BOTTOM_THICKNESS, RIM, Torn, bag, set_
 from gym_playbyear.bag_contents import CONTENTS, FRICTION, contents_prop, drop, middle_of
 from gym_playbyear.bag_experts import STRATEGIES, BagExpert, BlindBag
 from gym_playbyear.bag_gate import BagGate
+from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.proprioception import SensorNoise
 from gym_playbyear.rules import Groped, Pressed, Solved
 from gym_playbyear.task import Camera, Task
@@ -138,6 +139,7 @@ def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
         start_spread=0.01,
         sensors=numbers.sensors,
         felt=CONTENTS,
+        sound=SyntheticEars,
         numbers=numbers,
     )
 
