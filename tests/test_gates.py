@@ -62,7 +62,14 @@ def roll_out(env, seed: int, name: str):
     return info["is_success"], np.array(by_expert), reasons
 
 
-@pytest.mark.parametrize("task", [task for task in TASKS if task.startswith("Occluded")])
+@pytest.mark.parametrize(
+    "task",
+    [
+        pytest.param(task, marks=[pytest.mark.slow] if task.endswith("-v0") else [])
+        for task in TASKS
+        if task.startswith("Occluded")
+    ],
+)
 def test_a_policy_as_good_as_the_expert_is_left_alone(task):
     env = make(task)
     episodes = [roll_out(env, seed, "expert") for seed in range(3000, 3014)]
@@ -80,7 +87,14 @@ RESCUED = {
 }  # of six episodes, at least
 
 
-@pytest.mark.parametrize(("task", "name"), [(task, name) for task, names in RESCUED.items() for name in names])
+@pytest.mark.parametrize(
+    ("task", "name"),
+    [
+        pytest.param(task, name, marks=[pytest.mark.slow] if task.endswith("-v0") else [])
+        for task, names in RESCUED.items()
+        for name in names
+    ],
+)
 def test_a_bad_policy_is_rescued(task, name):
     """Alone these policies solve at most every fifth episode (`test_tasks.py` has the blind ones). The expert needs time."""
     env = make(task, horizon=350)
