@@ -108,6 +108,13 @@ class SoundServer:
         for name in self._sources:
             self.add(name)
 
+    def state(self) -> str:
+        """What a failure may come from: whether server and listeners run, and what the server said."""
+        ended = {"server": self._process, **self._listeners}
+        runs = {name: process is not None and process.poll() is None for name, process in ended.items()}
+        sources = self._pactl("list", "short", "sources", check=False) if runs["server"] else ""
+        return f"runs: {runs}; sources: {sources}; said: {(self._folder / 'server.log').read_text()[-1000:]}"
+
     def kill(self) -> None:
         """As if it had crashed."""
         process, self._process = self._process, None

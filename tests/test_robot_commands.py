@@ -65,7 +65,7 @@ def test_from_nothing_to_a_corrected_policy(bench, tmp_path):
     person = bench.person()
     record = (program("playbyear-record"), *bench.env, *bench.leader, "--expert.teleop.demonstrates=true", *data)
     status = person.run([*record, "--dataset.num_episodes=2"], bench.environment)
-    assert status == 0, person.output[-3000:]
+    assert status == 0, person.output[-3000:] + bench.server.state()
     # Where the machine is busy the script may miss the cube: then the attempt is not kept, and another one begins.
     assert person.pressed[0::2] == ["p"] * (len(person.pressed) // 2)
     assert person.pressed.count("s") == 2

@@ -1,5 +1,6 @@
 """What `playbyear-dagger` can be told."""
 
+import dataclasses
 import json
 import math
 from collections.abc import Sequence
@@ -224,11 +225,24 @@ def differences(folder: Path, cfg: DaggerConfig) -> list[str]:
     saved = json.loads((folder / CONFIG_NAME).read_text())
     options = json.loads(json.dumps(cfg.options()))
     names = ("demos", "interventions", "env", "expert", "seed", "episode_seed", "warmup_episodes", "rename_map")
+    for name in names:
+        _fill_in(saved.get(name), options.get(name), getattr(cfg, name))
     return [
         f"--{name} was {_brief(saved.get(name))} and is {_brief(options.get(name))}"
         for name in names
         if saved.get(name) != options.get(name)
     ]
+
+
+def _fill_in(saved: Any, options: Any, config: Any) -> None:
+    """What an older version did not know, and is as it is by default, was so then."""
+    if not (isinstance(saved, dict) and isinstance(options, dict) and dataclasses.is_dataclass(config)):
+        return
+    for option in dataclasses.fields(config):
+        make: Any = option.default_factory
+        default = option.default if make is dataclasses.MISSING else make()
+        if option.name in options and option.name not in saved and getattr(config, option.name) == default:
+            saved[option.name] = options[option.name]
 
 
 def _brief(value: Any) -> str:

@@ -60,10 +60,15 @@ class Ears:
                     card.recording.forget()
                     card.microphone.connect(card.recording.write)
             for card in self._cards:
+                if card.recording.wait_for_sound(_FIRST_SOUND_S):
+                    continue
+                card.microphone.disconnect()  # through a sound server a stream that was opened now and then never begins
+                card.microphone.connect(card.recording.write)
                 if not card.recording.wait_for_sound(_FIRST_SOUND_S):
                     raise MicrophoneError(
-                        f"From {card.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s. Is it plugged in, and used by no "
-                        "other program? `playbyear-find-microphones` shows whether it hears."
+                        f"From {card.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened "
+                        "again. Is it plugged in, and used by no other program? `playbyear-find-microphones` shows whether it "
+                        "hears."
                     )
             stack.pop_all()
 

@@ -129,10 +129,26 @@ def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
     channels = channels_to_open(card, 1)
     config = PortAudioMicrophoneConfig(device=card.number, sample_rate=rate)
     microphone = PortAudioMicrophone(config, channels)
+    samples = _heard(microphone, cfg.seconds)
+    if len(samples) == 0 and not microphone.problem:
+        samples = _heard(
+            microphone, cfg.seconds
+        )  # through a sound server a stream that was opened now and then never begins
+    if sys.stdout.isatty():
+        print("\r\033[K", end="")
+    if len(samples) == 0:
+        raise MicrophoneError(microphone.problem or "nothing came from it")
+    path = write_wav(cfg.output_dir / f"microphone_{card.number}.wav", samples, rate)
+    silent = "" if samples.any() else "; nothing but zeros: is it muted?"
+    return f"loudest: {level_text(samples)}{silent}\n  {path}"
+
+
+def _heard(microphone: PortAudioMicrophone, seconds: float) -> np.ndarray:
+    """What it hears in so many seconds from its first sample on, (n, channels) int16; its level is shown meanwhile."""
     with _without_stderr():
         microphone.connect()
-    parts, wanted = [np.zeros((0, channels), np.int16)], round(cfg.seconds * rate)
-    end = time.perf_counter() + cfg.seconds + _PATIENCE_S  # a card may take its time to begin
+    parts, wanted = [np.zeros((0, microphone.channels), np.int16)], round(seconds * microphone.sample_rate)
+    end = time.perf_counter() + seconds + _PATIENCE_S
     try:
         while sum(map(len, parts)) < wanted and time.perf_counter() < end and not microphone.problem:
             time.sleep(_LOOK_S)
@@ -141,14 +157,7 @@ def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
                 print(f"\r  {level_text(parts[-1])}", end="", flush=True)
     finally:
         microphone.disconnect()
-    if sys.stdout.isatty():
-        print("\r\033[K", end="")
-    samples = np.concatenate(parts)[:wanted]
-    if len(samples) == 0:
-        raise MicrophoneError(microphone.problem or "nothing came from it")
-    path = write_wav(cfg.output_dir / f"microphone_{card.number}.wav", samples, rate)
-    silent = "" if samples.any() else "; nothing but zeros: is it muted?"
-    return f"loudest: {level_text(samples)}{silent}\n  {path}"
+    return np.concatenate(parts)[:wanted]
 
 
 @contextlib.contextmanager
