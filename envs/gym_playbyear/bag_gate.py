@@ -12,6 +12,7 @@ from gym_playbyear.arm import ACTION_SCALE
 from gym_playbyear.bag import BAG, RIM, bottom_height
 from gym_playbyear.bag_contents import CONTENTS
 from gym_playbyear.bag_experts import TIP_BELOW_HAND, BagExpert
+from gym_playbyear.staged_gate import StagedGate
 
 SEARCH, GRASP, LIFT = range(3)
 _STAGES = {
@@ -42,45 +43,15 @@ class BagGateConfig:
     grasp_steps: int = 27
 
 
-class BagGate:
-    """The scripted expert beside a policy: says at every step who acts, and acts.
+class BagGate(StagedGate):
+    """The gate of the bag; see `StagedGate`."""
 
-    Args:
-        env: The unwrapped environment, after `reset`.
-        expert: Made for this episode; its phase is set anew whenever it takes over.
-        config: The thresholds.
-
-    Attributes:
-        reason: Why the expert is in control, in one word; None while the policy is.
-    """
+    stages = _STAGES
 
     def __init__(self, env, expert: BagExpert, config: BagGateConfig | None = None):
-        self.env, self.expert, self.config = env, expert, config or BagGateConfig()
-        self.reason: str | None = None
-        self._n_steps, self._empty_for = 0, 0
-        self._touched_at: int | None = None
-        self._hands_back_at = LIFT
+        super().__init__(env, expert, config or BagGateConfig())
+        self._empty_for = 0
         self._places: list[np.ndarray] = []
-
-    def wants_control(self, policy_action: np.ndarray) -> bool:
-        """Whether the expert acts in this step. Call it once per step, before the step.
-
-        Args:
-            policy_action: (4,) what the policy would do.
-        """
-        self._look()
-        if self.reason is not None and _STAGES[self.expert.phase] >= self._hands_back_at:
-            self.reason = None
-        if self.reason is None:
-            self.reason = self._find_reason(np.asarray(policy_action, dtype=float))
-            if self.reason is not None:
-                self._take_over()
-        self._n_steps += 1
-        return self.reason is not None
-
-    def act(self) -> np.ndarray:
-        """The expert's action (4,) for the present state."""
-        return self.expert.act()
 
     def _look(self) -> None:
         if self.env.contact_forces[f"gripper-{CONTENTS}"] > self.expert.config.contact_force:

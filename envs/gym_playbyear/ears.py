@@ -7,7 +7,6 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from gym_playbyear.crackle import Crackle
 from gym_playbyear.materials import ContactPair
 from gym_playbyear.sound_v2_crackle import Bending
 
@@ -72,7 +71,7 @@ class Ears(Protocol):
 
 
 class ForceEars:
-    """`ContactSound`: the force between two bodies is all that it hears of their contact, and clicks of what bends.
+    """`ContactSound`: the force between two bodies is all that it hears of their contact.
 
     Args:
         pairs: What can be heard, in the order of `Moment.forces`.
@@ -100,8 +99,6 @@ class ForceEars:
         ]
         # The quieter of the two decides; a blow is as loud as the square root of its force.
         self._loudness = np.array([min(pair.loudness) ** 2 for pair in pairs])
-        self._crackle = Crackle([side for pair in pairs for side in zip(pair.bodies, pair.materials, strict=True)])
-        named += self._crackle.pairs
         self.synthesis = ContactSound(named, microphones, sample_rate, control_hz, physics_dt, noise_level)
 
     def add_sensors(self, spec: mujoco.MjSpec) -> None:
@@ -109,13 +106,9 @@ class ForceEars:
 
     def reset(self, rng: np.random.Generator) -> None:
         self.synthesis.reset(rng)
-        self._crackle.reset(rng)
 
     def step(self, model: mujoco.MjModel, moment: Moment) -> dict[str, np.ndarray]:
         forces = moment.forces if (self._loudness == 1.0).all() else moment.forces * self._loudness
-        if self._crackle.pairs:
-            speeds = {name: bending.speed for name, bending in moment.bending.items()}
-            forces = np.hstack([forces, self._crackle.step(speeds, len(forces), self.synthesis.physics_dt)])
         return self.synthesis.step(forces, moment.joint_speed)
 
 

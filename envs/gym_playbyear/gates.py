@@ -17,6 +17,7 @@ from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP
 from gym_playbyear.arm import ACTION_SCALE
 from gym_playbyear.experts import GraspExpert
 from gym_playbyear.gate_config import GateConfig
+from gym_playbyear.staged_gate import StagedGate
 
 SEARCH, GRASP, LIFT, CARRY = range(4)
 _STAGES = {
@@ -27,47 +28,17 @@ _STAGES = {
 }
 
 
-class InterventionGate:
-    """The scripted expert beside a policy: says at every step who acts, and acts.
+class InterventionGate(StagedGate):
+    """The gate of the tasks with a cube; see `StagedGate`."""
 
-    Args:
-        env: The unwrapped environment, after `reset`.
-        expert: Made for this episode; its phase is set anew whenever it takes over.
-        config: The thresholds.
-
-    Attributes:
-        reason: Why the expert is in control, in one word; None while the policy is.
-    """
+    stages = _STAGES
 
     def __init__(self, env, expert: GraspExpert, config: GateConfig | None = None):
-        self.env, self.expert, self.config = env, expert, config or GateConfig()
-        self.reason: str | None = None
-        self._n_steps = 0
-        self._touched_at: int | None = None
+        super().__init__(env, expert, config or GateConfig())
         self._on_top_for = 0  # steps
-        self._hands_back_at = CARRY + 1
         self._was_held = False
         self._first_cube = env.cube_position
         self._positions: deque[np.ndarray] = deque(maxlen=self.config.still_steps + 1)
-        self._last_action: np.ndarray | None = None
-
-    def wants_control(self, policy_action: np.ndarray) -> bool:
-        """Whether the expert acts in this step. Call it once per step, before the step.
-
-        Args:
-            policy_action: (4,) what the policy would do.
-        """
-        action = np.asarray(policy_action, dtype=float)
-        self._look()
-        if self.reason is not None and _STAGES[self.expert.phase] >= self._hands_back_at:
-            self.reason = None  # found, held or lifted: the policy may go on
-        if self.reason is None:
-            self.reason = self._find_reason(action)
-            if self.reason is not None:
-                self._take_over()
-        self._last_action = action
-        self._n_steps += 1
-        return self.reason is not None
 
     def act(self) -> np.ndarray:
         """The expert's action (4,) for the present state."""
@@ -75,7 +46,7 @@ class InterventionGate:
             self.expert.phase = "hop"  # fingers that the policy closed take their time to open: wait above the cube
         if self.expert.phase == "lower" and (self._hears() or not self._is_open()):
             self.expert.phase = "approach"  # a new search begins as the first did: in silence
-        return self.expert.act()
+        return super().act()
 
     # What there is to see
 

@@ -7,7 +7,6 @@ set-up: the microphone touches the gripper and hears both air- and structure-bor
 reduction). Background noise and the arm's motors are always there. Nothing silent is audible.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,13 +14,14 @@ from scipy import signal
 
 from gym_playbyear import materials
 from gym_playbyear.materials import MATERIALS, MICROPHONES, ContactPair, Material, Microphone
+from gym_playbyear.sound_hum import HUM_RMS, Hum
+from gym_playbyear.sound_timing import physics_steps, samples_per_step
 
 __all__ = ["MATERIALS", "MICROPHONES", "ContactPair", "ContactSound", "Material", "Microphone", "pcm16"]
 
 # Levels: full scale (0 dBFS) is a wave of amplitude 1. All are our own choice.
 _NOISE_RMS = 10 ** (-61 / 20)  # broadband background up to _NOISE_BAND_HZ
 _NOISE_BAND_HZ = 8000.0
-_HUM_RMS = 10 ** (-69 / 20)  # the motors of an arm at rest
 _TOUCH_RMS = 10 ** (-28 / 20)  # both partners of a touch, struck by a force step of 1 N, over _TOUCH_SECONDS
 _TOUCH_SECONDS = 0.05
 _AIR_GAIN = 10 ** (-30 / 20)  # air-borne relative to structure-borne
@@ -35,13 +35,9 @@ _PITCH_SPREAD = 0.02
 _MIX_SPREAD = 0.2
 _STRENGTH_SPREAD = 0.2
 
-# Motors: pitch [Hz], relative amplitudes of the harmonics, growth of their level with speed and the speed
-# scale of that [rad/s], and its response time [s]: so slow that an arm checked by a contact does not tell.
+# Motors: pitch [Hz], which an episode draws, and relative amplitudes of the harmonics.
 _HUM_HZ = (55.0, 65.0)
 _HUM_HARMONICS = np.array([0.81, 0.49, 0.28, 0.16])
-_HUM_GROWTH = 0.5
-_HUM_SPEED = 0.5
-_HUM_SECONDS = 1.0
 
 _INAUDIBLE = 1e-6  # modes below this amplitude are stopped; half a step of 16-bit sound is 1.5e-5
 
@@ -81,8 +77,8 @@ class ContactSound:
         self.pairs = tuple(pairs)
         self.microphones = _microphones(microphones)
         self.sample_rate, self.control_hz, self.physics_dt = sample_rate, control_hz, physics_dt
-        self.samples_per_step = _samples_per_step(sample_rate, control_hz)
-        self.n_substeps = _physics_steps(control_hz, physics_dt)
+        self.samples_per_step = samples_per_step(sample_rate, control_hz)
+        self.n_substeps = physics_steps(control_hz, physics_dt)
         if not 0.0 <= noise_level < np.inf:
             raise ValueError(f"noise_level is {noise_level}; it must be 0 (silent background) or greater.")
         self.noise_level = float(noise_level)
@@ -103,7 +99,9 @@ class ContactSound:
         self._last_forces: np.ndarray | None = None
         self._noise_state = np.zeros((len(self.microphones), len(self._noise_filter[1]) - 1), np.float32)
         self._noise(self.sample_rate // 10)  # let the filter forget that it started from nothing
-        self._hum = _Hum(self._noise_rng, self.sample_rate, self.samples_per_step)
+        pitch, phases = self._noise_rng.uniform(*_HUM_HZ), self._noise_rng.uniform(size=len(_HUM_HARMONICS))
+        amplitudes = HUM_RMS * np.sqrt(2.0) * _HUM_HARMONICS
+        self._hum = Hum(phases, pitch, amplitudes, self.sample_rate, self.samples_per_step)
 
     def step(self, forces: np.ndarray, joint_speed: np.ndarray) -> dict[str, np.ndarray]:
         """Synthesises the sound of one control step.
@@ -226,32 +224,6 @@ class ContactSound:
         self._table = np.concatenate([wave.imag, wave.real]).astype(np.float32)  # (2 n_modes, samples of a step)
 
 
-class _Hum:
-    """The arm's motors: a tone of an episode's own pitch with harmonics, whose level follows the speed slowly."""
-
-    def __init__(self, rng: np.random.Generator, sample_rate: int, n_samples: int) -> None:
-        angles = 2j * np.pi * rng.uniform(*_HUM_HZ) * np.arange(1, len(_HUM_HARMONICS) + 1) / sample_rate
-        phases = np.exp(2j * np.pi * rng.uniform(size=len(_HUM_HARMONICS)))
-        self._harmonics = _HUM_RMS * np.sqrt(2.0) * _HUM_HARMONICS * phases
-        self._turn = np.exp(angles * n_samples)
-        wave = np.exp(angles[:, None] * np.arange(n_samples))
-        self._table = np.concatenate([wave.imag, wave.real]).astype(np.float32)  # (2 n_harmonics, n_samples)
-        self._ramp = np.linspace(0.0, 1.0, n_samples, dtype=np.float32)
-        self._response = -np.expm1(-n_samples / (sample_rate * _HUM_SECONDS))
-        self._speed = 0.0
-
-    def next(self, speed: float) -> np.ndarray:
-        """The next samples, (n_samples,), while the joints move at `speed` [rad/s]."""
-        before = self._level()
-        self._speed += self._response * (speed - self._speed)
-        parts = np.concatenate([self._harmonics.real, self._harmonics.imag]).astype(np.float32)
-        self._harmonics = self._harmonics * self._turn
-        return (parts @ self._table) * (before + (self._level() - before) * self._ramp)
-
-    def _level(self) -> float:
-        return 1.0 + _HUM_GROWTH * math.tanh(self._speed / _HUM_SPEED)
-
-
 def _path_gain(forces: np.ndarray, links: np.ndarray | None) -> np.ndarray | float:
     """Gain from a pair to a microphone: 1 through structure, and less through the air, per physics step."""
     if links is None:
@@ -275,24 +247,3 @@ def _microphones(names: Sequence[str]) -> tuple[Microphone, ...]:
             f"microphones is {names!r}; name at least one of {sorted(materials.ALL_MICROPHONES)}, each only once."
         )
     return tuple(materials.ALL_MICROPHONES[name] for name in names)
-
-
-def _samples_per_step(sample_rate: int, control_hz: int) -> int:
-    if sample_rate < 8000:
-        raise ValueError(f"sample_rate is {sample_rate}; use at least 8000, to keep what lies below 4 kHz.")
-    if control_hz <= 0 or sample_rate % control_hz:
-        raise ValueError(
-            f"sample_rate {sample_rate} is not a multiple of control_hz {control_hz}: a control step would not "
-            "hold a whole number of samples. Change one of the two, for example to 16000 and 20."
-        )
-    return int(sample_rate // control_hz)
-
-
-def _physics_steps(control_hz: int, physics_dt: float) -> int:
-    steps = 1.0 / (control_hz * physics_dt) if physics_dt > 0 else 0.0
-    if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
-        raise ValueError(
-            f"physics_dt {physics_dt} s does not divide a control step of 1/{control_hz} s into whole physics "
-            "steps. Change one of the two, for example to 0.002 and 20."
-        )
-    return round(steps)

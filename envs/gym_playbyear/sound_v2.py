@@ -14,14 +14,15 @@ import numpy as np
 from gym_playbyear.contact_kinematics import Contacts, SoundingPair
 from gym_playbyear.materials_v2 import material
 from gym_playbyear.sound import pcm16
-from gym_playbyear.sound_v2_background import Drive, Hum, Noise
+from gym_playbyear.sound_hum import HUM_RMS, Hum
+from gym_playbyear.sound_timing import physics_steps, samples_per_step
+from gym_playbyear.sound_v2_background import Drive, Noise
 from gym_playbyear.sound_v2_blows import BlowFinder, Blows, pulse_spectrum
 from gym_playbyear.sound_v2_crackle import Bending, Crackle
 from gym_playbyear.sound_v2_draws import draw
 from gym_playbyear.sound_v2_friction import Friction
 from gym_playbyear.sound_v2_modes import Arrivals, ModeBank
 from gym_playbyear.sound_v2_paths import MICROPHONES, Paths
-from gym_playbyear.sound_v2_timing import physics_steps, samples_per_step
 
 __all__ = ["MICROPHONES", "Bending", "ContactSynth"]
 
@@ -94,7 +95,7 @@ class ContactSynth:
         self._paths.reset(draws.structure, draws.air)
         self._noise = Noise(streams[_STREAMS:], self.sample_rate, draws.tilt)
         rates = (self.sample_rate, self.samples_per_step)
-        self._hum = Hum(noise_rng.uniform(size=len(draws.hum)), draws.hum_hz, draws.hum, *rates)
+        self._hum = Hum(noise_rng.uniform(size=len(draws.hum)), draws.hum_hz, HUM_RMS * draws.hum, *rates)
         self._drive = Drive(drive_rng.uniform(), draws.drive_hz, draws.drive, *rates, self.n_substeps)
 
     def step(

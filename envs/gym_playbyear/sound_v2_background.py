@@ -1,15 +1,12 @@
-"""What is heard without any contact: a noisy room, the arm's motors, and the hand's own drive."""
-
-import math
+"""What is heard without any contact: a noisy room, and the hand's own drive. The arm's motors are in `sound_hum`."""
 
 import numpy as np
 from scipy import signal
 
-from gym_playbyear.sound_v2_timing import Smoother
+from gym_playbyear.sound_timing import Smoother
 
 _NOISE_RMS = 10 ** (-61 / 20)  # up to `_NOISE_BAND_HZ`; full scale is a wave of amplitude 1
 _NOISE_BAND_HZ = 8000.0
-_HUM_RMS = 10 ** (-69 / 20)  # the motors of an arm at rest
 _DRIVE_RMS = 10 ** (-32 / 20)  # the hand's motor at full speed: a hand that closes is the loudest part of a robot
 _DRIVE_SPEED = 0.05  # m/s of a finger: full speed of the real hand (Franka Hand, product manual)
 _DRIVE_STILL = (0.0005, 0.004)  # m/s: slower is silent, faster turns the motor
@@ -17,10 +14,6 @@ _DRIVE_SMOOTHING = 0.004  # s
 _DRIVE_FASTEST = 1.5  # times full speed
 _TABLE = 4096  # values of one turn
 _POLES = 4
-
-# Growth of the hum with the joints' speed, and the speed scale of that [rad/s]; and its response time [s]: so slow that an arm
-# checked by a contact does not tell.
-_HUM_GROWTH, _HUM_SPEED, _HUM_SECONDS = 0.5, 0.5, 1.0
 
 
 class Noise:
@@ -37,33 +30,6 @@ class Noise:
         white = np.stack([rng.standard_normal(n_samples) for rng in self._rngs])
         noise, self._state = signal.lfilter(*self._filter, white, zi=self._state)
         return noise
-
-
-class Hum:
-    """The arm's motors: a steady tone with harmonics, whose level follows the joints' speed slowly."""
-
-    def __init__(
-        self, phases: np.ndarray, pitch: float, harmonics: np.ndarray, sample_rate: int, n_samples: int
-    ) -> None:
-        angles = 2j * np.pi * pitch * np.arange(1, len(harmonics) + 1) / sample_rate
-        self._harmonics = _HUM_RMS * harmonics * np.exp(2j * np.pi * phases)
-        self._turn = np.exp(angles * n_samples)
-        wave = np.exp(angles[:, None] * np.arange(n_samples))
-        self._table = np.concatenate([wave.imag, wave.real]).astype(np.float32)  # (2 n_harmonics, n_samples)
-        self._ramp = np.linspace(0.0, 1.0, n_samples, dtype=np.float32)
-        self._response = -np.expm1(-n_samples / (sample_rate * _HUM_SECONDS))
-        self._speed = 0.0
-
-    def next(self, speed: float) -> np.ndarray:
-        """The next samples, (n_samples,), while the joints move at `speed` [rad/s]."""
-        before = self._level()
-        self._speed += self._response * (speed - self._speed)
-        parts = np.concatenate([self._harmonics.real, self._harmonics.imag]).astype(np.float32)
-        self._harmonics = self._harmonics * self._turn
-        return (parts @ self._table) * (before + (self._level() - before) * self._ramp)
-
-    def _level(self) -> float:
-        return 1.0 + _HUM_GROWTH * math.tanh(self._speed / _HUM_SPEED)
 
 
 class Drive:

@@ -11,7 +11,7 @@ import numpy as np
 
 from gym_playbyear.contact_kinematics import Contacts, SoundingPair
 from gym_playbyear.materials_v2 import material
-from gym_playbyear.sound_v2_timing import Smoother
+from gym_playbyear.sound_timing import Smoother
 
 # Speeds below the first are solver jitter: silent; above the second all counts [m/s]. The second row is for bodies that touch
 # already: another edge comes down.

@@ -15,8 +15,8 @@ from scipy import signal
 
 from gym_playbyear.contact_kinematics import Contacts, SoundingPair
 from gym_playbyear.materials_v2 import material
+from gym_playbyear.sound_timing import Smoother
 from gym_playbyear.sound_v2_blows import smooth_step
-from gym_playbyear.sound_v2_timing import Smoother
 
 _AUDIBLE_SLIP = (0.003, 0.01)  # m/s: solvers let what they hold creep
 _SMOOTHING = 0.02  # s: what slides hops a little in MuJoCo, and is taken to press as much as it does on average

@@ -1,0 +1,64 @@
+"""What all gates of a scripted expert share: who acts in this step, and until which of its stages a correction lasts."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+
+class StagedGate:
+    """The scripted expert beside a policy: says at every step who acts, and acts.
+
+    A gate of a task says what it looks at (`_look`), when to take over (`_find_reason`), and where the expert begins then
+    (`_take_over`, which also sets `_hands_back_at`).
+
+    Args:
+        env: The unwrapped environment, after `reset`.
+        expert: Made for this episode; its phase is set anew whenever it takes over.
+        config: The thresholds.
+
+    Attributes:
+        reason: Why the expert is in control, in one word; None while the policy is.
+    """
+
+    stages: Mapping[str, int]
+    """Of each of the expert's phases, in the order in which a task goes through them."""
+
+    def __init__(self, env: Any, expert: Any, config: Any):
+        self.env, self.expert, self.config = env, expert, config
+        self.reason: str | None = None
+        self._n_steps = 0
+        self._touched_at: int | None = None
+        self._hands_back_at = max(self.stages.values()) + 1
+        self._last_action: np.ndarray | None = None
+
+    def wants_control(self, policy_action: np.ndarray) -> bool:
+        """Whether the expert acts in this step. Call it once per step, before the step.
+
+        Args:
+            policy_action: (4,) what the policy would do.
+        """
+        action = np.asarray(policy_action, dtype=float)
+        self._look()
+        if self.reason is not None and self.stages[self.expert.phase] >= self._hands_back_at:
+            self.reason = None  # the stage that went wrong is done: the policy may go on
+        if self.reason is None:
+            self.reason = self._find_reason(action)
+            if self.reason is not None:
+                self._take_over()
+        self._last_action = action
+        self._n_steps += 1
+        return self.reason is not None
+
+    def act(self) -> np.ndarray:
+        """The expert's action (4,) for the present state."""
+        return self.expert.act()
+
+    def _look(self) -> None:
+        raise NotImplementedError
+
+    def _find_reason(self, action: np.ndarray) -> str | None:
+        raise NotImplementedError
+
+    def _take_over(self) -> None:
+        raise NotImplementedError
