@@ -72,6 +72,9 @@ class PlaybyearConfig(PreTrainedConfig):
         low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
             normalisation. The paper has none; without it a few dozen demonstrations are learned by heart.
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
+        ema_decay: Weight of the past in an exponential moving average of the network's weights, which acts in rollouts in place
+            of the last update's; both are in a checkpoint. It rises to this in the first updates: (1 + n) / (10 + n) after n.
+            0: none (the paper).
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
@@ -125,6 +128,7 @@ class PlaybyearConfig(PreTrainedConfig):
     audio_noise_db: float | None = None
     low_dimensional_noise: float = 0.0
     spectrogram_momentum: float = 0.01
+    ema_decay: float = 0.0
     dtype: str | None = None
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.0
@@ -139,6 +143,8 @@ class PlaybyearConfig(PreTrainedConfig):
                 raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
         if not 0 < self.action_range < math.inf:
             raise ValueError(f"--policy.action_range must be above 0 and finite, got {self.action_range}.")
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(f"--policy.ema_decay must be at least 0 (none) and below 1, got {self.ema_decay}.")
         if self.audio_window_s < self.segment_s or self.hop_s <= 0:
             raise ValueError(
                 f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "

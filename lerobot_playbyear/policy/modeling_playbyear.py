@@ -14,6 +14,7 @@ from lerobot_playbyear.policy.card import with_hearing, write_card
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.feature_checks import check_fps
 from lerobot_playbyear.policy.history import RecentFrames, newest
+from lerobot_playbyear.policy.moving_average import MovingAverage, with_average, without_average
 from lerobot_playbyear.policy.networks import PlaybyearNetwork
 from lerobot_playbyear.policy.packed_encoder import act_by_folded_copies, prepare_to_act
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes, share_batch_norm
@@ -45,10 +46,22 @@ class PlaybyearPolicy(PreTrainedPolicy):
         self.model = PlaybyearNetwork(config)
         share_batch_norm(self.model)
         act_by_folded_copies(self.model)
+        self.averaged = MovingAverage(self.model, config.ema_decay) if config.ema_decay else None
         self.reset()
 
+    @property
+    def acting_network(self) -> PlaybyearNetwork:
+        """What acts: the moving average of the weights, or the weights of the last update."""
+        network: Any = self.model if self.averaged is None else self.averaged.module
+        return network
+
     def get_optim_params(self) -> Any:
-        return self.parameters()
+        return self.model.parameters()
+
+    def update(self) -> None:
+        """After an update of the weights: LeRobot calls it."""
+        if self.averaged is not None:
+            self.averaged.update_parameters(self.model)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         """Writes a checkpoint, of copies: on a GPU an LSTM's weights are views of one buffer, which safetensors refuses."""
@@ -63,6 +76,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         hint = "Use the configuration, with the sizes and the inputs, that the checkpoint was trained with."
         try:
             weights = load_file(model_file, device=resolve_safetensors_device(map_location))
+            weights = without_average(weights) if model.averaged is None else with_average(weights)
             missing, unexpected = model.load_state_dict(weights, strict=False)
         except RuntimeError as error:
             raise ValueError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
@@ -85,7 +99,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forgets the episode."""
-        prepare_to_act(self.model)
+        prepare_to_act(self.acting_network)
         self._recent = RecentFrames(self.config)
         self._encodings: Tensor | None = None
 
@@ -121,8 +135,9 @@ class PlaybyearPolicy(PreTrainedPolicy):
     def predict_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
         """Actions of the last `n_steps` (default K) frames of every item, (B, n_steps, n_actions), normalised."""
         n_frames = (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1
-        encodings = self.model.encode_run(batch, n_frames)  # (B, R, D)
-        return self.model.memory_head(encodings)
+        network = self.model if self.training else self.acting_network
+        encodings = network.encode_run(batch, n_frames)  # (B, R, D)
+        return network.memory_head(encodings)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -140,15 +155,16 @@ class PlaybyearPolicy(PreTrainedPolicy):
         self._check_sound(batch)
         if self.training:
             self.eval()
-        run = self._recent.add(batch, self.model.prepare_images)
+        network = self.acting_network
+        run = self._recent.add(batch, network.prepare_images)
         device = next(iter(run.values())).device
         with torch.autocast(device.type, enabled=False):  # bfloat16 would round positions to half a millimetre
-            encoding = self.model.encode_frame(run)  # (B, D)
+            encoding = network.encode_frame(run)  # (B, D)
             if self._encodings is None:
                 self._encodings = encoding.unsqueeze(1).repeat(1, self.config.memory_steps, 1)
             else:
                 self._encodings = torch.cat([self._encodings[:, 1:], encoding.unsqueeze(1)], dim=1)
-            return self.model.memory_head(self._encodings)[:, -1]
+            return network.memory_head(self._encodings)[:, -1]
 
     def _check_sound(self, batch: dict[str, Tensor]) -> None:
         missing = [key for key in self.config.audio_keys if key not in batch] if self.config.use_audio else []
