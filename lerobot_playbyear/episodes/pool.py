@@ -16,10 +16,11 @@ from multiprocessing import connection
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts, EnvSpec, RolloutError, env_facts
-from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.episodes.episode import Episode, Observation
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.script import Script
 
@@ -43,7 +44,7 @@ class RolloutPool:
         self._executor: ProcessPoolExecutor | None = None
         if num_workers:
             context = multiprocessing.get_context("spawn")
-            self._lifeline, self._workers_end = context.Pipe()  # workers exit when our end is closed, or dies with us
+            self._lifeline, self._workers_end = context.Pipe()  # workers stop when our end is closed, or dies with us
             self._executor = ProcessPoolExecutor(num_workers, context, _start_worker, (spec, self._workers_end))
 
     def facts(self) -> EnvFacts:
@@ -52,7 +53,7 @@ class RolloutPool:
         Raises:
             RolloutError: It cannot be made, or is not of the kind that datasets hold.
         """
-        return self._result(self._executor.submit(_facts_in_worker)) if self._executor else env_facts(self._own_env())
+        return self._result(self._executor.submit(_facts_in_worker)) if self._executor else env_facts(self.own_env())
 
     def episodes(self, seeds: Iterable[int]) -> Iterator[Episode]:
         """Expert episodes, one per seed and in their order; works ahead of the caller by two per worker.
@@ -63,7 +64,7 @@ class RolloutPool:
         executor = self._executor
         if executor is None:
             for seed in seeds:
-                yield play(self._own_env(), Script(), seed)
+                yield play(self.own_env(), Script(), seed)
             return
         futures = (executor.submit(_play_in_worker, seed) for seed in seeds)
         pending = deque(itertools.islice(futures, 2 * self._num_workers))
@@ -72,11 +73,10 @@ class RolloutPool:
             pending.extend(itertools.islice(futures, 1))
 
     def close(self) -> None:
-        """Ends the workers, without waiting for what they are doing."""
+        """Ends the workers; what they are doing is given up at its next step."""
         if self._executor is not None:
-            self._executor.shutdown(wait=False, cancel_futures=True)
             self._lifeline.close()
-            self._executor.shutdown(wait=True)
+            self._executor.shutdown(wait=True, cancel_futures=True)
             self._workers_end.close()
             self._executor = None
         if self._env is not None:
@@ -89,7 +89,8 @@ class RolloutPool:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _own_env(self) -> gym.Env:
+    def own_env(self) -> gym.Env:
+        """The environment of this process."""
         if self._env is None:
             self._env = self._spec.make()
         return self._env
@@ -106,17 +107,35 @@ class RolloutPool:
 
 # What follows runs in a worker; the environment there is the worker's own and lives as long as it does.
 _own_pool: RolloutPool
+_is_to_stop = threading.Event()
+_GRACE = 30.0  # seconds for a step of the environment
+
+
+class _StoppedError(Exception):
+    """Nobody wants the episode any more."""
+
+
+class _StoppableScript(Script):
+    def act(self, observation: Observation) -> np.ndarray:
+        if _is_to_stop.is_set():
+            raise _StoppedError
+        return super().act(observation)
 
 
 def _start_worker(spec: EnvSpec, lifeline: connection.Connection) -> None:
     global _own_pool
     _own_pool = RolloutPool(spec)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends the workers
-    threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
+    threading.Thread(target=_stop_with_parent, args=(lifeline,), daemon=True).start()
 
 
-def _exit_with_parent(lifeline: connection.Connection) -> None:
+def _stop_with_parent(lifeline: connection.Connection) -> None:
     connection.wait([lifeline])
+    # No exit yet: of a result that is sent in part, the parent would wait for the rest for ever.
+    _is_to_stop.set()
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel], timeout=_GRACE)
     os._exit(0)
 
 
@@ -125,4 +144,4 @@ def _facts_in_worker() -> EnvFacts:
 
 
 def _play_in_worker(seed: int) -> Episode:
-    return next(_own_pool.episodes([seed]))
+    return play(_own_pool.own_env(), _StoppableScript(), seed)
