@@ -7,7 +7,7 @@ import torch
 from torchaudio.functional import resample
 
 from lerobot_playbyear.policy.networks import AudioEncoder
-from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, to_float_wave
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
 
 SEGMENT_S, HOP_S, N_BINS, WINDOW_S = 0.040, 0.035, 160, 2.0
 
@@ -132,40 +132,3 @@ def test_seventeen_frames_at_20_hz_cost_half_the_segments():
     assert (shared.period, shared.n_stretches, shared.windows_per_stretch) == (7, 7, 3)
     segments = shared.n_stretches * ((32000 + 2 * 7 * 800 - 640) // 560 + 1)
     assert segments < 17 * 57 * 0.56
-
-
-def mixed_in(n_items: int, max_db: float, floor: float = 1e-3, n_samples: int = 32000) -> torch.Tensor:
-    """The noise that is mixed into white noise of this floor, in units of the floor: (n_items, n_samples)."""
-    torch.manual_seed(0)
-    wave = floor * torch.randn(n_items, n_samples)
-    return (mix_in_noise(wave, max_db, 16000) - wave) / floor
-
-
-def test_noise_in_training_is_as_loud_as_asked_for_and_seldom_so():
-    level = 20 * torch.log10(mixed_in(400, 18.0).square().mean(dim=1).sqrt())
-    assert -21 < level.min() < -17  # the hum may be as loud as the broadband noise: 3 dB more, a lucky draw 6
-    assert 15 < level.max() < 24
-    torch.testing.assert_close(level.mean(), torch.tensor(0.0), rtol=0, atol=2.0)
-
-
-def test_noise_in_training_is_white_pink_and_what_lies_between():
-    power = torch.fft.rfft(mixed_in(200, 0.0)).abs().square()  # bins of 0.5 Hz
-    octaves = torch.stack([power[:, low : 2 * low].mean(dim=1).log2() for low in (800, 1600, 3200, 6400)], dim=1)
-    slope = (octaves[:, 0] - octaves[:, -1]) / 3  # the exponent of 1 / frequency
-    assert slope.min() < 0.15
-    assert slope.max() > 1.05
-    torch.testing.assert_close(slope.mean(), torch.tensor(0.6), rtol=0, atol=0.08)
-
-
-def test_noise_in_training_hums_at_another_pitch_in_every_item():
-    power = torch.fft.rfft(mixed_in(200, 0.0)).abs().square()[:, :200]  # up to 100 Hz
-    loudest = power[:, 60:].argmax(dim=1) / 2 + 30  # [Hz]
-    hums = power[:, 60:].amax(dim=1) > 30 * power[:, 60:].median(dim=1).values
-    assert hums.float().mean() > 0.5
-    assert ((loudest[hums] > 44) & (loudest[hums] < 101)).all()
-    assert len(loudest[hums].unique()) > 30
-
-
-def test_sound_without_a_floor_stays_as_it_is():
-    wave = torch.zeros(3, 1600)
-    torch.testing.assert_close(mix_in_noise(wave, 18.0, 16000), wave)

@@ -13,7 +13,8 @@ from lerobot.utils.constants import OBS_STATE
 from lerobot_playbyear.compat import encode_choice
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.policy.feature_checks import check_features, sample_rate_of
-from lerobot_playbyear.policy.precision import DTYPES, training_dtype
+from lerobot_playbyear.policy.option_checks import check_options
+from lerobot_playbyear.policy.precision import training_dtype
 from lerobot_playbyear.policy.schedule import PlaybyearSchedulerConfig
 
 
@@ -69,6 +70,9 @@ class PlaybyearConfig(PreTrainedConfig):
         audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]; None
             mixes in none (the paper). Level, colour and a hum are drawn per item, the level uniformly from 20 dB below the
             floor up to this. It decides how loud a room the policy bears: 18 stands 8 times the background's amplitude.
+        audio_noise_files: Folder of WAV or FLAC files; half of the items get an excerpt of one mixed in besides, as loud. Only
+            training reads it.
+        audio_colour_db: Standard deviation of another microphone's gain, a smooth curve over frequency, drawn per item [dB].
         low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
             normalisation. The paper has none; without it a few dozen demonstrations are learned by heart.
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
@@ -126,6 +130,8 @@ class PlaybyearConfig(PreTrainedConfig):
     augmentation_translate: float = 0.05
     augmentation_scale: float = 0.05
     audio_noise_db: float | None = None
+    audio_noise_files: str | None = None
+    audio_colour_db: float = 0.0
     low_dimensional_noise: float = 0.0
     spectrogram_momentum: float = 0.01
     ema_decay: float = 0.0
@@ -138,24 +144,7 @@ class PlaybyearConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("fps", "n_frame_stack", "n_memory_steps", "n_supervised_steps", "vision_width", "image_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
-        if not 0 < self.action_range < math.inf:
-            raise ValueError(f"--policy.action_range must be above 0 and finite, got {self.action_range}.")
-        if not 0 <= self.ema_decay < 1:
-            raise ValueError(f"--policy.ema_decay must be at least 0 (none) and below 1, got {self.ema_decay}.")
-        if self.audio_window_s < self.segment_s or self.hop_s <= 0:
-            raise ValueError(
-                f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "
-                f"--policy.segment_s ({self.segment_s}), and --policy.hop_s ({self.hop_s}) must be positive."
-            )
-        if not (self.use_vision or self.use_audio or self.low_dimensional_keys or not self.input_features):
-            raise ValueError(
-                "use_vision and use_audio are both off and there is no other observation: nothing to learn from."
-            )
-        if self.dtype not in (None, *DTYPES):
-            raise ValueError(f"--policy.dtype must be one of {', '.join(DTYPES)}, got {self.dtype!r}.")
+        check_options(self)
         self._asked_dtype = self.dtype
         self.dtype = training_dtype(self.dtype, self.use_amp, str(self.device))  # LeRobot reads this, and not use_amp
 

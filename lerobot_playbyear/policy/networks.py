@@ -16,7 +16,8 @@ from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.history import before_episode, newest
-from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, mix_in_noise, to_float_wave
+from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
@@ -47,6 +48,7 @@ class PlaybyearNetwork(nn.Module):
             self.spectrogram = nn.ModuleDict({_module_name(key): _log_spectrogram(config) for key in config.audio_keys})
             encoders = {_module_name(key): make_encoder("audio_encoder", config) for key in config.audio_keys}
             self.hearing = nn.ModuleDict(encoders)
+            self.disturb = SoundAugmentation(config)
             n_fused += sum(encoder.embedding_size for encoder in self.hearing.values())  # type: ignore[misc]
         self.fusion = Fusion(n_fused, config)
         self.memory_head = MemoryHead(config, config.action_feature.shape[0])
@@ -91,9 +93,9 @@ class PlaybyearNetwork(nn.Module):
         n_heard = n_frames + config.audio_frames - 1
         sound = newest(batch, key, n_heard, config.feature_shape(key))  # (B, n_heard, S)
         wave = to_float_wave(sound.flatten(1), key)  # (B, n_heard * S)
-        if self.training and config.audio_noise_db is not None:
-            assert config.sample_rate is not None
-            wave = mix_in_noise(wave, config.audio_noise_db, config.sample_rate)
+        colour = None
+        if self.training:
+            wave, colour = self.disturb.noisy(wave), self.disturb.colour(len(wave))
         begun = torch.ones_like(wave, dtype=torch.bool)  # (B, n_heard * S)
         is_pad = before_episode(batch, n_heard)  # (B, n_heard)
         if is_pad is not None:
@@ -102,7 +104,11 @@ class PlaybyearNetwork(nn.Module):
         assert isinstance(spectrogram, LogSpectrogram)
         # Neighbouring windows overlap: their segments are computed once.
         shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
-        levels = spectrogram(shared.stretches(wave), shared.stretches(begun))  # (B * n_stretches, bins, columns)
+        if colour is not None:
+            colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
+        levels = spectrogram(
+            shared.stretches(wave), shared.stretches(begun), colour
+        )  # (B * n_stretches, bins, columns)
         n_columns = getattr(encoder, "window_columns", None)
         if isinstance(n_columns, int):  # convolutional along time: embeddings overlap, too
             embeddings = shared.windows(encoder(levels), n_columns)  # (B * n, channels, n_columns)

@@ -11,11 +11,6 @@ from lerobot_playbyear.policy.configuration_playbyear import segment_and_hop
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 
 _POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
-_NOISE_TILT = (0.0, 1.2)  # exponent of 1 / frequency: from white to a little steeper than pink
-_NOISE_LOWEST_HZ = 20.0  # below it noise grows no further
-_HUM_HZ = (45.0, 75.0)
-_HUM_HARMONICS = 4
-_HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
 
 
 def to_float_wave(wave: Tensor, key: str) -> Tensor:
@@ -140,17 +135,20 @@ class LogSpectrogram(nn.Module):
         power = spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
         return torch.log10(power * self.scale + _POWER_FLOOR)
 
-    def forward(self, wave: Tensor, begun: Tensor) -> Tensor:
+    def forward(self, wave: Tensor, begun: Tensor, colour: Tensor | None = None) -> Tensor:
         """Spectrograms in which what precedes the episode is the average sound: zero.
 
         Args:
             wave: (B, samples), in [-1, 1].
             begun: (B, samples) bool, False where the episode had not begun.
+            colour: (B, n_bins), gains of another microphone [10 dB].
 
         Returns:
             (B, n_bins, n_segments).
         """
         levels = self.log_power(wave)
+        if colour is not None:
+            levels = levels + colour.unsqueeze(2)
         # A segment counts if its first sample does: the episode, once begun, goes on.
         real = begun[:, : wave.shape[1] - self.segment + 1 : self.hop].unsqueeze(1)  # (B, 1, n_segments)
         if self.training and not self.keeps_statistics:
@@ -169,41 +167,3 @@ class LogSpectrogram(nn.Module):
         self.mean.lerp_(mean, momentum)
         self.variance.lerp_(variance, momentum)
         self.n_batches += counts
-
-
-def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int) -> Tensor:
-    """Adds a room's noise to training sound: broadband, of another colour and level in every item, with a mains-like hum.
-
-    White noise alone teaches nothing about rooms, whose noise is louder the lower it is. Drawn per item, uniformly: the
-    level, between 20 dB below the item's own noise floor and `max_db` above it; the tilt, power falling as frequency to the
-    power 0 to 1.2; the hum's pitch, 45 to 75 Hz with three overtones; and its level, from 20 dB below the broadband noise to
-    as loud.
-
-    Args:
-        wave: (B, samples), in [-1, 1].
-        max_db: Loudest broadband noise relative to the floor [dB].
-        sample_rate: Of the waveform [Hz].
-
-    Returns:
-        (B, samples).
-    """
-    n_items, n_samples = wave.shape
-    draws = torch.rand(4, n_items, 1, device=wave.device)
-    level, tilt, pitch, hum = (
-        low + (high - low) * draw
-        for (low, high), draw in zip(((-20.0, max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
-    )
-    resolution = sample_rate / n_samples  # [Hz] of a bin
-    frequency = resolution * torch.arange(1, n_samples // 2 + 1, device=wave.device)  # without the constant part
-    power = frequency.clamp(min=_NOISE_LOWEST_HZ) ** -tilt  # (B, bins)
-    power = power / power.sum(dim=1, keepdim=True)
-    overtones = torch.arange(1, _HUM_HARMONICS + 1, device=wave.device)
-    bins = (pitch * overtones / resolution).round().long().clamp(1, n_samples // 2) - 1  # (B, harmonics)
-    power = power.scatter_add(1, bins, (10 ** (hum / 10) / _HUM_HARMONICS).expand(-1, _HUM_HARMONICS))
-    spectrum = torch.randn(n_items, n_samples // 2, 2, device=wave.device) * power.sqrt().unsqueeze(2)
-    spectrum = functional.pad(spectrum, (0, 0, 1, 0))  # (B, bins + 1, 2)
-    noise = torch.fft.irfft(torch.view_as_complex(spectrum), n=n_samples) * (n_samples / 2)  # broadband power 1
-    blocks = wave[:, : n_samples // 16 * 16].unflatten(1, (16, -1))
-    levels = blocks.square().mean(dim=2).sqrt().sort(dim=1).values  # (B, 16)
-    floor = levels[:, 3:4].lerp(levels[:, 4:5], 0.75)  # (B, 1), the first quartile; torch's own asks the host
-    return wave + floor * 10 ** (level / 20) * noise

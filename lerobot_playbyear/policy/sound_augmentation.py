@@ -1,0 +1,101 @@
+"""What training does to sound, so that the policy bears other rooms and other microphones."""
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.recorded_noise import RecordedNoise
+
+_FAINTEST_DB = -20.0  # of what is mixed in, relative to an item's noise floor
+_NOISE_TILT = (0.0, 1.2)  # exponent of 1 / frequency: from white to a little steeper than pink
+_NOISE_LOWEST_HZ = 20.0  # below it noise grows no further
+_HUM_HZ = (45.0, 75.0)
+_HUM_HARMONICS = 4
+_HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
+_RECORDED_SHARE = 0.5  # of the items that get recorded noise
+_COLOUR_POINTS = 6  # of a microphone's response, evenly spaced in octaves
+
+
+class SoundAugmentation(nn.Module):
+    """Noise and another microphone's response, drawn anew for every item; nothing of it is in a checkpoint."""
+
+    response: Tensor
+
+    def __init__(self, config: PlaybyearConfig):
+        super().__init__()
+        assert config.sample_rate is not None
+        self.sample_rate, self.max_db = config.sample_rate, config.audio_noise_db
+        self.files, self.colour_db = config.audio_noise_files, config.audio_colour_db
+        self._recorded: RecordedNoise | None = None
+        octaves = torch.log2(torch.arange(1, config.n_frequency_bins + 1).float())
+        place = octaves / octaves.max().clamp(min=1e-6) * (_COLOUR_POINTS - 1)  # of a bin, in points
+        away = (place[:, None] - torch.arange(_COLOUR_POINTS)).abs()
+        self.register_buffer("response", (1 - away).clamp(min=0), persistent=False)  # (bins, points)
+
+    def noisy(self, wave: Tensor) -> Tensor:
+        """(B, samples) in [-1, 1] -> the same shape, with noise.
+
+        Raises:
+            InputError: The folder of recorded noise cannot be used.
+        """
+        if self.max_db is None:
+            return wave
+        mixed = mix_in_noise(wave, self.max_db, self.sample_rate)
+        if self.files is None:
+            return mixed
+        if self._recorded is None:
+            self._recorded = RecordedNoise(self.files, self.sample_rate)
+        excerpts = self._recorded.excerpts(*wave.shape).to(wave.device)
+        draws = torch.rand(2, len(wave), 1, device=wave.device)
+        gain = 10 ** ((_FAINTEST_DB + (self.max_db - _FAINTEST_DB) * draws[0]) / 20) * (draws[1] < _RECORDED_SHARE)
+        return mixed + noise_floor(wave) * gain * excerpts
+
+    def colour(self, n_items: int) -> Tensor | None:
+        """A microphone's gain in every bin of the spectrogram, a smooth curve, (n_items, bins) [10 dB]."""
+        if self.colour_db == 0:
+            return None
+        points = torch.randn(n_items, _COLOUR_POINTS, device=self.response.device)
+        return self.colour_db / 10 * points @ self.response.T
+
+
+def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int) -> Tensor:
+    """Adds a room's noise to training sound: broadband, of another colour and level in every item, with a mains-like hum.
+
+    White noise alone teaches nothing about rooms, whose noise is louder the lower it is. Drawn per item, uniformly: the
+    level, between 20 dB below the item's own noise floor and `max_db` above it; the tilt, power falling as frequency to the
+    power 0 to 1.2; the hum's pitch, 45 to 75 Hz with three overtones; and its level, from 20 dB below the broadband noise to
+    as loud.
+
+    Args:
+        wave: (B, samples), in [-1, 1].
+        max_db: Loudest broadband noise relative to the floor [dB].
+        sample_rate: Of the waveform [Hz].
+
+    Returns:
+        (B, samples).
+    """
+    n_items, n_samples = wave.shape
+    draws = torch.rand(4, n_items, 1, device=wave.device)
+    level, tilt, pitch, hum = (
+        low + (high - low) * draw
+        for (low, high), draw in zip(((_FAINTEST_DB, max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
+    )
+    resolution = sample_rate / n_samples  # [Hz] of a bin
+    frequency = resolution * torch.arange(1, n_samples // 2 + 1, device=wave.device)  # without the constant part
+    power = frequency.clamp(min=_NOISE_LOWEST_HZ) ** -tilt  # (B, bins)
+    power = power / power.sum(dim=1, keepdim=True)
+    overtones = torch.arange(1, _HUM_HARMONICS + 1, device=wave.device)
+    bins = (pitch * overtones / resolution).round().long().clamp(1, n_samples // 2) - 1  # (B, harmonics)
+    power = power.scatter_add(1, bins, (10 ** (hum / 10) / _HUM_HARMONICS).expand(-1, _HUM_HARMONICS))
+    spectrum = torch.randn(n_items, n_samples // 2, 2, device=wave.device) * power.sqrt().unsqueeze(2)
+    spectrum = functional.pad(spectrum, (0, 0, 1, 0))  # (B, bins + 1, 2)
+    noise = torch.fft.irfft(torch.view_as_complex(spectrum), n=n_samples) * (n_samples / 2)  # broadband power 1
+    return wave + noise_floor(wave) * 10 ** (level / 20) * noise
+
+
+def noise_floor(wave: Tensor) -> Tensor:
+    """(B, samples) -> (B, 1), root mean square of each item's quieter parts."""
+    blocks = wave[:, : wave.shape[1] // 16 * 16].unflatten(1, (16, -1))
+    levels = blocks.square().mean(dim=2).sqrt().sort(dim=1).values  # (B, 16)
+    return levels[:, 3:4].lerp(levels[:, 4:5], 0.75)  # the first quartile; torch's own asks the host
