@@ -18,6 +18,7 @@ from gym_playbyear.options import check_option, make_definition
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
 from gym_playbyear.rendering import SceneRenderer, Window
+from gym_playbyear.room import in_room
 from gym_playbyear.scene import Contacts, bending_joints, compose
 from gym_playbyear.sound_v2_crackle import Bending
 from gym_playbyear.task import Task
@@ -25,7 +26,7 @@ from gym_playbyear.task import Task
 SOUND_MODES = ("waveform", "contact_force", "none")
 _SETTLE_STEPS = 10
 _LIFTED_SILENCE_HEIGHT = TABLE_TOP + 0.04  # m: above it the paper's force proxy is silent (the authors' code)
-_ROOM_MICROPHONE = (0.6, 0.0, 1.2)  # m, world frame: for microphones that no part of the arm carries
+_ROOM_MICROPHONE = np.array((0.6, 0.0, 1.2))  # m, world frame: for microphones that no part of the arm carries
 
 
 class TaskEnv(PrivilegedState, gym.Env):
@@ -43,6 +44,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         microphones: Their names. None: the task's.
         horizon: Steps of an episode. None: the task's.
         hidden_object: False: the hand passes through what is hidden; all else is the same world.
+        room: Options of `gym_playbyear.room.Room`: noise, noise_level, response. None: as it is.
         render_mode: None, "rgb_array" or "human".
         render_size: Pixels of the picture that `render()` returns.
         task_options: The task's own options.
@@ -64,16 +66,16 @@ class TaskEnv(PrivilegedState, gym.Env):
         microphones: tuple[str, ...] | None = None,
         horizon: int | None = None,
         hidden_object: bool = True,
+        room: dict[str, Any] | None = None,
         render_mode: str | None = None,
         render_size: int = 480,
         **task_options: Any,
     ):
-        definition = make_definition(task, task_options)
+        self.definition = definition = make_definition(task, task_options)
         check_option("sound", sound, SOUND_MODES)
         check_option("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         if image_size < 8:
             raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
-        self.definition = definition
         self.task, self.task_description = definition.name, definition.description
         self.variant = definition.numbers
         self.metadata = {**self.metadata, "render_fps": definition.control_hz}
@@ -82,18 +84,17 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._image_size, self._sound_mode = image_size, sound
         self._microphones = tuple(microphones or definition.microphones)
         self._sample_rate = int(sample_rate or definition.sample_rate)
-        self.shown: dict[str, Any] = {}
-        self.secrets: dict[str, Any] = {}
-        self.materials: dict[str, str] = {}
+        self.shown, self.secrets, self.materials = {}, {}, {}
         # Rules remember things of an episode.
         self._success, self._ends = copy.deepcopy((definition.success, definition.ends))
 
         arm = definition.arm
         self.contacts = Contacts(definition)
-        self._sound: MaterialEars | None = None
+        self._sound: Any = None
         if sound == "waveform":
             rates = (self._sample_rate, definition.control_hz, definition.physics_dt)
-            self._sound = MaterialEars(definition.sound, self.contacts.heard(), self._microphones, *rates, noise_level)
+            ears = MaterialEars(definition.sound, self.contacts.heard(), self._microphones, *rates, noise_level)
+            self._sound = in_room(ears, self._microphones, self._sample_rate, room or {})
         spec = compose(definition, max(render_size, image_size), hidden_object)
         self.contacts.add_sensors(spec, definition.felt)
         if self._sound is not None:
@@ -109,10 +110,9 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
         self._cameras: dict[str, SceneRenderer] = {}  # those that have drawn
         self._window: Window | None = None
-        self._is_closed = False
+        self._is_closed, self._n_steps = False, 0
         self._expert_rng: np.random.Generator | None = None  # None before the first episode
         self._peak_forces = np.zeros(len(self.pairs))
-        self._n_steps = 0
         self._sensors = Proprioception(definition.sensors, definition.control_hz)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = self._describe_observation()
@@ -286,7 +286,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         )
 
     def _place_of(self, body: str | None) -> np.ndarray:
-        return np.array(_ROOM_MICROPHONE) if body is None else self.data.body(body).xpos
+        return _ROOM_MICROPHONE if body is None else self.data.body(body).xpos
 
     def _true_proprioception(self) -> np.ndarray:
         return np.concatenate(

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +17,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 from gym_playbyear import register_tasks
 from gym_playbyear.options import OptionError, make_definition
 from gym_playbyear.plugins import PluginError
+from gym_playbyear.room import RESPONSES
 from gym_playbyear.task import Task
 from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
@@ -38,6 +40,9 @@ class PlaybyearEnvConfig(EnvConfig):
         sound: `waveform` (int16 PCM per microphone), `contact_force` (the paper's proxy, 6 numbers), or `none`.
         microphones: Names of the microphones that are on, with `sound=waveform`: `gripper`, `table`. None: the task's own.
         noise_level: Multiplies the background noise and the arm's own hum. 1 is the task as published, 0 silence.
+        room_noise: A WAV file that plays in the room, over and over; None for a silent room.
+        room_noise_level: How loud it is, in units of the usual background's root mean square.
+        microphone_response: `flat`, or the frequency response of another microphone: `phone`, `dull`, `boomy`.
         cube_material: What the cube sounds like: `cube` (wood), `glass`, `tin`, `cardboard`, `rubber`; for tasks with a cube.
         variant: `default`, or `paper` for the paper's values where ours differ; for version 0 of the tasks.
         task_options: More options of the task, by name.
@@ -58,6 +63,9 @@ class PlaybyearEnvConfig(EnvConfig):
     sound: str = "waveform"
     microphones: list[str] | None = None
     noise_level: float = 1.0
+    room_noise: str | None = None
+    room_noise_level: float = 1.0
+    microphone_response: str = "flat"
     # Task
     cube_material: str = "cube"
     variant: str = "default"
@@ -104,6 +112,7 @@ class PlaybyearEnvConfig(EnvConfig):
             "microphones": tuple(self.microphones or ()),
             "horizon": self.episode_length,
             "hidden_object": self.hidden_object,
+            "room": self._room(),
             "render_mode": self.render_mode,
             "render_size": self.visualization_width,
             **self._own_options(),
@@ -146,6 +155,12 @@ class PlaybyearEnvConfig(EnvConfig):
         """What LeRobot runs on each observation before, and on each action after, the policy's own processors."""
         return PolicyProcessorPipeline(steps=[PcmToFloatProcessorStep()]), PolicyProcessorPipeline(steps=[])
 
+    def _room(self) -> dict[str, Any] | None:
+        """Options of `gym_playbyear.room.Room`, or None for the task's own room."""
+        if self.room_noise is None and self.microphone_response == "flat":
+            return None
+        return {"noise": self.room_noise, "noise_level": self.room_noise_level, "response": self.microphone_response}
+
     def _own_options(self) -> dict[str, str]:
         """Those that belong to the task. What has its default is left out: not every task knows it."""
         defaults = {"cube_material": "cube", "variant": "default"}
@@ -179,6 +194,12 @@ class PlaybyearEnvConfig(EnvConfig):
             )
         if self.sound == "waveform" and (not self.microphones or len(set(self.microphones)) < len(self.microphones)):
             raise self._error("microphones", "give at least one name and each only once")
+        if self.microphone_response not in RESPONSES:
+            raise self._error("microphone_response", f"choose one of {', '.join(RESPONSES)}")
+        if self.room_noise is not None and not Path(self.room_noise).is_file():
+            raise self._error("room_noise", "there is no such file, give a WAV file")
+        if not 0 <= self.room_noise_level < float("inf"):
+            raise self._error("room_noise_level", "give 0 (silent) or more")
         if self.visualization_width != self.visualization_height:
             raise self._error("visualization_width", "the picture is square: give both sides the same")
 

@@ -1,0 +1,113 @@
+"""A task heard in another room, or by another microphone: what does a policy make of sound that it did not train with?"""
+
+from collections.abc import Mapping
+from functools import cache
+from math import gcd
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy import signal
+from scipy.io import wavfile
+
+from gym_playbyear.ears import MaterialEars, Moment
+from gym_playbyear.options import OptionError, check_option
+from gym_playbyear.sound import pcm16
+
+USUAL_RMS = 10 ** (-60 / 20)
+"""Of a task's own background noise and hum, relative to full scale."""
+
+RESPONSES: dict[str, tuple[str, float | tuple[float, float], float]] = {
+    "flat": ("none", 0.0, 0.0),
+    "phone": ("bandpass", (300.0, 3400.0), 0.0),
+    "dull": ("lowpass", 900.0, 0.0),
+    "boomy": ("lowpass", 300.0, 3.0),
+}
+"""Frequency responses: kind of a Butterworth filter of the first order, its corner frequencies [Hz], and how often what it
+lets through is added to the sound; 0 puts it in the sound's place."""
+
+
+class Room:
+    """Ears in a room where a recording plays, and behind a microphone of another frequency response.
+
+    Args:
+        ears: What hears the task.
+        microphones: Their names; each hears the recording from another place in it.
+        sample_rate: Samples per second.
+        noise: A WAV file; it repeats. None: a silent room.
+        noise_level: Root mean square of the whole recording, in units of the usual background's.
+        response: One of `RESPONSES`.
+
+    Raises:
+        OptionError: The file cannot be read or is silent, or another value cannot be used.
+    """
+
+    def __init__(
+        self,
+        ears: MaterialEars,
+        microphones: tuple[str, ...],
+        sample_rate: int,
+        noise: str | None = None,
+        noise_level: float = 1.0,
+        response: str = "flat",
+    ):
+        check_option("response", response, RESPONSES)
+        if not 0.0 <= noise_level < np.inf:
+            raise OptionError("room_noise_level", noise_level, "give 0 (silent) or more")
+        self._ears, self._microphones = ears, microphones
+        recording = np.zeros(1, np.float32) if noise is None else _recording(str(noise), sample_rate)
+        self._recording = noise_level * USUAL_RMS * recording
+        kind, corner, self._added = RESPONSES[response]
+        self._filter = None if response == "flat" else signal.butter(1, corner, kind, fs=sample_rate, output="sos")
+        self.reset(np.random.default_rng(0))
+
+    def choose(self, materials: Mapping[str, str]) -> None:
+        self._ears.choose(materials)
+
+    def add_sensors(self, spec: mujoco.MjSpec) -> None:
+        self._ears.add_sensors(spec)
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """An episode begins, somewhere in the recording."""
+        self._ears.reset(rng)
+        (own,) = rng.spawn(1)
+        self._places = own.integers(len(self._recording), size=len(self._microphones))
+        n_sections = 0 if self._filter is None else len(self._filter)
+        self._state = np.zeros((n_sections, len(self._microphones), 2))
+
+    def step(self, model: mujoco.MjModel, moment: Moment) -> dict[str, np.ndarray]:
+        heard = self._ears.step(model, moment)
+        wave = np.stack([heard[name] for name in self._microphones]) / 32767.0  # (microphones, S)
+        span = np.arange(wave.shape[1])
+        wave += self._recording[(self._places[:, None] + span) % len(self._recording)]
+        self._places = (self._places + len(span)) % len(self._recording)
+        if self._filter is not None:
+            passed, self._state = signal.sosfilt(self._filter, wave, zi=self._state)
+            wave = wave + self._added * passed if self._added else passed
+        return dict(zip(self._microphones, pcm16(wave), strict=True))
+
+
+def in_room(ears: MaterialEars, microphones: tuple[str, ...], sample_rate: int, room: Mapping[str, Any]) -> Any:
+    """The ears themselves, or, with options of `Room`, in a room."""
+    return Room(ears, microphones, sample_rate, **room) if room else ears
+
+
+@cache
+def _recording(path: str, sample_rate: int) -> np.ndarray:
+    """A WAV file as one channel, (n,) float32 of root mean square 1, at this rate."""
+    if not Path(path).is_file():
+        raise OptionError("room_noise", path, "there is no such file, give a WAV file")
+    try:
+        rate, samples = wavfile.read(path)
+    except (ValueError, EOFError) as error:
+        raise OptionError("room_noise", path, f"it cannot be read as a WAV file ({error})") from error
+    wave = samples.astype(np.float64).reshape(len(samples), -1).mean(axis=1)
+    if samples.dtype == np.uint8:
+        wave -= 128.0
+    divisor = gcd(rate, sample_rate)
+    wave = signal.resample_poly(wave, sample_rate // divisor, rate // divisor)
+    level = np.sqrt(np.mean(np.square(wave))) if len(wave) else 0.0
+    if not level > 0.0 or not np.isfinite(level):
+        raise OptionError("room_noise", path, "it is silent, or not finite: give another recording")
+    return (wave / level).astype(np.float32)

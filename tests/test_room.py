@@ -1,0 +1,157 @@
+"""Recorded noise and other microphones in the environment: they change the sound, without seams, and nothing else."""
+
+import copy
+import itertools
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from draccus.utils import DecodingError
+from lerobot.envs.configs import EnvConfig  # noqa: F401  (registers LeRobot's own environments first)
+from scipy import signal
+from scipy.io import wavfile
+
+from gym_playbyear.options import OptionError
+from gym_playbyear.room import USUAL_RMS
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.policy.recorded_noise import RecordedNoise
+
+TASK = "gym_playbyear:gym_playbyear/OccludedGrasp-v1"
+N_STEPS = 12
+
+
+@pytest.fixture
+def chirp(tmp_path):
+    """Half a second of a rising tone in two channels, at another sample rate than the task's."""
+    time = np.arange(22050) / 44100
+    wave = 0.3 * signal.chirp(time, 300, 0.5, 3000)
+    wavfile.write(tmp_path / "chirp.wav", 44100, (32767 * np.stack([wave, wave], axis=1)).astype(np.int16))
+    return str(tmp_path / "chirp.wav")
+
+
+def heard(room, microphone="gripper", seed=3, **options):
+    """Everything but sound, and the sound (n,) in [-1, 1], of some random steps."""
+    env = gym.make(TASK, room=room, **options)
+    observation, _ = env.reset(seed=seed)
+    others, sound = [], [observation.pop(f"audio.{microphone}")]
+    others.append(observation)
+    rng = np.random.default_rng(0)
+    for _ in range(N_STEPS):
+        observation, *_ = env.step(rng.uniform(-0.3, 0.3, 4).astype(np.float32))
+        sound.append(observation.pop(f"audio.{microphone}"))
+        others.append(observation)
+    env.close()
+    return others, np.concatenate(sound) / 32767
+
+
+def test_a_recording_is_added_at_its_level_and_goes_on_from_step_to_step(chirp):
+    quiet, plain = heard(None, microphones=("gripper",))
+    noisy, sound = heard({"noise": chirp, "noise_level": 8.0}, microphones=("gripper",))
+    for ours, theirs in zip(quiet, noisy, strict=True):
+        assert np.array_equal(ours["agent_pos"], theirs["agent_pos"])
+        assert np.array_equal(ours["pixels"]["front"], theirs["pixels"]["front"])
+    added = sound - plain
+    assert len(added) == (N_STEPS + 1) * 800
+    assert np.sqrt(np.mean(added[:8000] ** 2)) == pytest.approx(8 * USUAL_RMS, rel=0.02)  # the recording, once around
+    np.testing.assert_allclose(added[8000:], added[: len(added) - 8000], atol=1.1 / 32767)  # and again
+    assert np.abs(np.diff(added)).max() < 0.02 * 8  # no clicks between steps
+
+
+def test_the_usual_background_is_as_loud_as_the_unit_says():
+    _, plain = heard(None, microphones=("gripper",))
+    _, silent = heard(None, microphones=("gripper",), noise_level=0.0)
+    background = (plain - silent)[: 4 * 800]
+    assert 0.5 * USUAL_RMS < np.sqrt(np.mean(background**2)) < 2 * USUAL_RMS
+
+
+@pytest.mark.parametrize("response", ["phone", "dull", "boomy"])
+def test_a_microphone_filters_all_that_it_hears_without_seams(response):
+    _, plain = heard(None, microphones=("gripper",))
+    _, sound = heard({"response": response}, microphones=("gripper",))
+    kind, corner, added = {
+        "phone": ("bandpass", (300, 3400), 0),
+        "dull": ("lowpass", 900, 0),
+        "boomy": ("lowpass", 300, 3),
+    }[response]
+    passed = signal.sosfilt(signal.butter(1, corner, kind, fs=16000, output="sos"), plain)
+    np.testing.assert_allclose(
+        sound, np.clip(added * plain + passed if not added else plain + added * passed, -1, 1), atol=1 / 32767
+    )
+
+
+def test_every_microphone_and_every_episode_is_somewhere_else_in_the_recording(chirp):
+    room = {"noise": chirp, "noise_level": 30.0}
+    env = gym.make(TASK, room=room, noise_level=0.0, microphones=("left_finger", "right_finger"))
+    starts = []
+    for seed in range(4):
+        observation, _ = env.reset(seed=seed)
+        starts += [observation["audio.left_finger"][:100], observation["audio.right_finger"][:100]]
+    again, _ = env.reset(seed=0)
+    assert np.array_equal(again["audio.left_finger"][:100], starts[0])
+    assert len({start.tobytes() for start in starts}) == len(starts)
+    env.close()
+
+
+def test_a_copy_goes_on_where_the_original_is(chirp):
+    env = gym.make(TASK, room={"noise": chirp, "response": "phone"}).unwrapped
+    env.reset(seed=1)
+    other = copy.deepcopy(env)
+    action = np.zeros(4, np.float32)
+    for _ in range(3):
+        ours, theirs = env.step(action)[0], other.step(action)[0]
+        assert np.array_equal(ours["audio.gripper"], theirs["audio.gripper"])
+    env.close()
+    other.close()
+
+
+def test_what_cannot_be_is_refused_with_option_and_value(tmp_path):
+    silent, broken = tmp_path / "silent.wav", tmp_path / "broken.wav"
+    wavfile.write(silent, 16000, np.zeros(1000, np.int16))
+    broken.write_text("no sound")
+    for room, message in [
+        ({"noise": str(tmp_path / "none.wav")}, r"room_noise='.*none.wav'.*no such file"),
+        ({"noise": str(silent)}, "it is silent"),
+        ({"noise": str(broken)}, "cannot be read as a WAV file"),
+        ({"noise_level": -1.0}, "room_noise_level=-1.0"),
+        ({"response": "vinyl"}, "response='vinyl'.*flat, phone, dull, boomy"),
+    ]:
+        with pytest.raises(OptionError, match=message):
+            gym.make(TASK, room=room)
+
+
+def test_lerobots_options_make_the_same_room(chirp):
+    config = PlaybyearEnvConfig(
+        task="OccludedGrasp-v1", room_noise=chirp, room_noise_level=4.0, microphone_response="dull"
+    )
+    assert config.gym_kwargs["room"] == {"noise": chirp, "noise_level": 4.0, "response": "dull"}
+    assert PlaybyearEnvConfig(task="OccludedGrasp-v1").gym_kwargs["room"] is None
+    for options in ({"room_noise": "none.wav"}, {"microphone_response": "vinyl"}, {"room_noise_level": -2.0}):
+        with pytest.raises(DecodingError, match="does not work"):
+            PlaybyearEnvConfig(task="OccludedGrasp-v1", **options)
+
+
+def test_the_recordings_of_the_example_suit_environment_and_policy(tmp_path):
+    example = Path(__file__).parent.parent / "examples" / "room_noise.py"
+    for seed in ("1", "2"):
+        command = [sys.executable, str(example), str(tmp_path / seed), "--seconds=3", "--seed", seed]
+        printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    assert [Path(path).stem for path in printed] == ["hum", "speech_like", "music_like", "clatter"]
+    spectra = []
+    for path in printed:
+        rate, samples = wavfile.read(path)
+        assert (rate, len(samples)) == (48000, 144000)
+        other = wavfile.read(str(path).replace("/2/", "/1/"))[1]
+        assert not np.array_equal(samples, other)  # another seed is another recording
+        power = signal.welch(samples / 32768, rate, nperseg=4096)[1]
+        spectra.append(power / power.sum())
+        config = PlaybyearEnvConfig(task="OccludedGrasp-v1", room_noise=path)
+        env = gym.make(TASK, room=config.gym_kwargs["room"], noise_level=0.0)
+        assert np.abs(env.reset(seed=0)[0]["audio.gripper"]).max() > 5
+        env.close()
+    overlap = [np.minimum(a, b).sum() for a, b in itertools.combinations(spectra, 2)]
+    assert max(overlap) < 0.7  # four kinds, not one
+    noise = RecordedNoise(tmp_path / "2", 16000)
+    assert len(noise) == 4
