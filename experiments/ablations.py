@@ -40,7 +40,6 @@ def main() -> None:
     options = parser.parse_args()
 
     record(options.task, N_DEMONSTRATIONS)
-    blind_floor(options.task)
     jobs = [
         Job(STUDY, options.task, condition, seed, threads=options.threads)
         for seed in options.seeds
@@ -53,6 +52,7 @@ def main() -> None:
             f"[{low:.0%}, {high:.0%}] after {result.minutes} min",
             flush=True,
         )
+    blind_floor(options.task)
 
 
 if __name__ == "__main__":

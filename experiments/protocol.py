@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 TASKS = ("OccludedGrasp-v0", "OccludedPickPlace-v0")
+NEW_TASKS = ("OccludedGrasp-v1", "OccludedPickPlace-v1", "TellApart-v1", "KeyBag-Easy-v1", "KeyBag-Hard-v1")
+FPS = {"TellApart-v1": 5, "KeyBag-Easy-v1": 5, "KeyBag-Hard-v1": 5}  # where it is not 20 [Hz]
 DEMONSTRATION_SEED = 0  # recording counts up from here, below 1000
 EVALUATION_SEEDS = range(70000, 70100)
 DONOR_SEEDS = range(60000, 60040)  # expert episodes whose sounds the listening probes play
@@ -33,7 +35,7 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
 }
 
 _OPTIONS: dict[str, dict[str, Any]] = {
-    "task": {"choices": TASKS, "default": TASKS[0]},
+    "task": {"choices": TASKS + NEW_TASKS, "default": TASKS[0]},
     "seeds": {"nargs": "+", "type": int, "default": TRAINING_SEEDS, "help": "of the policies' training"},
     "jobs": {"type": int, "default": 1, "help": "policies that are trained side by side"},
     "threads": {"type": int, "default": 1, "help": "per policy"},

@@ -11,6 +11,7 @@ from typing import Any
 from experiments.protocol import (
     CONDITIONS,
     EVALUATION_SEEDS,
+    FPS,
     N_DEMONSTRATIONS,
     RESULTS,
     RUNS,
@@ -112,6 +113,7 @@ def train(job: Job) -> tuple[str, float]:
         f"--seed={job.training_seed}",
         "--wandb.enable=false",
         *CONDITIONS[job.condition],
+        *([f"--policy.fps={FPS[job.task]}"] if job.task in FPS else []),
         *job.options,
     ]
     todo = command
