@@ -1,0 +1,55 @@
+"""Version 1 of the tasks gives the bytes that it always gave: what the policy's camera shows, what is heard, and the rest.
+
+A change of physics, of the sound or of the expert changes these digests, and then results stop being comparable: it wants a
+reason in the change log, and new digests. How people see the scene is not in them (`tests/test_looks.py`).
+`python tests/test_v1_digests.py` prints them; probes tell machines apart, as for version 0 (`test_v0_digests.py`).
+"""
+
+import hashlib
+import json
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from test_v0_digests import arithmetic, arrays, look
+
+DIGESTS = Path(__file__).parent / "v1_digests.json"
+TASKS = ("OccludedGrasp-v1", "OccludedPickPlace-v1", "TellApart-v1", "KeyBag-Easy-v1", "KeyBag-Hard-v1")
+
+
+def digests(task: str, **options) -> dict[str, str]:
+    """Of one seeded episode by the expert, after some random actions."""
+    env = gym.make(f"gym_playbyear:gym_playbyear/{task}", disable_env_checker=True, **options)
+    kinds = {"pictures": hashlib.sha256(), "sound": hashlib.sha256(), "numbers": hashlib.sha256()}
+    rng = np.random.default_rng(5)
+
+    def note(observation, *outcome) -> bool:
+        for name, value in arrays(observation):
+            kind = "pictures" if "pixels" in name else "sound" if "audio" in name else "numbers"
+            kinds[kind].update(f"{name} {value.dtype} {value.shape}".encode() + value.tobytes())
+        kinds["numbers"].update(repr([float(value) for value in outcome[:3]]).encode())
+        return bool(outcome) and (outcome[1] or outcome[2])
+
+    note(env.reset(seed=11)[0])
+    for _ in range(3):
+        note(*env.step(np.append(rng.uniform(-0.2, 0.2, 3), -1.0)))
+    expert = env.unwrapped.scripted_expert()
+    while not note(*env.step(expert.act())):
+        pass
+    env.close()
+    probes = {"pictures": look(), "sound": arithmetic(), "numbers": arithmetic()}
+    return {f"{kind}, {probes[kind]}": digest.hexdigest()[:16] for kind, digest in kinds.items()}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_is_the_one_it_always_was(task):
+    known = json.loads(DIGESTS.read_text())[task]
+    if f"numbers, {arithmetic()}" not in known:
+        pytest.skip(f"{DIGESTS.name} has no digests for this machine ({arithmetic()})")
+    seen = digests(task)
+    assert seen == {probe: known.get(probe, digest) for probe, digest in seen.items()}
+
+
+if __name__ == "__main__":
+    print(json.dumps({task: digests(task) for task in TASKS}, indent=1))
