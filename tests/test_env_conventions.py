@@ -125,7 +125,7 @@ def test_a_closed_environment_refuses_and_opens_nothing(call, was_reset):
     env.close()
     with pytest.raises(ClosedEnvironmentError, match=r"closed.*reset\(\)"):
         NEED_AN_EPISODE[call](env)
-    assert (env._cameras, env._window) == ({}, None)
+    assert (env._cameras, env._people) == ({}, None)
 
 
 def test_a_copy_of_a_closed_environment_is_closed():
@@ -196,7 +196,7 @@ def screen():
 
 _WATCH = """
 import sys, gymnasium
-env = gymnasium.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0", render_mode="human", sound="none")
+env = gymnasium.make("gym_playbyear:gym_playbyear/" + sys.argv[1], render_mode="human", sound="none")
 for cube in (-0.25, 0.25):
     observation, _ = env.reset(seed=0, options={"cube_position": (0.0, cube)})
     print(observation["agent_pos"].tolist(), flush=True)
@@ -215,16 +215,17 @@ def panel_on(picture: np.ndarray, before: float | None) -> float | None:
 
 
 @needs_screen
-def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen):
+@pytest.mark.parametrize("task", ["OccludedGrasp-v0", "OccludedGrasp-v1"])
+def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen, task):
     """The program does not close it: a window that is open when the process ends must not crash it either."""
     process = subprocess.Popen(
-        [sys.executable, "-c", _WATCH],
+        [sys.executable, "-c", _WATCH, task],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         env={**screen.environment, "MUJOCO_GL": "egl"},
     )
-    env = make(sound="none")
+    env = make(task, sound="none")
     place = None
     for cube in (-0.25, 0.25):
         measured = json.loads(process.stdout.readline())

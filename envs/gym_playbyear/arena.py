@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from gym_playbyear.looks_props import table_on_legs
 from gym_playbyear.plugins import Registry
 from gym_playbyear.task import Camera, Prop
 
@@ -23,6 +24,7 @@ TABLE = Prop(
             friction="0.4 0.005 0.0001" rgba="0.72 0.60 0.45 1"/>
     </body>""",
     material="table",
+    looks=table_on_legs,
 )
 """A table of 0.8 x 0.8 m, and the light above it."""
 

@@ -12,6 +12,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
+from gym_playbyear.looks_arm import dress_arm
 from gym_playbyear.plugins import Registry
 
 N_JOINTS = 7
@@ -74,6 +75,10 @@ class ArmConfig:
             f"""<mujoco><compiler angle="radian" autolimits="true"/><default>{ARM_DEFAULT_XML}</default>
             <worldbody>{arm_body_xml(self)}</worldbody>{arm_actuator_xml(self)}</mujoco>"""
         )
+
+    def dress(self, spec: mujoco.MjSpec) -> None:
+        """Gives it the shapes that people see."""
+        dress_arm(spec, self.base[2], FINGER_THICKNESS, FINGER_WIDTH)
 
     def controller(self, control_hz: int, physics_dt: float) -> "CartesianController":
         """What moves it, for so many control steps per second and physics steps of so many seconds."""

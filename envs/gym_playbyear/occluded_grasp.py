@@ -10,6 +10,7 @@ from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp, SteadyBlindGrasp
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, GraspExpert, SteadyGraspExpert
+from gym_playbyear.looks_props import panel_on_posts, wall_on_the_table
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.variant import OLD, PAPER, Variant
@@ -125,8 +126,9 @@ def occluded_grasp_v0(*, variant: str = "default", cube_material: str = "cube") 
 
 
 def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **scripts: Any) -> Task:
-    wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall")
-    panel = box("indicator", INDICATOR_HALF_SIZE, (INDICATOR_X, 0, INDICATOR_Z), "0.1 0.2 0.9 1")
+    wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall", looks=wall_on_the_table)
+    place = (INDICATOR_X, 0, INDICATOR_Z)
+    panel = box("indicator", INDICATOR_HALF_SIZE, place, "0.1 0.2 0.9 1", looks=panel_on_posts)
     return Task(
         name=name,
         description="Find the cube behind the wall by touch and sound, grasp it and lift it.",

@@ -10,6 +10,7 @@ from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, PickPlaceExpert
+from gym_playbyear.looks_props import wall_on_the_table
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.variant import OLD, PAPER, Variant
@@ -112,7 +113,7 @@ def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cu
 
 
 def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **traits: Any) -> Task:
-    wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall")
+    wall = box("wall", WALL_HALF_SIZE, WALL_CENTRE, WALL_COLOUR, material="wall", looks=wall_on_the_table)
     return Task(
         name=name,
         description="Find the cube behind the wall by touch and sound, grasp it and put it into the tray.",

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP
+from gym_playbyear.looks_props import soft_pouch
 from gym_playbyear.task import Prop
 
 POUCH = "pouch"
@@ -36,6 +37,7 @@ def pouch() -> Prop:
         </body>""",
         material=POUCH,
         loose=True,
+        looks=soft_pouch(HALF_SIZE),
     )
 
 

@@ -43,6 +43,8 @@ class Controller(Protocol):
 class Arm(Protocol):
     """An arm with a hand; its joints, then its fingers, come first in the model.
 
+    One that also has `dress(spec)` may change how people see it (`gym_playbyear.looks`).
+
     Attributes:
         base: Where it stands (3,) [m, world]; `agent_pos` counts from there.
         max_opening: Between the open fingers [m].
@@ -91,6 +93,8 @@ class Prop:
         inside: Name of the prop that it is shut in: it touches nothing but that and what else is in there.
         jingles: It has parts, bodies within that one, which are heard when they knock against each other.
         bends: Joints within it whose motion crackles, each with a factor from its speed to that of bending in rad/s.
+        looks: `looks(spec, body)` gives its body, in the scene that only people see, shapes for the eye
+            (`gym_playbyear.looks_shapes`). None: people see its geoms.
     """
 
     name: str
@@ -102,6 +106,7 @@ class Prop:
     inside: str | None = None
     jingles: bool = False
     bends: tuple[tuple[str, float], ...] = ()
+    looks: Callable[[mujoco.MjSpec, mujoco.MjsBody], None] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.spec, mujoco.MjSpec):

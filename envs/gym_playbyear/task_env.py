@@ -14,10 +14,11 @@ from mujoco import rollout
 
 from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.ears import MaterialEars, Moment
+from gym_playbyear.looks import PeopleView
 from gym_playbyear.options import check_option, make_definition
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
-from gym_playbyear.rendering import SceneRenderer, Window
+from gym_playbyear.rendering import SceneRenderer
 from gym_playbyear.room import in_room
 from gym_playbyear.scene import Contacts, bending_joints, compose
 from gym_playbyear.sound_v2_crackle import Bending
@@ -81,7 +82,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         self.metadata = {**self.metadata, "render_fps": definition.control_hz}
         self._max_episode_steps = int(horizon or definition.horizon)
         self.render_mode, self._render_size = render_mode, render_size
-        self._image_size, self._sound_mode = image_size, sound
+        self._image_size, self._sound_mode, self._hidden_object = image_size, sound, hidden_object
         self._microphones = tuple(microphones or definition.microphones)
         self._sample_rate = int(sample_rate or definition.sample_rate)
         self.shown, self.secrets, self.materials = {}, {}, {}
@@ -109,7 +110,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._rollout_state = np.empty((1, self._controller.n_substeps, len(self._state)))
         self._rollout_sensors = np.empty((1, self._controller.n_substeps, self.model.nsensordata))
         self._cameras: dict[str, SceneRenderer] = {}  # those that have drawn
-        self._window: Window | None = None
+        self._people: PeopleView | None = None  # made when somebody looks
         self._is_closed, self._n_steps = False, 0
         self._expert_rng: np.random.Generator | None = None  # None before the first episode
         self._peak_forces = np.zeros(len(self.pairs))
@@ -205,28 +206,27 @@ class TaskEnv(PrivilegedState, gym.Env):
 
     def render(self):
         self._check_is_running("render")
-        if self.render_mode == "human":
-            if self._window is None:
-                self._window = Window(self.model, self.data)
-            self._window.update()
-            time.sleep(1 / self.control_hz)
+        if self.render_mode is None:
             return None
-        if self.render_mode != "rgb_array":
-            return None
-        return self._picture("people", self._render_size)
+        self._people = self._people or PeopleView(self.definition, self._render_size, self._hidden_object)
+        if self.render_mode == "rgb_array":
+            return self._people.picture(self.model, self.data)
+        self._people.show(self.model, self.data)
+        return time.sleep(1 / self.control_hz)
 
     def close(self):
         """Closes window and OpenGL. Only `reset` opens them again, as in Gymnasium's own environments; until then `step` and
         `render` raise ClosedEnvironmentError."""
         self._is_closed = True
-        for resource in (*self._cameras.values(), self._window):
-            if resource is not None:
-                resource.close()
-        self._cameras, self._window = {}, None
+        for renderer in self._cameras.values():
+            renderer.close()
+        if self._people is not None:
+            self._people.close()
+        self._cameras, self._people = {}, None
 
     def __getstate__(self) -> dict[str, Any]:
         # What is open belongs to this process and to this object: a copy opens its own.
-        return {**self.__dict__, "_cameras": {}, "_window": None}
+        return {**self.__dict__, "_cameras": {}, "_people": None}
 
     def _check_is_running(self, call: str) -> None:
         if self._is_closed:
