@@ -204,10 +204,14 @@ for cube in (-0.25, 0.25):
 """
 
 
-def panel_on(picture: np.ndarray, before: float | None) -> float | None:
-    """Where the blue panel is, as a share of the screen's width; None while there is none, or it is where it was before."""
-    red, green, blue = picture.astype(int).transpose(2, 0, 1)
-    columns = np.flatnonzero(((blue - red > 80) & (blue - green > 80)).any(axis=0))
+_RED, _BLUE = 0, 2
+
+
+def spot_on(picture: np.ndarray, colour: int, before: float | None) -> float | None:
+    """Where the cube (red) or the panel (blue) is, as a share of the screen's width; None while there is none, or it is where
+    it was before."""
+    own, others = picture[..., colour].astype(int), np.delete(picture, colour, axis=-1).max(axis=-1)
+    columns = np.flatnonzero((own - others > 80).any(axis=0))
     if len(columns) < 5:
         return None
     place = float(columns.mean() / picture.shape[1])
@@ -215,8 +219,8 @@ def panel_on(picture: np.ndarray, before: float | None) -> float | None:
 
 
 @needs_screen
-@pytest.mark.parametrize("task", ["OccludedGrasp-v0", "OccludedGrasp-v1"])
-def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen, task):
+@pytest.mark.parametrize(("task", "colour"), [("OccludedGrasp-v0", _BLUE), ("OccludedGrasp-v1", _RED)])
+def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen, task, colour):
     """The program does not close it: a window that is open when the process ends must not crash it either."""
     process = subprocess.Popen(
         [sys.executable, "-c", _WATCH, task],
@@ -231,7 +235,7 @@ def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen,
         measured = json.loads(process.stdout.readline())
         unseen = env.reset(seed=0, options={"cube_position": (0.0, cube)})[0]["agent_pos"]
         assert measured == unseen.tolist()
-        place = wait_for(lambda before=place: panel_on(screen.picture(), before))
+        place = wait_for(lambda before=place: spot_on(screen.picture(), colour, before))
         process.stdin.write("\n")
         process.stdin.flush()
     env.close()

@@ -15,6 +15,8 @@ FRICTION = 0.5
 _TOUCH = f'priority="2" condim="4" friction="{FRICTION} 0.005 0.0002" solref="0.005 1" solimp="0.95 0.99 0.0005"'
 _STEEL, _BRASS = "0.75 0.77 0.80 1", "0.80 0.65 0.30 1"
 _SOFT = 'priority="2" condim="4" friction="0.5 0.005 0.0002" solref="0.02 1" solimp="0.9 0.95 0.003"'
+# What is round does not roll away: there are pills in the bottle, and the paper below gives way.
+_ROUND = 'priority="2" condim="6" friction="0.5 0.005 0.002" solref="0.005 1" solimp="0.95 0.99 0.0005"'
 _WHITE, _PENS = "0.95 0.95 0.95 1", ("0.15 0.25 0.75 1", "0.1 0.1 0.1 1", "0.7 0.15 0.15 1")
 _HANG = {
     "lever": (1, 0, 0),
@@ -24,7 +26,8 @@ _HANG = {
 }  # where each sits on the ring
 _DROOP = (0.0, 0.6)  # rad: how far they hang down when the ring falls; a right angle is straight down
 _RING_HEIGHT, _DROP_HEIGHT = 0.07, 0.045  # m
-_TURN = 0.15  # of a whole turn either way, for what is longer than the fingers open: it lies across them
+# How far what is too long for the fingers may be turned from lying across them [rad]; the rest lies as it likes.
+_LARGEST_TURN = {"bottle": 0.5, "chips": 0.4, "pens": 0.4, "sponge": 0.2}
 _GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)  # (P, 3)
 _RING_RADIUS, _WIRE = 0.008, 0.0013  # m
 
@@ -69,8 +72,8 @@ def _keys() -> str:
 def _bottle() -> str:
     """A pill bottle of 0.04 kg, on its side."""
     lying = 'euler="0 1.5708 0"'
-    cap = _geom("cylinder", (0.012, 0.006), 0.005, _WHITE, f'pos="0.029 0 0" {lying}')
-    return _body(_geom("cylinder", (0.014, 0.024), 0.035, "0.95 0.6 0.2 1", lying) + cap)
+    cap = _geom("cylinder", (0.012, 0.006), 0.005, _WHITE, f'pos="0.029 0 0" {lying}', _ROUND)
+    return _body(_geom("cylinder", (0.014, 0.024), 0.035, "0.95 0.6 0.2 1", lying, _ROUND) + cap)
 
 
 def _chips() -> str:
@@ -83,7 +86,7 @@ def _chips() -> str:
 
 def _pens() -> str:
     """Three pens in a rubber band."""
-    pens = [_geom("capsule", (0.0045, 0.055), 0.009, colour, 'euler="0 1.5708 0"') for colour in _PENS]
+    pens = [_geom("capsule", (0.0045, 0.055), 0.009, colour, 'euler="0 1.5708 0"', _ROUND) for colour in _PENS]
     return _body(pens[0] + _hanging("pen_1", "0 0.0095 0.001", pens[1]) + _hanging("pen_2", "0 -0.0095 0.001", pens[2]))
 
 
@@ -96,8 +99,8 @@ def _candies() -> str:
 
 def _cloth() -> str:
     """A crumpled cloth: soft lumps that hang together."""
-    lump = _geom("ellipsoid", (0.018, 0.014, 0.009), 0.006, "0.35 0.5 0.75 1", touch=_SOFT)
-    around = ((0.014, 0.008, 0.004), (-0.014, 0.008, 0.002), (0.012, -0.010, 0.003), (-0.012, -0.010, 0.004))
+    lump = _geom("ellipsoid", (0.014, 0.011, 0.009), 0.006, "0.35 0.5 0.75 1", touch=_SOFT)
+    around = ((0.010, 0.006, 0.004), (-0.010, 0.007, 0.002), (0.009, -0.008, 0.003), (-0.009, -0.007, 0.004))
     return _body(lump + "".join(_hanging(f"fold_{k}", " ".join(map(str, at)), lump) for k, at in enumerate(around)))
 
 
@@ -137,16 +140,22 @@ def drop(env: Any, place: np.ndarray, yaw: float, height: float, rng: np.random.
     Args:
         env: The environment, at the beginning of an episode.
         place: (2,) above which point [m, world].
-        yaw: Turn about the vertical [rad]; what is longer than the fingers open turns less.
+        yaw: Turn about the vertical in [-pi, pi] [rad]; what is longer than the fingers open turns less, in proportion.
         height: Of what they fall on [m, world].
         rng: How far the keys hang is drawn from it.
     """
     hanging = [name for name in _HANG if _has_joint(env.model, name)]
+    yaw *= _LARGEST_TURN.get(_kind(env), np.pi) / np.pi
     env.put(CONTENTS, (*place, height + (_RING_HEIGHT if hanging else _DROP_HEIGHT)), yaw)
     for name in hanging:
         axis, angle = np.cross(_HANG[name], (0, 0, -1)), rng.uniform(*_DROOP)
         address = env.model.joint(name).qposadr[0]
         env.data.qpos[address : address + 4] = (np.cos(angle / 2), *(np.sin(angle / 2) * axis))
+
+
+def _kind(env: Any) -> str:
+    """What is in the bag."""
+    return next(str(prop.material) for prop in env.definition.props if prop.name == CONTENTS)
 
 
 def _has_joint(model: mujoco.MjModel, name: str) -> bool:

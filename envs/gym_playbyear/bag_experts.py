@@ -45,6 +45,10 @@ class BagExpertConfig:
     out: float = 0.055  # the hand above the rim, at the end
 
 
+FOR_TALLER_THINGS = BagExpertConfig(hover=0.045)
+"""For what is higher than a heap of keys: fingers that move to its place pass over it."""
+
+
 class BagExpert:
     """Finds what is in the bag by touch, grasps it and lifts it out.
 

@@ -10,7 +10,7 @@ from gym_playbyear.arena import TABLE, TABLE_TOP
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.bag import BAG_MIDDLE, BOTTOM_THICKNESS, RIM, Torn, bag, set_bottom
 from gym_playbyear.bag_contents import CONTENTS, FRICTION, contents_prop, drop, middle_of
-from gym_playbyear.bag_experts import STRATEGIES, BagExpert, BlindBag
+from gym_playbyear.bag_experts import FOR_TALLER_THINGS, STRATEGIES, BagExpert, BlindBag
 from gym_playbyear.bag_gate import BagGate
 from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.proprioception import SensorNoise
@@ -128,7 +128,7 @@ def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
             Torn(numbers.max_tear),
             Groped(numbers.closings),
         ),
-        expert=BagExpert,
+        expert=BagExpert if contents == "keys" else partial(BagExpert, config=FOR_TALLER_THINGS),
         gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},
         horizon=numbers.horizon,
