@@ -207,15 +207,14 @@ for cube in (-0.25, 0.25):
 _RED, _BLUE = 0, 2
 
 
-def spot_on(picture: np.ndarray, colour: int, before: float | None) -> float | None:
-    """Where the cube (red) or the panel (blue) is, as a share of the screen's width; None while there is none, or it is where
-    it was before."""
+def spot_on(picture: np.ndarray, colour: int, before: np.ndarray | None) -> np.ndarray | None:
+    """Where cube (red) or panel (blue) is (2,), in shares of the screen; None while there is none, or it is where it was."""
     own, others = picture[..., colour].astype(int), np.delete(picture, colour, axis=-1).max(axis=-1)
-    columns = np.flatnonzero((own - others > 80).any(axis=0))
-    if len(columns) < 5:
+    found = np.argwhere(own - others > 80)
+    if len(found) < 25:
         return None
-    place = float(columns.mean() / picture.shape[1])
-    return None if before is not None and abs(place - before) < 0.05 else place
+    place = found.mean(axis=0) / picture.shape[:2]
+    return None if before is not None and np.linalg.norm(place - before) < 0.05 else place
 
 
 @needs_screen

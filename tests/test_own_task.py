@@ -15,6 +15,7 @@ from lerobot.scripts import lerobot_eval
 from lerobot.utils.import_utils import register_third_party_plugins
 
 import gym_playbyear
+from gym_playbyear.materials_v2 import material
 from gym_playbyear.plugins import PluginError
 from gym_playbyear.task_env import TaskEnv
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -23,6 +24,21 @@ from lerobot_playbyear.scripts import record, train
 EXAMPLE = Path(__file__).parent.parent / "examples" / "own_task"
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 ENV = ["--env.type=playbyear", "--env.task=StopAtTheTin-v1", "--env.image_size=16"]
+
+
+_EARS = """
+from gym_playbyear.sound_v2_paths import Microphone
+BASE = Microphone({"table": 0.7, "link1": 1.0}, hum=3.0)
+"""
+
+
+def _install(site: Path, name: str, code: str, entry_points: str) -> None:
+    """Another distribution of one module, as an installer would leave it."""
+    (site / f"{name}.py").write_text(code)
+    info = site / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(entry_points)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -39,7 +55,9 @@ def installed(tmp_path_factory):
     (broken / "entry_points.txt").write_text(
         "[gym_playbyear.tasks]\nBroken-v1 = module_that_is_not_there:task\nno name at all! = json:dumps\n"
         "OccludedGrasp-v1 = json:dumps\n"
+        "[gym_playbyear.materials_v2]\nno_material = json:dumps\n[gym_playbyear.microphones_v2]\nno_microphone = json:dumps\n"
     )
+    _install(folder / "site", "ears", _EARS, "[gym_playbyear.microphones_v2]\nbase = ears:BASE\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder / "site")
         with pytest.warns(UserWarning, match="'no name at all!' is left out"):
@@ -72,6 +90,39 @@ def test_its_expert_solves_it_and_its_material_is_heard():
         assert info["end"] == "success"
         assert loudest > 500
     env.close()
+
+
+def test_a_microphone_of_another_distribution_hears_in_our_tasks():
+    config = PlaybyearEnvConfig(task="OccludedGrasp-v1", microphones=["gripper", "base"])
+    assert config.features["audio.base"].shape == (800,)
+    env = TaskEnv("OccludedGrasp-v1", image_size=8, microphones=("gripper", "base"))
+    observation = env.reset(seed=0)[0]
+    heard = {name: np.abs(observation[f"audio.{name}"].astype(int)).mean() for name in ("gripper", "base")}
+    assert heard["base"] > heard["gripper"] > 0  # its arm hums louder
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"microphones": ("none",)}, r"microphones is \('none',\); name at least one of base, gripper, .*table"),
+        (
+            {"microphones": ("no_microphone",)},
+            r"'no_microphone' of the entry points gym_playbyear\.microphones_v2 is a builtins",
+        ),
+    ],
+)
+def test_a_microphone_that_is_none_says_so(options, message):
+    with pytest.raises(ValueError, match=message):
+        TaskEnv("OccludedGrasp-v1", **options)
+
+
+def test_a_material_that_is_none_says_so():
+    assert len(material("tin_can").frequencies) == 4
+    with pytest.raises(ValueError, match=r"Material 'marble' is not known: choose one of bag, .*tin_can"):
+        material("marble")
+    with pytest.raises(ValueError, match=r"'no_material' of .*materials_v2 is a .*; wanted a .*materials_v2\.Material"):
+        material("no_material")
 
 
 def test_lerobot_records_trains_and_evaluates_it_without_a_change_here(tmp_path):

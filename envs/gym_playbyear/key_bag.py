@@ -128,7 +128,7 @@ def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
             Torn(numbers.max_tear),
             Groped(numbers.closings),
         ),
-        expert=BagExpert if contents == "keys" else partial(BagExpert, config=FOR_TALLER_THINGS),
+        expert=BagExpert if contents in ("keys", "candies") else partial(BagExpert, config=FOR_TALLER_THINGS),
         gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},
         horizon=numbers.horizon,

@@ -7,12 +7,14 @@ A struck body rings in its modes: damped sines (modal synthesis: van den Doel, K
 - Stiffness, density and damping of substances marked with * are table 4 of Wang and James, "KleinPAT" (SIGGRAPH 2019), which
   RealImpact (CVPR 2023) compares its recordings with: a mode of angular frequency w decays with (alpha + beta w^2) / 2. The
   others' are engineering values, their damping is chosen.
-- Sizes, damping by supports, roughness and loudness are chosen; so is all of what is made with `_chosen`.
+- Sizes, damping by supports, roughness and loudness are chosen; so is all of what is made with `chosen`.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+
+from gym_playbyear.plugins import Registry
 
 
 @dataclass(frozen=True)
@@ -95,15 +97,15 @@ def cup(substance: Substance, radius: float, thickness: float, waves: tuple[int,
     return tuple(float(f) for f in shape * thickness * substance.wave_speed / (2 * np.pi * np.sqrt(12) * radius**2))
 
 
-def _ringing(substance: Substance, frequencies: tuple[float, ...], support: float, **more: float) -> Material:
-    """A real shape. `support`: decay that holding or lying on something adds [1/s]."""
+def ringing(substance: Substance, frequencies: tuple[float, ...], support: float, **more: float) -> Material:
+    """A real shape. `support`: decay that holding or lying on something adds [1/s]; `more` of `Material`."""
     w = 2.0 * np.pi * np.array(frequencies)
     decays = 0.5 * (substance.alpha + substance.beta * w**2) + support
     return Material(substance, frequencies, tuple(float(d) for d in decays), **more)
 
 
-def _chosen(substance: Substance, frequencies: tuple[float, ...], decay: float, **more: float) -> Material:
-    """Something without a pitch: modes where it is loud, all with the same short decay [1/s]."""
+def chosen(substance: Substance, frequencies: tuple[float, ...], decay: float, **more: float) -> Material:
+    """Something without a pitch: modes where it is loud, all with the same short decay [1/s]; `more` of `Material`."""
     return Material(substance, frequencies, (decay,) * len(frequencies), **more)
 
 
@@ -115,45 +117,48 @@ _KEYS = bar(BRASS, 55 * _MM, 2 * _MM / 12**0.5, 2) + bar(BRASS, 45 * _MM, 2.2 * 
 
 MATERIALS: dict[str, Material] = {
     # Steel fingers, 10 x 20 mm, 75 mm with their carriage, in a hand with a cover of 200 x 63 x 4 mm aluminium.
-    "gripper": _ringing(STEEL, _FINGER + plate(ALUMINIUM, (0.2, 0.063), 4 * _MM, "11 21"), 60, roughness=6e-5),
+    "gripper": ringing(STEEL, _FINGER + plate(ALUMINIUM, (0.2, 0.063), 4 * _MM, "11 21"), 60, roughness=6e-5),
     # Hollow box of hard plastic, walls of 40 x 40 x 1.5 mm.
-    "cube": _ringing(PLASTIC, plate(PLASTIC, (0.04, 0.04), 1.5 * _MM, "11 12 22 13 23"), 30, roughness=1.2e-4),
+    "cube": ringing(PLASTIC, plate(PLASTIC, (0.04, 0.04), 1.5 * _MM, "11 12 22 13 23"), 30, roughness=1.2e-4),
     # Steel sheet, 800 x 600 x 3 mm: some of its many modes, spread over what is heard.
-    "wall": _ringing(STEEL, plate(STEEL, (0.8, 0.6), 3 * _MM, "22 42 44 65 97 b9 db"), 25, roughness=8e-5),
+    "wall": ringing(STEEL, plate(STEEL, (0.8, 0.6), 3 * _MM, "22 42 44 65 97 b9 db"), 25, roughness=8e-5),
     # Wood, 800 x 800 x 40 mm.
-    "table": _ringing(WOOD, plate(WOOD, (0.8, 0.8), 40 * _MM, "11 12 22 13 23 24"), 60, roughness=2.5e-4),
+    "table": ringing(WOOD, plate(WOOD, (0.8, 0.8), 40 * _MM, "11 12 22 13 23 24"), 60, roughness=2.5e-4),
     # Plastic tray, 80 x 80 x 2 mm.
-    "tray": _ringing(PLASTIC, plate(PLASTIC, (0.08, 0.08), 2 * _MM, "11 12 22 13 23 33"), 25, roughness=1.5e-4),
+    "tray": ringing(PLASTIC, plate(PLASTIC, (0.08, 0.08), 2 * _MM, "11 12 22 13 23 33"), 25, roughness=1.5e-4),
     # What the cube can be made of instead: a tumbler, a can, a box, a block.
-    "glass": _ringing(GLASS, cup(GLASS, 35 * _MM, 1.5 * _MM, (2, 3, 4, 5)), 12, roughness=5e-5),
-    "tin": _ringing(TINPLATE, cup(TINPLATE, 35 * _MM, 0.25 * _MM, (4, 6, 8, 9, 10)), 15, roughness=8e-5),
-    "cardboard": _ringing(CARDBOARD, plate(CARDBOARD, (0.04, 0.04), 0.8 * _MM, "11 12 22 13"), 30, loudness=0.5),
-    "rubber": _chosen(RUBBER, (90.0, 150.0, 260.0), 200, loudness=0.5, roughness=4e-4),
+    "glass": ringing(GLASS, cup(GLASS, 35 * _MM, 1.5 * _MM, (2, 3, 4, 5)), 12, roughness=5e-5),
+    "tin": ringing(TINPLATE, cup(TINPLATE, 35 * _MM, 0.25 * _MM, (4, 6, 8, 9, 10)), 15, roughness=8e-5),
+    "cardboard": ringing(CARDBOARD, plate(CARDBOARD, (0.04, 0.04), 0.8 * _MM, "11 12 22 13"), 30, loudness=0.5),
+    "rubber": chosen(RUBBER, (90.0, 150.0, 260.0), 200, loudness=0.5, roughness=4e-4),
     # Screws of 5 x 80 and 5 x 60 mm; three keys of 2 mm brass on a steel ring of 30 mm.
-    "screws": _ringing(STEEL, bar(STEEL, 80 * _MM, 1.25 * _MM, 2) + bar(STEEL, 60 * _MM, 1.25 * _MM, 1), 60, roughness=2e-4),
-    "keys": _ringing(BRASS, _KEYS + cup(STEEL, 15 * _MM, 3**0.5 * _MM, (2,)), 40, roughness=8e-5),
+    "screws": ringing(STEEL, bar(STEEL, 80 * _MM, 1.25 * _MM, 2) + bar(STEEL, 60 * _MM, 1.25 * _MM, 1), 60, roughness=2e-4),
+    "keys": ringing(BRASS, _KEYS + cup(STEEL, 15 * _MM, 3**0.5 * _MM, (2,)), 40, roughness=8e-5),
     # Pill bottle of 40 x 1.2 mm, pens (tubes of 8 and 6 mm, 140 mm long), wrapped sweets.
-    "bottle": _ringing(PLASTIC, cup(PLASTIC, 20 * _MM, 1.2 * _MM, (2, 3, 4, 5)), 40, roughness=1e-4),
-    "pens": _ringing(POLYCARBONATE, bar(POLYCARBONATE, 140 * _MM, 2.5 * _MM, 4), 40, loudness=0.8, roughness=1e-4),
-    "candies": _chosen(PLASTIC, (1900.0, 2750.0, 3600.0, 5200.0), 350, loudness=0.6, roughness=1.5e-4, crackle=25),
+    "bottle": ringing(PLASTIC, cup(PLASTIC, 20 * _MM, 1.2 * _MM, (2, 3, 4, 5)), 40, roughness=1e-4),
+    "pens": ringing(POLYCARBONATE, bar(POLYCARBONATE, 140 * _MM, 2.5 * _MM, 4), 40, loudness=0.8, roughness=1e-4),
+    "candies": chosen(PLASTIC, (1900.0, 2750.0, 3600.0, 5200.0), 350, loudness=0.6, roughness=1.5e-4, crackle=25),
     # Packing peanuts: light foam, almost without a sound of its own.
-    "peanuts": _chosen(FOAM, (350.0, 620.0, 1100.0), 400, loudness=0.12, roughness=6e-4),
+    "peanuts": chosen(FOAM, (350.0, 620.0, 1100.0), 400, loudness=0.12, roughness=6e-4),
     # Bags that crackle.
-    "pouch": _chosen(FILM, (500.0, 900.0, 1600.0, 2600.0), 500, loudness=0.25, roughness=3e-4, crackle=15),
-    "bag": _chosen(FILM, (800.0, 1500.0, 2600.0, 4300.0, 6900.0), 700, loudness=0.4, roughness=2.5e-4, crackle=40),
-    "chips": _chosen(FILM, (1100.0, 2000.0, 3300.0, 5400.0), 600, loudness=0.5, roughness=2e-4, crackle=60),
+    "pouch": chosen(FILM, (500.0, 900.0, 1600.0, 2600.0), 500, loudness=0.25, roughness=3e-4, crackle=15),
+    "bag": chosen(FILM, (800.0, 1500.0, 2600.0, 4300.0, 6900.0), 700, loudness=0.4, roughness=2.5e-4, crackle=40),
+    "chips": chosen(FILM, (1100.0, 2000.0, 3300.0, 5400.0), 600, loudness=0.5, roughness=2e-4, crackle=60),
     # Nearly mute.
-    "cloth": _chosen(CLOTH, (150.0, 300.0, 600.0), 500, loudness=0.05, roughness=8e-4),
-    "sponge": _chosen(CLOTH, (120.0, 220.0, 400.0), 500, loudness=0.05, roughness=1e-3),
+    "cloth": chosen(CLOTH, (150.0, 300.0, 600.0), 500, loudness=0.05, roughness=8e-4),
+    "sponge": chosen(CLOTH, (120.0, 220.0, 400.0), 500, loudness=0.05, roughness=1e-3),
 }  # fmt: skip
+
+
+ALL_MATERIALS = Registry("materials_v2", MATERIALS)
+"""Ours, and those of other distributions (`gym_playbyear.plugins`)."""
 
 
 def material(name: str) -> Material:
     """The material of that name.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is none, or another distribution's is no `Material`.
+        PluginError: Another distribution's cannot be loaded.
     """
-    if name not in MATERIALS:
-        raise ValueError(f"Material '{name}' is not known: choose one of {', '.join(sorted(MATERIALS))}.")
-    return MATERIALS[name]
+    return ALL_MATERIALS.checked(name, Material)

@@ -14,7 +14,8 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 GROUP = "gym_playbyear"
-KINDS = ("tasks", "arms", "props", "materials", "microphones")
+KINDS = ("tasks", "arms", "props", "materials_v2", "microphones_v2", "materials", "microphones")
+"""Those with `_v2` are for tasks with `sound=SyntheticEars`, the other two for the sound of contact forces alone."""
 
 
 class PluginError(RuntimeError):
@@ -61,6 +62,24 @@ class Registry(Mapping[str, Any]):
                 f"{name!r} of {owner} ({self.kind}, {point.value}) cannot be loaded: {type(error).__name__}: {error}. "
                 "Mend or uninstall that distribution, or choose another."
             ) from error
+
+    def checked[T](self, name: str, kind: type[T]) -> T:
+        """What has this name, of the class that it must have.
+
+        Raises:
+            ValueError: Nothing has this name, or it is of another class; the message says what to do.
+            PluginError: Another distribution's cannot be loaded.
+        """
+        if name not in self:
+            noun = self.kind.removesuffix("_v2").removesuffix("s").capitalize()
+            raise ValueError(f"{noun} '{name}' is not known: choose one of {', '.join(sorted(self))}.")
+        found = self[name]
+        if not isinstance(found, kind):
+            raise ValueError(
+                f"{name!r} of the entry points {GROUP}.{self.kind} is a {type(found).__module__}.{type(found).__qualname__}; "
+                f"wanted a {kind.__module__}.{kind.__qualname__}."
+            )
+        return found
 
     def _others(self) -> dict[str, EntryPoint]:
         # Asked for anew each time: a distribution may be installed while a notebook runs.

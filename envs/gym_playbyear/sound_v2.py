@@ -22,7 +22,7 @@ from gym_playbyear.sound_v2_crackle import Bending, Crackle
 from gym_playbyear.sound_v2_draws import draw
 from gym_playbyear.sound_v2_friction import Friction
 from gym_playbyear.sound_v2_modes import Arrivals, ModeBank
-from gym_playbyear.sound_v2_paths import MICROPHONES, Paths
+from gym_playbyear.sound_v2_paths import ALL_MICROPHONES, MICROPHONES, Microphone, Paths
 
 __all__ = ["MICROPHONES", "Bending", "ContactSynth"]
 
@@ -36,7 +36,7 @@ class ContactSynth:
 
     Args:
         pairs: Contacts that can be heard, in the order of the columns of `Contacts`.
-        microphones: Names in `MICROPHONES`.
+        microphones: Names in `ALL_MICROPHONES`: ours, and those of other distributions.
         sample_rate: Samples per second, at least 8,000, and a multiple of `control_hz`.
         control_hz: Control steps per second.
         physics_dt: Duration of a physics step [s]; a control step holds a whole number of them.
@@ -57,8 +57,9 @@ class ContactSynth:
         noise_level: float = 1.0,
         randomise: bool = True,
     ) -> None:
-        if not microphones or len(set(microphones)) != len(microphones) or not set(microphones) <= set(MICROPHONES):
-            known = ", ".join(sorted(MICROPHONES))
+        unknown = [name for name in microphones if name not in ALL_MICROPHONES]
+        if not microphones or len(set(microphones)) != len(microphones) or unknown:
+            known = ", ".join(sorted(ALL_MICROPHONES))
             raise ValueError(f"microphones is {tuple(microphones)}; name at least one of {known}, each only once.")
         if not 0.0 <= noise_level < np.inf:
             raise ValueError(f"noise_level is {noise_level}; it must be 0 (silent background) or greater.")
@@ -67,7 +68,7 @@ class ContactSynth:
         self.samples_per_step = samples_per_step(sample_rate, control_hz)
         self.n_substeps = physics_steps(control_hz, physics_dt)
         self.noise_level, self.randomise = float(noise_level), randomise
-        self._fixtures = [MICROPHONES[name] for name in microphones]
+        self._fixtures = [ALL_MICROPHONES.checked(name, Microphone) for name in microphones]
         self._hum_levels = np.array([[m.hum] for m in self._fixtures])
         self._drive_levels = np.array([[m.drive] for m in self._fixtures])
         self._crackle = Crackle(pairs, physics_dt)

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from gym_playbyear.plugins import Registry
+
 _HALVED_AT = 0.1  # m through structure at which a sound has half its amplitude
 _PASSED_ON = 0.5  # what a firm contact lets through
 _FIRM = 0.5  # N: a contact that presses so hard lets half of that through
@@ -51,6 +53,10 @@ MICROPHONES: dict[str, Microphone] = {
     # Touches nothing, and is amplified.
     "room": Microphone(hum=0.2, drive=0.1, air=10.0),
 }
+
+
+ALL_MICROPHONES = Registry("microphones_v2", MICROPHONES)
+"""Ours, and those of other distributions (`gym_playbyear.plugins`)."""
 
 
 class Paths:

@@ -11,15 +11,15 @@ import numpy as np
 
 from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP, WALL_COLOUR, box
 from gym_playbyear.arm import ACTION_SCALE, ArmConfig
-from gym_playbyear.materials import Material
+from gym_playbyear.ears_v2 import SyntheticEars
+from gym_playbyear.materials_v2 import TINPLATE, cup, ringing
 from gym_playbyear.rules import Shoved, Solved
 from gym_playbyear.task import Prop, Task
 
-TIN_CAN = Material((930.0, 1480.0, 2210.0, 3050.0), (35.0, 45.0, 60.0, 80.0), (1.0, 0.8, 0.7, 0.4))
 RADIUS, HALF_HEIGHT = 0.025, 0.025  # m
+TIN_CAN = ringing(TINPLATE, cup(TINPLATE, RADIUS, 0.0003, (2, 3, 4, 5)), support=30.0)
 RANGE = (-0.1, 0.25)  # m: where along the wall it may stand
-SWEEP_HEIGHT = 0.03  # m
-NEAR = 0.01  # m
+SWEEP_HEIGHT, NEAR = 0.03, 0.01  # m
 TIN = Prop(
     "tin",
     f"""<body name="tin"><freejoint name="tin"/>
@@ -44,6 +44,7 @@ def stop_at_the_tin() -> Task:
         expert=Expert,
         horizon=200,
         start=(0.0, -0.25, 0.9),
+        sound=SyntheticEars,
     )
 
 
@@ -55,8 +56,7 @@ def place(env, options) -> dict:
 
 def gap(env) -> float:
     """Between finger and tin [m]."""
-    reach = env.definition.arm.max_opening / 2 + 0.01 + RADIUS
-    return float(env.tin_position[1] - env.eef_position[1] - reach)
+    return float(env.tin_position[1] - env.eef_position[1]) - env.definition.arm.max_opening / 2 - 0.01 - RADIUS
 
 
 def is_near(env) -> bool:
