@@ -19,7 +19,7 @@ from lerobot_playbyear.film.video import amplify, compose, episode_sound, write_
 
 _SIZE = 360  # pixels of a view's side
 _FINER = 2  # the people's view is drawn so many times larger, so that its edges become smooth
-_QUALITY = {"crf": "27", "preset": "slow"}
+_QUALITY = {"crf": "31", "preset": "slow"}
 _STILL = 300  # pixels
 
 

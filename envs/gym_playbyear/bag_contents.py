@@ -77,11 +77,14 @@ def _bottle() -> str:
 
 
 def _chips() -> str:
-    """A small bag of chips, thick in the middle."""
-    return _body(
-        _geom("box", (0.022, 0.014, 0.010), 0.014, "0.85 0.2 0.15 1")
-        + _geom("box", (0.032, 0.016, 0.004), 0.008, "0.95 0.75 0.2 1")
-    )
+    """A small bag of chips, thick in the middle, whose halves give way to each other."""
+
+    def half(side: int) -> str:
+        thick = _geom("box", (0.022, 0.007, 0.010), 0.007, "0.85 0.2 0.15 1", f'pos="0 {side * 0.007} 0"')
+        return thick + _geom("box", (0.032, 0.008, 0.004), 0.004, "0.95 0.75 0.2 1", f'pos="0 {side * 0.008} 0"')
+
+    hinge = '<joint name="fold" axis="1 0 0" stiffness="0.15" damping="0.002" range="-0.5 0.5"/>'
+    return _body(half(1) + _body(half(-1), "other_half", joint=hinge))
 
 
 def _pens() -> str:
@@ -119,6 +122,11 @@ _MADE = {
     "sponge": _sponge,
 }
 CONTENTS_KINDS = tuple(_MADE)
+# What crackles when it bends: the packet, and sweets in their wrappers. Joints, and factors on their speed.
+_BENDS = {
+    "chips": (("fold", 1.0),),
+    "candies": tuple((f"sweet_{k}", 0.5) for k in range(4)),
+}
 _LOUDNESS = {"cloth": 0.05, "sponge": 0.05}  # of 1: nearly mute
 
 
@@ -131,7 +139,9 @@ def contents_prop(kind: str) -> Prop:
     check_option("contents", kind, CONTENTS_KINDS)
     spec = _MADE[kind]()
     has_parts = spec.count("<body") > 1
-    return Prop(CONTENTS, spec, kind, _LOUDNESS.get(kind, 1.0), loose=True, hidden=True, jingles=has_parts)
+    return Prop(
+        CONTENTS, spec, kind, _LOUDNESS.get(kind, 1.0), True, True, jingles=has_parts, bends=_BENDS.get(kind, ())
+    )
 
 
 def drop(env: Any, place: np.ndarray, yaw: float, height: float, rng: np.random.Generator) -> None:
