@@ -67,6 +67,22 @@ def test_the_expert_takes_the_keys_out(task):
         assert middle_of(env)[2] > RIM
 
 
+@pytest.mark.parametrize("kind", [kind for kind in CONTENTS_KINDS if kind != "keys"])
+def test_the_expert_takes_other_things_out(kind):
+    env = make(EASY, sound="none", contents=kind)
+    assert play(env, 2001)[0]["end"] == "success"
+    assert middle_of(env)[2] > RIM
+
+
+def test_what_is_too_long_for_the_fingers_lies_across_them():
+    env = make(EASY, sound="none", contents="pens")
+    extents = []
+    for seed in range(6):
+        env.begin_episode(seed=seed)
+        extents.append(np.ptp(points_of(env)[:, :2], axis=0))
+    assert (np.array(extents)[:, 0] > np.array(extents)[:, 1]).all()  # fingers open along y
+
+
 def test_what_ends_an_attempt():
     env = make(EASY, sound="none")
     for expected, options, actions in (
