@@ -207,14 +207,14 @@ for cube in (-0.25, 0.25):
 _RED, _BLUE = 0, 2
 
 
-def spot_on(picture: np.ndarray, colour: int, before: np.ndarray | None) -> np.ndarray | None:
-    """Where cube (red) or panel (blue) is (2,), in shares of the screen; None while there is none, or it is where it was."""
+def spot_on(picture: np.ndarray, colour: int, before: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Row and column of the cube (red) or panel (blue), in shares of the screen; None: there is none, or it is where it was."""
     own, others = picture[..., colour].astype(int), np.delete(picture, colour, axis=-1).max(axis=-1)
     found = np.argwhere(own - others > 80)
     if len(found) < 25:
         return None
-    place = found.mean(axis=0) / picture.shape[:2]
-    return None if before is not None and np.linalg.norm(place - before) < 0.05 else place
+    row, column = found.mean(axis=0) / picture.shape[:2]
+    return None if before is not None and np.hypot(row - before[0], column - before[1]) < 0.05 else (row, column)
 
 
 @needs_screen
