@@ -86,7 +86,8 @@ class Prop:
         spec: That body as MJCF, `<body name=...>...</body>` or a whole `<mujoco>`, or as an `MjSpec` (kept as MJCF, so that
             tasks can be copied). Angles are in radians unless the `<mujoco>` says otherwise. Geoms that leave `contype` and
             `conaffinity` alone touch what a thing of this kind touches; zero for both means that one only sees them.
-        material: Name in `materials_v2.ALL_MATERIALS`, or `materials.ALL_MATERIALS` for `contact_sound`. None: its contacts make no sound and are not measured.
+        material: Name in `materials_v2.ALL_MATERIALS`, or `materials.ALL_MATERIALS` for `contact_sound`. None: its
+            contacts make no sound and are not measured.
         loudness: Factor on its own share of a contact's sound.
         loose: It moves freely, by a free joint that has the prop's name, and may touch whatever is there.
         hidden: What no camera sees and hearing has to find. With `hidden_object=False` the hand passes through it.
