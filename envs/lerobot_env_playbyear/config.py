@@ -199,7 +199,9 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("spectrogram", "install lerobot_policy_playbyear, which makes the pictures") from error
         rates = dict.fromkeys(self.microphones or [], self.sample_rate)
         try:
-            return pictures_for(self.spectrogram, rates, self.fps, [camera.name for camera in self._definition().cameras])
+            return pictures_for(
+                self.spectrogram, rates, self.fps, [camera.name for camera in self._definition().cameras]
+            )
         except InputError as error:
             raise self._error("spectrogram", str(error).rstrip(".")) from error
 

@@ -116,7 +116,9 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
             f"{how.feature}: the last {how.seconds:.2f} s of '{how.microphone}', {how.width} x {how.height}, "
             f"{how.low_db:g} to {how.high_db:g} dB"
         )
-    print(f"\nDataset: {target} ({dataset.num_episodes} episodes). To roll out what it taught: --env.spectrogram={target}")
+    print(
+        f"\nDataset: {target} ({dataset.num_episodes} episodes). To roll out what it taught: --env.spectrogram={target}"
+    )
     return target
 
 
@@ -151,8 +153,8 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: "LeRobotDataset | LongDataset")
             )
         if columns > rates[key] // fps:
             raise AttachSpectrogramError(
-                f"--seconds={cfg.seconds:g}: a frame of '{key}' has {rates[key] // fps} samples, and would have {columns} columns. "
-                "Give more seconds, or a smaller --width."
+                f"--seconds={cfg.seconds:g}: a frame of '{key}' has {rates[key] // fps} samples and would have {columns} "
+                "columns. Give more seconds, or a smaller --width."
             )
         plans.append(PicturePlan(key, feature, rates[key], height, width, columns))
     return plans

@@ -37,7 +37,7 @@ def fit_levels(
     """
     how = SoundPicture(
         plan.microphone, plan.feature, plan.sample_rate, int(dataset.fps), plan.height, plan.width, plan.columns_per_frame,
-        FLOOR_DB, _LOUDEST_DB, average=(0,) * plan.height,
+        FLOOR_DB, _LOUDEST_DB, before_episode=(0,) * plan.height,
     )  # fmt: skip
     edges = np.arange(FLOOR_DB, _LOUDEST_DB + _STEP_DB / 2, _STEP_DB)
     counts = np.zeros((plan.height, len(edges) - 1), np.int64)
@@ -64,12 +64,12 @@ def fit_levels(
         raise AttachSpectrogramError(
             f"--low_db={low:g} and --high_db={high:g}: wanted {FLOOR_DB:g} or more, and the second above the first."
         )
-    middle = edges[:-1] + _STEP_DB / 2
-    mean = (counts @ middle) / np.maximum(counts.sum(axis=1), 1)  # (height,)
-    average = np.rint(255 * np.clip((mean - low) / (high - low), 0, 1)).astype(int)
+    halves = counts.sum(axis=1, keepdims=True) / 2
+    median = edges[(np.cumsum(counts, axis=1) < halves).sum(axis=1)]  # (height,)
+    usual = np.rint(255 * np.clip((median - low) / (high - low), 0, 1)).astype(int)
     return SoundPicture(
         plan.microphone, plan.feature, plan.sample_rate, int(dataset.fps), plan.height, plan.width, plan.columns_per_frame,
-        low, high, tuple(average.tolist()),
+        low, high, tuple(usual.tolist()),
     )  # fmt: skip
 
 
@@ -151,7 +151,9 @@ def _contexts(dataset: LeRobotDataset | LongDataset, how: SoundPicture) -> Itera
         n_heard = 0
         for first in range(start, end, _FRAMES_AT_ONCE):
             rows = read_rows(dataset, how.microphone, first, min(_FRAMES_AT_ONCE, end - first))
-            wave = np.concatenate([np.zeros(how.context - len(tail), rows.dtype), tail.astype(rows.dtype), rows.reshape(-1)])
+            wave = np.concatenate(
+                [np.zeros(how.context - len(tail), rows.dtype), tail.astype(rows.dtype), rows.reshape(-1)]
+            )
             for frame in range(len(rows)):
                 n_heard += how.samples_per_frame
                 stop = how.context + (frame + 1) * how.samples_per_frame

@@ -34,7 +34,7 @@ class ImageColumn:
         self.rows_at_once = pictures.rows_at_once
 
     def columns(self, runs: Sequence[tuple[int, int, int]], schema: pa.Schema) -> list[pa.Array]:
-        """The pictures of some frames: of an episode, from one frame to before another. Raises as `EpisodePictures.pictures`."""
+        """The pictures of some frames: of an episode, from one frame to before another. Raises as `pictures` of them."""
         values = [{"bytes": _png(one), "path": None} for run in runs for one in self._pictures.pictures(*run)]
         return [pa.array(values, schema.field(self.keys[0]).type)]
 

@@ -50,8 +50,8 @@ class SoundPicture:
         width: Columns [pixels].
         columns_per_frame: By how many the picture moves to the left from one frame to the next.
         low_db, high_db: Levels that are black and white [dB; a sine at full scale has 0 in its bin].
-        average: What stands for the time before the episode: each band's average in the dataset, (height,) of 0 to 255, the
-            lowest frequency first. Silence would tell a policy how long ago the episode began.
+        before_episode: What stands for the time before the episode: each band's median in the dataset, (height,) of 0 to 255,
+            the lowest frequency first. Silence would tell a policy loudly how long ago the episode began.
         layout: Of what is computed.
 
     Raises:
@@ -67,7 +67,7 @@ class SoundPicture:
     columns_per_frame: int
     low_db: float
     high_db: float
-    average: tuple[int, ...]
+    before_episode: tuple[int, ...]
     layout: int = _LAYOUT
 
     def __post_init__(self) -> None:
@@ -87,9 +87,9 @@ class SoundPicture:
             raise self._error("columns_per_frame", "at most as many as a frame has samples, which is sample_rate / fps")
         if not FLOOR_DB <= self.low_db < self.high_db:
             raise self._error("low_db", f"at least {FLOOR_DB:g}, and below high_db={self.high_db}")
-        object.__setattr__(self, "average", tuple(self.average))
-        if len(self.average) != self.height or not all(0 <= level <= 255 for level in self.average):
-            raise self._error("average", f"{self.height} numbers of 0 to 255")
+        object.__setattr__(self, "before_episode", tuple(self.before_episode))
+        if len(self.before_episode) != self.height or not all(0 <= level <= 255 for level in self.before_episode):
+            raise self._error("before_episode", f"{self.height} numbers of 0 to 255")
 
     @property
     def name(self) -> str:
@@ -144,15 +144,15 @@ class SoundPicture:
 
         Args:
             sound: As for `levels`.
-            n_heard: How many of these samples, the last ones, belong to the episode. A column of which a sample does not is
-                the average.
+            n_heard: How many of these samples, the last ones, belong to the episode. A column of which a sample does not
+                is what stands before the episode.
 
         Returns:
             (columns_per_frame, height) uint8, the lowest frequency first.
         """
         share = (self.levels(sound) - self.low_db) / (self.high_db - self.low_db)
         pixels = np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
-        return np.where(self.begun(n_heard)[:, None], pixels, np.array(self.average, np.uint8))
+        return np.where(self.begun(n_heard)[:, None], pixels, np.array(self.before_episode, np.uint8))
 
     def begun(self, n_heard: int) -> np.ndarray:
         """Which of a frame's columns hear nothing but the episode, (columns_per_frame,) bool. `n_heard` as for `columns`."""
@@ -168,13 +168,13 @@ class SoundPicture:
             (height, width, 3) uint8.
         """
         columns = columns[-self.width :]
-        before = np.broadcast_to(np.array(self.average, np.uint8), (self.width - len(columns), self.height))
+        before = np.broadcast_to(np.array(self.before_episode, np.uint8), (self.width - len(columns), self.height))
         grey = np.concatenate([before, columns]).T[::-1]  # (height, width), low frequencies at the bottom
         return np.repeat(grey[:, :, None], 3, axis=2)
 
     def as_info(self) -> dict[str, Any]:
         """As it stands in the feature's `info`."""
-        return {INFO_KEY: {**asdict(self), "average": list(self.average)}}
+        return {INFO_KEY: {**asdict(self), "before_episode": list(self.before_episode)}}
 
     @cached_property
     def _ends(self) -> list[int]:
@@ -242,7 +242,9 @@ def pictures_of(features: Mapping[str, Mapping[str, Any]]) -> list[SoundPicture]
         if said is None:
             continue
         if not isinstance(said, dict) or set(said) != names:
-            raise InputError(f"'{key}': {INFO_KEY} in its info is {said!r}; wanted the fields {', '.join(sorted(names))}.")
+            raise InputError(
+                f"'{key}': {INFO_KEY} in its info is {said!r}; wanted the fields {', '.join(sorted(names))}."
+            )
         try:
             found.append(SoundPicture(**said))
         except TypeError as error:
@@ -271,7 +273,9 @@ def read_pictures(path: str | Path) -> list[SoundPicture]:
             f"{file} cannot be read ({error}); wanted a dataset's folder or its {INFO_PATH}, from playbyear-attach-spectrogram"
         ) from error
     if not pictures:
-        raise InputError(f"{file} names no pictures of sound; make a dataset that has some: playbyear-attach-spectrogram")
+        raise InputError(
+            f"{file} names no pictures of sound; make a dataset that has some: playbyear-attach-spectrogram"
+        )
     return pictures
 
 

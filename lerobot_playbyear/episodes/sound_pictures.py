@@ -32,7 +32,9 @@ class HeardSound:
 
     def __init__(self, picture: SoundPicture) -> None:
         self._how = picture
-        self._frames: deque[np.ndarray] = deque(maxlen=picture.n_frames + 1)  # one more than is seen: see `forget_newest`
+        self._frames: deque[np.ndarray] = deque(
+            maxlen=picture.n_frames + 1
+        )  # one more than is seen: see `forget_newest`
         n_blocks = -(-picture.context // picture.samples_per_frame)
         self._blocks: deque[np.ndarray] = deque(maxlen=n_blocks + 1)
 
@@ -121,7 +123,9 @@ def with_sound_pictures(make: Callable[[], gym.Env], pictures: Sequence[SoundPic
     return partial(_make, make, tuple(pictures)) if pictures else make
 
 
-def pictures_for(path: str | Path, sample_rates: Mapping[str, int], fps: int, cameras: Sequence[str]) -> list[SoundPicture]:
+def pictures_for(
+    path: str | Path, sample_rates: Mapping[str, int], fps: int, cameras: Sequence[str]
+) -> list[SoundPicture]:
     """The pictures of a dataset, for an environment.
 
     Args:
@@ -144,7 +148,9 @@ def pictures_for(path: str | Path, sample_rates: Mapping[str, int], fps: int, ca
             ("fps", fps, how.fps),
         ):
             if seen != wanted:
-                raise InputError(f"{path} has pictures of '{microphone}' for {name}={wanted}; the environment has {seen}")
+                raise InputError(
+                    f"{path} has pictures of '{microphone}' for {name}={wanted}; the environment has {seen}"
+                )
         if how.name in cameras:
             raise InputError(
                 f"{path} has pictures of '{microphone}' that are called '{how.name}', as a camera of the environment is; "
