@@ -17,7 +17,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.attached_sound import EpisodesSound
-from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature
+from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature, audio_keys
 from lerobot_playbyear.datasets.audio_layout import AUDIO_FOLDER
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.parquet_files import (
@@ -138,7 +138,7 @@ def write_changed(root: Path, target: Path, change: DatasetChange) -> None:
         elif name != Path(INFO_PATH):
             shutil.copyfile(path, target / name)
     known = {key: stats for key, stats in (load_stats(root) or {}).items() if key not in change.removed}
-    write_stats({**known, **add_stats(None, change.stats, change.added)}, target)
+    write_stats({**known, **add_stats(None, change.stats, audio_keys(change.added))}, target)
     info = {**info, "features": features, **change.info}
     kept = {name: value for name, value in info.items() if name not in change.info or value is not None}
     (target / INFO_PATH).write_text(json.dumps(kept, indent=4, ensure_ascii=False), encoding="utf-8")
