@@ -1,6 +1,7 @@
 """Pictures of sound: what they show, that nothing of the future is in them, and that rollouts show what datasets hold."""
 
 import itertools
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,10 @@ from draccus.utils import DecodingError
 from lerobot.datasets import LeRobotDataset
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
-from lerobot.scripts import lerobot_edit_dataset
+from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_edit_dataset, lerobot_eval, lerobot_train
+from robot_factory import joint_config, noise_file, robot_env
+from test_peers import needs
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets import picture_storage
@@ -384,3 +388,90 @@ def test_an_environment_of_ones_own_is_wrapped():
         assert all(env.observation_space.contains(observation) for observation in observations)
         pictures = np.stack([observation["pixels"]["gripper"] for observation in observations])
         np.testing.assert_array_equal(pictures, watch(noise(9, seed)))
+
+
+def test_a_robot_shows_them_too_also_after_a_person_took_over(tmp_path):
+    info = tmp_path / "info.json"
+    info.write_text(json.dumps({"features": {PICTURE: {"info": HOW.as_info()}}}))
+    with robot_env(joint_config(noise_file(tmp_path, 16000), spectrogram=str(info))) as env:
+        for _ in range(2):
+            observation, _ = env.reset(seed=0)
+            blocks, seen = [observation["audio.gripper"]], [observation["pixels"]["gripper"]]
+            for tick in range(6):
+                if tick == 3:
+                    env.hold()
+                    env.go_on()  # what the last frame saw and heard is replaced
+                    blocks[-1], seen[-1] = observation["audio.gripper"], observation["pixels"]["gripper"]
+                observation, *_ = env.step(np.zeros(3, np.float32))
+                assert env.observation_space.contains(observation)
+                blocks.append(observation["audio.gripper"])
+                seen.append(observation["pixels"]["gripper"])
+            np.testing.assert_array_equal(seen, watch(np.stack(blocks)))
+    with pytest.raises(DecodingError, match="the environment has none"):
+        joint_config(spectrogram=str(info))
+
+
+# LeRobot's policies
+
+SMALL = {
+    "act": (
+        "dim_model=32 n_heads=2 dim_feedforward=32 n_encoder_layers=1 n_vae_encoder_layers=1 latent_dim=4 chunk_size=5 "
+        "n_action_steps=1"
+    ),
+    "diffusion": (
+        "horizon=8 n_action_steps=1 down_dims=[16,32] n_groups=4 use_group_norm=true diffusion_step_embed_dim=16 "
+        "num_train_timesteps=4 spatial_softmax_num_keypoints=8"
+    ),
+}
+
+
+def call(command, *arguments: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [command.__name__, *arguments])
+        command.main()
+
+
+@pytest.mark.parametrize(
+    "name", ["act", pytest.param("diffusion", marks=[needs("diffusers", "diffusion"), pytest.mark.slow])]
+)
+def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path, one_thread):
+    call(
+        lerobot_train,
+        f"--policy.type={name}",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--policy.pretrained_backbone_weights=null",
+        *(f"--policy.{option}" for option in SMALL[name].split()),
+        "--dataset.repo_id=t/seen",
+        f"--dataset.root={recorded}",
+        "--dataset.video_backend=pyav",
+        "--num_workers=0",
+        "--batch_size=2",
+        "--steps=2",
+        f"--output_dir={tmp_path / 'train'}",
+    )
+    checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
+    call(
+        lerobot_eval,
+        f"--policy.path={checkpoint}",
+        "--env.type=playbyear",
+        "--env.task=OccludedGrasp-v1",
+        f"--env.spectrogram={recorded}",
+        "--env.episode_length=3",
+        "--env.visualization_width=64",
+        "--env.visualization_height=64",
+        "--eval.n_episodes=4",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 4
+    policy = get_policy_class(name).from_pretrained(checkpoint).eval()
+    item = load(recorded)[45]
+    actions = []
+    for shown in (item[PICTURE], 1 - item[PICTURE]):
+        policy.reset()
+        torch.manual_seed(0)
+        batch = {key: value[None] for key, value in item.items() if key.startswith("observation.")}
+        actions.append(policy.select_action({**batch, PICTURE: shown[None]}))
+    assert not torch.equal(*actions), "what is heard has no part in what is done"
