@@ -15,6 +15,7 @@ import torchaudio
 from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
 from draccus.utils import DecodingError
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.feature_utils import features_equal_for_merge
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.policies.factory import get_policy_class
@@ -34,7 +35,7 @@ from lerobot_playbyear.episodes import frames
 from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.script import Script
-from lerobot_playbyear.episodes.sound_pictures import HeardSound, WithSoundPictures
+from lerobot_playbyear.episodes.sound_pictures import HeardSound, WithSoundPictures, pictures_for
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
 from lerobot_playbyear.recording.record import RecordConfig, record
 
@@ -251,7 +252,7 @@ def test_a_dataset_without_sound_or_with_nothing_but_silence(tmp_path):
         attach_spectrogram(config(tmp_path / "silent", tmp_path / "seen"))
 
 
-def test_lerobots_tools_keep_how_the_pictures_were_made_and_mix_no_levels(original, seen, tmp_path, monkeypatch):
+def test_lerobots_tools_keep_how_the_pictures_were_made_and_mix_no_levels(seen, tmp_path, monkeypatch):
     def edit(*options: str) -> None:
         monkeypatch.setattr(sys, "argv", ["lerobot-edit-dataset", *options])
         lerobot_edit_dataset.main()
@@ -260,12 +261,10 @@ def test_lerobots_tools_keep_how_the_pictures_were_made_and_mix_no_levels(origin
     edit("--repo_id=t/seen", f"--root={seen}", "--new_repo_id=t/less", f"--new_root={tmp_path / 'less'}", *less)
     assert read_pictures(tmp_path / "less") == read_pictures(seen)
     np.testing.assert_array_equal(picture(load(tmp_path / "less"), 0), picture(load(seen), LENGTHS[0]))
-    other = attach_spectrogram(config(original, tmp_path / "other", low_db=-90.0))
-    both = ["--operation.type=merge", "--operation.repo_ids=['t/seen', 't/seen']"]
-    with pytest.raises(ValueError, match="features"):
-        edit(
-            "--new_repo_id=t/both", f"--new_root={tmp_path / 'both'}", *both, f"--operation.roots=['{seen}', '{other}']"
-        )
+    features = load(seen).features
+    other = {**features, PICTURE: {**features[PICTURE], "info": HOW.as_info()}}
+    assert features_equal_for_merge(features, features)
+    assert not features_equal_for_merge(features, other), "LeRobot would merge pictures of different levels"
 
 
 @pytest.mark.parametrize(
@@ -362,6 +361,8 @@ def test_an_environment_that_hears_otherwise_is_refused(recorded, options, messa
 def test_a_dataset_without_pictures_is_refused_and_so_is_recording_with_them(original, recorded, tmp_path):
     with pytest.raises(DecodingError, match="names no pictures of sound"):
         env_config(original)
+    with pytest.raises(InputError, match="as a camera of the environment is; attach them with another --name"):
+        pictures_for(recorded, {"gripper": 16000}, 20, ["gripper"])
     arguments = ["--env.type=playbyear", f"--env.spectrogram={recorded}", "--env.task=OccludedGrasp-v1"]
     data = ["--dataset.repo_id=t/new", f"--dataset.root={tmp_path / 'new'}"]
     with pytest.raises(RolloutError, match="Leave it out here"):

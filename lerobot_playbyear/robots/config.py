@@ -1,6 +1,5 @@
 """`--env.type=playbyear_robot`: its options."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -115,10 +114,10 @@ class RobotEnvConfig(EnvConfig):
                     f"{microphone.sample_rate} does not work: each of the {self.fps} ticks per second must hold the same "
                     f"number of samples; give a multiple of {self.fps}, such as {nearest}, or another --env.fps.",
                 )
-        self.sound_pictures([])
+        self.sound_pictures()
 
-    def sound_pictures(self, cameras: Sequence[str]) -> list[SoundPicture]:
-        """The pictures of sound that policies look at, besides those of these cameras.
+    def sound_pictures(self) -> list[SoundPicture]:
+        """The pictures of sound that policies look at, besides those of the robot's cameras.
 
         Raises:
             DecodingError: They cannot be made from these microphones.
@@ -126,6 +125,7 @@ class RobotEnvConfig(EnvConfig):
         if self.spectrogram is None:
             return []
         rates = {name: microphone.sample_rate for name, microphone in self.microphones.items()}
+        cameras = list(getattr(self.robot, "cameras", None) or {})
         try:
             return pictures_for(self.spectrogram, rates, self.fps, cameras)
         except InputError as error:

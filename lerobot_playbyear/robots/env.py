@@ -68,7 +68,7 @@ class RobotEnv(gym.Env):
         for name, microphone in config.microphones.items():
             shape = (microphone.sample_rate // config.fps,)
             observation[f"audio.{name}"] = spaces.Box(-32768, 32767, shape, np.int16)
-        self._sound_pictures = SoundPictures(config.sound_pictures(list(arm.cameras)))
+        self._sound_pictures = SoundPictures(config.sound_pictures())
         self.observation_space = self._sound_pictures.space(spaces.Dict(observation))
         self._limit = np.inf if arm.has_a_position and self._hand is None else 1.0
         self.action_space = spaces.Box(-self._limit, self._limit, (len(self.action_names),), np.float32)

@@ -1,8 +1,8 @@
 """playbyear-attach-spectrogram: a copy of a dataset with sound in which the sound can also be seen.
 
-Every microphone gets observation.images.<microphone>: the log-mel spectrogram of the last seconds as a
-picture, the newest sound at the right. LeRobot's ACT, Diffusion and SmolVLA then hear without knowing.
-The same pictures come at rollout with --env.spectrogram=<the copy>. More: docs/peers.md.
+Every microphone gets observation.images.<microphone>: the log-mel spectrogram of the last seconds
+as a picture, the newest sound at the right. LeRobot's ACT, Diffusion and SmolVLA then hear without
+knowing. --env.spectrogram=<the copy> shows the same pictures at rollout. More: docs/peers.md.
 
     playbyear-attach-spectrogram --dataset.repo_id=me/occluded --dataset.root=outputs/occluded \\
         --output.repo_id=me/seen --output.root=outputs/seen
@@ -16,11 +16,14 @@ The same pictures come at rollout with --env.spectrogram=<the copy>. More: docs/
                                camera has the microphone's name
   --seconds=2.0                how much sound a picture shows at least [s]; every frame moves it by
                                whole columns, so it may be a little more
-  --height=null --width=null   of a picture [pixels]; else as the first camera's, or 84
-  --low_db=null --high_db=null levels that are black and white [dB of full scale]; else those of the
-                               dataset: its quietest hundredth, and its loudest sound
+  --height=null                of a picture [pixels]; else as the first camera's, or 84
+  --width=null                 the same
+  --low_db=null                level that is black [dB of full scale]; else that of the dataset's
+                               quietest hundredth
+  --high_db=null               level that is white; else that of the dataset's loudest sound
   --video=false                video, which is smaller and lossy; else each picture without loss
-  --vcodec=null --crf=null     of video, such as h264 and 18; else LeRobot's own
+  --vcodec=null                of video, such as h264; else LeRobot's own
+  --crf=null                   of video: its quality, 0 the best; else LeRobot's own
 """
 
 from lerobot_playbyear.scripts.command import run_alone, run_command
