@@ -62,8 +62,8 @@ SETTINGS = {
 }
 """Options of each policy, without `--policy.`."""
 
-_BATCH_SIZE = 16
-_TRIAL_STEPS, _TRIAL_LOG = 40, 20
+_BATCH_SIZE = 8  # LeRobot's own
+_TRIAL_STEPS, _TRIAL_LOG = 30, 15
 _TIMES = re.compile(r"updt_s:([\d.]+) data_s:([\d.]+)")
 
 
