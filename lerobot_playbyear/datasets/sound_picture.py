@@ -5,7 +5,7 @@ the same whole number of columns, so that what was heard before moves to the lef
 well, and a column never depends on what comes after it. Black and white stand for two levels that are fixed for a dataset.
 
 Here is numpy alone, in double precision and without matrix products, whose sums depend on how many threads there are: the
-same samples give the same picture wherever it is made. Environments in processes of their own import neither torch nor LeRobot.
+same samples give the same picture, whichever process makes it. Environments need neither torch nor LeRobot for it.
 """
 
 import json
