@@ -3,9 +3,9 @@
     python -m experiments.others --task=OccludedGrasp-v1 --minutes=20
 
 All get the same demonstrations, the same number of processor cores and as many updates as fit into the minutes, which a short
-training measures first. Networks are small, for pictures are; every setting that was tried is in `SETTINGS`. Datasets hold no
-column that a policy does not read: LeRobot would read it all the same. Resumes: results that are there are kept, a training
-that was interrupted goes on. Diffusion needs `lerobot[diffusion]`.
+training measures first. Networks are small, for pictures are; every setting is in `SETTINGS`. Datasets hold no column that a
+policy does not look at: LeRobot would read it all the same. Resumes: results that are there are kept, a training that was
+interrupted goes on. Diffusion needs `lerobot[diffusion]`.
 """
 
 import re
@@ -24,9 +24,9 @@ from lerobot.utils.constants import OBS_STR
 from experiments.protocol import (
     EVALUATION_SEEDS,
     N_DEMONSTRATIONS,
+    NEW_TASKS,
     RESULTS,
     RUNS,
-    TASKS,
     Result,
     command_line,
     dataset_root,
@@ -227,9 +227,8 @@ def show(results: Iterable[tuple[str, OtherResult]]) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__, "threads")
-    tasks = list(dict.fromkeys(["OccludedGrasp-v1", "OccludedPickPlace-v1", *TASKS]))
-    parser.add_argument("--task", choices=tasks, default=tasks[0])
+    parser = command_line(__doc__, "task", "threads")
+    parser.set_defaults(task=NEW_TASKS[0])
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS[:1], help="of the policies' training")
     parser.add_argument("--minutes", type=float, default=20.0, help="of training, on an idle machine")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=["act", "diffusion"])
