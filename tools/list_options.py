@@ -17,6 +17,7 @@ from draccus.utils import is_choice_type
 from lerobot_playbyear.calibration.calibrate import CalibrateLatencyConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.attach import AttachAudioConfig
+from lerobot_playbyear.datasets.attach_spectrogram import AttachSpectrogramConfig
 from lerobot_playbyear.datasets.convert_audio import ConvertAudioConfig
 from lerobot_playbyear.datasets.repair.command import RepairConfig
 from lerobot_playbyear.film.filming import VideoConfig
@@ -30,6 +31,7 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 CONFIGS: dict[str, type] = {
     "playbyear-attach-audio": AttachAudioConfig,
+    "playbyear-attach-spectrogram": AttachSpectrogramConfig,
     "playbyear-calibrate-latency": CalibrateLatencyConfig,
     "playbyear-convert-audio": ConvertAudioConfig,
     "playbyear-dagger": DaggerConfig,

@@ -1,9 +1,10 @@
 """`--env.type=playbyear`: how LeRobot makes the environments and names what they observe."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from draccus.utils import DecodingError
@@ -20,6 +21,9 @@ from gym_playbyear.plugins import PluginError
 from gym_playbyear.room import RESPONSES
 from gym_playbyear.task import Task
 from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
+
+if TYPE_CHECKING:  # of the other distribution, which is needed for these pictures alone
+    from lerobot_playbyear.datasets.sound_picture import SoundPicture
 
 SOUND_MODES = ("waveform", "contact_force", "none")
 _STATE_DIM, _ACTION_DIM, _FORCE_DIM = 7, 4, 6
@@ -43,6 +47,8 @@ class PlaybyearEnvConfig(EnvConfig):
         room_noise: A WAV file that plays in the room, over and over; None for a silent room.
         room_noise_level: How loud it is, in units of the usual background's root mean square.
         microphone_response: `flat`, or the frequency response of another microphone: `phone`, `dull`, `boomy`.
+        spectrogram: For policies that look at pictures of sound: the folder of the dataset that they learned from, made by
+            `playbyear-attach-spectrogram`, or its `meta/info.json`. The same pictures then come as `pixels/<microphone>`.
         cube_material: What the cube sounds like: `cube` (wood), `glass`, `tin`, `cardboard`, `rubber`; for tasks with a cube.
         variant: `default`, or `paper` for the paper's values where ours differ; for version 0 of the tasks.
         task_options: More options of the task, by name.
@@ -66,6 +72,7 @@ class PlaybyearEnvConfig(EnvConfig):
     room_noise: str | None = None
     room_noise_level: float = 1.0
     microphone_response: str = "flat"
+    spectrogram: str | None = None
     # Task
     cube_material: str = "cube"
     variant: str = "default"
@@ -91,6 +98,8 @@ class PlaybyearEnvConfig(EnvConfig):
         if self.sound == "waveform":
             for mic in self.microphones or []:
                 entries[f"audio.{mic}"] = (FeatureType.STATE, (self.samples_per_frame,), f"{OBS_STR}.audio.{mic}")
+            for how in self._sound_pictures():
+                entries[f"pixels/{how.name}"] = (FeatureType.VISUAL, (how.height, how.width, 3), how.feature)
         elif self.sound == "contact_force":
             entries["contact_force"] = (FeatureType.STATE, (_FORCE_DIM,), f"{OBS_STR}.contact_force")
         self.features = {key: PolicyFeature(type=kind, shape=shape) for key, (kind, shape, _) in entries.items()}
@@ -137,12 +146,16 @@ class PlaybyearEnvConfig(EnvConfig):
         """
         self._check()
         register_tasks()  # those of distributions that were installed since gym_playbyear was imported
-        make = partial(
+        make: Callable[[], gym.Env] = partial(
             gym.make,
             f"{self.package_name}:{self.gym_id}",
             disable_env_checker=self.disable_env_checker,
             **self.gym_kwargs,
         )
+        if self.spectrogram is not None:
+            from lerobot_playbyear.episodes.sound_pictures import with_sound_pictures
+
+            make = with_sound_pictures(make, self._sound_pictures())
         factories = [freeze_after_episode_end(make) for _ in range(n_envs)]
         vec: gym.vector.VectorEnv
         if use_async_envs and n_envs > 1:
@@ -176,6 +189,22 @@ class PlaybyearEnvConfig(EnvConfig):
         except PluginError as error:
             raise self._error("task", str(error).rstrip(".")) from error
 
+    def _sound_pictures(self) -> "list[SoundPicture]":
+        if self.spectrogram is None:
+            return []
+        try:
+            from lerobot_playbyear.datasets.errors import InputError
+            from lerobot_playbyear.episodes.sound_pictures import pictures_for
+        except ImportError as error:
+            raise self._error("spectrogram", "install lerobot_policy_playbyear, which makes the pictures") from error
+        rates = dict.fromkeys(self.microphones or [], self.sample_rate)
+        try:
+            return pictures_for(
+                self.spectrogram, rates, self.fps, [camera.name for camera in self._definition().cameras]
+            )
+        except InputError as error:
+            raise self._error("spectrogram", str(error).rstrip(".")) from error
+
     def _check(self) -> None:
         definition = self._definition()
         hz = definition.control_hz
@@ -200,6 +229,8 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("room_noise", "there is no such file, give a WAV file")
         if not 0 <= self.room_noise_level < float("inf"):
             raise self._error("room_noise_level", "give 0 (silent) or more")
+        if self.spectrogram is not None and self.sound != "waveform":
+            raise self._error("spectrogram", f"--env.sound={self.sound} has no sound to show; leave one of them out")
         if self.visualization_width != self.visualization_height:
             raise self._error("visualization_width", "the picture is square: give both sides the same")
 

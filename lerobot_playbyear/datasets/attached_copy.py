@@ -1,4 +1,4 @@
-"""The copy of a dataset whose sound is stored otherwise, or that gets sound: every other file as it is."""
+"""The copy of a dataset whose sound is stored otherwise, or that gets sound or pictures of it: every other file as it is."""
 
 import itertools
 import json
@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -17,9 +17,9 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.attached_sound import EpisodesSound
-from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature
+from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature, audio_keys
 from lerobot_playbyear.datasets.audio_layout import AUDIO_FOLDER
-from lerobot_playbyear.datasets.columns import column_to_numpy, numpy_to_column
+from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
     open_checked,
@@ -33,14 +33,41 @@ from lerobot_playbyear.datasets.statistics import Stats, add_stats, with_sound_s
 _SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
 
 
+Frames = tuple[int, int, int]
+"""Of one episode: its number, the first frame, and the one after the last."""
+
+
+class AddedColumns(Protocol):
+    """Columns of the data files that a dataset gets.
+
+    Attributes:
+        keys: Their names.
+        rows_at_once: How many rows of them may be in memory together.
+    """
+
+    @property
+    def keys(self) -> list[str]: ...
+
+    @property
+    def rows_at_once(self) -> int: ...
+
+    def columns(self, runs: Sequence[Frames], schema: pa.Schema) -> list[pa.Array]:
+        """For each key its values of all these frames, of the type that the schema says.
+
+        Raises:
+            ValueError: There are no such frames.
+        """
+        ...
+
+
 @dataclass
-class SoundChange:
+class DatasetChange:
     """In what a copy differs from its dataset.
 
     Args:
         added: The features that it has more.
         stats: Their statistics, for each episode.
-        sounds: Of all episodes, where these features are columns.
+        columns: Those of these features that are columns of the data files.
         removed: The features that it lacks, with their columns, statistics and files of sound.
         episode_columns: Columns that `meta/episodes` has more, a value per episode.
         info: Fields of `meta/info.json` that differ; None: left out.
@@ -48,7 +75,7 @@ class SoundChange:
 
     added: dict[str, dict[str, Any]]
     stats: list[Stats]
-    sounds: Sequence[EpisodesSound] = ()
+    columns: Sequence[AddedColumns] = ()
     removed: Collection[str] = ()
     episode_columns: Mapping[str, Sequence] = field(default_factory=dict)
     info: Mapping[str, Any] = field(default_factory=dict)
@@ -78,11 +105,11 @@ def write_with_sound(
     n_episodes = len(sounds[0].episodes)
     stats = [{key: own for sound in sounds for key, own in sound.stats(i).items()} for i in range(n_episodes)]
     info = {"audio_path": None, "audio_files_size_in_mb": None} if removed else {}
-    write_changed(root, target, SoundChange(added, stats, sounds, removed, info=info))
+    write_changed(root, target, DatasetChange(added, stats, sounds, removed, info=info))
 
 
-def write_changed(root: Path, target: Path, change: SoundChange) -> None:
-    """Writes a dataset with other sound. Arguments and errors as for `write_with_sound`.
+def write_changed(root: Path, target: Path, change: DatasetChange) -> None:
+    """Writes a dataset with other features. Arguments and errors as for `write_with_sound`.
 
     Args:
         change: In what it differs.
@@ -111,20 +138,20 @@ def write_changed(root: Path, target: Path, change: SoundChange) -> None:
         elif name != Path(INFO_PATH):
             shutil.copyfile(path, target / name)
     known = {key: stats for key, stats in (load_stats(root) or {}).items() if key not in change.removed}
-    write_stats({**known, **add_stats(None, change.stats, change.added)}, target)
+    write_stats({**known, **add_stats(None, change.stats, audio_keys(change.added))}, target)
     info = {**info, "features": features, **change.info}
     kept = {name: value for name, value in info.items() if name not in change.info or value is not None}
     (target / INFO_PATH).write_text(json.dumps(kept, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def _changed_features(features: Mapping[str, dict], change: SoundChange) -> dict[str, dict[str, Any]]:
+def _changed_features(features: Mapping[str, dict], change: DatasetChange) -> dict[str, dict[str, Any]]:
     kept = {key: feature for key, feature in features.items() if key not in change.removed}
     own = {key: feature for key, feature in kept.items() if key not in DEFAULT_FEATURES}
     return {**own, **change.added, **kept}
 
 
-def _write_data(source: Path, target: Path, schema: pa.Schema, change: SoundChange) -> None:
-    keys = [key for sound in change.sounds for key in sound.keys]
+def _write_data(source: Path, target: Path, schema: pa.Schema, change: DatasetChange) -> None:
+    keys = [key for columns in change.columns for key in columns.keys]
     with open_checked(source) as file:
         metadata = file.schema_arrow.metadata or {}
         if b"huggingface" in metadata:
@@ -134,11 +161,11 @@ def _write_data(source: Path, target: Path, schema: pa.Schema, change: SoundChan
 
         def convert(table: pa.Table) -> pa.Table:
             try:
-                return _with_columns(table.select([column.name for column in kept]), target_schema, change.sounds)
+                return _with_columns(table.select([column.name for column in kept]), target_schema, change.columns)
             except ValueError as error:
                 raise ParquetDamageError(f"{source} is damaged: {error}.") from error
 
-        rows = min((sound.rows_at_once for sound in change.sounds), default=None)
+        rows = min((columns.rows_at_once for columns in change.columns), default=None)
         write_tables(target, map(convert, _tables(file, source, rows)), target_schema)
 
 
@@ -150,20 +177,17 @@ def _tables(file: Any, source: Path, rows: int | None) -> Iterator[pa.Table]:
             yield table.slice(start, rows)
 
 
-def _with_columns(table: pa.Table, schema: pa.Schema, sounds: Sequence[EpisodesSound]) -> pa.Table:
-    if sounds:
+def _with_columns(table: pa.Table, schema: pa.Schema, added: Sequence[AddedColumns]) -> pa.Table:
+    runs: list[Frames] = []
+    if added:
         episodes = column_to_numpy(table.column("episode_index"))
         frames = column_to_numpy(table.column("frame_index"))
         edges = np.flatnonzero((np.diff(episodes) != 0) | (np.diff(frames) != 1)) + 1
-        runs = list(itertools.pairwise([0, *edges.tolist(), len(table)]))
-    for sound in sounds:
-        parts = [
-            sound.blocks(int(episodes[first]), int(frames[first]), int(frames[first]) + stop - first)
-            for first, stop in runs
-        ]
-        blocks = np.concatenate(parts)
-        for i, key in enumerate(sound.keys):
-            table = table.append_column(key, numpy_to_column(blocks[..., i], schema.field(key).type))
+        for first, stop in itertools.pairwise([0, *edges.tolist(), len(table)]):
+            runs.append((int(episodes[first]), int(frames[first]), int(frames[first]) + stop - first))
+    for columns in added:
+        for key, values in zip(columns.keys, columns.columns(runs, schema), strict=True):
+            table = table.append_column(key, values)
     return table.replace_schema_metadata(schema.metadata)
 
 
@@ -175,7 +199,7 @@ def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
         raise ParquetDamageError(f"{path} is damaged: {error}.") from error
 
 
-def _write_rows(source: Path, target: Path, change: SoundChange) -> None:
+def _write_rows(source: Path, target: Path, change: DatasetChange) -> None:
     rows = read_named_table(source)
     episodes = rows.column("episode_index").to_pylist()
     for episode in episodes:

@@ -1,18 +1,20 @@
 """The files of sound that a dataset gets: decoded once, checked against its episodes, and read where they are indexed."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from lerobot.datasets import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled, audio_pieces
+from lerobot_playbyear.datasets.columns import numpy_to_column
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES
 from lerobot_playbyear.datasets.statistics import Stats, repeated_stats
@@ -76,6 +78,11 @@ class EpisodesSound:
                 f"it holds frames {start} to {stop - 1} of episode {episode}, for which meta/episodes counts {n_frames}"
             )
         return self.episodes[episode][start * size : stop * size].reshape(-1, size, len(self.keys))
+
+    def columns(self, runs: Sequence[tuple[int, int, int]], schema: pa.Schema) -> list[pa.Array]:
+        """For each key the blocks of some frames: of an episode, from one frame to before another. Raises as `blocks`."""
+        blocks = np.concatenate([self.blocks(*run) for run in runs])
+        return [numpy_to_column(blocks[..., i], schema.field(key).type) for i, key in enumerate(self.keys)]
 
     def stats(self, episode: int) -> Stats:
         """An episode's statistics."""

@@ -105,7 +105,7 @@ def _to_columns(cfg: ConvertAudioConfig, target: Path) -> Path:
 
 def _to_files(cfg: ConvertAudioConfig, target: Path) -> Path:
     dataset = open_for_copy(cfg.dataset)
-    from lerobot_playbyear.datasets.attached_copy import SoundChange, write_changed
+    from lerobot_playbyear.datasets.attached_copy import DatasetChange, write_changed
     from lerobot_playbyear.datasets.audio_export import FILE_MEGABYTES, check_codec, microphones_of, write_track
     from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 
@@ -121,7 +121,7 @@ def _to_files(cfg: ConvertAudioConfig, target: Path) -> Path:
 
     def write(root: Path, folder: Path) -> None:
         tracks = {mic.key: write_track(dataset, bounds, mic, cfg.codec, folder) for mic in microphones}
-        change = SoundChange(
+        change = DatasetChange(
             added={key: track.feature for key, track in tracks.items()},
             stats=[{key: track.stats[i] for key, track in tracks.items()} for i in range(len(bounds))],
             removed=[column for mic in microphones for column in mic.columns],

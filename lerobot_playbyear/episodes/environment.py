@@ -46,7 +46,16 @@ class EnvSpec:
 
 
 def env_spec(env: "EnvConfig") -> EnvSpec:
-    """How Gymnasium makes the environment that a LeRobot configuration describes."""
+    """How Gymnasium makes the environment that a LeRobot configuration describes.
+
+    Raises:
+        RolloutError: It asks for pictures of sound, which datasets get from `playbyear-attach-spectrogram`.
+    """
+    if getattr(env, "spectrogram", None) is not None:
+        raise RolloutError(
+            f"--env.spectrogram={env.spectrogram}: these pictures are for policies of LeRobot that act in lerobot-eval, "
+            "lerobot-train or playbyear-video. Leave it out here: playbyear-attach-spectrogram makes them of what is recorded."
+        )
     return EnvSpec(f"{env.package_name}:{env.gym_id}", dict(env.gym_kwargs))
 
 

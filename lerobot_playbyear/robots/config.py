@@ -16,6 +16,9 @@ from lerobot.robots import RobotConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
 from lerobot_playbyear.compat import import_devices
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.sound_picture import SoundPicture
+from lerobot_playbyear.episodes.sound_pictures import pictures_for
 from lerobot_playbyear.microphones.config import MicrophoneConfig, register_microphone_plugins
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
 from lerobot_playbyear.robots import ENV_ID
@@ -43,6 +46,8 @@ class RobotEnvConfig(EnvConfig):
         robot: The robot, as for lerobot-record.
         end_effector: Actions are displacements of the hand instead of the robot's joints. None: they are the robot's own.
         microphones: By their names.
+        spectrogram: For policies that look at pictures of sound: the folder of the dataset that they learned from, made by
+            `playbyear-attach-spectrogram`, or its `meta/info.json`.
         episode_s: How long an attempt may take [s].
         camera_latency_s: How long after it was exposed a picture arrives [s]; `playbyear-calibrate-latency` measures it.
         rest: Where the arm goes before every attempt, by joint, such as `{shoulder_pan.pos: 0}`. None: where it was when the
@@ -67,6 +72,7 @@ class RobotEnvConfig(EnvConfig):
     robot: RobotConfig | None = None
     end_effector: EndEffectorConfig | None = None
     microphones: dict[str, MicrophoneConfig] = field(default_factory=dict)
+    spectrogram: str | None = None
     episode_s: float = 30.0
     camera_latency_s: float = 0.0
     rest: dict[str, float] | None = None
@@ -108,6 +114,22 @@ class RobotEnvConfig(EnvConfig):
                     f"{microphone.sample_rate} does not work: each of the {self.fps} ticks per second must hold the same "
                     f"number of samples; give a multiple of {self.fps}, such as {nearest}, or another --env.fps.",
                 )
+        self.sound_pictures()
+
+    def sound_pictures(self) -> list[SoundPicture]:
+        """The pictures of sound that policies look at, besides those of the robot's cameras.
+
+        Raises:
+            DecodingError: They cannot be made from these microphones.
+        """
+        if self.spectrogram is None:
+            return []
+        rates = {name: microphone.sample_rate for name, microphone in self.microphones.items()}
+        cameras = list(getattr(self.robot, "cameras", None) or {})
+        try:
+            return pictures_for(self.spectrogram, rates, self.fps, cameras)
+        except InputError as error:
+            raise self._error("spectrogram", str(error).rstrip(".")) from error
 
     @property
     def is_real_time(self) -> bool:

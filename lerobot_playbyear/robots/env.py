@@ -11,6 +11,7 @@ from gymnasium import spaces
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.episode import Verdict
+from lerobot_playbyear.episodes.sound_pictures import SoundPictures
 from lerobot_playbyear.robots.arm import Arm
 from lerobot_playbyear.robots.config import RobotEnvConfig
 from lerobot_playbyear.robots.end_effector import EndEffector
@@ -67,7 +68,8 @@ class RobotEnv(gym.Env):
         for name, microphone in config.microphones.items():
             shape = (microphone.sample_rate // config.fps,)
             observation[f"audio.{name}"] = spaces.Box(-32768, 32767, shape, np.int16)
-        self.observation_space = spaces.Dict(observation)
+        self._sound_pictures = SoundPictures(config.sound_pictures())
+        self.observation_space = self._sound_pictures.space(spaces.Dict(observation))
         self._limit = np.inf if arm.has_a_position and self._hand is None else 1.0
         self.action_space = spaces.Box(-self._limit, self._limit, (len(self.action_names),), np.float32)
         self.person = Person(self._rig, self._max_episode_steps)
@@ -104,6 +106,7 @@ class RobotEnv(gym.Env):
                 now = self._begin()
                 rig.ears.restart(now - config.camera_latency_s)
                 rig.watchdog.feed()
+                self._sound_pictures.clear()
                 self._last = self._observe(now)
                 return self._last, {"is_success": False}
             except PlaybyearError as error:
@@ -197,6 +200,7 @@ class RobotEnv(gym.Env):
         now = self._begin() if self._ticks.n == 0 else self._ticks.go_on()
         self._rig.ears.skip_to(now - 1 / self.config.fps - self.config.camera_latency_s)
         if self._last is not None:
+            self._sound_pictures.forget_newest()
             seen = self._observe(now)
             self._last.clear()  # whoever has the observation of this step has the new one
             self._last.update(seen)
@@ -268,7 +272,7 @@ class RobotEnv(gym.Env):
             observation["pixels"] = self._pictures
         if self.state_names:
             observation["agent_pos"] = state
-        return observation | {f"audio.{name}": block for name, block in heard.items()}
+        return self._sound_pictures.add(observation | {f"audio.{name}": block for name, block in heard.items()})
 
     def _end(self, problem: str, was_sent: bool = True):
         """The attempt ends because something went wrong, before or after its last action was sent."""

@@ -1,0 +1,284 @@
+"""The sound of the last seconds as a picture, which policies that know nothing of sound can look at.
+
+A log-mel spectrogram: low frequencies at the bottom, the newest sound at the right, grey in three channels. Every frame adds
+the same whole number of columns, so that what was heard before moves to the left without changing: such pictures compress
+well, and a column never depends on what comes after it. Black and white stand for two levels that are fixed for a dataset.
+
+Here is numpy alone, in double precision and without matrix products, whose sums depend on how many threads there are: the
+same samples give the same picture, whichever process makes it. Environments need neither torch nor LeRobot for it.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import INFO_PATH
+
+PICTURE_PREFIX = "observation.images."
+"""What the key of every picture starts with, those of cameras as well."""
+
+INFO_KEY = "spectrogram"
+"""Where a picture's feature says how it was made, in its `info`."""
+
+FLOOR_DB = -100.0
+"""Of full scale: below what 16 bits can hold. Nothing is quieter."""
+
+_LAYOUT = 1  # of what is computed; another number when it changes
+_FULL_SCALE = 32768.0  # int16 PCM
+_SHORTEST_SEGMENT_S = 0.04  # as in "Play it by Ear", appendix: 1,920 samples at 48 kHz
+_LONGEST_FFT = 2**18
+_LARGEST = 4096  # pixels along a side
+
+
+@dataclass(frozen=True)
+class SoundPicture:
+    """How one microphone's pictures are made.
+
+    Args:
+        microphone: Its key, `observation.audio.<microphone>`.
+        feature: The pictures' key, `observation.images.<name>`.
+        sample_rate: Of the microphone [Hz].
+        fps: Frames per second [Hz].
+        height: Mel bands, from 0 Hz to half the sample rate [pixels].
+        width: Columns [pixels].
+        columns_per_frame: By how many the picture moves to the left from one frame to the next.
+        low_db, high_db: Levels that are black and white [dB; a sine at full scale has 0 in its bin].
+        before_episode: What stands for the time before the episode: each band's median in the dataset, (height,) of 0 to 255,
+            the lowest frequency first. Silence would tell a policy loudly how long ago the episode began.
+        layout: Of what is computed.
+
+    Raises:
+        InputError: The numbers do not go together.
+    """
+
+    microphone: str
+    feature: str
+    sample_rate: int
+    fps: int
+    height: int
+    width: int
+    columns_per_frame: int
+    low_db: float
+    high_db: float
+    before_episode: tuple[int, ...]
+    layout: int = _LAYOUT
+
+    def __post_init__(self) -> None:
+        if self.layout != _LAYOUT:
+            raise self._error("layout", f"{_LAYOUT}, which this version makes")
+        for name in ("sample_rate", "fps", "height", "width", "columns_per_frame"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise self._error(name, "a whole number above 0")
+        for name, prefix in (("microphone", AUDIO_PREFIX), ("feature", PICTURE_PREFIX)):
+            if not str(getattr(self, name)).startswith(prefix):
+                raise self._error(name, f"a key that begins with {prefix}")
+        for name in ("height", "width"):
+            if getattr(self, name) > _LARGEST:
+                raise self._error(name, f"at most {_LARGEST} pixels")
+        if self.sample_rate % self.fps or self.columns_per_frame > self.samples_per_frame:
+            raise self._error("columns_per_frame", "at most as many as a frame has samples, which is sample_rate / fps")
+        if not FLOOR_DB <= self.low_db < self.high_db:
+            raise self._error("low_db", f"at least {FLOOR_DB:g}, and below high_db={self.high_db}")
+        object.__setattr__(self, "before_episode", tuple(self.before_episode))
+        if len(self.before_episode) != self.height or not all(0 <= level <= 255 for level in self.before_episode):
+            raise self._error("before_episode", f"{self.height} numbers of 0 to 255")
+
+    @property
+    def name(self) -> str:
+        """Of the picture among those of an environment."""
+        return self.feature.removeprefix(PICTURE_PREFIX)
+
+    @property
+    def samples_per_frame(self) -> int:
+        return self.sample_rate // self.fps
+
+    @property
+    def seconds(self) -> float:
+        """That the picture shows."""
+        return self.width / (self.columns_per_frame * self.fps)
+
+    @property
+    def n_frames(self) -> int:
+        """Whose sound is in the picture, wholly or in part."""
+        return -(-self.width // self.columns_per_frame)
+
+    @property
+    def segment(self) -> int:
+        """Samples behind one column: those of two columns, and no fewer than 0.04 s."""
+        two = 2 * -(-self.samples_per_frame // self.columns_per_frame)
+        return max(two, round(_SHORTEST_SEGMENT_S * self.sample_rate))
+
+    @property
+    def context(self) -> int:
+        """Samples that one frame's columns depend on: its own, and some before it."""
+        return self.samples_per_frame + self.segment
+
+    def levels(self, sound: np.ndarray) -> np.ndarray:
+        """A frame's columns as levels.
+
+        Args:
+            sound: (context,), the samples up to the frame: int16 PCM, or floats in [-1, 1].
+
+        Returns:
+            (columns_per_frame, height) [dB], the lowest frequency first.
+        """
+        wave = sound / _FULL_SCALE if sound.dtype.kind == "i" else sound.astype(np.float64)
+        segments = np.stack([wave[end - self.segment : end] for end in self._ends])  # (C, segment)
+        spectrum = np.fft.rfft(segments * self._window, self._fft_size)
+        power = spectrum.real**2 + spectrum.imag**2  # (C, bins)
+        bands = np.empty((self.columns_per_frame, self.height))
+        for band, (first, weights) in enumerate(self._bank):
+            bands[:, band] = (power[:, first : first + len(weights)] * weights).sum(axis=1)
+        return 10 * np.log10(bands + 10 ** (FLOOR_DB / 10))
+
+    def columns(self, sound: np.ndarray, n_heard: int) -> np.ndarray:
+        """A frame's columns as pixels.
+
+        Args:
+            sound: As for `levels`.
+            n_heard: How many of these samples, the last ones, belong to the episode. A column of which a sample does not
+                is what stands before the episode.
+
+        Returns:
+            (columns_per_frame, height) uint8, the lowest frequency first.
+        """
+        share = (self.levels(sound) - self.low_db) / (self.high_db - self.low_db)
+        pixels = np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
+        return np.where(self.begun(n_heard)[:, None], pixels, np.array(self.before_episode, np.uint8))
+
+    def begun(self, n_heard: int) -> np.ndarray:
+        """Which of a frame's columns hear nothing but the episode, (columns_per_frame,) bool. `n_heard` as for `columns`."""
+        return np.array(self._ends) - self.segment >= self.context - n_heard
+
+    def picture(self, columns: np.ndarray) -> np.ndarray:
+        """What a frame's picture is.
+
+        Args:
+            columns: (n, height) uint8, those of the episode up to this frame, or of its last `n_frames` frames.
+
+        Returns:
+            (height, width, 3) uint8.
+        """
+        columns = columns[-self.width :]
+        before = np.broadcast_to(np.array(self.before_episode, np.uint8), (self.width - len(columns), self.height))
+        grey = np.concatenate([before, columns]).T[::-1]  # (height, width), low frequencies at the bottom
+        return np.repeat(grey[:, :, None], 3, axis=2)
+
+    def as_info(self) -> dict[str, Any]:
+        """As it stands in the feature's `info`."""
+        return {INFO_KEY: {**asdict(self), "before_episode": list(self.before_episode)}}
+
+    @cached_property
+    def _ends(self) -> list[int]:
+        """Where each column's segment ends in `context` samples; the last one ends with the frame."""
+        size, n = self.samples_per_frame, self.columns_per_frame
+        return [self.context - size + (column + 1) * size // n for column in range(n)]
+
+    @cached_property
+    def _window(self) -> np.ndarray:
+        window = np.sin(np.pi * np.arange(self.segment) / self.segment) ** 2  # Hann's, periodic
+        return 2 * window / window.sum()
+
+    @property
+    def _fft_size(self) -> int:
+        return 2 * (self._bank_and_bins[1] - 1)
+
+    @property
+    def _bank(self) -> list[tuple[int, np.ndarray]]:
+        return self._bank_and_bins[0]
+
+    @cached_property
+    def _bank_and_bins(self) -> tuple[list[tuple[int, np.ndarray]], int]:
+        """Each band's first bin and the weights of its bins, and how many bins there are: so many that no band is without."""
+        size = 1 << (self.segment - 1).bit_length()
+        while True:
+            bank = mel_bank(self.height, size, self.sample_rate)
+            if all(len(weights) for _, weights in bank):
+                return bank, size // 2 + 1
+            size *= 2
+            if size > _LONGEST_FFT:
+                raise self._error("height", "fewer bands")
+
+    def _error(self, name: str, wanted: str) -> InputError:
+        return InputError(f"The picture of '{self.microphone}': {name}={getattr(self, name)!r}; wanted {wanted}.")
+
+
+def mel_bank(n_bands: int, fft_size: int, sample_rate: int) -> list[tuple[int, np.ndarray]]:
+    """Overlapping triangles, equally wide on the mel scale (2595 log10(1 + f / 700), as torchaudio's default has it).
+
+    Returns:
+        For each band the first bin with a weight, and the weights from there on.
+    """
+    highest = 2595 * np.log10(1 + sample_rate / 2 / 700)
+    edges = 700 * (10 ** (np.linspace(0, highest, n_bands + 2) / 2595) - 1)
+    frequency = np.arange(fft_size // 2 + 1) * (sample_rate / fft_size)
+    bank = []
+    for low, peak, high in zip(edges, edges[1:], edges[2:], strict=False):
+        weights = np.minimum((frequency - low) / (peak - low), (high - frequency) / (high - peak))
+        inside = np.flatnonzero(weights > 0)
+        first = int(inside[0]) if len(inside) else 0
+        bank.append((first, weights[inside]))
+    return bank
+
+
+def pictures_of(features: Mapping[str, Mapping[str, Any]]) -> list[SoundPicture]:
+    """The pictures of sound among a dataset's features.
+
+    Raises:
+        InputError: What one says of itself is not what is wanted.
+    """
+    found = []
+    names = {one.name for one in fields(SoundPicture)}
+    for key, feature in features.items():
+        said = (feature.get("info") or {}).get(INFO_KEY)
+        if said is None:
+            continue
+        if not isinstance(said, dict) or set(said) != names:
+            raise InputError(
+                f"'{key}': {INFO_KEY} in its info is {said!r}; wanted the fields {', '.join(sorted(names))}."
+            )
+        try:
+            found.append(SoundPicture(**said))
+        except TypeError as error:
+            raise InputError(f"'{key}': {INFO_KEY} in its info cannot be read: {error}.") from error
+    return found
+
+
+def read_pictures(path: str | Path) -> list[SoundPicture]:
+    """How the pictures of a dataset were made.
+
+    Args:
+        path: The dataset's folder, or its `meta/info.json`, also one that was copied elsewhere.
+
+    Raises:
+        InputError: There is none, or it has no pictures of sound.
+    """
+    path = Path(path)
+    file = path / INFO_PATH if path.is_dir() else path
+    try:
+        features = json.loads(file.read_text())["features"]
+        pictures = pictures_of(features)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"{file} cannot be read ({error}); wanted a dataset's folder or its {INFO_PATH}, from playbyear-attach-spectrogram"
+        ) from error
+    if not pictures:
+        raise InputError(
+            f"{file} names no pictures of sound; make a dataset that has some: playbyear-attach-spectrogram"
+        )
+    return pictures
+
+
+def picture_feature(microphone: str, pattern: str) -> str:
+    """The key of a microphone's pictures: the pattern says with {microphone} where its name stands."""
+    return PICTURE_PREFIX + pattern.replace("{microphone}", microphone.removeprefix(AUDIO_PREFIX))

@@ -1,0 +1,478 @@
+"""Pictures of sound: what they show, that nothing of the future is in them, and that rollouts show what datasets hold."""
+
+import itertools
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import draccus
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+import torchaudio
+from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
+from draccus.utils import DecodingError
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.feature_utils import features_equal_for_merge
+from lerobot.envs import make_env, preprocess_observation
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
+from lerobot.policies.factory import get_policy_class
+from lerobot.scripts import lerobot_edit_dataset, lerobot_eval, lerobot_train
+from robot_factory import joint_config, noise_file, robot_env
+from test_peers import needs
+
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.datasets import picture_storage
+from lerobot_playbyear.datasets.attach import AttachError, DatasetPlace
+from lerobot_playbyear.datasets.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.sound_picture import SoundPicture, pictures_of, read_pictures
+from lerobot_playbyear.episodes import frames
+from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.episodes.sound_pictures import HeardSound, WithSoundPictures, pictures_for
+from lerobot_playbyear.inspection import DatasetSource, check_numbers
+from lerobot_playbyear.recording.record import RecordConfig, record
+
+PICTURE = "observation.images.gripper"
+HOW = SoundPicture(MICROPHONE, PICTURE, 16000, 20, 84, 84, 2, -80.0, -20.0, tuple(range(84)))
+LENGTHS = (12, 25, 9)
+
+
+def noise(n_frames: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0, 2000, (n_frames, HOW.samples_per_frame)).astype(np.int16)
+
+
+def watch(blocks: np.ndarray, how: SoundPicture = HOW) -> np.ndarray:
+    """The pictures of an episode as a rollout makes them, (n, height, width, 3)."""
+    heard = HeardSound(how)
+    return np.stack([heard.add(block) for block in blocks])
+
+
+def test_a_column_is_torchaudios_mel_spectrogram_of_the_newest_sound():
+    sound = noise(2).reshape(-1)
+    transform = torchaudio.transforms.MelSpectrogram(
+        16000, n_fft=1024, win_length=800, hop_length=400, n_mels=84, center=False, power=2.0
+    )
+    wave = torch.from_numpy(sound / 32768.0).float()
+    newest = torch.nn.functional.pad(wave[-800:], (112, 112))  # torch puts the window in the middle of the transform
+    expected = 10 * torch.log10(transform(newest)[:, 0] * (2 / 400) ** 2 + 1e-10)
+    levels = HOW.levels(sound[-HOW.context :])[-1]
+    np.testing.assert_allclose(levels, expected.numpy(), atol=0.01)
+
+
+def test_a_sine_at_full_scale_has_no_decibels_and_stands_where_its_pitch_is():
+    time = np.arange(HOW.context) / 16000
+    (*_, low), (*_, high) = (HOW.levels(np.sin(2 * np.pi * pitch * time)) for pitch in (500, 4000))
+    assert high.max() == pytest.approx(0, abs=3)  # it may lie between two bands
+    assert low.argmax() < high.argmax()
+    picture = watch(np.tile((20000 * np.sin(2 * np.pi * 500 * time[:800])).astype(np.int16), (3, 1)))[-1]
+    assert picture[:, -1, 0].argmax() > 42, "low frequencies are at the bottom"
+
+
+def test_sound_is_new_at_the_right_and_moves_left_without_changing():
+    pictures = watch(noise(60))
+    for before, after in itertools.pairwise(pictures):
+        np.testing.assert_array_equal(after[:, :-2], before[:, 2:])
+    silent = noise(60)
+    silent[30:] = 0
+    assert (watch(silent)[31, :, -1] == 0).all()
+    assert (pictures == pictures[..., :1]).all(), "it is grey"
+
+
+def test_nothing_of_the_future_is_in_a_picture():
+    """Whoever changes all samples after a frame changes no pixel up to it; whoever changes one before, within reach, does."""
+    sound = noise(60)
+    pictures = watch(sound)
+    for frame in (0, 1, 20, 58):
+        changed = sound.copy()
+        changed[frame + 1 :] = noise(60, seed=1)[frame + 1 :] * 10
+        np.testing.assert_array_equal(watch(changed)[: frame + 1], pictures[: frame + 1])
+        assert (watch(changed)[frame + 1] != pictures[frame + 1]).any()
+
+
+def test_a_picture_forgets_what_is_older_than_it_shows():
+    sound, other = noise(60), noise(60, seed=1)
+    oldest = 60 - HOW.n_frames - 1  # a column reaches into the frame before its own
+    mixed = np.concatenate([other[:oldest], sound[oldest:]])
+    np.testing.assert_array_equal(watch(sound)[-1], watch(mixed)[-1])
+    mixed = np.concatenate([other[: oldest + 1], sound[oldest + 1 :]])
+    assert (watch(sound)[-1] != watch(mixed)[-1]).any()
+
+
+def test_before_the_episode_is_neither_silence_nor_the_episode_before():
+    heard = HeardSound(HOW)
+    for block in noise(50):
+        heard.add(block)
+    heard.clear()
+    picture = heard.add(noise(1)[0])
+    usual = np.array(HOW.before_episode)[::-1]
+    assert (picture[:, :-1] == usual[:, None, None]).all()  # one of the two columns would reach before the episode
+    assert (picture[:, -1, 0] != usual).any()
+    np.testing.assert_array_equal(picture, watch(noise(1))[0])
+
+
+def test_floats_and_pcm_give_the_same_picture():
+    sound = noise(5)
+    np.testing.assert_array_equal(watch(sound), watch((sound / np.float32(32768)).astype(np.float32)))
+
+
+@pytest.mark.parametrize(("fps", "rate", "columns"), [(5, 16000, 8), (5, 48000, 8), (30, 48000, 1), (20, 16000, 3)])
+def test_other_rates_move_by_whole_columns_too(fps, rate, columns):
+    how = replace(HOW, fps=fps, sample_rate=rate, columns_per_frame=columns)
+    sound = np.random.default_rng(0).normal(0, 2000, (15, how.samples_per_frame)).astype(np.int16)
+    pictures = watch(sound, how)
+    np.testing.assert_array_equal(pictures[-1][:, :-columns], pictures[-2][:, columns:])
+
+
+def test_another_frame_in_place_of_the_newest():
+    sound, other = noise(50), noise(1, seed=1)[0]
+    heard = HeardSound(HOW)
+    for block in sound:
+        heard.add(block)
+    heard.forget_newest()
+    np.testing.assert_array_equal(heard.add(other), watch(np.concatenate([sound[:-1], other[None]]))[-1])
+
+
+# Datasets
+
+
+def config(root: Path, output: Path, **options) -> AttachSpectrogramConfig:
+    places = DatasetPlace("t/heard", str(root)), DatasetPlace("t/seen", str(output))
+    return AttachSpectrogramConfig(*places, **{"seconds": 0.5, **options})
+
+
+def load(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("t/seen", root=root, video_backend="pyav")
+
+
+def picture(dataset: LeRobotDataset, row: int, key: str = PICTURE) -> np.ndarray:
+    """(height, width, 3) uint8, as stored."""
+    return (dataset[row][key] * 255).round().byte().permute(1, 2, 0).numpy()
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("heard") / "dataset"
+    make_dataset(root, LENGTHS, image_size=16, repo_id="t/heard", microphones=(MICROPHONE, "observation.audio.table"))
+    return root
+
+
+@pytest.fixture(scope="module")
+def seen(original, tmp_path_factory) -> Path:
+    return attach_spectrogram(config(original, tmp_path_factory.mktemp("seen") / "dataset"))
+
+
+def test_every_frame_shows_the_last_seconds_and_all_else_stays(original, seen, tmp_path):
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in original.rglob("*") if path.is_file()}
+    again = attach_spectrogram(config(original, tmp_path / "again"))
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in before} == before
+    assert (again / "meta/info.json").read_bytes() == (seen / "meta/info.json").read_bytes()
+    old, new = LeRobotDataset("t/heard", root=original), load(seen)
+    assert set(new.features) - set(old.features) == {PICTURE, "observation.images.table"}
+    (how, _) = read_pictures(seen)
+    assert (how.height, how.width, how.columns_per_frame, how.seconds) == (16, 16, 1, 0.8), "the camera's size"
+    row = 0
+    for length in LENGTHS:
+        blocks = np.stack([old[row + frame][MICROPHONE].numpy() for frame in range(length)]).astype(np.int16)
+        for frame, expected in enumerate(watch(blocks, how)):
+            np.testing.assert_array_equal(picture(new, row + frame), expected)
+        assert torch.equal(new[row][CAMERA], old[row][CAMERA])
+        row += length
+    assert new.meta.stats[PICTURE]["mean"].shape == new.meta.stats[CAMERA]["mean"].shape
+    pixels = np.stack([picture(new, row) for row in range(len(new))]) / 255
+    np.testing.assert_allclose(new.meta.stats[PICTURE]["mean"].ravel(), pixels.mean((0, 1, 2)), atol=1e-6)
+    assert check_dataset(seen).is_sound
+    assert [verdict for verdict in check_numbers(DatasetSource(new)) if verdict.level == "error"] == []
+
+
+def test_a_video_shows_nearly_the_same(original, seen, tmp_path):
+    options = {"video": True, "vcodec": "h264", "crf": 18, "microphones": ["gripper"]}
+    film = load(attach_spectrogram(config(original, tmp_path / "film", **options)))
+    stored = load(seen)
+    assert film.features[PICTURE]["dtype"] == "video"
+    assert pictures_of(film.features) == pictures_of(stored.features)[:1]
+    wrong = [np.abs(picture(film, row).astype(int) - picture(stored, row)).mean() for row in (0, 11, 12, 30, 40, 45)]
+    assert max(wrong) < 8
+    assert check_dataset(film.root).is_sound
+
+
+def test_a_copy_that_fails_is_not_there_and_one_that_is_there_is_not_touched(original, seen, tmp_path, monkeypatch):
+    with pytest.raises(AttachError, match="is there already"):
+        attach_spectrogram(config(original, seen))
+    monkeypatch.setattr(picture_storage, "_png", lambda picture: (_ for _ in ()).throw(OSError("the disk is full")))
+    with pytest.raises(OSError, match="disk is full"):
+        attach_spectrogram(config(original, tmp_path / "new"))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"microphones": ["nose"]}, "--microphones names 'nose'; the dataset has gripper, table"),
+        ({"microphones": []}, "names none"),
+        ({"name": "front"}, "'observation.images.front' is in the dataset already"),
+        ({"name": "heard"}, "is in the dataset already"),  # for the second microphone
+        ({"seconds": 3.0}, "60 frames do not fit into 16 columns.*at most 0.80"),
+        ({"seconds": 0.0}, "above 0"),
+        ({"height": 3}, "8 to 4096 pixels"),
+        ({"low_db": 10.0, "high_db": -10.0}, "the second above the first"),
+        ({"crf": 10}, "for --video=true"),
+        ({"video": True, "vcodec": "mjpeg"}, "mjpeg"),
+        ({"dataset": DatasetPlace("t/nothing", "/nonexistent/dataset")}, "There is no dataset"),
+    ],
+)
+def test_what_does_not_fit_is_one_clear_error(original, tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        attach_spectrogram(replace(config(original, tmp_path / "seen"), **options))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_without_sound_or_with_nothing_but_silence(tmp_path):
+    features = {key: f for key, f in dataset_features(image_size=16).items() if key != MICROPHONE}
+    make_dataset(tmp_path / "deaf", (5,), features=features)
+    with pytest.raises(InputError, match="has no sound in columns"):
+        attach_spectrogram(config(tmp_path / "deaf", tmp_path / "seen"))
+    dataset = LeRobotDataset.create(
+        "t/silent", 20, dataset_features(image_size=16), root=tmp_path / "silent", use_videos=False
+    )
+    for _ in range(3):
+        silence = {
+            k: np.zeros(f["shape"], f["dtype"]) for k, f in dataset_features(image_size=16).items() if k != CAMERA
+        }
+        dataset.add_frame({**silence, CAMERA: np.zeros((16, 16, 3), np.uint8), "task": "Wait."})
+    dataset.save_episode()
+    dataset.finalize()
+    with pytest.raises(InputError, match="nothing but silence"):
+        attach_spectrogram(config(tmp_path / "silent", tmp_path / "seen"))
+
+
+def test_lerobots_tools_keep_how_the_pictures_were_made_and_mix_no_levels(seen, tmp_path, monkeypatch):
+    def edit(*options: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["lerobot-edit-dataset", *options])
+        lerobot_edit_dataset.main()
+
+    less = ["--operation.type=delete_episodes", "--operation.episode_indices=[0]"]
+    edit("--repo_id=t/seen", f"--root={seen}", "--new_repo_id=t/less", f"--new_root={tmp_path / 'less'}", *less)
+    assert read_pictures(tmp_path / "less") == read_pictures(seen)
+    np.testing.assert_array_equal(picture(load(tmp_path / "less"), 0), picture(load(seen), LENGTHS[0]))
+    features = load(seen).features
+    other = {**features, PICTURE: {**features[PICTURE], "info": HOW.as_info()}}
+    assert features_equal_for_merge(features, features)
+    assert not features_equal_for_merge(features, other), "LeRobot would merge pictures of different levels"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"height": 10**9}, "height=1000000000; wanted at most 4096"),
+        ({"width": "84"}, "width='84'; wanted a whole number"),
+        ({"columns_per_frame": 801}, "columns_per_frame=801"),
+        ({"sample_rate": 16001}, "sample_rate / fps"),
+        ({"low_db": None}, "cannot be read"),
+        ({"before_episode": [0]}, "84 numbers of 0 to 255"),
+        ({"layout": 2}, "wanted 1, which this version makes"),
+        ({"feature": "observation.state"}, "begins with observation.images."),
+        ({"colour": "red"}, "wanted the fields"),
+    ],
+)
+def test_a_dataset_that_says_nonsense_of_its_pictures_is_refused(change, message):
+    info = {"spectrogram": {**HOW.as_info()["spectrogram"], **change}}
+    with pytest.raises(InputError, match=message):
+        pictures_of({PICTURE: {"info": info}})
+
+
+# Environments
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    """The first 46 frames of two attempts of the expert: a picture shows 42."""
+    folder = tmp_path_factory.mktemp("recorded")
+    env = env_spec(PlaybyearEnvConfig(task="OccludedGrasp-v1", episode_length=46)).make()
+    features = frames.dataset_features(env_facts(env))
+    with DurableWriter("t/heard", folder / "dataset", 20, features) as writer:
+        for seed in (0, 1):
+            for frame in frames.episode_frames(play(env, Script(), seed), features):
+                writer.add_frame(frame)
+            writer.save_episode()
+    env.close()
+    return attach_spectrogram(config(folder / "dataset", folder / "seen", seconds=2.0))
+
+
+def env_config(recorded: Path, **options) -> PlaybyearEnvConfig:
+    return PlaybyearEnvConfig(**{"task": "OccludedGrasp-v1", "spectrogram": str(recorded), **options})
+
+
+def test_a_rollout_shows_what_the_dataset_holds_bit_for_bit(recorded):
+    """Two environments side by side play both episodes, one after the other and in the other order."""
+    dataset = load(recorded)
+    starts = [0, int(dataset.meta.episodes["length"][0])]
+    cfg = env_config(recorded)
+    vec = make_env(cfg, n_envs=2)["playbyear"][0]
+    declared = {key: feature.shape for key, feature in env_to_policy_features(cfg).items() if key != "action"}
+    for order in ([0, 1], [1, 0]):
+        rows = [starts[episode] for episode in order]
+        seeds = [int(dataset[row]["seed"]) for row in rows]
+        observation, _ = vec.reset(seed=seeds, options={NEW_ROLLOUT_OPTION: True})
+        for frame in range(46):
+            batch = preprocess_observation(observation)
+            assert {key: tuple(value.shape[1:]) for key, value in batch.items()} == declared
+            items = [dataset[row + frame] for row in rows]
+            for key in (MICROPHONE, PICTURE, CAMERA):
+                assert torch.equal(batch[key], torch.stack([item[key].float() for item in items])), (key, frame)
+            observation, *_ = vec.step(np.stack([item["action"].numpy() for item in items]))
+    vec.close()
+
+
+@pytest.mark.slow
+def test_environments_in_processes_of_their_own_show_the_same(recorded):
+    seen = []
+    for use_async_envs in (False, True):
+        vec = make_env(env_config(recorded), n_envs=2, use_async_envs=use_async_envs)["playbyear"][0]
+        vec.reset(seed=[3, 4])
+        for _ in range(3):
+            observation, *_ = vec.step(np.zeros((2, 4), np.float32))
+        seen.append(observation["pixels"]["gripper"])
+        vec.close()
+    np.testing.assert_array_equal(*seen)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spectrogram": "/nonexistent"}, "cannot be read"),
+        ({"sound": "none"}, "has no sound to show"),
+        ({"microphones": ["table"]}, "the microphone 'gripper'; the environment has table"),
+        ({"sample_rate": 48000}, "sample_rate=16000; the environment has 48000"),
+        ({"task": "TellApart-v1"}, "sample_rate=16000|fps=20; the environment has"),
+    ],
+)
+def test_an_environment_that_hears_otherwise_is_refused(recorded, options, message):
+    with pytest.raises(DecodingError, match=message):
+        env_config(recorded, **options)
+
+
+def test_a_dataset_without_pictures_is_refused_and_so_is_recording_with_them(original, recorded, tmp_path):
+    with pytest.raises(DecodingError, match="names no pictures of sound"):
+        env_config(original)
+    with pytest.raises(InputError, match="as a camera of the environment is; attach them with another --name"):
+        pictures_for(recorded, {"gripper": 16000}, 20, ["gripper"])
+    arguments = ["--env.type=playbyear", f"--env.spectrogram={recorded}", "--env.task=OccludedGrasp-v1"]
+    data = ["--dataset.repo_id=t/new", f"--dataset.root={tmp_path / 'new'}"]
+    with pytest.raises(RolloutError, match="Leave it out here"):
+        record(draccus.parse(RecordConfig, args=[*arguments, *data]))
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_environment_of_ones_own_is_wrapped():
+    class Room(gym.Env):
+        observation_space = gym.spaces.Dict({"audio.gripper": gym.spaces.Box(-32768, 32767, (800,), np.int16)})
+        action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.blocks = iter(noise(9, seed or 0))
+            return {"audio.gripper": next(self.blocks)}, {}
+
+        def step(self, action):
+            return {"audio.gripper": next(self.blocks)}, 0.0, False, False, {}
+
+    env = WithSoundPictures(Room(), [HOW])
+    for seed in (0, 1):
+        observations = [env.reset(seed=seed)[0], *(env.step(np.zeros(1, np.float32))[0] for _ in range(8))]
+        assert all(env.observation_space.contains(observation) for observation in observations)
+        pictures = np.stack([observation["pixels"]["gripper"] for observation in observations])
+        np.testing.assert_array_equal(pictures, watch(noise(9, seed)))
+
+
+def test_a_robot_shows_them_too_also_after_a_person_took_over(tmp_path):
+    info = tmp_path / "info.json"
+    info.write_text(json.dumps({"features": {PICTURE: {"info": HOW.as_info()}}}))
+    with robot_env(joint_config(noise_file(tmp_path, 16000), spectrogram=str(info))) as env:
+        for _ in range(2):
+            observation, _ = env.reset(seed=0)
+            blocks, seen = [observation["audio.gripper"]], [observation["pixels"]["gripper"]]
+            for tick in range(6):
+                if tick == 3:
+                    env.hold()
+                    env.go_on()  # what the last frame saw and heard is replaced
+                    blocks[-1], seen[-1] = observation["audio.gripper"], observation["pixels"]["gripper"]
+                observation, *_ = env.step(np.zeros(3, np.float32))
+                assert env.observation_space.contains(observation)
+                blocks.append(observation["audio.gripper"])
+                seen.append(observation["pixels"]["gripper"])
+            np.testing.assert_array_equal(seen, watch(np.stack(blocks)))
+    with pytest.raises(DecodingError, match="the environment has none"):
+        joint_config(spectrogram=str(info))
+
+
+# LeRobot's policies
+
+SMALL = {
+    "act": (
+        "dim_model=32 n_heads=2 dim_feedforward=32 n_encoder_layers=1 n_vae_encoder_layers=1 latent_dim=4 chunk_size=5 "
+        "n_action_steps=1"
+    ),
+    "diffusion": (
+        "horizon=8 n_action_steps=1 down_dims=[16,32] n_groups=4 use_group_norm=true diffusion_step_embed_dim=16 "
+        "num_train_timesteps=4 spatial_softmax_num_keypoints=8"
+    ),
+}
+
+
+def call(command, *arguments: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", [command.__name__, *arguments])
+        command.main()
+
+
+@pytest.mark.parametrize(
+    "name", ["act", pytest.param("diffusion", marks=[needs("diffusers", "diffusion"), pytest.mark.slow])]
+)
+def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path, one_thread):
+    call(
+        lerobot_train,
+        f"--policy.type={name}",
+        "--policy.push_to_hub=false",
+        "--policy.device=cpu",
+        "--policy.pretrained_backbone_weights=null",
+        *(f"--policy.{option}" for option in SMALL[name].split()),
+        "--dataset.repo_id=t/seen",
+        f"--dataset.root={recorded}",
+        "--dataset.video_backend=pyav",
+        "--num_workers=0",
+        "--batch_size=2",
+        "--steps=2",
+        f"--output_dir={tmp_path / 'train'}",
+    )
+    checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
+    call(
+        lerobot_eval,
+        f"--policy.path={checkpoint}",
+        "--env.type=playbyear",
+        "--env.task=OccludedGrasp-v1",
+        f"--env.spectrogram={recorded}",
+        "--env.episode_length=3",
+        "--env.visualization_width=64",
+        "--env.visualization_height=64",
+        "--eval.n_episodes=4",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 4
+    policy = get_policy_class(name).from_pretrained(checkpoint).eval()
+    item = load(recorded)[45]
+    actions = []
+    for shown in (item[PICTURE], 1 - item[PICTURE]):
+        policy.reset()
+        torch.manual_seed(0)
+        batch = {key: value[None] for key, value in item.items() if key.startswith("observation.")}
+        actions.append(policy.select_action({**batch, PICTURE: shown[None]}))
+    assert not torch.equal(*actions), "what is heard has no part in what is done"
