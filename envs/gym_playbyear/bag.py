@@ -7,6 +7,8 @@ that it touches something so soft.
 
 from typing import Any
 
+import numpy as np
+
 from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.rules import Rule
 from gym_playbyear.task import Prop
@@ -21,6 +23,8 @@ _WALL = 0.0015  # m, half its thickness
 _STIFFNESS = (2.0, 0.8)  # Nm/rad of the hinges at the foot and halfway up
 _DAMPING = (0.06, 0.02)  # Nms/rad
 _COLOURS = ("0.70 0.52 0.33 1", "0.75 0.57 0.38 1")  # of the lower and the upper halves: brown paper
+_PARTS = ("foot", "half")
+_SEEN = 0.005  # rad
 _BOTTOM_STIFFNESS, _BOTTOM_DAMPING = 1500.0, 40.0  # N/m, Ns/m
 _BOTTOM_PRESSED = 0.05  # m: so far down it crackles as a wall that bends by one radian
 
@@ -57,12 +61,18 @@ def _wall(name: str, axis: int, sign: int) -> str:
     ]
     joints = [
         f'<joint name="{name}_{part}" axis="{hinge}" stiffness="{stiffness}" damping="{damping}" range="-1.2 1.2"/>'
-        for part, stiffness, damping in zip(("foot", "half"), _STIFFNESS, _DAMPING, strict=True)
+        for part, stiffness, damping in zip(_PARTS, _STIFFNESS, _DAMPING, strict=True)
     ]
     return f"""
       <body name="{name}_lower" pos="{place[0]} {place[1]} {place[2]}">{joints[0]}{panels[0]}
         <body name="{name}_upper" pos="0 0 {2 * half}">{joints[1]}{panels[1]}</body>
       </body>"""
+
+
+def walls_seen(env: Any) -> dict[str, np.ndarray]:
+    """What the camera shows of the moment: how the eight panels are bent [rad], to a tenth of a pixel or so."""
+    angles = [env.data.joint(f"{wall}_{part}").qpos[0] for wall in ("front", "back", "left", "right") for part in _PARTS]
+    return {"bag_bend": np.round(np.array(angles) / _SEEN) * _SEEN}
 
 
 def set_bottom(env: Any, height: float) -> None:

@@ -200,10 +200,12 @@ def as_text(report: Report) -> str:
     if report.twin is not None:
         twin = report.twin
         same = "every observation but sound is the same" if twin.equal_until_touch else "OBSERVATIONS DIFFER"
-        lines.append(f"twin worlds, {twin.n_episodes} episodes: until the touch {same};")
+        until, judged = ("until the touch", "after it") if twin.can_be_touched else ("to the end", "at any time")
+        lines.append(f"twin worlds, {twin.n_episodes} episodes: {until} {same};")
         for name, spread in twin.auc.items():
-            lines.append(f"  after it, {name}: area {spread.value:.3f} ({spread.low:.3f}-{spread.high:.3f})")
-        lines.append(f"  pictures that differ after it: {100 * twin.pictures_after_touch:.0f} %")
+            lines.append(f"  {judged}, {name}: area {spread.value:.3f} ({spread.low:.3f}-{spread.high:.3f})")
+        if twin.can_be_touched:
+            lines.append(f"  pictures that differ after it: {100 * twin.pictures_after_touch:.0f} %")
     lines += [f"broken: {fault}" for fault in report.broken] or ["all limits hold"]
     return "\n".join(lines)
 

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from gym_playbyear.adversaries.groping import GROPES, GropingScript
 from gym_playbyear.arena import TABLE, TABLE_TOP
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.bag import BAG_MIDDLE, BOTTOM_THICKNESS, RIM, Torn, bag, set_bottom
+from gym_playbyear.bag import BAG_MIDDLE, BOTTOM_THICKNESS, RIM, Torn, bag, set_bottom, walls_seen
 from gym_playbyear.bag_contents import CONTENTS, FRICTION, contents_prop, drop, middle_of
 from gym_playbyear.bag_experts import FOR_TALLER_THINGS, STRATEGIES, BagExpert, BlindBag
 from gym_playbyear.bag_gate import BagGate
@@ -131,6 +132,8 @@ def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
         expert=BagExpert if contents in ("keys", "candies") else partial(BagExpert, config=FOR_TALLER_THINGS),
         gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},
+        deaf={name: partial(GropingScript, grope=grope, bottom=numbers.bottom) for name, grope in GROPES.items()},
+        sees=walls_seen,
         horizon=numbers.horizon,
         control_hz=5,
         sample_rate=48000,

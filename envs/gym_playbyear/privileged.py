@@ -49,8 +49,12 @@ class PrivilegedState:
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def camera_numbers(self) -> dict[str, Any]:
-        """What the camera shows of the episode, in numbers: scripts that do not hear may know it."""
-        return dict(self.shown)
+        """What the camera shows of the episode and of the moment, in numbers: scripts that do not hear may know it."""
+        return {**self.shown, **(self.definition.sees(self) if self.definition.sees else {})}
+
+    def deaf_scripts(self) -> dict[str, Any]:
+        """The task's own scripts that feel with the arm and do not hear (`gym_playbyear.adversaries`), by name."""
+        return dict(self.definition.deaf)
 
     @property
     def check_limits(self) -> dict[str, float]:

@@ -152,6 +152,10 @@ class Task:
         correcting_expert: An expert that corrects, where that differs from one that demonstrates.
         gate: `gate(env, expert)` makes the intervention gate; None: there is none.
         blind: Scripts without any sense of contact, by name; each is `script(env)`.
+        deaf: Scripts that feel with the arm and do not hear, by name; each is `script(facts, rng)`, see
+            `gym_playbyear.adversaries`. Tasks whose camera shows a `hidden_range` have ours without naming any.
+        sees: `sees(env)`: what the camera shows of the moment, in numbers by name, besides what `place` returned.
+        twins: Options of two worlds in which nothing differs but what only sound tells.
         control_hz, sample_rate: Steps, and samples of a microphone, per second.
         physics_dt: Duration of a physics step [s].
         microphones: Those that are on unless the environment is asked for others.
@@ -178,6 +182,9 @@ class Task:
     correcting_expert: Callable[[Any], Any] | None = None
     gate: Callable[[Any, Any], Any] | None = None
     blind: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
+    deaf: Mapping[str, Callable[[Any, np.random.Generator], Any]] = field(default_factory=dict)
+    sees: Callable[[Any], dict[str, Any]] | None = None
+    twins: tuple[Mapping[str, Any], Mapping[str, Any]] = ({}, {"hidden_object": False})
     control_hz: int = 20
     sample_rate: int = 16000
     physics_dt: float = PHYSICS_DT

@@ -114,6 +114,8 @@ def tell_apart(*, contents: str | None = None) -> Task:
         ends=(ToldWrong(course),),
         expert=PouchExpert,
         blind={name: partial(BlindPouch, strategy=name) for name in BLIND_STRATEGIES},
+        sees=_pouch_seen,
+        twins=tuple({"contents": contents} for contents in CONTENTS),  # whoever acts, and whatever is done
         control_hz=5,
         horizon=100,
         cameras=(FRONT_CAMERA,),
@@ -138,6 +140,11 @@ def _place(env: Any, options: dict[str, Any], *, contents: str | None) -> dict[s
     env.secrets["contents"] = chosen
     env.materials |= dict.fromkeys(PIECES, chosen)
     return {"pouch_place": (x, y)}
+
+
+def _pouch_seen(env: Any) -> dict[str, Any]:
+    """Where the pouch is and how it lies: (3,) [m, world], and a quaternion (4,)."""
+    return {"pouch_now": env.pouch_position, "pouch_turn": env.data.body(POUCH).xquat.copy()}
 
 
 def is_lifted(env: Any) -> bool:

@@ -26,11 +26,10 @@ def players(task: str, **options: Any) -> dict[str, str]:
 def deaf_scripts(deaf_task: DeafTask) -> dict[str, ScriptMaker]:
     """The deaf scripts that know how to play a task, after its episode began.
 
-    A task may bring its own: its environment then has a method `deaf_scripts`. Ours look for an object on a line.
+    A task brings its own (`Task.deaf`). Those that are for all look for an object on a line.
     """
-    if hasattr(deaf_task.env, "deaf_scripts"):
-        return dict(deaf_task.env.deaf_scripts())
-    return SCRIPTS if "hidden_range" in camera_numbers(deaf_task.env) else {}
+    own = dict(deaf_task.env.deaf_scripts())
+    return own or (SCRIPTS if "hidden_range" in camera_numbers(deaf_task.env) else {})
 
 
 def promised_limits(task: str, **options: Any) -> dict[str, float]:

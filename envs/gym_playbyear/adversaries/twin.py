@@ -1,9 +1,12 @@
-"""Twin worlds: one with the hidden object and one without, in which the hand does the same.
+"""Twin worlds, which differ in nothing but what only sound tells: one with the hidden object and one without, or one with
+screws in the pouch and one with peanuts. The hand does the same in both.
 
-Until the hand touches the object, nothing but sound may differ at all. After it, the arm's measurements may differ by less than
-their noise: a classifier that sees the last half second of them must not tell the worlds apart.
+Until the hand touches the object, nothing but sound may differ at all; where what is hidden cannot be touched, never. After the
+touch, the arm's measurements may differ by less than their noise, and so may what the camera shows in numbers: a
+classifier that sees the last ten of them must not tell the worlds apart.
 
-The hand moves as the scripted expert does in the world with the object; its actions are replayed in the other.
+The hand moves as the scripted expert does in the world with the object, or in either of two that nothing can be touched in; its
+actions are replayed in the other.
 """
 
 import hashlib
@@ -13,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from gym_playbyear.adversaries.classifier import CLASSIFIERS, area_under_curve
-from gym_playbyear.adversaries.view import DeafTask
+from gym_playbyear.adversaries.view import DeafTask, DeafView
 from gym_playbyear.arm import ACTION_SCALE
 
 _HISTORY = 10  # steps in a window
 _AFTER = 10  # steps after the touch that are judged
-_FAR_AWAY = (-50.0, -50.0, 0.0)  # m: where no camera looks
 _N_DRAWS = 500
 
 
@@ -36,9 +38,10 @@ class TwinResult:
     """What tells twin worlds apart.
 
     Attributes:
-        n_episodes: Those in which the object was touched, of which half trained the classifiers.
+        n_episodes: Those in which the object was touched, of which half trained the classifiers; all, if nothing can be touched.
         n_windows: Judged windows of the held-out half.
-        equal_until_touch: Whether every observation but sound was the same, byte for byte, until the touch.
+        equal_until_touch: Whether every observation but sound was the same, byte for byte, until the touch; to the end, if
+            nothing can be touched.
         first_difference: Where it was not: the seed, the step and the observation; None if it was.
         pictures_after_touch: Share of compared pictures after the touch that differ.
         auc: Area under the curve of each classifier.
@@ -50,11 +53,12 @@ class TwinResult:
     first_difference: str | None
     pictures_after_touch: float
     auc: dict[str, Spread]
+    can_be_touched: bool = True
 
 
 @dataclass
 class _Run:
-    """One world's episode: what was measured (T, 7), and which step touched first."""
+    """One world's episode: what was measured and seen (T, 7 + numbers of the camera), and which step touched first."""
 
     measured: np.ndarray
     touched_at: int | None
@@ -69,33 +73,33 @@ class Twins:
     """
 
     def __init__(self, task: str, **options: Any):
-        self.present = DeafTask(task, **options)
-        try:
-            self.absent, self._must_remove = DeafTask(task, hidden_object=False, **options), False
-        except TypeError:  # an older task: its object is taken far away after the reset
-            self.absent, self._must_remove = DeafTask(task, **options), True
+        asked = DeafTask(task, **options)
+        first, second = asked.env.definition.twins
+        asked.close()
+        self.worlds = DeafTask(task, **{**options, **first}), DeafTask(task, **{**options, **second})
+        self.can_be_touched = self.worlds[0].can_be_touched
 
-    def expert_run(self, seed: int) -> tuple[_Run, list[np.ndarray]]:
-        """The expert's episode until some steps after its first touch, and its actions."""
-        view = self.present.begin(seed)
-        expert = self.present.env.scripted_expert()
-        measured, actions, touched_at, done = [view.agent_pos], [], None, False
+    def expert_run(self, seed: int) -> tuple[_Run, list[np.ndarray], DeafTask]:
+        """The expert's episode until some steps after its first touch, its actions, and the other world."""
+        world, other = self.worlds if self.can_be_touched or seed % 2 else self.worlds[::-1]
+        view = world.begin(seed)
+        expert = world.env.scripted_expert()
+        measured, actions, touched_at, done = [_numbers(view)], [], None, False
         while not done and (touched_at is None or len(actions) < touched_at + _AFTER):
             actions.append(expert.act())
-            view, done, _ = self.present.advance(actions[-1])
-            measured.append(view.agent_pos)
-            if touched_at is None and self.present.has_touched:
+            view, done, _ = world.advance(actions[-1])
+            measured.append(_numbers(view))
+            if touched_at is None and world.has_touched:
                 touched_at = len(actions)
-        return _Run(np.stack(measured), touched_at), actions
+        return _Run(np.stack(measured), touched_at), actions, other
 
-    def replay(self, seed: int, actions: list[np.ndarray]) -> _Run:
-        """The same actions in the world without the object."""
-        measured = [self.absent.begin(seed).agent_pos]
-        self._remove()
+    def replay(self, world: DeafTask, seed: int, actions: list[np.ndarray]) -> _Run:
+        """The same actions in the other world, as long as the attempt lasts there."""
+        measured = [_numbers(world.begin(seed))]
         for action in actions:
-            view, done, _ = self.absent.advance(action)
-            measured.append(view.agent_pos)
-            if done and not self._must_remove:  # a removed object is taken for one that was shoved
+            view, done, _ = world.advance(action)
+            measured.append(_numbers(view))
+            if done:
                 break
         return _Run(np.stack(measured), None)
 
@@ -107,10 +111,9 @@ class Twins:
         Returns:
             Where they differ before the touch, and for each picture after it whether it differs.
         """
-        first = _digests(self.present.env, seed, actions, lambda: None)
-        second = _digests(self.absent.env, seed, actions, self._remove)
+        first, second = (_digests(world.env, seed, actions) for world in self.worlds)
         before, after = [], []
-        for step, (one, other) in enumerate(zip(first, second, strict=False)):
+        for step, (one, other) in enumerate(zip(first, second, strict=True)):
             different = [key for key in one if one[key] != other.get(key)]
             if step < touched_at:
                 before += [f"seed {seed}, step {step}: {key}" for key in different]
@@ -119,20 +122,18 @@ class Twins:
         return before, after
 
     def close(self) -> None:
-        self.present.close()
-        self.absent.close()
-
-    def _remove(self) -> None:
-        if self._must_remove:
-            data = self.absent.env.data
-            address = self.absent.env.model.joint("cube").qposadr[0]
-            data.qpos[address : address + 3] = _FAR_AWAY
+        for world in self.worlds:
+            world.close()
 
 
-def _digests(env: Any, seed: int, actions: list[np.ndarray], begun) -> list[dict[str, str]]:
+def _numbers(view: DeafView) -> np.ndarray:
+    """(7 + N,) what the arm measures, and what the camera shows."""
+    return np.concatenate([view.agent_pos, *(np.ravel(shown) for shown in view.shown.values())])
+
+
+def _digests(env: Any, seed: int, actions: list[np.ndarray]) -> list[dict[str, str]]:
     """A digest of every observation but sound, for each step."""
     observations = [env.reset(seed=seed)[0]]
-    begun()
     observations += [env.step(action)[0] for action in actions]
     return [
         {key: hashlib.sha256(value.tobytes()).hexdigest() for key, value in _flat(seen) if not key.startswith("audio")}
@@ -150,15 +151,18 @@ def _flat(observation: dict[str, Any], prefix: str = "") -> list[tuple[str, np.n
 def windows(run: _Run, actions: list[np.ndarray], steps: range) -> np.ndarray:
     """What a deaf policy with half a second of memory may look at in each of `steps`, (N, F).
 
-    How far the hand is from where it was sent since the window began, the fingers, their velocities, and what was sent.
+    How far the hand is from where it was sent since the window began, the fingers, their velocities, what was sent, and what
+    the camera shows, as far as it changes in the episode.
     """
+    seen = run.measured[:, 7:] - run.measured[0, 7:]
     sent = np.cumsum([np.zeros(3), *(action[:3] * ACTION_SCALE for action in actions)], axis=0)
     features = []
     for step in steps:
         window = slice(step + 1 - _HISTORY, step + 1)
         moved, meant = run.measured[window, :3], sent[window]
         lag = (moved - moved[0]) - (meant - meant[0])
-        features.append(np.concatenate([lag.ravel(), run.measured[window, 3:].ravel(), (meant - meant[0]).ravel()]))
+        arm = [lag.ravel(), run.measured[window, 3:7].ravel(), (meant - meant[0]).ravel()]
+        features.append(np.concatenate([*arm, seen[window].ravel()]))
     return np.stack(features)
 
 
@@ -180,22 +184,26 @@ def twin_test(task: str, seeds: range, *, n_pictured: int = 3, **options: Any) -
     pictures: list[bool] = []
     n_episodes = 0
     for seed in seeds:
-        run, actions = twins.expert_run(seed)
-        if run.touched_at is None or run.touched_at < _HISTORY:
+        run, actions, other_world = twins.expert_run(seed)
+        if twins.can_be_touched and (run.touched_at is None or run.touched_at < _HISTORY):
             continue
-        other = twins.replay(seed, actions)
-        before = np.flatnonzero((run.measured[: run.touched_at] != other.measured[: run.touched_at]).any(axis=1))
-        differences += [f"seed {seed}, step {step}: agent_pos" for step in before]
-        steps = range(run.touched_at, min(len(run.measured), len(other.measured)))
-        for world, has_object in ((run, True), (other, False)):
+        other = twins.replay(other_world, seed, actions)
+        end = min(len(run.measured), len(other.measured))
+        same_until, judged_from = (run.touched_at,) * 2 if run.touched_at else (end, _HISTORY)
+        before = np.flatnonzero((run.measured[:same_until] != other.measured[:same_until]).any(axis=1))
+        differences += [f"seed {seed}, step {step}: agent_pos, or numbers of the camera" for step in before]
+        steps = range(judged_from, end)
+        is_first = other_world is twins.worlds[1]
+        for world, label in ((run, is_first), (other, not is_first)):
             features.append(windows(world, actions, steps))
-            labels += [has_object] * len(steps)
+            labels += [label] * len(steps)
             episodes += [n_episodes] * len(steps)
         if n_episodes < n_pictured:
-            found, changed = twins.differing_observations(seed, actions, run.touched_at)
+            found, changed = twins.differing_observations(seed, actions[: end - 1], same_until)
             differences += found
             pictures += changed
         n_episodes += 1
+    can_be_touched = twins.can_be_touched
     twins.close()
     if n_episodes < 4:
         raise ValueError(f"The expert touched the hidden object in {n_episodes} episodes of {len(seeds)}: give more.")
@@ -207,8 +215,14 @@ def twin_test(task: str, seeds: range, *, n_pictured: int = 3, **options: Any) -
         equal_until_touch=not differences,
         first_difference=differences[0] if differences else None,
         pictures_after_touch=float(np.mean(pictures)) if pictures else 0.0,
-        auc=_areas(np.concatenate(features), np.array(labels), of_episode, held_out),
+        auc=_areas(_changing(np.concatenate(features)), np.array(labels), of_episode, held_out),
+        can_be_touched=can_be_touched,
     )
+
+
+def _changing(features: np.ndarray) -> np.ndarray:
+    """(N, F) without what is always the same."""
+    return features[:, features.max(axis=0) > features.min(axis=0)]
 
 
 def _areas(features: np.ndarray, labels: np.ndarray, episodes: np.ndarray, held_out: np.ndarray) -> dict[str, Spread]:

@@ -53,7 +53,8 @@ class DeafView:
     Attributes:
         agent_pos: (7,) float32 as the policy gets it: hand x, y, z [m, from the robot's base], two finger positions [m], two
             finger velocities [m/s].
-        shown: What the camera shows, in numbers [m, world]: `hidden_range` (2,), and `bin_position` (3,) where there is a tray.
+        shown: What the camera shows, in numbers, as the task says: `hidden_range` (2,) [m, world], `bin_position` (3,) where
+            there is a tray, how the bag's walls are bent [rad].
         step: Steps since the episode began.
     """
 
@@ -66,12 +67,9 @@ def camera_numbers(env: Any) -> dict[str, np.ndarray]:
     """What the camera shows of the episode, in numbers.
 
     Args:
-        env: The unwrapped environment, after its reset. A task with something else to show has a method `camera_numbers`.
+        env: The unwrapped environment, after its reset.
     """
-    if hasattr(env, "camera_numbers"):
-        return {name: np.array(value, dtype=float) for name, value in env.camera_numbers().items()}
-    names = [name for name in ("hidden_range", "bin_position") if hasattr(env, name)]
-    return {name: np.array(getattr(env, name), dtype=float) for name in names}
+    return {name: np.array(value, dtype=float) for name, value in env.camera_numbers().items()}
 
 
 class DeafTask:
@@ -88,20 +86,23 @@ class DeafTask:
     def __init__(self, task: str, **options: Any):
         made: Any = gym.make(f"gym_playbyear/{task}", **{"sound": "none", "disable_env_checker": True, **options})
         self.env: Any = made.unwrapped
-        variant, hz = self.env.variant, float(self.env.metadata["render_fps"])
-        arm = variant.arm
+        definition, variant, hz = self.env.definition, self.env.variant, float(self.env.control_hz)
+        arm = definition.arm
         self.facts = TaskFacts(
             horizon=int(self.env._max_episode_steps),
             base=np.array(arm.base, dtype=float),
             line_x=float(np.mean(getattr(variant, "cube_x", 0.0))),
             max_opening=float(arm.max_opening),
-            cooldown=round(arm.gripper_cooldown * hz),
+            cooldown=round(getattr(arm, "gripper_cooldown", 0.0) * hz),
             max_shove=float(getattr(variant, "max_shove", np.inf)),
-            max_lead=float(arm.max_lead),
-            workspace=np.array(arm.workspace, dtype=float),
+            max_lead=float(getattr(arm, "max_lead", np.inf)),
+            workspace=np.array(getattr(arm, "workspace", ((-np.inf,) * 3, (np.inf,) * 3)), dtype=float),
             control_hz=hz,
         )
-        self._sensors = Proprioception(variant.sensors, hz)
+        self._touches = [
+            pair for pair in self.env.contact_forces for prop in definition.props if prop.hidden and pair == f"gripper-{prop.name}"
+        ]
+        self._sensors = Proprioception(definition.sensors, hz)
         self._rng = np.random.default_rng(0)
         self._n_steps = 0
         self.has_touched = False
@@ -132,11 +133,14 @@ class DeafTask:
 
     @property
     def touch_force(self) -> float:
-        """Largest force between gripper and hidden object in the last step [N]; for judges.
+        """Largest force between the hand and a hidden object in the last step [N]; for judges."""
+        forces = self.env.contact_forces
+        return max((forces[pair] for pair in self._touches), default=0.0)
 
-        A task whose hidden object is no cube names the pair of bodies in its attribute `hidden_pair`.
-        """
-        return float(self.env.contact_forces.get(getattr(self.env, "hidden_pair", "gripper-cube"), 0.0))
+    @property
+    def can_be_touched(self) -> bool:
+        """Whether the hand can touch what is hidden; what is shut in it cannot."""
+        return bool(self._touches)
 
     def close(self) -> None:
         self.env.close()

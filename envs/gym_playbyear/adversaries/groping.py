@@ -1,0 +1,246 @@
+"""Groping in a bag without hearing: how deep the things lie is what nobody sees, and what the arm may feel.
+
+The bag's bottom gives way, but it presses back, and the hand then lags behind where it was sent, by some hundredths of a
+millimetre for each millimetre that it is pressed down. A script keeps a belief about the bottom's height, goes down
+at a constant speed so that the lag is the same but for that, and closes where the things must then be between the fingers. What the
+fingers measure tells whether they hold something; if not, it goes on, as long as the attempt lasts.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gym_playbyear.adversaries.script import TIP_BELOW_HAND, Actions, DeafScript
+from gym_playbyear.adversaries.view import TaskFacts
+from gym_playbyear.arena import TABLE_TOP
+from gym_playbyear.bag import BAG_MIDDLE, RIM
+
+_RESOLUTION = 0.001  # m
+_NOISE = 0.00032  # m: of one measurement of the hand's height
+_GIVE = 0.021  # how much the hand lags behind for what the bottom is pressed down: its stiffness over the arm's
+_THICK = 0.008  # m: what lies on the bottom is met so far above it
+_TOO_FAR = (0.0095, 0.0215)  # m: pressed down further than that, the bag tears, or the hand is stopped
+_CATCH = (-0.006, 0.010)  # m: tips so far above the bottom close around what lies on it
+_MISTAKE = 0.02
+_EMPTY = 0.004  # m: opening of fingers that hold nothing
+_CLEAR = 0.028  # m: so high above its highest bottom nothing lies in the bag
+_AFTER_CLOSING = 16  # steps from closing fingers to things that were held in sight
+_FAST = 0.045  # m per step
+
+
+@dataclass(frozen=True)
+class Grope:
+    """How to grope. Lengths in metres.
+
+    Attributes:
+        closed: Pokes with closed fingers first, which meet what lies in the middle, then opens them.
+        step: What the hand goes down per control step.
+        rests: Steps of rest after each, in which the lag is measured; 0: it is measured on the way.
+        places: Where it closes, beside the bag's middle (x, y); the next one after every closing on nothing.
+        sure: It closes where the things are between the fingers with this probability.
+        feels: Without, it goes by what it was not stopped by.
+        aside: How far it goes aside where its fingers stand on the things.
+        gathers: Sweeps the things together before it closes, so far.
+    """
+
+    closed: bool = False
+    step: float = 0.003
+    rests: int = 0
+    places: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
+    sure: float = 0.6
+    feels: bool = True
+    aside: float = 0.02
+    gathers: float = 0.0
+
+
+GROPES = {
+    "feel": Grope(),
+    "feel_slowly": Grope(step=0.002, sure=0.5),
+    "feel_patiently": Grope(step=0.006, rests=2),
+    "feel_around": Grope(places=((0.0, 0.02), (0.0, -0.02)), sure=0.5),
+    "poke": Grope(closed=True, step=0.004, sure=0.7),
+    "poke_slowly": Grope(closed=True, step=0.003, sure=0.8),
+    "poke_fast": Grope(closed=True, step=0.006, sure=0.6),
+    "gather": Grope(gathers=0.05),
+    "survive": Grope(feels=False, step=0.01, sure=0.4),
+}
+
+
+class DepthBelief:
+    """A probability for each height of the bag's bottom, and for what the hand meets: the bottom, or things on it.
+
+    Args:
+        lower, upper: Between which heights the bottom is [m, above the table].
+        things: The probability that the hand meets things.
+    """
+
+    def __init__(self, lower: float, upper: float, things: float):
+        self.heights = np.arange(lower, upper + _RESOLUTION / 2, _RESOLUTION)
+        self.met = self.heights + np.array([[0.0], [_THICK]])  # (2, heights): the bottom, or things on it
+        self.probability = np.array([[1 - things], [things]]) * np.full(len(self.heights), 1 / len(self.heights))
+
+    def update(self, tips: float, lag: float) -> None:
+        """Learns from a measurement.
+
+        Args:
+            tips: Height of the fingers' tips [m, above the table].
+            lag: How far the hand is above where it would be in the air [m].
+        """
+        expected = _GIVE * np.clip(self.met - tips, 0, _TOO_FAR[1])
+        deviation = np.hypot(_NOISE, 0.3 * expected)
+        self._weigh(np.exp(-0.5 * ((lag - expected) / deviation) ** 2) / deviation + 1e-3 / _NOISE)
+
+    def survived(self, tips: float) -> None:
+        """The attempt goes on: what may not be pressed down further is not that high."""
+        self._weigh(np.where(self.met - tips > np.array(_TOO_FAR)[:, None], _MISTAKE, 1.0))
+
+    def rule_out(self, tips: float) -> None:
+        """Fingers that closed held nothing."""
+        self._weigh(np.where(self._caught(tips), 0.4, 1.0))
+
+    def chance(self, tips: float) -> float:
+        """The probability that things are between fingers whose tips are at that height."""
+        return float(self.probability[:, self._caught(tips)].sum())
+
+    def best(self) -> float:
+        """The tips' height at which that is greatest [m]."""
+        tips = np.arange(self.heights[0] + _CATCH[0], self.heights[-1] + _CATCH[1], _RESOLUTION)
+        return float(tips[np.argmax([self.chance(height) for height in tips])])
+
+    def danger(self, tips: float) -> float:
+        """The probability that the next step presses too hard."""
+        return float(self.probability[self.met - tips > np.array(_TOO_FAR)[:, None] - 0.003].sum())
+
+    def stands(self, tips: float) -> float:
+        """The probability that the hand stands on things."""
+        return float(self.probability[1, self.met[1] - tips > 0.003].sum())
+
+    def _caught(self, tips: float) -> np.ndarray:
+        above = tips - self.heights
+        return (above > _CATCH[0]) & (above < _CATCH[1])
+
+    def _weigh(self, likelihood: np.ndarray) -> None:
+        self.probability = self.probability * likelihood
+        self.probability /= self.probability.sum()
+
+
+class GropingScript(DeafScript):
+    """Goes down, feels for the bottom, closes, lifts.
+
+    Args:
+        facts, rng: As of every script.
+        grope: How to grope.
+        bottom: Between which heights the bag's bottom is [m, above the table].
+    """
+
+    def __init__(self, facts: TaskFacts, rng: np.random.Generator, grope: Grope, bottom: tuple[float, float]):
+        self.grope, self.bottom = grope, bottom
+        super().__init__(facts, rng)
+
+    def _plan(self) -> Actions:
+        self.belief = DepthBelief(*self.bottom, things=0.9 if self.grope.closed else 0.5)
+        self._in_air: list[float] = []
+        self._n_closings = 0
+        self._shift = np.zeros(2)
+        yield from self._travel()
+        if self.grope.closed:
+            yield from self._set_grip(True)
+            self._n_closings += 1
+            yield from self._descend()
+            yield from self._rise_over(self.belief.best())
+            yield from self._set_grip(False)
+            yield from self._lower_to(self.belief.best())
+            yield from self._close()
+        while True:
+            yield from self._descend()
+            if self.grope.gathers and self.steps_left > _AFTER_CLOSING + 14:
+                yield from self._gather()
+            elif self.belief.stands(self._tips()) > 0.6 and self.steps_left > _AFTER_CLOSING:
+                yield from self._go_aside()
+            yield from self._close()
+
+    def _travel(self) -> Actions:
+        """To above the next place, over all that may lie there."""
+        yield from self._rise_over(self.bottom[1])
+
+    def _rise_over(self, bottom: float) -> Actions:
+        """To above the next place, over what may lie on a bottom of that height."""
+        yield from self._go(np.array([*self._sent[:2], TABLE_TOP + bottom + _CLEAR + TIP_BELOW_HAND]), _FAST)
+        yield from self._go(np.array([*self._place(), self._sent[2]]), _FAST)
+
+    def _place(self) -> np.ndarray:
+        """(2,) where to go down [m, world]."""
+        place = self.grope.places[self._n_closings % len(self.grope.places)]
+        return np.array(BAG_MIDDLE) + place + self._shift
+
+    def _tips(self) -> float:
+        """Where the fingers' tips were sent [m, above the table]."""
+        return float(self._sent[2] - TIP_BELOW_HAND - TABLE_TOP)
+
+    def _descend(self) -> Actions:
+        """Down until the bottom's height is known well enough, or time is short."""
+        grope, belief, n_steps = self.grope, self.belief, 0
+        while self._tips() > self.bottom[0] - 0.004 and self.steps_left > _AFTER_CLOSING:
+            yield self._move(np.array([0, 0, -grope.step]))
+            n_steps += 1
+            for _ in range(grope.rests):
+                yield self._move(np.zeros(3))
+                self._feel(n_steps)
+            if not grope.rests:
+                self._feel(n_steps)
+            belief.survived(self._tips())
+            tips = self._tips()
+            chance = belief.chance(belief.best()) if grope.closed else belief.chance(tips)
+            if chance > grope.sure:
+                return
+            if belief.danger(tips) > 0.3:
+                if not grope.closed:
+                    yield from self._lower_to(belief.best())
+                return
+
+    def _feel(self, n_steps: int) -> None:
+        """Weighs what is measured now."""
+        lag = float(self.lag[2])
+        if self._tips() > self.belief.met.max():
+            if n_steps > 1:
+                self._in_air.append(lag)
+        elif self.grope.feels and len(self._in_air) > 2:
+            self.belief.update(self._tips(), lag - float(np.mean(self._in_air)))
+
+    def _lower_to(self, tips: float) -> Actions:
+        """Straight to where the tips are so high above the table [m]."""
+        yield from self._go(np.array([*self._place(), TABLE_TOP + tips + TIP_BELOW_HAND]), 0.02)
+
+    def _go_aside(self) -> Actions:
+        """The fingers stand on the things: up, a little aside, and down again."""
+        self._shift = self.rng.choice([-1.0, 1.0]) * np.array([0.0, self.grope.aside])
+        yield from self._rise_over(self.belief.best())
+        yield from self._lower_to(self.belief.best())
+
+    def _gather(self) -> Actions:
+        """Shoves what lies beside the hand in front of a finger, and comes down around it."""
+        tips, side = self.belief.best(), self.rng.choice([-1.0, 1.0])
+        low = np.array([*self._place(), TABLE_TOP + tips + 0.002 + TIP_BELOW_HAND])
+        yield from self._go(low + [0, -side * self.grope.gathers, 0], 0.02)
+        yield from self._go(low + [0, side * 0.01, 0], 0.02)
+        found = low + [0, side * 0.05, 0]
+        yield from self._go(self._sent + [0, 0, _CLEAR], _FAST)
+        yield from self._go(found + [0, 0, _CLEAR], _FAST)
+        yield from self._go(found, 0.02)
+
+    def _close(self) -> Actions:
+        """Closes where the hand is, and lifts what it holds. Ends when it holds nothing."""
+        tips = self._tips()
+        yield from self._set_grip(True)
+        if self.holds:
+            yield from self._go(np.array([*self._sent[:2], RIM + 0.055]), 0.03)
+        while self.holds:  # success is for the environment to see
+            yield self._move(np.zeros(3))
+        self._n_closings += 1
+        self.belief.rule_out(tips)
+        yield from self._travel()
+        yield from self._set_grip(False)
+
+    @property
+    def holds(self) -> bool:
+        return self._closes and self.opening > _EMPTY
