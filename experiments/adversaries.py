@@ -23,7 +23,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from experiments.protocol import RESULTS, RUNS, command_line, save
 from experiments.recurrent_player import (
-    EXPERT,
     RecurrentPlayer,
     demonstrations,
     imitate,
@@ -32,7 +31,7 @@ from experiments.recurrent_player import (
     save_checkpoint,
 )
 from gym_playbyear.adversaries.numeric_env import NumericTask
-from gym_playbyear.adversaries.scripts import SCRIPTS
+from gym_playbyear.adversaries.players import EXPERT
 
 DEMONSTRATION_SEED = 10000
 TRIAL_SEED = 20000  # of the episodes that the curve is measured on
@@ -88,7 +87,7 @@ def freeze_player(model: RecurrentPPO, frozen: bool) -> None:
 
 def learn(model: RecurrentPPO, env: NumericTask, arguments: Any, folder: Path, progress: dict[str, Any]) -> None:
     """Explores until so many steps of the task are done; a checkpoint and a line of metrics every now and then."""
-    per_update = arguments.n_envs * arguments.n_steps * arguments.repeat
+    per_update = arguments.n_envs * arguments.n_steps * env.repeat
     while progress["steps"] < arguments.steps:
         began = time.perf_counter()
         for _ in range(min(arguments.updates_per_trial, -(-(arguments.steps - progress["steps"]) // per_update))):
@@ -162,13 +161,13 @@ def parser():
     made.add_argument(
         "--hears", type=lambda text: text.lower() == "true", default=False, help="true: with the contact signal"
     )
-    made.add_argument("--teacher", choices=(EXPERT, NO_TEACHER, *SCRIPTS), default=EXPERT)
+    made.add_argument("--teacher", default=EXPERT, help=f"{EXPERT}, {NO_TEACHER}, or one of the task's deaf scripts")
     made.add_argument("--steps", type=int, default=2_000_000, help="of the task")
     made.add_argument("--seed", type=int, default=1)
     made.add_argument("--episodes", type=int, default=100, help="that judge the result")
     made.add_argument("--horizon", type=int)
     made.add_argument("--variant")
-    made.add_argument("--repeat", type=int, default=2, help="steps of the task for each action")
+    made.add_argument("--repeat", type=int, help="steps of the task for each action; by default the task's")
     made.add_argument("--n_demonstrations", type=int, default=200)
     made.add_argument("--imitation_updates", type=int, default=1500)
     made.add_argument("--n_envs", type=int, default=16)

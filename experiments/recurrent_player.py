@@ -14,11 +14,10 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from gym_playbyear.adversaries.numeric_env import N_PLAYER, STEP, NumericTask
-from gym_playbyear.adversaries.scripts import SCRIPTS
+from gym_playbyear.adversaries.numeric_env import N_PLAYER, NumericTask
+from gym_playbyear.adversaries.players import EXPERT, deaf_scripts
 from gym_playbyear.arm import ACTION_SCALE
 
-EXPERT = "expert"
 _BATCH = 16  # demonstrations
 
 
@@ -75,17 +74,22 @@ def demonstrations(env: NumericTask, teacher: str, seeds: range) -> list[tuple[n
 
     Args:
         env: The task in numbers.
-        teacher: `expert`, which knows the truth, or one of the deaf `SCRIPTS`.
+        teacher: `expert`, which knows the truth, or one of the task's deaf scripts.
         seeds: Of the episodes.
 
     Returns:
         Observations (T, features) and actions (T, 4) of each.
+
+    Raises:
+        ValueError: There is no such teacher.
     """
-    solved = []
+    solved, scripts = [], deaf_scripts(env.task)
+    if teacher not in (EXPERT, *scripts):
+        raise ValueError(f"teacher={teacher!r} does not know this task: choose from {', '.join((EXPERT, *scripts))}.")
     for seed in seeds:
         observation, _ = env.reset(seed=seed)
         expert = env.task.env.scripted_expert() if teacher == EXPERT else None
-        script = None if expert else SCRIPTS[teacher](env.task.facts, np.random.default_rng(seed))
+        script = None if expert else scripts[teacher](env.task.facts, np.random.default_rng(seed))
         observations, actions, done, info = [], [], False, {"is_success": False}
         while not done:
             observations.append(observation)
@@ -96,7 +100,7 @@ def demonstrations(env: NumericTask, teacher: str, seeds: range) -> list[tuple[n
                 done, info = env.advance(taken[-1])
                 if done:
                     break
-            move = np.mean([action[:3] for action in taken], axis=0) * ACTION_SCALE / STEP
+            move = np.mean([action[:3] for action in taken], axis=0) * ACTION_SCALE / env.step_size
             actions.append(np.append(np.clip(move, -1, 1), 1.0 if taken[0][3] > 0 else -1.0))
             observation = env.end_action(actions[-1])
         if info["is_success"]:

@@ -71,7 +71,9 @@ def _wall(name: str, axis: int, sign: int) -> str:
 
 def walls_seen(env: Any) -> dict[str, np.ndarray]:
     """What the camera shows of the moment: how the eight panels are bent [rad], to a tenth of a pixel or so."""
-    angles = [env.data.joint(f"{wall}_{part}").qpos[0] for wall in ("front", "back", "left", "right") for part in _PARTS]
+    angles = [
+        env.data.joint(f"{wall}_{part}").qpos[0] for wall in ("front", "back", "left", "right") for part in _PARTS
+    ]
     return {"bag_bend": np.round(np.array(angles) / _SEEN) * _SEEN}
 
 

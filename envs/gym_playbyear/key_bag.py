@@ -45,7 +45,7 @@ class BagNumbers:
             max_opening=0.056, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
         )
     )
-    sensors: SensorNoise = field(default_factory=SensorNoise)
+    sensors: SensorNoise = field(default_factory=lambda: SensorNoise(wander=0.0006))
 
 
 EASY = BagNumbers(offset=(0.0, 0.008), bottom=(0.025, 0.10))
@@ -132,7 +132,10 @@ def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
         expert=BagExpert if contents in ("keys", "candies") else partial(BagExpert, config=FOR_TALLER_THINGS),
         gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},
-        deaf={name: partial(GropingScript, grope=grope, bottom=numbers.bottom) for name, grope in GROPES.items()},
+        deaf={
+            name: partial(GropingScript, grope=grope, bottom=numbers.bottom, sensors=numbers.sensors)
+            for name, grope in GROPES.items()
+        },
         sees=walls_seen,
         horizon=numbers.horizon,
         control_hz=5,

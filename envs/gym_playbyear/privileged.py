@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from gymnasium.error import ResetNeeded
 
+from gym_playbyear.proprioception import Proprioception
 from gym_playbyear.scene import Contacts
 from gym_playbyear.task import Controller, Task
 
@@ -36,6 +37,7 @@ class PrivilegedState:
     _fingers: slice
     _peak_forces: np.ndarray
     _expert_rng: np.random.Generator | None
+    np_random: np.random.Generator
     _rollout_sensors: np.ndarray
 
     def __getattr__(self, name: str) -> Any:
@@ -145,3 +147,9 @@ class PrivilegedState:
     def _weigh(self, name: str, falls: bool) -> None:
         root = self.model.body(name).id
         self.model.body_gravcomp[self.model.body_rootid == root] = 0.0 if falls else 1.0
+
+    def _fresh_sensors(self) -> Proprioception:
+        """The arm's sensors in a new episode. What wanders in them draws nothing from `np_random`."""
+        own: Any = self.np_random.bit_generator
+        rng = np.random.default_rng(own.seed_seq.spawn(1)[0])
+        return Proprioception(self.definition.sensors, self.control_hz, rng)

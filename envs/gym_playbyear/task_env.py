@@ -172,7 +172,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         if self._sound is not None:
             self._sound.choose(self.materials)
             self._sound.reset(np.random.default_rng(self.np_random.integers(2**63)))
-        self._sensors = Proprioception(self.definition.sensors, self.control_hz)
+        self._sensors = self._fresh_sensors()
         self._n_steps = 0
         mujoco.mj_forward(self.model, self.data)
         hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)

@@ -1,9 +1,9 @@
 """Groping in a bag without hearing: how deep the things lie is what nobody sees, and what the arm may feel.
 
 The bag's bottom gives way, but it presses back, and the hand then lags behind where it was sent, by some hundredths of a
-millimetre for each millimetre that it is pressed down. A script keeps a belief about the bottom's height, goes down
-at a constant speed so that the lag is the same but for that, and closes where the things must then be between the fingers. What the
-fingers measure tells whether they hold something; if not, it goes on, as long as the attempt lasts.
+millimetre for each millimetre that it is pressed down. A script keeps a belief about the bottom's height, goes down at a
+constant speed so that the lag is the same but for that, and closes where the things must then be between the fingers. What
+the fingers measure tells whether they hold something; if not, it goes on, as long as the attempt lasts.
 """
 
 from dataclasses import dataclass
@@ -14,12 +14,14 @@ from gym_playbyear.adversaries.script import TIP_BELOW_HAND, Actions, DeafScript
 from gym_playbyear.adversaries.view import TaskFacts
 from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.bag import BAG_MIDDLE, RIM
+from gym_playbyear.proprioception import SensorNoise
 
 _RESOLUTION = 0.001  # m
-_NOISE = 0.00032  # m: of one measurement of the hand's height
-_GIVE = 0.021  # how much the hand lags behind for what the bottom is pressed down: its stiffness over the arm's
-_THICK = 0.008  # m: what lies on the bottom is met so far above it
-_TOO_FAR = (0.0095, 0.0215)  # m: pressed down further than that, the bag tears, or the hand is stopped
+_UNEVEN = 0.0001  # m: the arm's own deviation, from one height to the next
+_LAG_NOT_KNOWN = 0.001  # m: of a hand in the air
+_GIVE = 0.022  # how much the hand lags behind for what the bottom is pressed down: its stiffness over the arm's
+_THICK = 0.010  # m: what lies on the bottom is met so far above it
+_TOO_FAR = (0.0085, 0.0190)  # m: pressed down further than that, the bag tears, or the hand is stopped
 _CATCH = (-0.006, 0.010)  # m: tips so far above the bottom close around what lies on it
 _MISTAKE = 0.02
 _EMPTY = 0.004  # m: opening of fingers that hold nothing
@@ -72,23 +74,33 @@ class DepthBelief:
     Args:
         lower, upper: Between which heights the bottom is [m, above the table].
         things: The probability that the hand meets things.
+        sensors: What is wrong with what the arm measures.
+        rate_hz: Measurements per second.
     """
 
-    def __init__(self, lower: float, upper: float, things: float):
+    def __init__(self, lower: float, upper: float, things: float, sensors: SensorNoise, rate_hz: float):
+        self._noise = float(np.hypot(sensors.position, sensors.quantum_position / 3))
+        self._wander = float(np.hypot(sensors.wander, _UNEVEN))
+        self._kept = float(np.exp(-1 / (sensors.wander_seconds * rate_hz)))
+        self._variance = _LAG_NOT_KNOWN**2
         self.heights = np.arange(lower, upper + _RESOLUTION / 2, _RESOLUTION)
         self.met = self.heights + np.array([[0.0], [_THICK]])  # (2, heights): the bottom, or things on it
+        self._wrong = np.zeros_like(self.met)
         self.probability = np.array([[1 - things], [things]]) * np.full(len(self.heights), 1 / len(self.heights))
 
     def update(self, tips: float, lag: float) -> None:
-        """Learns from a measurement.
+        """Learns from a measurement: a Kalman filter of what the sensor is wrong by, for each height at once.
 
         Args:
             tips: Height of the fingers' tips [m, above the table].
-            lag: How far the hand is above where it would be in the air [m].
+            lag: How far the hand is above where it was sent, while it goes down at a constant speed [m].
         """
-        expected = _GIVE * np.clip(self.met - tips, 0, _TOO_FAR[1])
-        deviation = np.hypot(_NOISE, 0.3 * expected)
-        self._weigh(np.exp(-0.5 * ((lag - expected) / deviation) ** 2) / deviation + 1e-3 / _NOISE)
+        surprise = lag - _GIVE * np.clip(self.met - tips, 0, _TOO_FAR[1]) - self._wrong
+        spread = self._variance + self._noise**2
+        self._wrong = self._wrong + self._variance / spread * surprise
+        self._variance *= 1 - self._variance / spread
+        self._variance = self._kept**2 * self._variance + (1 - self._kept**2) * self._wander**2
+        self._weigh(np.exp(-0.5 * surprise**2 / spread) + 1e-3)
 
     def survived(self, tips: float) -> None:
         """The attempt goes on: what may not be pressed down further is not that high."""
@@ -131,15 +143,23 @@ class GropingScript(DeafScript):
         facts, rng: As of every script.
         grope: How to grope.
         bottom: Between which heights the bag's bottom is [m, above the table].
+        sensors: What is wrong with what the arm measures.
     """
 
-    def __init__(self, facts: TaskFacts, rng: np.random.Generator, grope: Grope, bottom: tuple[float, float]):
-        self.grope, self.bottom = grope, bottom
+    def __init__(
+        self,
+        facts: TaskFacts,
+        rng: np.random.Generator,
+        grope: Grope,
+        bottom: tuple[float, float],
+        sensors: SensorNoise,
+    ):
+        self.grope, self.bottom, self.sensors = grope, bottom, sensors
         super().__init__(facts, rng)
 
     def _plan(self) -> Actions:
-        self.belief = DepthBelief(*self.bottom, things=0.9 if self.grope.closed else 0.5)
-        self._in_air: list[float] = []
+        things = 0.9 if self.grope.closed else 0.5
+        self.belief = DepthBelief(*self.bottom, things, self.sensors, self.facts.control_hz)
         self._n_closings = 0
         self._shift = np.zeros(2)
         yield from self._travel()
@@ -200,12 +220,8 @@ class GropingScript(DeafScript):
 
     def _feel(self, n_steps: int) -> None:
         """Weighs what is measured now."""
-        lag = float(self.lag[2])
-        if self._tips() > self.belief.met.max():
-            if n_steps > 1:
-                self._in_air.append(lag)
-        elif self.grope.feels and len(self._in_air) > 2:
-            self.belief.update(self._tips(), lag - float(np.mean(self._in_air)))
+        if self.grope.feels and n_steps > 1:  # the first step is not at full speed
+            self.belief.update(self._tips(), float(self.lag[2]))
 
     def _lower_to(self, tips: float) -> Actions:
         """Straight to where the tips are so high above the table [m]."""
@@ -219,14 +235,14 @@ class GropingScript(DeafScript):
 
     def _gather(self) -> Actions:
         """Shoves what lies beside the hand in front of a finger, and comes down around it."""
-        tips, side = self.belief.best(), self.rng.choice([-1.0, 1.0])
-        low = np.array([*self._place(), TABLE_TOP + tips + 0.002 + TIP_BELOW_HAND])
-        yield from self._go(low + [0, -side * self.grope.gathers, 0], 0.02)
-        yield from self._go(low + [0, side * 0.01, 0], 0.02)
-        found = low + [0, side * 0.05, 0]
-        yield from self._go(self._sent + [0, 0, _CLEAR], _FAST)
-        yield from self._go(found + [0, 0, _CLEAR], _FAST)
-        yield from self._go(found, 0.02)
+        side = self.rng.choice([-1.0, 1.0])
+        low = np.array([*self._place(), TABLE_TOP + self.belief.best() + 0.002 + TIP_BELOW_HAND])
+        along, up = np.array([0, side, 0]), np.array([0, 0, _CLEAR])
+        yield from self._go(low - self.grope.gathers * along, 0.02)
+        yield from self._go(low + 0.01 * along, 0.02)
+        yield from self._go(self._sent + up, _FAST)
+        yield from self._go(low + 0.05 * along + up, _FAST)
+        yield from self._go(low + 0.05 * along, 0.02)
 
     def _close(self) -> Actions:
         """Closes where the hand is, and lifts what it holds. Ends when it holds nothing."""

@@ -11,37 +11,39 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from gym_playbyear.adversaries.numeric_terms import N_SHOWN, N_TRUTH, terms_of
 from gym_playbyear.adversaries.view import DeafTask, DeafView
-from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.arm import ACTION_SCALE
 
-N_PLAYER = 27
-N_TRUTH = 8
-STEP = 0.025  # m per unit of action and step: what a hand covers that searches and grasps
+N_HEARD = 4
+N_PLAYER = 17 + N_SHOWN + N_HEARD
+_SPEED = 0.5  # m/s per unit of action: what a hand covers that searches and grasps
 _SUCCESS, _FAILURE = 5.0, -1.0
-_GRIP = 10.0  # N: fingers that are closed and press this hard hold something
 _HEARD = 0.2  # N: what the scripted expert takes for a touch
-_GRASP_HEIGHT = 0.022  # m
 
 
 class NumericTask(gym.Env):
     """A task whose observations are numbers.
 
-    `observation_space`: the player's `N_PLAYER` numbers, then the truth's `N_TRUTH`. `action_space`: (4,) in [-1, 1]:
-    displacement in units of `STEP` along x, y, z for each of `repeat` steps; the gripper closes above 0.5, opens below
-    -0.5, and stays as it is between.
+    `observation_space`: the player's `N_PLAYER` numbers, of which the last `N_HEARD` are what it hears, then the truth's
+    `N_TRUTH`. `action_space`: (4,) in [-1, 1]: displacement along x, y, z in units of `step_size` [m] for each of `repeat`
+    steps; the gripper closes above 0.5, opens below -0.5, and stays as it is between.
 
     Args:
         task: Its name, such as `OccludedGrasp-v0`.
         hears: Whether the player gets the contact signal. A deaf player gets zeros.
-        repeat: Steps of the task for each action.
+        repeat: Steps of the task for each action; by default as many as fit into a tenth of a second, one at least.
         discount: Of the learner; the reward's shaping is a potential's difference, which changes no best policy.
         options: For `gymnasium.make`.
     """
 
-    def __init__(self, task: str, *, hears: bool, repeat: int = 2, discount: float = 0.99, **options: Any):
+    def __init__(self, task: str, *, hears: bool, repeat: int | None = None, discount: float = 0.99, **options: Any):
         self.task = DeafTask(task, **options)
-        self.hears, self.repeat, self.discount = hears, repeat, discount
+        self.hears, self.discount = hears, discount
+        self.repeat = repeat or max(1, round(self.task.facts.control_hz / 10))
+        self.step_size = min(ACTION_SCALE, _SPEED / self.task.facts.control_hz)
+        self.task.begin(0)
+        self.terms = terms_of(self.task)
         self.observation_space = spaces.Box(-np.inf, np.inf, (N_PLAYER + N_TRUTH,), np.float32)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self._view: DeafView
@@ -53,12 +55,12 @@ class NumericTask(gym.Env):
         super().reset(seed=seed)
         episode = int(self.np_random.integers(2**31)) if seed is None else seed
         self._view = self.task.begin(episode, **(options or {}))
-        self._first_place = self._object()
+        self.terms.begin()
         self._last_action: np.ndarray = np.zeros(4)
         self._closes, self._changed_at = False, -(10**6)
         self._sent = self._hand()
         self._touch = np.zeros(2)
-        self._potential = self._worth()
+        self._potential = self.terms.worth(self._view.shown, self._closes)
         return self._observe(), {}
 
     def step(self, action):
@@ -92,7 +94,7 @@ class NumericTask(gym.Env):
     def control(self, action: np.ndarray) -> np.ndarray:
         """The task's action (4,) for the learner's."""
         closes = bool(action[3] > (-0.5 if self._closes else 0.5))
-        return np.append(np.clip(action[:3], -1, 1) * STEP / ACTION_SCALE, 1.0 if closes else -1.0)
+        return np.append(np.clip(action[:3], -1, 1) * self.step_size / ACTION_SCALE, 1.0 if closes else -1.0)
 
     def advance(self, control: np.ndarray) -> tuple[bool, dict[str, Any]]:
         """One step of the task itself. Whether the episode is over, and the task's `info`."""
@@ -106,15 +108,12 @@ class NumericTask(gym.Env):
         lag = self._hand() - self._sent
         if np.abs(lag).max() < 0.001:
             self._sent = self._sent + 0.1 * lag
-        forces = self.task.env.contact_forces
-        elsewhere = [force for pair, force in forces.items() if pair.startswith("gripper-") and "cube" not in pair]
-        others = max(elsewhere, default=0.0)
-        self._touch = np.maximum(self._touch, [forces.get("gripper-cube", 0.0), others])
+        self._touch = np.maximum(self._touch, self.terms.heard())
         return done, info
 
     def reward(self, done: bool, info: dict[str, Any]) -> float:
         """What the last action earned."""
-        before, self._potential = self._potential, self._worth()
+        before, self._potential = self._potential, self.terms.worth(self._view.shown, self._closes)
         if done:
             self._potential = 0.0
         earned = self.discount * self._potential - before
@@ -129,63 +128,25 @@ class NumericTask(gym.Env):
     # What there is to see
 
     def _observe(self) -> np.ndarray:
-        facts, view = self.task.facts, self._view
-        lower, upper = view.shown["hidden_range"]
-        hand = self._hand()
-        tray = view.shown.get("bin_position", np.array([0.0, lower, 0.0]))
+        facts, view, hand = self.task.facts, self._view, self._hand()
         cooling = np.clip(1 - (view.step - self._changed_at) / max(facts.cooldown, 1), 0, 1)
+        shown = self.terms.shown(view.shown, hand)
         player = np.concatenate(
             [
-                (hand - [facts.line_x, (lower + upper) / 2, TABLE_TOP + 0.05]) / 0.05,
-                [hand[1], (lower + upper) / 2, upper - lower, (tray[1] - hand[1])],
+                (hand - self.terms.middle(view.shown)) / 0.05,
                 view.agent_pos[3:5] / facts.max_opening * 4 - 1,
                 view.agent_pos[5:7] / 0.05,
                 np.clip((hand - self._sent) / 0.001, -5, 5),
                 self._last_action,
                 [1.0 if self._closes else -1.0, cooling, 2 * view.step / facts.horizon - 1],
-                np.clip([(hand[2] - TABLE_TOP - 0.03) / 0.02, (hand[2] - TABLE_TOP - 0.05) / 0.005], -2, 2),
+                shown,
+                np.zeros(N_SHOWN - len(shown)),
                 np.log1p(self._touch / _HEARD) / 3 if self.hears else np.zeros(2),
                 [float(self._touch[0] > _HEARD) if self.hears else 0.0, float(self.hears)],
             ]
         )
-        return np.concatenate([player, self._truth()]).astype(np.float32)
-
-    def _truth(self) -> np.ndarray:
-        cube, hand = self._object(), self.task.env.eef_position
-        moved = np.linalg.norm((cube - self._first_place)[:2])
-        return np.array(
-            [
-                *(cube - hand) / 0.05,
-                (cube[2] - self._first_place[2]) / 0.05,
-                moved / 0.03,
-                float(self._holds()),
-                np.log1p(self.task.touch_force),
-                self._potential,
-            ]
-        )
+        return np.concatenate([player, self.terms.truth(self._closes), [self._potential]]).astype(np.float32)
 
     def _hand(self) -> np.ndarray:
         """(3,) where the hand says that it is [m, world]."""
         return self._view.agent_pos[:3] + self.task.facts.base
-
-    def _object(self) -> np.ndarray:
-        return self.task.env.cube_position
-
-    def _holds(self) -> bool:
-        near = np.linalg.norm(self._object() - self.task.env.eef_position) < 0.035
-        return bool(self._closes and near and self.task.touch_force > _GRIP)
-
-    def _worth(self) -> float:
-        """How far the attempt has come: the hand is over the object, around it, holds it, lifts it, carries it."""
-        cube, hand = self._object(), self.task.env.eef_position
-        aside = float(np.linalg.norm((cube - hand)[:2]))
-        worth = 1.0 - np.tanh(8 * aside)
-        if aside < 0.015:
-            worth += float(np.clip(1 - (hand[2] - TABLE_TOP - _GRASP_HEIGHT) / 0.05, 0, 1))
-        if self._holds():
-            lifted = float(np.clip((cube[2] - self._first_place[2]) / 0.05, 0, 1))
-            worth += 1.0 + 2.0 * lifted
-            tray = self._view.shown.get("bin_position")
-            if tray is not None:
-                worth += 2.0 * lifted * (1 - np.tanh(5 * float(np.linalg.norm((cube - tray)[:2]))))
-        return float(worth)

@@ -38,7 +38,7 @@ class TwinResult:
     """What tells twin worlds apart.
 
     Attributes:
-        n_episodes: Those in which the object was touched, of which half trained the classifiers; all, if nothing can be touched.
+        n_episodes: Those in which the object was touched, of which half trained the classifiers; all, if nothing can be.
         n_windows: Judged windows of the held-out half.
         equal_until_touch: Whether every observation but sound was the same, byte for byte, until the touch; to the end, if
             nothing can be touched.

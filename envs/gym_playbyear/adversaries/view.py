@@ -15,6 +15,7 @@ import gym_playbyear  # noqa: F401 (registers the tasks)
 from gym_playbyear.proprioception import Proprioception
 
 _NOISE_STREAM = 7  # tells the sensors' random numbers from those of a script with the same seed
+_WANDER_STREAM = 8
 _FINGER_JOINTS = slice(7, 9)
 _UNTOUCHED = 1e-9  # N
 
@@ -99,9 +100,8 @@ class DeafTask:
             workspace=np.array(getattr(arm, "workspace", ((-np.inf,) * 3, (np.inf,) * 3)), dtype=float),
             control_hz=hz,
         )
-        self._touches = [
-            pair for pair in self.env.contact_forces for prop in definition.props if prop.hidden and pair == f"gripper-{prop.name}"
-        ]
+        hidden = {f"gripper-{prop.name}" for prop in definition.props if prop.hidden}
+        self._touches = [pair for pair in self.env.contact_forces if pair in hidden]
         self._sensors = Proprioception(definition.sensors, hz)
         self._rng = np.random.default_rng(0)
         self._n_steps = 0
@@ -116,7 +116,9 @@ class DeafTask:
         """
         self.env.begin_episode(seed=seed, options=options)
         self._rng = np.random.default_rng([seed, _NOISE_STREAM])
-        self._sensors.reset()
+        self._sensors = Proprioception(
+            self.env.definition.sensors, self.facts.control_hz, np.random.default_rng([seed, _WANDER_STREAM])
+        )
         self._n_steps = 0
         self.has_touched = False
         return self._view()
