@@ -276,10 +276,18 @@ class CartesianController:
             rotation = data.site_xmat[self._site].reshape(3, 3)
             error = np.empty(6)
             error[:3] = self.target - data.site_xpos[self._site]
-            error[3:] = 0.5 * np.cross(rotation.T, self._orientation.T).sum(axis=0)
+            error[3:] = 0.5 * _crossed(rotation.T, self._orientation.T).sum(axis=0)
             gram = jacobian @ jacobian.T
             gram[np.diag_indices(6)] += 1e-5
             # The seventh degree of freedom is drawn home, in the null space of the task.
             posture = 0.05 * (HOME_JOINTS - self.joints)
             step = posture + jacobian.T @ np.linalg.solve(gram, error - jacobian @ posture)
             self.joints = np.clip(self.joints + step, self._lower, self._upper)
+
+
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+
+
+def _crossed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(N, 3) cross products, to the last bit as from `np.cross`, which costs a tenth of a whole control step."""
+    return first[:, _NEXT] * second[:, _LAST] - first[:, _LAST] * second[:, _NEXT]

@@ -150,6 +150,6 @@ class PrivilegedState:
 
     def _fresh_sensors(self) -> Proprioception:
         """The arm's sensors in a new episode. What wanders in them draws nothing from `np_random`."""
-        own: Any = self.np_random.bit_generator
-        rng = np.random.default_rng(own.seed_seq.spawn(1)[0])
+        seeds: Any = self.np_random.bit_generator.seed_seq
+        rng = np.random.default_rng(seeds.spawn(1)[0])
         return Proprioception(self.definition.sensors, self.control_hz, rng)

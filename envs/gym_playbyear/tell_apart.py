@@ -115,7 +115,7 @@ def tell_apart(*, contents: str | None = None) -> Task:
         expert=PouchExpert,
         blind={name: partial(BlindPouch, strategy=name) for name in BLIND_STRATEGIES},
         sees=_pouch_seen,
-        twins=tuple({"contents": contents} for contents in CONTENTS),  # whoever acts, and whatever is done
+        twins=({"contents": SCREWS}, {"contents": PEANUTS}),
         control_hz=5,
         horizon=100,
         cameras=(FRONT_CAMERA,),

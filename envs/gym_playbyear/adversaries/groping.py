@@ -20,8 +20,8 @@ _RESOLUTION = 0.001  # m
 _UNEVEN = 0.0001  # m: the arm's own deviation, from one height to the next
 _LAG_NOT_KNOWN = 0.001  # m: of a hand in the air
 _GIVE = 0.022  # how much the hand lags behind for what the bottom is pressed down: its stiffness over the arm's
-_THICK = 0.010  # m: what lies on the bottom is met so far above it
-_TOO_FAR = (0.0085, 0.0190)  # m: pressed down further than that, the bag tears, or the hand is stopped
+_ABOVE = np.array([[0.0], [0.006], [0.013]])  # m, above the bottom: what the hand meets: it, or things on it
+_TOO_FAR = np.array([[0.008], [0.019], [0.019]])  # m: pressed down further, the bag tears, or the hand is stopped
 _CATCH = (-0.006, 0.010)  # m: tips so far above the bottom close around what lies on it
 _MISTAKE = 0.02
 _EMPTY = 0.004  # m: opening of fingers that hold nothing
@@ -40,6 +40,7 @@ class Grope:
         rests: Steps of rest after each, in which the lag is measured; 0: it is measured on the way.
         places: Where it closes, beside the bag's middle (x, y); the next one after every closing on nothing.
         sure: It closes where the things are between the fingers with this probability.
+        dares: It does not go on with so much risk of pressing too hard.
         feels: Without, it goes by what it was not stopped by.
         aside: How far it goes aside where its fingers stand on the things.
         gathers: Sweeps the things together before it closes, so far.
@@ -50,6 +51,7 @@ class Grope:
     rests: int = 0
     places: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     sure: float = 0.6
+    dares: float = 0.3
     feels: bool = True
     aside: float = 0.02
     gathers: float = 0.0
@@ -61,7 +63,7 @@ GROPES = {
     "feel_patiently": Grope(step=0.006, rests=2),
     "feel_around": Grope(places=((0.0, 0.02), (0.0, -0.02)), sure=0.5),
     "poke": Grope(closed=True, step=0.004, sure=0.7),
-    "poke_slowly": Grope(closed=True, step=0.003, sure=0.8),
+    "poke_slowly": Grope(closed=True, step=0.003, sure=0.8, dares=0.15),
     "poke_fast": Grope(closed=True, step=0.006, sure=0.6),
     "gather": Grope(gathers=0.05),
     "survive": Grope(feels=False, step=0.01, sure=0.4),
@@ -84,9 +86,11 @@ class DepthBelief:
         self._kept = float(np.exp(-1 / (sensors.wander_seconds * rate_hz)))
         self._variance = _LAG_NOT_KNOWN**2
         self.heights = np.arange(lower, upper + _RESOLUTION / 2, _RESOLUTION)
-        self.met = self.heights + np.array([[0.0], [_THICK]])  # (2, heights): the bottom, or things on it
+        self.met = self.heights + _ABOVE  # (3, heights)
         self._wrong = np.zeros_like(self.met)
-        self.probability = np.array([[1 - things], [things]]) * np.full(len(self.heights), 1 / len(self.heights))
+        self.probability = np.array([[1 - things], [things / 2], [things / 2]]) * np.full(
+            len(self.heights), 1 / len(self.heights)
+        )
 
     def update(self, tips: float, lag: float) -> None:
         """Learns from a measurement: a Kalman filter of what the sensor is wrong by, for each height at once.
@@ -95,7 +99,7 @@ class DepthBelief:
             tips: Height of the fingers' tips [m, above the table].
             lag: How far the hand is above where it was sent, while it goes down at a constant speed [m].
         """
-        surprise = lag - _GIVE * np.clip(self.met - tips, 0, _TOO_FAR[1]) - self._wrong
+        surprise = lag - _GIVE * np.clip(self.met - tips, 0, _TOO_FAR.max()) - self._wrong
         spread = self._variance + self._noise**2
         self._wrong = self._wrong + self._variance / spread * surprise
         self._variance *= 1 - self._variance / spread
@@ -104,7 +108,7 @@ class DepthBelief:
 
     def survived(self, tips: float) -> None:
         """The attempt goes on: what may not be pressed down further is not that high."""
-        self._weigh(np.where(self.met - tips > np.array(_TOO_FAR)[:, None], _MISTAKE, 1.0))
+        self._weigh(np.where(self.met - tips > _TOO_FAR, _MISTAKE, 1.0))
 
     def rule_out(self, tips: float) -> None:
         """Fingers that closed held nothing."""
@@ -119,13 +123,13 @@ class DepthBelief:
         tips = np.arange(self.heights[0] + _CATCH[0], self.heights[-1] + _CATCH[1], _RESOLUTION)
         return float(tips[np.argmax([self.chance(height) for height in tips])])
 
-    def danger(self, tips: float) -> float:
-        """The probability that the next step presses too hard."""
-        return float(self.probability[self.met - tips > np.array(_TOO_FAR)[:, None] - 0.003].sum())
+    def danger(self, tips: float, further: float) -> float:
+        """The probability that a step of that length presses too hard [m]."""
+        return float(self.probability[self.met - tips > _TOO_FAR - further].sum())
 
     def stands(self, tips: float) -> float:
         """The probability that the hand stands on things."""
-        return float(self.probability[1, self.met[1] - tips > 0.003].sum())
+        return float(self.probability[1:][self.met[1:] - tips > 0.003].sum())
 
     def _caught(self, tips: float) -> np.ndarray:
         above = tips - self.heights
@@ -186,9 +190,9 @@ class GropingScript(DeafScript):
     def _rise_over(self, bottom: float) -> Actions:
         """To above the next place, over what may lie on a bottom of that height."""
         yield from self._go(np.array([*self._sent[:2], TABLE_TOP + bottom + _CLEAR + TIP_BELOW_HAND]), _FAST)
-        yield from self._go(np.array([*self._place(), self._sent[2]]), _FAST)
+        yield from self._go(np.array([*self._entry(), self._sent[2]]), _FAST)
 
-    def _place(self) -> np.ndarray:
+    def _entry(self) -> np.ndarray:
         """(2,) where to go down [m, world]."""
         place = self.grope.places[self._n_closings % len(self.grope.places)]
         return np.array(BAG_MIDDLE) + place + self._shift
@@ -213,7 +217,7 @@ class GropingScript(DeafScript):
             chance = belief.chance(belief.best()) if grope.closed else belief.chance(tips)
             if chance > grope.sure:
                 return
-            if belief.danger(tips) > 0.3:
+            if belief.danger(tips, grope.step) > grope.dares:
                 if not grope.closed:
                     yield from self._lower_to(belief.best())
                 return
@@ -225,7 +229,7 @@ class GropingScript(DeafScript):
 
     def _lower_to(self, tips: float) -> Actions:
         """Straight to where the tips are so high above the table [m]."""
-        yield from self._go(np.array([*self._place(), TABLE_TOP + tips + TIP_BELOW_HAND]), 0.02)
+        yield from self._go(np.array([*self._entry(), TABLE_TOP + tips + TIP_BELOW_HAND]), 0.02)
 
     def _go_aside(self) -> Actions:
         """The fingers stand on the things: up, a little aside, and down again."""
@@ -236,7 +240,7 @@ class GropingScript(DeafScript):
     def _gather(self) -> Actions:
         """Shoves what lies beside the hand in front of a finger, and comes down around it."""
         side = self.rng.choice([-1.0, 1.0])
-        low = np.array([*self._place(), TABLE_TOP + self.belief.best() + 0.002 + TIP_BELOW_HAND])
+        low = np.array([*self._entry(), TABLE_TOP + self.belief.best() + 0.002 + TIP_BELOW_HAND])
         along, up = np.array([0, side, 0]), np.array([0, 0, _CLEAR])
         yield from self._go(low - self.grope.gathers * along, 0.02)
         yield from self._go(low + 0.01 * along, 0.02)
