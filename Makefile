@@ -5,7 +5,7 @@ SHELL := /bin/bash
 
 BIN := .venv/bin
 TEST_JOBS ?= 2
-TASK ?= OccludedGrasp-v0
+TASK ?= OccludedGrasp-v1
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
 
@@ -38,7 +38,7 @@ test-slow: install  ## The tests that take minutes, side by side like the others
 bench: install  ## Measures speed and memory, beside alternatives, in a quarter of an hour
 	$(BIN)/python benchmarks/run.py
 
-adversaries: install  ## Trains the learned adversary, deaf and hearing, some hours in all (TASK=OccludedGrasp-v0)
+adversaries: install  ## Trains the learned adversary, deaf and hearing, some hours in all (TASK=OccludedGrasp-v1)
 	for hears in false true; do \
 	  OMP_NUM_THREADS=1 $(BIN)/python -m experiments.adversaries --task=$(TASK) --hears=$$hears --steps=2000000; done
 

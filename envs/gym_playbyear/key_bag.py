@@ -104,7 +104,7 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
     ## Version History
     - v1: first version.
     """
-    return _task("KeyBag-Easy-v1", EASY, contents)
+    return _task("KeyBag-Easy-v1", EASY, contents, limits={"blind": 0.4})
 
 
 def key_bag_hard(*, contents: str = "keys") -> Task:
@@ -115,7 +115,7 @@ def key_bag_hard(*, contents: str = "keys") -> Task:
     return _task("KeyBag-Hard-v1", HARD, contents)
 
 
-def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
+def _task(name: str, numbers: BagNumbers, contents: str, **more: Any) -> Task:
     return Task(
         name=name,
         description="Find the keys in the bag by touch and sound, grasp them and lift them out.",
@@ -147,6 +147,7 @@ def _task(name: str, numbers: BagNumbers, contents: str) -> Task:
         felt=CONTENTS,
         sound=SyntheticEars,
         numbers=numbers,
+        **more,
     )
 
 

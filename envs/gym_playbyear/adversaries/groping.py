@@ -13,6 +13,7 @@ import numpy as np
 from gym_playbyear.adversaries.script import TIP_BELOW_HAND, Actions, DeafScript
 from gym_playbyear.adversaries.view import TaskFacts
 from gym_playbyear.arena import TABLE_TOP
+from gym_playbyear.arm import FINGER_THICKNESS
 from gym_playbyear.bag import BAG_MIDDLE, RIM
 from gym_playbyear.proprioception import SensorNoise
 
@@ -36,6 +37,7 @@ class Grope:
 
     Attributes:
         closed: Pokes with closed fingers first, which meet what lies in the middle, then opens them.
+        finger: Pokes with one of the open fingers first, which costs no closing.
         step: What the hand goes down per control step.
         rests: Steps of rest after each, in which the lag is measured; 0: it is measured on the way.
         places: Where it closes, beside the bag's middle (x, y); the next one after every closing on nothing.
@@ -47,6 +49,7 @@ class Grope:
     """
 
     closed: bool = False
+    finger: bool = False
     step: float = 0.003
     rests: int = 0
     places: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
@@ -65,6 +68,8 @@ GROPES = {
     "poke": Grope(closed=True, step=0.004, sure=0.7),
     "poke_slowly": Grope(closed=True, step=0.003, sure=0.8, dares=0.15),
     "poke_fast": Grope(closed=True, step=0.006, sure=0.6),
+    "prod": Grope(finger=True, step=0.003, sure=0.8, dares=0.15),
+    "prod_slowly": Grope(finger=True, step=0.0025, sure=0.9, dares=0.1, places=((0.0, 0.0), (0.0, 0.012))),
     "gather": Grope(gathers=0.05),
     "survive": Grope(feels=False, step=0.01, sure=0.4),
 }
@@ -162,19 +167,21 @@ class GropingScript(DeafScript):
         super().__init__(facts, rng)
 
     def _plan(self) -> Actions:
-        things = 0.9 if self.grope.closed else 0.5
+        things = 0.9 if self._pokes else 0.5
         self.belief = DepthBelief(*self.bottom, things, self.sensors, self.facts.control_hz)
         self._n_closings = 0
         self._shift = np.zeros(2)
+        if self.grope.finger:
+            self._shift = np.array(
+                [0.0, self.rng.choice([-1.0, 1.0]) * (self.facts.max_opening + FINGER_THICKNESS) / 2]
+            )
         yield from self._travel()
-        if self.grope.closed:
-            yield from self._set_grip(True)
-            self._n_closings += 1
-            yield from self._descend()
-            yield from self._rise_over(self.belief.best())
-            yield from self._set_grip(False)
-            yield from self._lower_to(self.belief.best())
-            yield from self._close()
+        if self._pokes:
+            yield from self._poke()
+        if self.grope.finger:
+            yield from self._grasp_at_best()
+        if self._pokes:
+            yield from self._grasp_at_best()
         while True:
             yield from self._descend()
             if self.grope.gathers and self.steps_left > _AFTER_CLOSING + 14:
@@ -182,6 +189,25 @@ class GropingScript(DeafScript):
             elif self.belief.stands(self._tips()) > 0.6 and self.steps_left > _AFTER_CLOSING:
                 yield from self._go_aside()
             yield from self._close()
+
+    @property
+    def _pokes(self) -> bool:
+        return self.grope.closed or self.grope.finger
+
+    def _poke(self) -> Actions:
+        """Feels for the height of what lies in the middle, and opens the fingers above it."""
+        if self.grope.closed:
+            yield from self._set_grip(True)
+            self._n_closings += 1
+        yield from self._descend()
+        self._shift = np.zeros(2)
+        yield from self._rise_over(self.belief.best())
+        yield from self._set_grip(False)
+
+    def _grasp_at_best(self) -> Actions:
+        yield from self._rise_over(self.belief.best())
+        yield from self._lower_to(self.belief.best())
+        yield from self._close()
 
     def _travel(self) -> Actions:
         """To above the next place, over all that may lie there."""
@@ -214,11 +240,11 @@ class GropingScript(DeafScript):
                 self._feel(n_steps)
             belief.survived(self._tips())
             tips = self._tips()
-            chance = belief.chance(belief.best()) if grope.closed else belief.chance(tips)
+            chance = belief.chance(belief.best()) if self._pokes else belief.chance(tips)
             if chance > grope.sure:
                 return
             if belief.danger(tips, grope.step) > grope.dares:
-                if not grope.closed:
+                if not self._pokes:
                     yield from self._lower_to(belief.best())
                 return
 
@@ -258,7 +284,7 @@ class GropingScript(DeafScript):
             yield self._move(np.zeros(3))
         self._n_closings += 1
         self.belief.rule_out(tips)
-        yield from self._travel()
+        yield from self._rise_over(self.belief.best() if self._pokes else self.bottom[1])
         yield from self._set_grip(False)
 
     @property
