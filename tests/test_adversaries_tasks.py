@@ -53,7 +53,7 @@ def test_twins_that_differ_are_found_out(monkeypatch):
         return view
 
     monkeypatch.setattr(DeafTask, "begin", lighter)
-    result = twin_test(POUCH, range(60000, 60004), n_pictured=0)
+    result = twin_test(POUCH, range(60000, 60004), n_pictured=0, horizon=15)
     assert not result.equal_until_touch
 
 
@@ -92,10 +92,10 @@ def test_a_belief_finds_what_presses_back_unless_the_hands_error_wanders():
     def error(wander: float) -> float:
         """How far off the believed height of the bottom is, on average [m]."""
         sensors, rng, errors = SensorNoise(wander=wander), np.random.default_rng(0), []
-        for _ in range(40):
+        for number in range(60):
             bottom = rng.uniform(0.035, 0.09)
             belief = DepthBelief(0.025, 0.10, 0.9, sensors, 5)
-            arm = Proprioception(sensors, 5, rng)
+            arm = Proprioception(sensors, 5, np.random.default_rng(number))
             tips = np.arange(0.125, bottom - 0.006, -0.003)
             for height in tips:
                 lag = 0.0003 + 0.022 * max(0.0, bottom + 0.012 - height)
@@ -103,7 +103,7 @@ def test_a_belief_finds_what_presses_back_unless_the_hands_error_wanders():
             errors.append(abs(belief.best() - bottom))
         return float(np.mean(errors))
 
-    assert error(0.0) < 0.6 * error(0.0006)
+    assert error(0.0) < 0.75 * error(0.001)
 
 
 def test_a_wandering_error_wanders_and_draws_nothing_of_the_usual_numbers():
@@ -133,19 +133,19 @@ def test_the_wandering_error_is_the_episodes_own():
     env.close()
 
 
-@pytest.mark.parametrize("name", [EASY, POUCH])
-def test_other_tasks_in_numbers(name):
-    env = NumericTask(name, hears=True)
+@pytest.mark.parametrize(("name", "options"), [(EASY, {}), (POUCH, {"contents": "screws"})])
+def test_other_tasks_in_numbers(name, options):
+    env = NumericTask(name, hears=True, **options)
     assert env.repeat == 1
     observation, _ = env.reset(seed=1)
     expert = env.task.env.scripted_expert()
-    heard, worth, done = np.zeros(N_HEARD), [], False
+    heard, worth, earned, done = np.zeros(N_HEARD), [], 0.0, False
     while not done:
         assert env.observation_space.contains(observation)
         env.begin_action()
         control = expert.act()
         done, info = env.advance(control)
-        reward = env.reward(done, info)
+        earned += env.reward(done, info)
         observation = env.end_action(control)
         heard = np.maximum(heard, observation[N_PLAYER - N_HEARD : N_PLAYER])
         env.hears = False
@@ -153,9 +153,9 @@ def test_other_tasks_in_numbers(name):
         env.hears = True
         worth.append(env._potential)
     assert info["is_success"]
-    assert reward > 0
+    assert earned > 1
     assert max(worth) > worth[0] + 3
-    assert heard[1:].all()
+    assert heard[[0, 2, 3]].all()
 
 
 def test_peanuts_are_not_heard_and_screws_are():

@@ -23,7 +23,7 @@ _LAG_NOT_KNOWN = 0.001  # m: of a hand in the air
 _GIVE = 0.022  # how much the hand lags behind for what the bottom is pressed down: its stiffness over the arm's
 _ABOVE = np.array([[0.0], [0.006], [0.013]])  # m, above the bottom: what the hand meets: it, or things on it
 _TOO_FAR = np.array([[0.008], [0.019], [0.019]])  # m: pressed down further, the bag tears, or the hand is stopped
-_CATCH = (-0.006, 0.010)  # m: tips so far above the bottom close around what lies on it
+_CATCH = (-0.008, 0.003)  # m: tips so far above the bottom close around what lies on it
 _MISTAKE = 0.02
 _EMPTY = 0.004  # m: opening of fingers that hold nothing
 _CLEAR = 0.028  # m: so high above its highest bottom nothing lies in the bag
@@ -64,12 +64,9 @@ GROPES = {
     "feel": Grope(),
     "feel_slowly": Grope(step=0.002, sure=0.5),
     "feel_patiently": Grope(step=0.006, rests=2),
-    "feel_around": Grope(places=((0.0, 0.02), (0.0, -0.02)), sure=0.5),
-    "poke": Grope(closed=True, step=0.004, sure=0.7),
-    "poke_slowly": Grope(closed=True, step=0.003, sure=0.8, dares=0.15),
-    "poke_fast": Grope(closed=True, step=0.006, sure=0.6),
+    "poke": Grope(closed=True, step=0.003, sure=0.8, dares=0.15),
     "prod": Grope(finger=True, step=0.003, sure=0.8, dares=0.15),
-    "prod_slowly": Grope(finger=True, step=0.0025, sure=0.9, dares=0.1, places=((0.0, 0.0), (0.0, 0.012))),
+    "prod_quickly": Grope(finger=True, step=0.006, sure=0.9, dares=0.05, places=((0.0, 0.0), (0.0, 0.012))),
     "gather": Grope(gathers=0.05),
     "survive": Grope(feels=False, step=0.01, sure=0.4),
 }
@@ -126,7 +123,7 @@ class DepthBelief:
     def best(self) -> float:
         """The tips' height at which that is greatest [m]."""
         tips = np.arange(self.heights[0] + _CATCH[0], self.heights[-1] + _CATCH[1], _RESOLUTION)
-        return float(tips[np.argmax([self.chance(height) for height in tips])])
+        return float(tips[np.argmax(self._caught(tips[:, None]) @ self.probability.sum(axis=0))])
 
     def danger(self, tips: float, further: float) -> float:
         """The probability that a step of that length presses too hard [m]."""
@@ -136,7 +133,7 @@ class DepthBelief:
         """The probability that the hand stands on things."""
         return float(self.probability[1:][self.met[1:] - tips > 0.003].sum())
 
-    def _caught(self, tips: float) -> np.ndarray:
+    def _caught(self, tips: float | np.ndarray) -> np.ndarray:
         above = tips - self.heights
         return (above > _CATCH[0]) & (above < _CATCH[1])
 
