@@ -1,6 +1,7 @@
 """The adversaries of tasks without a cube: bags and pouches, their twin worlds, their scripts, the same tasks in numbers."""
 
 import gc
+import json
 from dataclasses import replace
 
 import gymnasium as gym
@@ -16,6 +17,7 @@ from gym_playbyear.adversaries.players import deaf_scripts, players
 from gym_playbyear.adversaries.scripts import play
 from gym_playbyear.adversaries.twin import twin_test
 from gym_playbyear.adversaries.view import DeafTask
+from gym_playbyear.check import check
 from gym_playbyear.proprioception import Proprioception, SensorNoise
 
 EASY, HARD, POUCH = "KeyBag-Easy-v1", "KeyBag-Hard-v1", "TellApart-v1"
@@ -170,6 +172,29 @@ def test_peanuts_are_not_heard_and_screws_are():
         loudest[contents] = rattle
     assert loudest["peanuts"] == 0
     assert loudest["screws"] > 0.2
+
+
+# The check
+
+
+def test_a_check_that_was_stopped_goes_on_with_the_next_player(tmp_path):
+    file = tmp_path / "check.partial"
+    settings = {"first_seed": 1000, "twin": False, "progress": file}
+    first = check("OccludedGrasp-v1", 1, names=["middle"], **settings)
+    kept = json.loads(file.read_text())
+    kept["played"]["middle"][0]["end"] = "as it was kept"
+    file.write_text(json.dumps(kept))
+    both = check("OccludedGrasp-v1", 1, names=["middle", "push"], **settings)
+    assert [row.ends for row in both.rows] == [{"as it was kept": 1}, {"shoved": 1}]
+    other = check("OccludedGrasp-v1", 2, names=["middle"], **settings)
+    assert "as it was kept" not in other.rows[0].ends
+    assert first.rows[0].ends != both.rows[0].ends
+
+
+def test_a_learners_result_on_another_task_is_refused():
+    learned = [{"name": "rl", "task": "OccludedGrasp-v0", "hears": False, "successes": 1, "n_episodes": 10}]
+    with pytest.raises(ValueError, match="'rl' is no learner's result on 'OccludedGrasp-v1'"):
+        check("OccludedGrasp-v1", 1, names=["push"], twin=False, learned=learned)
 
 
 # The committed table

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players, promised_limits
+from gym_playbyear.adversaries.progress import Progress
 from gym_playbyear.adversaries.scripts import Outcome
 from gym_playbyear.adversaries.twin import TwinResult, twin_test
 
@@ -92,6 +93,7 @@ def check(
     limits: Limits | None = None,
     learned: list[dict[str, Any]] | None = None,
     options: dict[str, Any] | None = None,
+    progress: Path | None = None,
 ) -> Report:
     """Plays a task with everyone, and compares twin worlds.
 
@@ -105,6 +107,7 @@ def check(
         limits: What the task promises; by default what it says itself, or else `Limits()`.
         learned: Results of learned adversaries: `name`, `successes`, `n_episodes`, `hears`.
         options: For `gymnasium.make`.
+        progress: A file of who has played already; a check that was stopped goes on from there.
 
     Raises:
         ValueError: A name is not among the task's players.
@@ -118,17 +121,22 @@ def check(
     chosen = {name: kind for name, kind in known.items() if not names or name in names}
     seeds = range(first_seed, first_seed + n_episodes)
     play = partial(outcomes, task, seeds=seeds, options=options)
+    done = Progress(progress, {"task": task, "options": options, "seeds": [first_seed, n_episodes]})
+    missing = [name for name in chosen if done.attempts(name) is None]
     found: TwinResult | None
     if jobs > 1:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             pending = pool.submit(partial(twin_test, task, seeds, **options)) if twin else None
-            played = [_told(name, attempts) for name, attempts in zip(chosen, pool.map(play, chosen), strict=True)]
+            for name, attempts in zip(missing, pool.map(play, missing), strict=True):
+                done.keep(name, _told(name, attempts))
             found = pending.result() if pending else None
     else:
-        played = [_told(name, play(name)) for name in chosen]
+        for name in missing:
+            done.keep(name, _told(name, play(name)))
         found = twin_test(task, seeds, **options) if twin else None
     rows = []
-    for (name, kind), attempts in zip(chosen.items(), played, strict=True):
+    for name, kind in chosen.items():
+        attempts = done.attempts(name) or []
         ends = dict(Counter(attempt.end for attempt in attempts).most_common())
         rows.append(Row(name, kind, sum(attempt.success for attempt in attempts), n_episodes, ends))
     for result in learned or []:
@@ -242,9 +250,10 @@ def main() -> int:
     parser.add_argument("--variant", help="of the task")
     parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
     parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments.adversaries")
-    parser.add_argument("--output", type=Path, help="a JSON file for the results")
+    parser.add_argument("--output", type=Path, help="a JSON file for the results; a check that was stopped goes on")
     arguments = parser.parse_args()
     given = {"variant": arguments.variant, "horizon": arguments.horizon}
+    progress = arguments.output.with_suffix(".partial") if arguments.output else None
     report = check(
         arguments.task,
         arguments.episodes,
@@ -254,10 +263,12 @@ def main() -> int:
         jobs=arguments.jobs,
         learned=[json.loads(path.read_text()) for path in arguments.learned],
         options={name: value for name, value in given.items() if value is not None},
+        progress=progress,
     )
     print(as_text(report))
-    if arguments.output:
+    if progress is not None:
         arguments.output.write_text(json.dumps(asdict(report), indent=1) + "\n")
+        progress.unlink(missing_ok=True)
     return 1 if report.broken else 0
 
 

@@ -69,7 +69,8 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
     A dictionary:
     - `pixels.front`: `(image_size, image_size, 3)` uint8, the camera in front of the bag. Its walls bend;
     - `agent_pos`: `(7,)` float32, end effector x, y, z [m, from the robot's base], two finger positions [m], two finger
-      velocities [m/s], with the noise and resolution of a real arm's encoders, and an error of its place that wanders by 0.6 mm;
+      velocities [m/s], with the noise and resolution of a real arm's encoders, and an error of its place that wanders by
+      0.6 mm;
     - `audio.<microphone>`: `(sample_rate / 5,)` int16, what the microphone heard during the last step (`sound="waveform"`):
       keys that knock on each other, the bag and the hand, the bag that crackles while it bends;
     - `contact_force`: `(6,)` float32, mean net contact force [N] and torque [Nm] on the keys (`sound="contact_force"`).
