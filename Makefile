@@ -40,7 +40,7 @@ bench: install  ## Measures speed and memory, beside alternatives, in a quarter 
 
 adversaries: install  ## Trains the learned adversary, deaf and hearing, some hours in all (TASK=OccludedGrasp-v1)
 	for hears in false true; do \
-	  OMP_NUM_THREADS=1 $(BIN)/python -m experiments.adversaries --task=$(TASK) --hears=$$hears --steps=2000000; done
+	  OMP_NUM_THREADS=1 $(BIN)/python -m experiments.adversaries --task=$(TASK) --hears=$$hears; done
 
 lock: install  ## Writes the versions in .venv to constraints.txt
 	VIRTUAL_ENV=$(CURDIR)/.venv $$(command -v $(BIN)/uv || command -v uv) pip freeze --exclude-editable \

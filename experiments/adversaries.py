@@ -37,6 +37,7 @@ DEMONSTRATION_SEED = 10000
 TRIAL_SEED = 20000  # of the episodes that the curve is measured on
 FINAL_SEED = 80000  # of those that the result is measured on, as `python -m gym_playbyear.check` does
 NO_TEACHER = "none"
+_EXPERIENCE = 100_000  # s
 _CRITIC_ALONE = 8  # updates in which only the critic learns, lest it spoil what the teacher taught
 
 
@@ -123,6 +124,7 @@ def run(arguments: Any) -> dict[str, Any]:
     folder = RUNS / "adversaries" / name
     model = make_model(arguments)
     env = NumericTask(arguments.task, hears=arguments.hears, repeat=arguments.repeat, **environment_options(arguments))
+    arguments.steps = arguments.steps or round(_EXPERIENCE * env.task.facts.control_hz)
     progress = load_checkpoint(model, folder)
     if progress is None:
         progress = {"steps": 0, "n_updates": 0, "seconds": 0.0, "curve": [], "imitation": teach(model, env, arguments)}
@@ -162,7 +164,9 @@ def parser():
         "--hears", type=lambda text: text.lower() == "true", default=False, help="true: with the contact signal"
     )
     made.add_argument("--teacher", default=EXPERT, help=f"{EXPERT}, {NO_TEACHER}, or one of the task's deaf scripts")
-    made.add_argument("--steps", type=int, default=2_000_000, help="of the task")
+    made.add_argument(
+        "--steps", type=int, help="of the task; by default two million at 20 Hz, and in proportion at other rates"
+    )
     made.add_argument("--seed", type=int, default=1)
     made.add_argument("--episodes", type=int, default=100, help="that judge the result")
     made.add_argument("--horizon", type=int)
