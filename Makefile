@@ -6,10 +6,11 @@ SHELL := /bin/bash
 BIN := .venv/bin
 TEST_JOBS ?= 2
 TASK ?= OccludedGrasp-v1
+ALL_TASKS := OccludedGrasp-v1 OccludedPickPlace-v1 TellApart-v1 KeyBag-Easy-v1 KeyBag-Hard-v1
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
 
-.PHONY: help install demo test test-slow lint bench adversaries lock clean
+.PHONY: help install demo test test-slow lint bench checks adversaries lock clean
 
 help:  ## Says what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-11s %s\n", $$1, $$2}'
@@ -37,6 +38,12 @@ test-slow: install  ## The tests that take minutes, side by side like the others
 
 bench: install  ## Measures speed and memory, beside alternatives, in a quarter of an hour
 	$(BIN)/python benchmarks/run.py
+
+checks: install  ## Plays version 1 of every task with all who cannot hear: hours; goes on where it was stopped
+	for task in $(ALL_TASKS); do \
+	  OMP_NUM_THREADS=1 $(BIN)/python -m gym_playbyear.check $$task --jobs=$(TEST_JOBS) \
+	    --output=experiments/results/adversaries/$$task-check.json || [ $$? = 1 ]; done
+	$(BIN)/python -m experiments.adversary_table
 
 adversaries: install  ## Trains the learned adversary, deaf and hearing, some hours in all (TASK=OccludedGrasp-v1)
 	for hears in false true; do \
