@@ -10,6 +10,9 @@ ALL_TASKS ?= OccludedGrasp-v1 OccludedPickPlace-v1 TellApart-v1 KeyBag-Easy-v1 K
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
 
+# In the order of their names: otherwise the longest, which are few in their files, come last and one by one.
+PYTEST := $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder
+
 .PHONY: help install demo test test-slow lint bench checks adversaries lock clean
 
 help:  ## Says what there is
@@ -31,10 +34,10 @@ lint: install  ## Style and types
 
 test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, default 2)
 	./tools/test_programs.sh
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST)
 
 test-slow: install  ## The tests that take minutes, side by side like the others
-	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(BIN)/pytest -m slow --timeout 3600 -n $(TEST_JOBS) --dist loadfile
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST) -m slow --timeout 3600
 
 bench: install  ## Measures speed and memory, beside alternatives, in a quarter of an hour
 	$(BIN)/python benchmarks/run.py

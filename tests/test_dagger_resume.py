@@ -86,7 +86,7 @@ def cut_power(monkeypatch, owner, name, after):
     ("owner", "name", "after"),
     [
         (folder_module.RunFolder, "commit", 3),  # the attempt is on disk and not yet counted
-        (folder_module.os, "replace", 8),  # the checkpoint is complete and not yet at its place
+        pytest.param(folder_module.os, "replace", 8, marks=pytest.mark.slow),  # the checkpoint is not yet at its place
         (folder_module.RunFolder, "clean", 3),  # the last round counts, and `last` does not say so yet
         pytest.param(DurableWriter, "add_frame", 20, marks=pytest.mark.slow),  # while an attempt is written
         pytest.param(folder_module.RunFolder, "save_checkpoint", 1, marks=pytest.mark.slow),

@@ -35,7 +35,7 @@ def open_stock(root, episodes=None):
     return LeRobotDataset("tests/noise", root, episodes=episodes, delta_timestamps=timestamps, video_backend="pyav")
 
 
-@pytest.mark.parametrize("episodes", [None, [0, 2]])
+@pytest.mark.parametrize("episodes", [pytest.param(None, marks=pytest.mark.slow), [0, 2]])
 def test_windows_equal_those_of_lerobot(root, episodes):
     stock = open_stock(root, episodes)
     store = EpisodeStore.from_dataset(stock, device="cpu", video_backend="pyav")

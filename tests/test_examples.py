@@ -43,6 +43,7 @@ def test_a_dataset_is_heard_as_wav(tmp_path):
         assert file.getnframes() == 12 * 800
 
 
+@pytest.mark.slow
 def test_own_robot_trains(tmp_path):
     run(sys.executable, EXAMPLES / "own_robot.py", f"--root={tmp_path / 'robot'}", "--frames=40")
     run(

@@ -210,6 +210,7 @@ def test_lerobot_trains_on_a_dataset_from_the_hub(pushed, hub, client, tmp_path)
     assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
 
 
+@pytest.mark.slow
 def test_our_commands_load_a_dataset_from_the_hub_although_one_request_in_ten_fails(pushed, hub, client, tmp_path):
     hub.fault = one_in(10, seed=1)
     looked = client.run("playbyear-inspect", f"--dataset.repo_id={DATASET}", "--json")

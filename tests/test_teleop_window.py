@@ -175,6 +175,7 @@ def person_corrects(screen, process, log):
     screen.press("s")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(500)
 def test_playbyear_dagger_learns_from_a_person_at_lerobots_keyboard(screen, tmp_path):
     kind = "keyboard_ee" if find_spec("pynput") else "keyboard_window"
