@@ -87,7 +87,7 @@ def cut_power(monkeypatch, owner, name, after):
     [
         (folder_module.RunFolder, "commit", 3),  # the attempt is on disk and not yet counted
         pytest.param(folder_module.os, "replace", 8, marks=pytest.mark.slow),  # the checkpoint is not yet at its place
-        (folder_module.RunFolder, "clean", 3),  # the last round counts, and `last` does not say so yet
+        pytest.param(folder_module.RunFolder, "clean", 3, marks=pytest.mark.slow),  # `last` is behind
         pytest.param(DurableWriter, "add_frame", 20, marks=pytest.mark.slow),  # while an attempt is written
         pytest.param(folder_module.RunFolder, "save_checkpoint", 1, marks=pytest.mark.slow),
     ],
@@ -206,6 +206,7 @@ def test_killed_in_an_evaluation_it_evaluates_again(tmp_path, monkeypatch):
     assert [line["round"] for line in metrics(tmp_path, "eval")] == [0, 2, 3]
 
 
+@pytest.mark.slow
 def test_killed_it_goes_on(processes, tmp_path):
     found = run_and_kill(processes, tmp_path, 2, 0.5, 3.0, *RUN, *EVALUATED)
     assert len(found) > 0

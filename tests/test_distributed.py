@@ -53,6 +53,7 @@ def run_together(folder: Path, n_processes: int) -> list[dict[str, torch.Tensor]
     return [load_file(folder / f"{n_processes}.{rank}.safetensors") for rank in range(n_processes)]
 
 
+@pytest.mark.slow
 def test_two_processes_normalise_and_weigh_like_one_with_all_items(tmp_path):
     generator = torch.Generator().manual_seed(0)
     begun = torch.ones(8, 32000, dtype=torch.bool)

@@ -337,6 +337,7 @@ def test_a_commit_whose_answer_is_lost_happens_once(pushed, hub, client, kind):
     assert hub.dataset("tester/once").messages == ["initial commit", "Upload dataset", "Upload card"]
 
 
+@pytest.mark.slow
 def test_checkpoints_go_up_once_although_answers_are_lost(pushed, hub, client, tmp_path):
     hub.fault = every_second("lost", "POST", "/commit/|/tag/|/create")
     run = (*TINY, "--policy.push_to_hub=true", "--policy.repo_id=tester/steps", "--steps=2", "--save_freq=1")

@@ -161,6 +161,7 @@ def meet_random_faults(disk: FaultyDisk, originals: dict[str, Path], folder: Pat
     assert n_failed >= 0.9 * len(seeds)  # some calls are made only now and then
 
 
+@pytest.mark.slow
 def test_whole_episodes_stay_where_a_disk_fails_for_a_moment(disk, originals, tmp_path):
     meet_random_faults(disk, originals, tmp_path, range(10))
 

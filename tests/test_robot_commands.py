@@ -59,6 +59,7 @@ def bench(tmp_path_factory) -> Iterator[Bench]:
         yield Bench(stack, folder)
 
 
+@pytest.mark.slow
 def test_from_nothing_to_a_corrected_policy(bench, tmp_path):
     demos, train, dagger = tmp_path / "demos", tmp_path / "train", tmp_path / "dagger"
     data = ("--dataset.repo_id=me/demos", f"--dataset.root={demos}")

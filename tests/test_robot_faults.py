@@ -100,8 +100,12 @@ def test_the_microphone_is_pulled_out_and_only_zeros_come(caplog):
         assert len(errors_of(caplog)) == 1
         assert "The microphone gripper" in errors_of(caplog)[0]
         server.add("bench")
-        env.reset(seed=1)
-        assert not env.step(np.zeros(3, np.float32))[3]
+        for seed in (1, 2):  # a busy machine may stand still once, which ends an attempt, too
+            env.reset(seed=seed)
+            if not env.step(np.zeros(3, np.float32))[3]:
+                break
+        else:
+            pytest.fail(f"No attempt goes on: {errors_of(caplog)}")
 
 
 @needs_server

@@ -33,6 +33,7 @@ class PrivilegedState:
     secrets: dict[str, Any]
     materials: dict[str, str]
     _controller: Controller
+    _success: Any
     _tool: int
     _fingers: slice
     _peak_forces: np.ndarray
@@ -62,6 +63,11 @@ class PrivilegedState:
     def check_limits(self) -> dict[str, float]:
         """What the task promises of those who play it, where that differs from other tasks."""
         return dict(self.definition.limits)
+
+    @property
+    def success_rule(self) -> Any:
+        """The rule by which this environment's episodes succeed, with what it remembers of the present one."""
+        return self._success
 
     @property
     def control_hz(self) -> int:

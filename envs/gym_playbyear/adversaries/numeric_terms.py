@@ -184,7 +184,7 @@ class PouchTerms(Terms):
         return worth
 
     def _was_dropped(self) -> bool:
-        return bool(self.env._success.course.was_dropped)
+        return bool(self.env.success_rule.course.was_dropped)
 
 
 def terms_of(task: DeafTask) -> Terms:
