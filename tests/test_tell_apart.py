@@ -101,7 +101,7 @@ def test_the_expert_lifts_screws_and_leaves_peanuts(contents):
         env.begin_episode(seed=seed, options={"contents": contents})
         expert = env.scripted_expert()
         _, info = finish(env, expert)
-        assert info == {"is_success": True, "end": "success", "contents": contents}
+        assert info == {"is_success": True, "end": "success", "contents": contents, "acted_early": False}
         assert expert.phase == {"screws": "keep", "peanuts": "rest"}[contents]
 
 
@@ -117,8 +117,8 @@ def test_what_is_done_after_the_drop_decides(contents):
     other_script.strategy = "leave"
     ends = {one.strategy: finish(world, one)[1] for world, one in ((other, other_script), (env, script))}
     right, wrong = {"screws": ("lift", "leave"), "peanuts": ("leave", "lift")}[contents]
-    assert ends[right] == {"is_success": True, "end": "success", "contents": contents}
-    assert ends[wrong] == {"is_success": False, "end": "wrong", "contents": contents}
+    assert ends[right] == {"is_success": True, "end": "success", "contents": contents, "acted_early": False}
+    assert ends[wrong] == {"is_success": False, "end": "wrong", "contents": contents, "acted_early": False}
 
 
 def test_leaving_without_having_lifted_and_dropped_counts_for_nothing():

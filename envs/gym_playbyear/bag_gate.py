@@ -100,3 +100,12 @@ class BagGate(StagedGate):
             phase = "enter" if self.env.eef_position[2] > RIM else "descend"
         self.expert.begin_at(phase)
         self._hands_back_at = LIFT + 1 if self.reason == "opens" else _STAGES[phase] + 1
+
+    def _follow(self) -> None:
+        phase, stage = self.expert.phase, _STAGES[self.expert.phase]
+        if self._holds() and stage < LIFT:
+            self.expert.begin_at("lift")
+        elif phase == "enter" and self.env.eef_position[2] <= RIM:
+            self.expert.begin_at("descend")
+        elif stage == SEARCH and phase != "enter" and self.env.eef_position[2] > RIM:
+            self.expert.begin_at("enter")

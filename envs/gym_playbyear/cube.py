@@ -8,6 +8,7 @@ import numpy as np
 from gym_playbyear.arena import CUBE_HALF_SIZE, FRONT_CAMERA, TABLE, TABLE_TOP, loose_box
 from gym_playbyear.arm import FINGER_FRICTION
 from gym_playbyear.gates import InterventionGate
+from gym_playbyear.haste import ClosedUnheard
 from gym_playbyear.materials import CUBE_MATERIALS
 from gym_playbyear.options import check_option
 from gym_playbyear.rules import Groped, Pressed, Rule, Shoved, Solved
@@ -69,6 +70,7 @@ def cube_task(variant: Variant, condition: Callable[[Any], bool]) -> dict[str, A
         "cameras": (FRONT_CAMERA,),
         "success": solved,
         "ends": tuple(ends),
+        "haste": ClosedUnheard(CUBE),
         "gate": InterventionGate,
         "horizon": variant.horizon,
         "sensors": variant.sensors,

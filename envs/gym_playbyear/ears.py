@@ -10,6 +10,9 @@ import numpy as np
 from gym_playbyear.materials import ContactPair
 from gym_playbyear.sound_v2_crackle import Bending
 
+USUAL_RMS = 10 ** (-60 / 20)
+"""Of version 0's background noise and hum, relative to full scale."""
+
 
 @dataclass(frozen=True)
 class HeardPair:
@@ -122,9 +125,13 @@ class MaterialEars:
         make: `make(pairs, *rest)` makes a synthesiser. What it measures must not depend on materials.
         pairs: What can be heard, of the usual materials.
         rest: Its other arguments.
+
+    Attributes:
+        background_rms: Of the task's own noise and hum, relative to full scale: what the synthesiser says, or version 0's.
     """
 
     def __init__(self, make: Callable[..., Ears], pairs: list[HeardPair], *rest: Any):
+        self.background_rms: float = getattr(make, "background_rms", USUAL_RMS)
         self._make, self._pairs, self._rest = make, pairs, rest
         self._made: dict[tuple[tuple[str, str], ...], Ears] = {}
         self.choose({})

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 
 from gym_playbyear.contact_kinematics import ContactReader, SoundingPair, add_sensors
-from gym_playbyear.ears import HeardPair, Moment
-from gym_playbyear.sound_v2 import ContactSynth
+from gym_playbyear.ears import USUAL_RMS, HeardPair, Moment
+from gym_playbyear.sound_v2 import BACKGROUND, ContactSynth
 
 _RENAMED = {"bin": "tray"}  # materials that have another name here
 _FINGER_CLICK = SoundingPair(("left_finger", "right_finger"), ("gripper", "gripper"), stop="left_finger")
@@ -21,7 +21,12 @@ class SyntheticEars:
         control_hz: Control steps per second.
         physics_dt: Duration of a physics step [s].
         noise_level: Factor on noise and hum.
+
+    Attributes:
+        background_rms: Of noise and hum, relative to full scale.
     """
+
+    background_rms = BACKGROUND * USUAL_RMS
 
     def __init__(
         self,

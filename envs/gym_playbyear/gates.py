@@ -212,6 +212,14 @@ class InterventionGate(StagedGate):
         if self.reason == "opens":
             self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
 
+    def _follow(self) -> None:
+        phase, now = self._fitting_phase(), _STAGES[self.expert.phase]
+        found = phase in ("dwell", "grasp") and now == SEARCH and self.expert.phase != "sweep"
+        if found or _STAGES[phase] > max(now, GRASP):
+            self.expert.begin_at(phase)
+        elif _STAGES[phase] == now == SEARCH:
+            self.expert.phase = phase  # its speeds stay those of this search
+
     def _fitting_phase(self) -> str:
         if self._holds():
             high = self._height() > getattr(self.expert, "carry_height", np.inf) - 0.01

@@ -14,6 +14,7 @@ from gym_playbyear.bag_contents import CONTENTS, FRICTION, contents_prop, drop, 
 from gym_playbyear.bag_experts import FOR_TALLER_THINGS, STRATEGIES, BagExpert, BlindBag
 from gym_playbyear.bag_gate import BagGate
 from gym_playbyear.ears_v2 import SyntheticEars
+from gym_playbyear.haste import ClosedUnheard
 from gym_playbyear.proprioception import SensorNoise
 from gym_playbyear.rules import Groped, Pressed, Solved
 from gym_playbyear.task import Camera, Task
@@ -130,6 +131,7 @@ def _task(name: str, numbers: BagNumbers, contents: str, **more: Any) -> Task:
             Torn(numbers.max_tear),
             Groped(numbers.closings),
         ),
+        haste=ClosedUnheard(CONTENTS),
         expert=BagExpert if contents in ("keys", "candies") else partial(BagExpert, config=FOR_TALLER_THINGS),
         gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},

@@ -52,7 +52,7 @@ def pieces() -> tuple[Prop, ...]:
                 condim="6" friction="0.3 0.005 0.001" {_BOUNCE} rgba="0.5 0.5 0.5 1"/></body>""",
             material=CONTENTS[0],
             loose=True,
-            loudness=5.0,
+            loudness=60.0,
             hidden=True,
             inside=POUCH,
         )

@@ -15,9 +15,6 @@ from gym_playbyear.ears import MaterialEars, Moment
 from gym_playbyear.options import OptionError, check_option
 from gym_playbyear.sound import pcm16
 
-USUAL_RMS = 10 ** (-60 / 20)
-"""Of a task's own background noise and hum, relative to full scale."""
-
 RESPONSES: dict[str, tuple[str, float | tuple[float, float], float]] = {
     "flat": ("none", 0.0, 0.0),
     "phone": ("bandpass", (300.0, 3400.0), 0.0),
@@ -57,7 +54,7 @@ class Room:
             raise OptionError("room_noise_level", noise_level, "give 0 (silent) or more")
         self._ears, self._microphones = ears, microphones
         recording = np.zeros(1, np.float32) if noise is None else _recording(str(noise), sample_rate)
-        self._recording = noise_level * USUAL_RMS * recording
+        self._recording = noise_level * ears.background_rms * recording
         kind, corner, self._added = RESPONSES[response]
         self._filter = None if response == "flat" else signal.butter(1, corner, kind, fs=sample_rate, output="sos")
         self.reset(np.random.default_rng(0))

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 
 from gym_playbyear.ears import Ears, HeardPair, contact_sound
+from gym_playbyear.haste import Haste
 from gym_playbyear.proprioception import SensorNoise
 from gym_playbyear.rules import Rule, Solved
 
@@ -149,6 +150,7 @@ class Task:
         ends: Rules by which an attempt fails, in order; their names appear in `info["end"]`.
         expert: `expert(env)` makes the scripted expert: `act()` gives the next action.
         horizon: Steps after which an attempt is cut off.
+        haste: What tells whether an attempt acted before it had heard anything (`info["acted_early"]`).
         correcting_expert: An expert that corrects, where that differs from one that demonstrates.
         gate: `gate(env, expert)` makes the intervention gate; None: there is none.
         blind: Scripts without any sense of contact, by name; each is `script(env)`.
@@ -179,6 +181,7 @@ class Task:
     expert: Callable[[Any], Any]
     horizon: int
     ends: tuple[Rule, ...] = ()
+    haste: Haste = field(default_factory=Haste)
     correcting_expert: Callable[[Any], Any] | None = None
     gate: Callable[[Any, Any], Any] | None = None
     blind: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)

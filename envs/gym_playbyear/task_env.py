@@ -77,8 +77,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         check_option("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         if image_size < 8:
             raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
-        self.task, self.task_description = definition.name, definition.description
-        self.variant = definition.numbers
+        self.task, self.task_description, self.variant = definition.name, definition.description, definition.numbers
         self.metadata = {**self.metadata, "render_fps": definition.control_hz}
         self._max_episode_steps = int(horizon or definition.horizon)
         self.render_mode, self._render_size = render_mode, render_size
@@ -87,7 +86,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._sample_rate = int(sample_rate or definition.sample_rate)
         self.shown, self.secrets, self.materials = {}, {}, {}
         # Rules remember things of an episode.
-        self._success, self._ends = copy.deepcopy((definition.success, definition.ends))
+        self._success, self._ends, self._haste = copy.deepcopy((definition.success, definition.ends, definition.haste))
 
         arm = definition.arm
         self.contacts = Contacts(definition)
@@ -178,7 +177,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)
         for _ in range(_SETTLE_STEPS):
             self._advance(hold)
-        for rule in (self._success, *self._ends):
+        for rule in (self._success, *self._ends, self._haste):
             rule.begin(self)
 
     def step(self, action):
@@ -188,8 +187,8 @@ class TaskEnv(PrivilegedState, gym.Env):
     def advance(self, action) -> tuple[float, bool, bool, dict[str, Any]]:
         """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise.
 
-        `info["is_success"]` says whether the task is solved, and `info["end"]`, at the last step, how the attempt ended:
-        "success", the name of one of the task's rules, or "time". What the task kept secret is there, too, by then.
+        `info["is_success"]` says whether the task is solved, and at the last step `info["end"]` how the attempt ended:
+        "success", the name of a rule, or "time". By then the task's secrets are there, and "acted_early" (`haste.py`).
         """
         self._check_is_running("step")
         action = np.asarray(action, dtype=float)
@@ -197,11 +196,12 @@ class TaskEnv(PrivilegedState, gym.Env):
             raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
         self._advance(self._controller.command(np.clip(action, -1, 1), self.eef_position))
         self._n_steps += 1
+        self._haste.look(self)
         end = next((rule.name for rule in (self._success, *self._ends) if rule.applies(self)), None)
         truncated = end is None and self._n_steps >= self._max_episode_steps
         info: dict[str, Any] = {"is_success": end == self._success.name}
         if end is not None or truncated:
-            info |= {"end": end or "time", **self.secrets}
+            info |= {"end": end or "time", **self.secrets, **self._haste.info()}
         return float(info["is_success"]), end is not None, truncated, info
 
     def render(self):

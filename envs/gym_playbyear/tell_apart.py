@@ -9,6 +9,7 @@ import numpy as np
 from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.ears_v2 import SyntheticEars
+from gym_playbyear.haste import MovedUnheard
 from gym_playbyear.options import check_option
 from gym_playbyear.pouch import CONTENTS, HALF_SIZE, PIECES, POUCH, pieces, pouch, put_pouch
 from gym_playbyear.proprioception import SensorNoise
@@ -112,6 +113,7 @@ def tell_apart(*, contents: str | None = None) -> Task:
         place=partial(_place, contents=contents),
         success=ToldApart(course),
         ends=(ToldWrong(course),),
+        haste=MovedUnheard(POUCH, is_lifted, has_landed),
         expert=PouchExpert,
         blind={name: partial(BlindPouch, strategy=name) for name in BLIND_STRATEGIES},
         sees=_pouch_seen,
@@ -156,7 +158,12 @@ def is_left(env: Any) -> bool:
     """Whether the pouch lies on the table and the open hand is away from it."""
     is_open = env.finger_positions.sum() > _OPEN * env.variant.arm.max_opening
     distance = np.linalg.norm(env.eef_position - env.pouch_position)
-    return bool(_height(env) < _DOWN and is_open and distance > env.variant.away)
+    return bool(has_landed(env) and is_open and distance > env.variant.away)
+
+
+def has_landed(env: Any) -> bool:
+    """Whether the pouch lies on the table, or stands there."""
+    return _height(env) < _DOWN
 
 
 def _height(env: Any) -> float:
@@ -189,7 +196,7 @@ class Course:
             self.answer = next((contents for contents, rule in self._answers.items() if rule.applies(env)), None)
         elif is_lifted(env):
             self._was_lifted = True
-        elif self._was_lifted and _height(env) < _DOWN:
+        elif self._was_lifted and has_landed(env):
             self.was_dropped = bool(env.eef_position[2] - env.pouch_position[2] > env.variant.dropped)
             self._was_lifted = False  # what was set down has to be lifted once more
 

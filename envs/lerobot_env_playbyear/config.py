@@ -20,6 +20,7 @@ from gym_playbyear.options import OptionError, make_definition
 from gym_playbyear.plugins import PluginError
 from gym_playbyear.room import RESPONSES
 from gym_playbyear.task import Task
+from lerobot_env_playbyear.attempts import with_attempts_file
 from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
 if TYPE_CHECKING:  # of the other distribution, which is needed for these pictures alone
@@ -55,6 +56,8 @@ class PlaybyearEnvConfig(EnvConfig):
         hidden_object: False: the hand passes through what is hidden; all else is the same world.
         visualization_width, visualization_height: Of the picture that `render()` gives people; the same number twice [pixels].
         render_mode: `rgb_array` (for videos), or `human` for a window.
+        attempts_file: A file to which every attempt, at its end, appends a line of JSON: seed, steps, success, how it ended,
+            and whether the hand acted before anything was heard (`attempts.py`).
 
     Raises:
         DecodingError: A value is not one that the tasks know. LeRobot's commands print it as one line and stop.
@@ -82,6 +85,7 @@ class PlaybyearEnvConfig(EnvConfig):
     visualization_width: int = 480
     visualization_height: int = 480
     render_mode: str = "rgb_array"
+    attempts_file: str | None = None
     # Filled in by __post_init__ from the fields above
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=dict)
@@ -156,6 +160,7 @@ class PlaybyearEnvConfig(EnvConfig):
             from lerobot_playbyear.episodes.sound_pictures import with_sound_pictures
 
             make = with_sound_pictures(make, self._sound_pictures())
+        make = with_attempts_file(make, self.attempts_file)
         factories = [freeze_after_episode_end(make) for _ in range(n_envs)]
         vec: gym.vector.VectorEnv
         if use_async_envs and n_envs > 1:
@@ -227,6 +232,8 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("microphone_response", f"choose one of {', '.join(RESPONSES)}")
         if self.room_noise is not None and not Path(self.room_noise).is_file():
             raise self._error("room_noise", "there is no such file, give a WAV file")
+        if self.attempts_file is not None and Path(self.attempts_file).is_dir():
+            raise self._error("attempts_file", "it is a folder, give a file in it, such as attempts.jsonl")
         if not 0 <= self.room_noise_level < float("inf"):
             raise self._error("room_noise_level", "give 0 (silent) or more")
         if self.spectrogram is not None and self.sound != "waveform":

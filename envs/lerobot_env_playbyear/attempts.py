@@ -1,0 +1,54 @@
+"""How every attempt ended, in a file: LeRobot's evaluations keep successes alone."""
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+
+class AttemptsFile(gym.Wrapper):
+    """Appends one line of JSON to a file at the end of every attempt.
+
+    A line has `seed` (null where the environment drew it), `steps`, and what the environment's `info` says at the end:
+    `is_success`, `end`, `acted_early` where the task tells it, and what the task kept secret. Attempts that are broken off
+    leave none. Several environments, also in processes of their own, may share a file.
+
+    Args:
+        env: The environment.
+        path: The file; its folder is made.
+    """
+
+    def __init__(self, env: gym.Env, path: str):
+        super().__init__(env)
+        self._path = Path(path)
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._seed: int | None = None
+        self._n_steps, self._is_over = 0, False
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        self._seed, self._n_steps, self._is_over = seed, 0, False
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action):
+        outcome = self.env.step(action)
+        self._n_steps += 1
+        _, _, terminated, truncated, info = outcome
+        if (terminated or truncated) and not self._is_over:
+            self._is_over = True
+            told = {key: value for key, value in info.items() if isinstance(value, bool | int | float | str)}
+            line = json.dumps({"seed": self._seed, "steps": self._n_steps, **told})
+            with self._path.open("a") as file:
+                file.write(line + "\n")  # one write: lines of several processes do not mix
+        return outcome
+
+
+def with_attempts_file(make: Callable[[], gym.Env], path: str | None) -> Callable[[], gym.Env]:
+    """What makes an environment that keeps such a file, if one is named, from what makes it without; it can be pickled."""
+    return make if path is None else partial(_make, make, path)
+
+
+def _make(make: Callable[[], gym.Env], path: str) -> gym.Env:
+    return AttemptsFile(make(), path)

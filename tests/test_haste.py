@@ -1,0 +1,157 @@
+"""Acting too early is told beside success: the hand closes before anything was heard, or leaves before the drop was heard."""
+
+import copy
+import json
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from draccus.utils import DecodingError
+from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+
+from experiments.protocol import RESULTS, Result, load, load_results
+from experiments.training import early_attempts
+from gym_playbyear.haste import ClosedUnheard
+from gym_playbyear.task_env import TaskEnv
+from lerobot_env_playbyear import PlaybyearEnvConfig
+
+OPEN, CLOSE = -1.0, 1.0
+
+
+def make(task: str, **options):
+    return gym.make(f"gym_playbyear:gym_playbyear/{task}", disable_env_checker=True, **options).unwrapped
+
+
+def finish(env, script) -> dict:
+    over = False
+    while not over:
+        _, terminated, truncated, info = env.advance(script.act())
+        over = terminated or truncated
+    return info
+
+
+@pytest.mark.parametrize("task", ["OccludedGrasp-v1", "OccludedPickPlace-v1", "KeyBag-Easy-v1", "TellApart-v1"])
+def test_experts_hear_first(task):
+    env = make(task)
+    for seed in range(2):
+        env.begin_episode(seed=seed)
+        info = finish(env, env.scripted_expert())
+        assert info["is_success"]
+        assert info["acted_early"] is False
+
+
+def after(env, *commands: tuple[float, int, float]) -> dict:
+    """What the last step says of some steps: (sideways [5 cm], how many, gripper)."""
+    for sideways, n_steps, grip in commands:
+        for _ in range(n_steps):
+            *_, info = env.advance(np.array([0, sideways, 0, grip]))
+    return info
+
+
+def test_a_hand_that_closes_in_the_air_was_early_and_one_that_stays_open_was_not():
+    for commands, early in ((((0, 10, OPEN), (0, 10, CLOSE)), True), (((0, 20, OPEN),), False)):
+        env = make("OccludedGrasp-v1", horizon=20)
+        env.begin_episode(seed=3)
+        assert after(env, *commands) == {"is_success": False, "end": "time", "acted_early": early}
+
+
+def test_only_the_first_closing_counts():
+    """A grasp that missed after the touch is followed by another one: it was not early, nor does hearing later excuse."""
+    env = make("OccludedGrasp-v1")
+    env.begin_episode(seed=3)
+    watch = ClosedUnheard("cube")
+
+    class World:
+        definition = env.definition
+
+        def __init__(self, opening, force):
+            self.finger_positions, self.contact_forces = np.array([opening / 2] * 2), {"gripper-cube": force}
+
+    wide = env.definition.arm.max_opening
+    for steps, early in (
+        ([(wide, 3.0), (wide, 0.0), (0.0, 0.0), (wide, 0.0), (0.0, 0.0)], False),
+        ([(0.0, 0.0), (wide, 3.0), (0.0, 3.0)], True),
+        ([(wide, 0.1), (0.8 * wide, 30.0)], True),  # closing itself touches it: the action was chosen before
+        ([(wide, 3.0), (0.8 * wide, 30.0)], False),
+    ):
+        watch.begin(env)
+        for step in steps:
+            watch.look(World(*step))
+        assert watch.acted_early is early
+
+
+@pytest.mark.parametrize(("sideways", "early"), [(0.0, False), (0.6, True)])
+def test_a_hand_that_moves_on_while_the_pouch_falls_was_early(sideways, early):
+    env = make("TellApart-v1")
+    env.begin_episode(seed=1)
+    script = env.scripted_expert()
+    while not script.was_dropped:
+        env.advance(script.act())
+    with_hand_open = script.act()
+    with_hand_open[1] += sideways
+    for _ in range(4):
+        env.advance(np.clip(with_hand_open, -1, 1))
+    assert env._haste._is_decided
+    assert env._haste.acted_early is early
+    assert copy.deepcopy(env)._haste.acted_early is early
+    env.begin_episode(seed=2)
+    assert env._haste.acted_early is False
+
+
+def test_a_task_made_of_another_one_without_the_thing_does_not_ask():
+    task = replace(make("OccludedGrasp-v1").definition, haste=ClosedUnheard("pouch"), horizon=2)
+    env = TaskEnv(task)
+    env.begin_episode(seed=0)
+    assert after(env, (0, 2, CLOSE)) == {"is_success": False, "end": "time"}
+
+
+def vector_env(path, **options):
+    config = PlaybyearEnvConfig(task="OccludedGrasp-v1", episode_length=3, attempts_file=str(path), **options)
+    return config.create_envs(2)["playbyear"][0]
+
+
+def test_every_attempt_leaves_one_line_in_the_file(tmp_path):
+    path = tmp_path / "deep" / "attempts.jsonl"
+    envs = vector_env(path)
+    for first in (11, 13):
+        envs.reset(seed=[first, first + 1], options={NEW_ROLLOUT_OPTION: True})
+        for _ in range(5):  # beyond the end, as in a rollout whose slowest attempt goes on
+            envs.step(np.array([[0, 0, 0, CLOSE], [0, 0, 0, OPEN]], np.float32))
+    envs.close()
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert [line["seed"] for line in lines] == [11, 12, 13, 14]
+    assert lines[0].keys() == {"seed", "steps", "is_success", "end", "acted_early"}
+    assert {(line["steps"], line["end"], line["is_success"]) for line in lines} == {(3, "time", False)}
+    early = early_attempts(path, range(11, 15))
+    assert early[1::2] == [False, False]
+    assert early_attempts(path, range(10, 15)) == []
+    assert early_attempts(tmp_path / "nothing", range(11, 15)) == []
+
+
+def test_the_file_changes_nothing_that_is_observed(tmp_path):
+    observed = []
+    for options in ({}, {"attempts_file": str(tmp_path / "a.jsonl")}):
+        config = PlaybyearEnvConfig(task="OccludedGrasp-v1", **options)
+        envs = config.create_envs(1)["playbyear"][0]
+        observation, _ = envs.reset(seed=[5], options={NEW_ROLLOUT_OPTION: True})
+        observed.append((observation, envs.step(np.zeros((1, 4), np.float32))[0]))
+        envs.close()
+    for one, other in zip(*observed, strict=True):
+        np.testing.assert_array_equal(one["pixels"]["front"], other["pixels"]["front"])
+        np.testing.assert_array_equal(one["audio.gripper"], other["audio.gripper"])
+        np.testing.assert_array_equal(one["agent_pos"], other["agent_pos"])
+
+
+def test_a_folder_is_no_file_for_attempts(tmp_path):
+    with pytest.raises(DecodingError, match=r"attempts_file.*it is a folder, give a file"):
+        PlaybyearEnvConfig(attempts_file=str(tmp_path))
+
+
+def test_results_from_before_are_read_and_new_ones_tell_the_share():
+    old = load_results("ablations/OccludedGrasp-v0-full-*.json")
+    assert old
+    assert all(result.early_rate is None and "early" not in result.summary for result in old)
+    content = load(next((RESULTS / "ablations").glob("OccludedGrasp-v0-full-*.json")))
+    new = Result(**{**content, "successes": [True, False], "acted_early": [False, True]})
+    assert (new.early_rate, new.summary) == (0.5, "50% (acted early: 50%)")
