@@ -1,6 +1,5 @@
 """Configuration of the policy `playbyear`."""
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,19 +15,12 @@ from lerobot_playbyear.policy.feature_checks import check_features, sample_rate_
 from lerobot_playbyear.policy.option_checks import check_options
 from lerobot_playbyear.policy.precision import training_dtype
 from lerobot_playbyear.policy.schedule import PlaybyearSchedulerConfig
-
-
-def segment_and_hop(sample_rate: int, segment_s: float, hop_s: float) -> tuple[int, int]:
-    """Samples of a spectrogram's segment and of a step.
-
-    The step is rounded down, so that a window holds as many segments at every sample rate.
-    """
-    return round(segment_s * sample_rate), math.floor(hop_s * sample_rate + 1e-6)
+from lerobot_playbyear.policy.window_lengths import WindowLengths
 
 
 @PreTrainedConfig.register_subclass("playbyear")
 @dataclass
-class PlaybyearConfig(PreTrainedConfig):
+class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     """The audio-visual LSTM of "Play it by Ear" (Du et al., RSS 2022). Defaults are the paper's unless a line says otherwise.
 
     Every frame is encoded from the last `n_frame_stack` images of every camera, the last `audio_window_s` of every
@@ -44,6 +36,9 @@ class PlaybyearConfig(PreTrainedConfig):
         audio_window_s: Seconds of sound behind one encoding.
         segment_s, hop_s: Length and step of the spectrogram's segments [s].
         n_frequency_bins: Lowest bins of the spectrogram that are kept; a bin is 1 / segment_s wide.
+        audio_features: What the audio encoder gets of them: "spectrogram", their log power (the paper); "log_mel", that of
+            `n_mels` bands; "pcen", the bands' power relative to its own recent past, which steady noise hardly moves.
+        n_mels: Bands of equal width on the mel scale, over the kept bins; for "log_mel" and "pcen".
         image_size: Pixels, height and width, that the vision encoder sees. 84 trains about five times faster than 224.
         audio_steps: Names in LeRobot's ProcessorStepRegistry: steps that sound passes through before the network, in training
             as in a rollout. A trained policy keeps those it was trained with (`extension.MicrophoneStep`).
@@ -52,6 +47,8 @@ class PlaybyearConfig(PreTrainedConfig):
         vision_encoder, audio_encoder: Names of registered encoders (`extension.register_vision_encoder`, `_audio_encoder`).
         vision_width: Channels of the ResNet-18's first stage; 64 is ResNet-18, and its embedding has 8 times as many.
         audio_channels: Channels of the audio encoder's convolutions, all with kernel 7.
+        fusion: "concatenation" of all encodings (the paper), or "attention" among them, each a token, before the same MLP.
+        fusion_dropout: Share of a joint encoding's numbers that training sets to 0; acting uses all.
         hidden_size: Of the two hidden layers in the fusion and in the head.
         embedding_size: Of the fused encoding and of the LSTM, D.
         normalize_encodings: Bring every camera's and microphone's encoding to the same size before the fusion (a layer norm
@@ -79,6 +76,11 @@ class PlaybyearConfig(PreTrainedConfig):
         ema_decay: Weight of the past in an exponential moving average of the network's weights, which acts in rollouts in place
             of the last update's; both are in a checkpoint. It rises to this in the first updates: (1 + n) / (10 + n) after n.
             0: none (the paper).
+        auxiliary_*: Weights, beside the action's loss, of what training predicts besides (`auxiliary.py`); 0: not at all (the
+            paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame
+            [cross entropy, nats]; next_sound: the last spectrogram column of the next frame [squared standard deviations];
+            inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that is
+            executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss].
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
@@ -99,6 +101,8 @@ class PlaybyearConfig(PreTrainedConfig):
     segment_s: float = 0.040
     hop_s: float = 0.035
     n_frequency_bins: int = 160
+    audio_features: str = "spectrogram"
+    n_mels: int = 40
     image_size: int = 224
     audio_steps: tuple[str, ...] = ()
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -115,6 +119,8 @@ class PlaybyearConfig(PreTrainedConfig):
     audio_encoder: str = "spectrogram_cnn"
     vision_width: int = 64
     audio_channels: tuple[int, ...] = (64, 32, 16, 8)
+    fusion: str = "concatenation"
+    fusion_dropout: float = 0.0
     hidden_size: int = 1024
     embedding_size: int = 50
     normalize_encodings: bool = True
@@ -135,6 +141,11 @@ class PlaybyearConfig(PreTrainedConfig):
     low_dimensional_noise: float = 0.0
     spectrogram_momentum: float = 0.01
     ema_decay: float = 0.0
+    auxiliary_onset: float = 0.0
+    auxiliary_next_sound: float = 0.0
+    auxiliary_inverse_dynamics: float = 0.0
+    auxiliary_chunk: float = 0.0
+    auxiliary_chunk_size: int = 4
     dtype: str | None = None
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.0
@@ -147,51 +158,6 @@ class PlaybyearConfig(PreTrainedConfig):
         check_options(self)
         self._asked_dtype = self.dtype
         self.dtype = training_dtype(self.dtype, self.use_amp, str(self.device))  # LeRobot reads this, and not use_amp
-
-    # Windows, in frames
-
-    @property
-    def memory_steps(self) -> int:
-        """Encodings that the LSTM reads: H, or 1 without memory."""
-        return self.n_memory_steps if self.use_memory else 1
-
-    @property
-    def frame_stack(self) -> int:
-        """Images per encoding, 1 without memory."""
-        return self.n_frame_stack if self.use_memory else 1
-
-    @property
-    def audio_frames(self) -> int:
-        """Frames whose sound one encoding hears."""
-        return math.ceil(round(self.audio_window_s * self.fps, 6))
-
-    @property
-    def n_run_frames(self) -> int:
-        """Frames that a training item encodes, R = K + H - 1."""
-        return self.n_supervised_steps + self.memory_steps - 1
-
-    @property
-    def n_image_frames(self) -> int:
-        """Images that a training item needs."""
-        return self.n_run_frames + self.frame_stack - 1
-
-    @property
-    def n_audio_frames(self) -> int:
-        """Frames of sound that a training item needs."""
-        return self.n_run_frames + self.audio_frames - 1
-
-    @property
-    def observation_delta_indices(self) -> list[int]:
-        longest = max(self.n_image_frames, self.n_audio_frames if self.use_audio else 0)
-        return list(range(1 - longest, 1))
-
-    @property
-    def action_delta_indices(self) -> list[int]:
-        return list(range(1 - self.n_supervised_steps, 1))
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None
 
     # Features
 
@@ -219,19 +185,6 @@ class PlaybyearConfig(PreTrainedConfig):
     def feature_shape(self, key: str) -> tuple[int, ...]:
         """Shape of one frame of an observation."""
         return tuple((self.input_features or {})[key].shape)
-
-    @property
-    def window_samples(self) -> int:
-        """Samples of one encoding's sound."""
-        assert self.sample_rate is not None
-        return round(self.audio_window_s * self.sample_rate)
-
-    @property
-    def n_segments(self) -> int:
-        """Columns of the spectrogram of one encoding's sound."""
-        assert self.sample_rate is not None
-        segment, hop = segment_and_hop(self.sample_rate, self.segment_s, self.hop_s)
-        return (self.window_samples - segment) // hop + 1
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
         """Takes the sample rate from the dataset's features; LeRobot calls it before it builds the policy.

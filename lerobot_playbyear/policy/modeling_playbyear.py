@@ -103,7 +103,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         self._recent = RecentFrames(self.config)
         self._encodings: Tensor | None = None
 
-    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Tensor]]:
         """Mean squared error over the K windows of every item that end inside its episode.
 
         Args:
@@ -113,31 +113,68 @@ class PlaybyearPolicy(PreTrainedPolicy):
             reduction: "mean" for one loss, "none" for one of every item, (B,), as LeRobot's sample weights want it.
 
         Returns:
-            The loss, and no other numbers for the log.
+            The loss, and for the log, where training has `auxiliary_*` losses, its parts. Out of training the loss is that of
+            the action alone.
 
         Raises:
             ValueError: A key is missing or sound is not finite.
         """
-        predicted = self.predict_run(batch)  # (B, K, n_actions)
+        network, n_frames = self._network(), self.config.n_run_frames
+        encodings = network.encode_run(batch, n_frames)  # (B, R, D)
+        outputs = network.memory_head.recall(encodings)  # (B, K, D)
+        predicted = network.memory_head.act(outputs)  # (B, K, n_actions)
         n_windows = predicted.shape[1]
         target = newest(batch, ACTION, n_windows, predicted.shape[-1:])
         error = (predicted - target).square().mean(dim=-1)  # (B, K)
         weight = torch.ones_like(error)
         if f"{ACTION}_is_pad" in batch:
             weight = weight * ~batch[f"{ACTION}_is_pad"][:, -n_windows:]
+        loss = self._average(error, weight, reduction)
+        if network.auxiliary is None or not self.training:
+            return loss, {}
+        figures = {"loss_action": loss.detach().mean()}
+        for other in network.auxiliary(batch, encodings[:, -n_windows:], outputs, target, weight):
+            average = self._average(other.error, other.weight, reduction)
+            figures[f"loss_{other.kind}"] = average.detach().mean()
+            loss = loss + other.factor * average
+        return loss, figures
+
+    def _average(self, error: Tensor, weight: Tensor, reduction: str) -> Tensor:
+        """Of errors (B, n) with weights: one number, or with "none" one of every item, (B,)."""
         if reduction == "none":
-            losses = (error * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)  # (B,)
-            return losses, {}
+            return (error * weight).sum(dim=1) / weight.sum(dim=1).clamp(min=1e-8)
         # Over the mean weight of all processes: the mean of their losses is then that of one with all their items.
         total = mean_over_processes(weight.sum()) if self.training else weight.sum()
-        return (error * weight).sum() / total.clamp(min=1e-8), {}
+        return (error * weight).sum() / total.clamp(min=1e-8)
+
+    def _network(self) -> PlaybyearNetwork:
+        """What learns in training, and what acts otherwise."""
+        return self.model if self.training else self.acting_network
 
     def predict_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
         """Actions of the last `n_steps` (default K) frames of every item, (B, n_steps, n_actions), normalised."""
-        n_frames = (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1
-        network = self.model if self.training else self.acting_network
-        encodings = network.encode_run(batch, n_frames)  # (B, R, D)
-        return network.memory_head(encodings)
+        network = self._network()
+        return network.memory_head(self._encode(network, batch, n_steps))
+
+    def memory_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
+        """What the policy remembers at the last `n_steps` (default K) frames of every item, (B, n_steps, D)."""
+        network = self._network()
+        return network.memory_head.recall(self._encode(network, batch, n_steps))
+
+    @property
+    def memory(self) -> Tensor:
+        """What it remembers since the last `select_action`, (B, D)."""
+        assert self._encodings is not None, "select_action comes first"
+        with torch.no_grad():
+            return self.acting_network.memory_head.recall(self._encodings)[:, -1]
+
+    def act_from(self, memories: Tensor) -> Tensor:
+        """The actions (..., n_actions), normalised, that follow from memories (..., D)."""
+        return self.acting_network.memory_head.act(memories)
+
+    def _encode(self, network: PlaybyearNetwork, batch: dict[str, Tensor], n_steps: int | None) -> Tensor:
+        """Joint encodings of every item's last frames, (B, R, D)."""
+        return network.encode_run(batch, (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

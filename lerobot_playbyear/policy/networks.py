@@ -13,9 +13,12 @@ from torchvision.models import ResNet
 
 from lerobot_playbyear.compat import BasicBlock
 from lerobot_playbyear.policy.augmentation import Augmentation, resize
+from lerobot_playbyear.policy.auxiliary import make_auxiliary
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
+from lerobot_playbyear.policy.fusion import FUSIONS, mlp
 from lerobot_playbyear.policy.history import before_episode, newest
+from lerobot_playbyear.policy.mel_features import make_ear
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
 
@@ -39,19 +42,22 @@ class PlaybyearNetwork(nn.Module):
             config.augmentation_translate,
             config.augmentation_scale,
         )
-        n_fused = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
+        sizes: list[int] = []  # of what is fused, in the order in which `_encode` lists it
         if config.use_vision:
             encoders = {_module_name(key): make_encoder("vision_encoder", config) for key in config.camera_keys}
             self.vision = nn.ModuleDict(encoders)
-            n_fused += sum(encoder.embedding_size for encoder in self.vision.values())  # type: ignore[misc]
+            sizes += [encoder.embedding_size for encoder in self.vision.values()]  # type: ignore[misc]
         if config.use_audio:
-            self.spectrogram = nn.ModuleDict({_module_name(key): _log_spectrogram(config) for key in config.audio_keys})
+            self.spectrogram = nn.ModuleDict({_module_name(key): make_ear(config) for key in config.audio_keys})
             encoders = {_module_name(key): make_encoder("audio_encoder", config) for key in config.audio_keys}
             self.hearing = nn.ModuleDict(encoders)
             self.disturb = SoundAugmentation(config)
-            n_fused += sum(encoder.embedding_size for encoder in self.hearing.values())  # type: ignore[misc]
-        self.fusion = Fusion(n_fused, config)
+            sizes += [encoder.embedding_size for encoder in self.hearing.values()]  # type: ignore[misc]
+        sizes += [math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys]
+        self.fusion = FUSIONS[config.fusion](sizes, config)
         self.memory_head = MemoryHead(config, config.action_feature.shape[0])
+        # Last, so that all else begins with the weights that it has without.
+        self.auxiliary = make_auxiliary(config, config.action_feature.shape[0])
 
     def encode_run(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
         """Joint encodings of the last `n_frames` frames of every item, each encoded once: (B, n_frames, D).
@@ -103,7 +109,9 @@ class PlaybyearNetwork(nn.Module):
         spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
         assert isinstance(spectrogram, LogSpectrogram)
         # Neighbouring windows overlap: their segments are computed once.
-        shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
+        shared = SharedStretches(
+            n_frames, sound.shape[2], config.window_samples, spectrogram.hop, spectrogram.is_per_window
+        )
         if colour is not None:
             colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
         levels = spectrogram(
@@ -230,18 +238,6 @@ class AudioEncoder(nn.Module):
         return self.layers(spectrogram)
 
 
-class Fusion(nn.Module):
-    """MLP with two hidden layers from all encodings of a frame to one joint encoding z."""
-
-    def __init__(self, n_in: int, config: PlaybyearConfig):
-        super().__init__()
-        self.layers = _mlp(n_in, config.hidden_size, config.embedding_size)
-
-    def forward(self, encodings: list[Tensor]) -> Tensor:
-        """[(N, ...)] -> (N, D)."""
-        return self.layers(torch.cat(encodings, dim=-1))
-
-
 class MemoryHead(nn.Module):
     """One-layer LSTM over a window of joint encodings, fresh for every window, and an MLP from its last output."""
 
@@ -249,29 +245,27 @@ class MemoryHead(nn.Module):
         super().__init__()
         self.memory_steps, self.action_range = config.memory_steps, config.action_range
         self.lstm = nn.LSTM(config.embedding_size, config.embedding_size, batch_first=True)
-        self.head = _mlp(config.embedding_size, config.hidden_size, n_actions)
+        self.head = mlp(config.embedding_size, config.hidden_size, n_actions)
 
     def forward(self, encodings: Tensor) -> Tensor:
-        """The action after every full window.
-
-        Args:
-            encodings: (B, n, D) consecutive frames' joint encodings.
+        """The action after every full window of consecutive frames' joint encodings, (B, n, D).
 
         Returns:
             (B, K, n_actions) with K = n - H + 1, in [-1, 1] times the action range.
         """
+        return self.act(self.recall(encodings))
+
+    def recall(self, encodings: Tensor) -> Tensor:
+        """(B, n, D) consecutive encodings -> (B, K, D) the memory's output after every full window."""
         windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
-        n_items, n_windows = windows.shape[:2]
         outputs, _ = self.lstm(windows.flatten(0, 1))  # (B * K, H, D)
-        actions = self.head(outputs[:, -1]).float()  # (B * K, n_actions), whatever autocast computed in
+        return outputs[:, -1].unflatten(0, windows.shape[:2])
+
+    def act(self, memories: Tensor) -> Tensor:
+        """(..., D) of `recall` -> (..., n_actions)."""
+        actions = self.head(memories.flatten(0, -2)).float()  # whatever autocast computed in
         actions = self.action_range * torch.tanh(actions / self.action_range)
-        return actions.unflatten(0, (n_items, n_windows))  # (B, K, n_actions)
-
-
-def _mlp(n_in: int, hidden: int, n_out: int) -> nn.Sequential:
-    return nn.Sequential(
-        nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, n_out)
-    )
+        return actions.unflatten(0, memories.shape[:-1])
 
 
 @register_vision_encoder("resnet18")
@@ -281,14 +275,7 @@ def _vision_encoder(config: PlaybyearConfig) -> VisionEncoder:
 
 @register_audio_encoder("spectrogram_cnn")
 def _audio_encoder(config: PlaybyearConfig) -> AudioEncoder:
-    return AudioEncoder(config.n_frequency_bins, config.n_segments, tuple(config.audio_channels))
-
-
-def _log_spectrogram(config: PlaybyearConfig) -> LogSpectrogram:
-    assert config.sample_rate is not None
-    return LogSpectrogram(
-        config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins, config.spectrogram_momentum
-    )
+    return AudioEncoder(config.n_audio_channels, config.n_segments, tuple(config.audio_channels))
 
 
 def _module_name(key: str) -> str:

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_playbyear.policy.configuration_playbyear import segment_and_hop
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes
+from lerobot_playbyear.policy.window_lengths import segment_and_hop
 
-_POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
+POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
 
 
 def to_float_wave(wave: Tensor, key: str) -> Tensor:
@@ -46,16 +46,20 @@ class SharedStretches:
         step: Between the windows' ends [samples].
         length: Of a window [samples].
         hop: Between the segments' starts [samples].
+        is_apart: Every window is a stretch of its own, for what depends on where a window begins.
     """
 
     n_windows: int
     step: int
     length: int
     hop: int
+    is_apart: bool = False
 
     @property
     def period(self) -> int:
         """Frames after which windows have segments in common."""
+        if self.is_apart:
+            return self.n_windows
         return self.hop // math.gcd(self.step, self.hop)
 
     @property
@@ -101,18 +105,31 @@ class LogSpectrogram(nn.Module):
         segment_s, hop_s: Length and step of the segments [s].
         n_bins: Lowest frequency bins kept; bin b is at b / segment_s Hz.
         momentum: Weight of the newest batch in the running statistics.
+        n_channels: Numbers that a column has in the end, where they are not the bins.
 
     Attributes:
+        is_per_window: A column depends on where its window begins, so that windows cannot share it.
         keeps_statistics: Whether the running statistics stay as they are in training too.
     """
+
+    is_per_window = False
 
     window: Tensor
     mean: Tensor
     variance: Tensor
     n_batches: Tensor
 
-    def __init__(self, sample_rate: int, segment_s: float, hop_s: float, n_bins: int, momentum: float = 0.01):
+    def __init__(
+        self,
+        sample_rate: int,
+        segment_s: float,
+        hop_s: float,
+        n_bins: int,
+        momentum: float = 0.01,
+        n_channels: int | None = None,
+    ):
         super().__init__()
+        self.sample_rate = sample_rate
         self.segment, self.hop = segment_and_hop(sample_rate, segment_s, hop_s)
         if n_bins > self.segment // 2 + 1:
             raise ValueError(
@@ -124,16 +141,33 @@ class LogSpectrogram(nn.Module):
         self.register_buffer("window", torch.hann_window(self.segment).clone(), persistent=False)
         # A full-scale sine has power 1 in its bin, whatever the segment's length.
         self.scale = 4.0 / float(self.window.sum()) ** 2
-        self.register_buffer("mean", torch.zeros(n_bins))
-        self.register_buffer("variance", torch.ones(n_bins))
+        self.register_buffer("mean", torch.zeros(n_channels or n_bins))
+        self.register_buffer("variance", torch.ones(n_channels or n_bins))
         self.register_buffer("n_batches", torch.zeros((), dtype=torch.long))
 
     def log_power(self, wave: Tensor) -> Tensor:
         """(B, samples) in [-1, 1] -> (B, n_bins, n_segments), in units of 10 dB re full scale."""
+        return torch.log10(self.power(wave) * self.scale + POWER_FLOOR)
+
+    def power(self, wave: Tensor) -> Tensor:
+        """(B, samples) in [-1, 1] -> (B, n_bins, n_segments); times `scale` a full-scale sine has 1 in its bin."""
         spectrum = torch.stft(wave, self.segment, self.hop, window=self.window, center=False, return_complex=True)
         spectrum = torch.view_as_real(spectrum[:, : self.n_bins])
-        power = spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
-        return torch.log10(power * self.scale + _POWER_FLOOR)
+        return spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
+
+    def levels(self, wave: Tensor, real: Tensor, colour: Tensor | None) -> Tensor:
+        """What a column is before it is normalised.
+
+        Args:
+            wave: (B, samples), in [-1, 1].
+            real: (B, 1, n_segments) bool, False for segments before the episode.
+            colour: (B, n_bins), gains of another microphone [10 dB].
+
+        Returns:
+            (B, channels of a column, n_segments).
+        """
+        levels = self.log_power(wave)
+        return levels if colour is None else levels + colour.unsqueeze(2)
 
     def forward(self, wave: Tensor, begun: Tensor, colour: Tensor | None = None) -> Tensor:
         """Spectrograms in which what precedes the episode is the average sound: zero.
@@ -144,13 +178,11 @@ class LogSpectrogram(nn.Module):
             colour: (B, n_bins), gains of another microphone [10 dB].
 
         Returns:
-            (B, n_bins, n_segments).
+            (B, channels of a column, n_segments).
         """
-        levels = self.log_power(wave)
-        if colour is not None:
-            levels = levels + colour.unsqueeze(2)
         # A segment counts if its first sample does: the episode, once begun, goes on.
         real = begun[:, : wave.shape[1] - self.segment + 1 : self.hop].unsqueeze(1)  # (B, 1, n_segments)
+        levels = self.levels(wave, real, colour)
         if self.training and not self.keeps_statistics:
             self._update(levels.detach(), real)
         levels = (levels - self.mean[:, None]) * torch.rsqrt(self.variance + 1e-5)[:, None]

@@ -14,7 +14,7 @@ from lerobot.utils.utils import flatten_dict
 OWN_CONFIG_NAME = "playbyear_train_config.json"
 """File beside `train_config.json` that holds the options which lerobot-train does not know."""
 
-_OWN_FIELDS = ("preset", "sampling", "store", "mix", "compile")
+_OWN_FIELDS = ("preset", "sampling", "store", "mix", "compile", "save_best")
 
 
 @dataclass
@@ -91,7 +91,7 @@ class MixConfig:
 
 @dataclass
 class PlaybyearTrainConfig(TrainPipelineConfig):
-    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*`, `--store.*`, `--mix` and `--compile`.
+    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*`, `--store.*`, `--mix` and so on.
 
     A checkpoint keeps lerobot-train's options in its `train_config.json` and the others in a file of their own, so
     that lerobot-train can resume what playbyear-train began, and the other way round.
@@ -103,6 +103,8 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         mix: Further datasets that are learned from at the same time.
         compile: Whether torch compiles the encoders and the head, which takes a minute or more before the first update. Meant
             for GPUs; what it is worth there was not measured.
+        save_best: Whether every checkpoint's loss on the held-out episodes is measured, and `checkpoints/best` is the one where
+            it is lowest.
     """
 
     preset: str | None = None
@@ -110,6 +112,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
     store: StoreConfig = field(default_factory=StoreConfig)
     mix: list[MixConfig] = field(default_factory=list)
     compile: bool = False
+    save_best: bool = False
 
     def validate(self) -> None:
         """As for lerobot-train; options that need its data loader are refused.
@@ -131,6 +134,11 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
             raise ValueError(
                 "--dataset.streaming does not work in playbyear-train: give --store=disk, which keeps decoded frames in files "
                 "instead of in memory, or use lerobot-train."
+            )
+        if self.save_best and not (self.dataset.eval_split > 0 and self.save_checkpoint):
+            raise ValueError(
+                f"--save_best=true compares checkpoints on held-out episodes: give --dataset.eval_split=0.1 (got "
+                f"{self.dataset.eval_split}) and --save_checkpoint=true (got {str(self.save_checkpoint).lower()})."
             )
         self.sampling.check()
         for other in self.mix:

@@ -26,6 +26,7 @@ from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
+from lerobot_playbyear.training.checkpoints import BestCheckpoint
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
 from lerobot_playbyear.training.parts import TrainingParts, make_training_parts
@@ -78,7 +79,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         windows = PolicyWindows(config, meta, cfg.rename_map)
         is_shared = accelerator.num_processes > 1
         stores = [read_store(each, windows, cfg, is_shared) for each in datasets]
-        is_validated = held_out is not None and cfg.eval_steps > 0
+        is_validated = held_out is not None and (cfg.eval_steps > 0 or cfg.save_best)
         validation_store = read_store(held_out, windows, cfg, is_shared) if is_validated else None
 
     reach = Reach(config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
@@ -136,6 +137,7 @@ def _loop(
     accelerator = parts.accelerator
     is_first = accelerator.is_main_process
     batches = _batches(cfg, accelerator, windows, store, sampler)
+    best = BestCheckpoint(Path(str(cfg.output_dir)), parts.step) if cfg.save_best and is_first else None
     while parts.step < cfg.steps:
         start = time.perf_counter()
         batch = next(batches)
@@ -144,10 +146,17 @@ def _loop(
         is_last = parts.step == cfg.steps
         if is_due(parts.step, cfg.log_freq):
             report.write_training()
-        if validation_store is not None and is_first and (is_due(parts.step, cfg.eval_steps) or is_last):
-            report.write("validation", {"loss": validation_loss(parts, windows, validation_store, cfg.batch_size)})
-        if cfg.save_checkpoint and is_first and (is_due(parts.step, cfg.save_freq) or is_last):
-            report.saved(parts.save(cfg))
+        is_saved = cfg.save_checkpoint and (is_due(parts.step, cfg.save_freq) or is_last)
+        is_measured = is_due(parts.step, cfg.eval_steps) or is_last or (is_saved and cfg.save_best)
+        loss = None
+        if validation_store is not None and is_first and is_measured:
+            loss = validation_loss(parts, windows, validation_store, cfg.batch_size)
+            report.write("validation", {"loss": loss})
+        if is_saved and is_first:
+            checkpoint = parts.save(cfg)
+            report.saved(checkpoint)
+            if best is not None and loss is not None:
+                best.offer(checkpoint, loss)
         is_tried = cfg.env is not None and cfg.env_eval_freq > 0 and is_first
         if is_tried and (is_due(parts.step, cfg.env_eval_freq) or is_last):
             report.write_evaluation(parts.evaluate(cfg))

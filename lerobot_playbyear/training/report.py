@@ -16,6 +16,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from lerobot_playbyear.compat import WandBLogger
 from lerobot_playbyear.datasets.mixture import Windowed
 from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.training.checkpoints import BEST_LINK
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.figures import Figures
 from lerobot_playbyear.training.parts import TrainingParts
@@ -144,5 +145,7 @@ def print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
         policy = folder / "checkpoints" / "last" / "pretrained_model"
         env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."
         print(f"Policy:     {policy}")
+        if cfg.save_best:
+            print(f"Best:       {policy.parent.with_name(BEST_LINK) / policy.name}, by its loss on held-out episodes")
         print(f"Evaluate:   lerobot-eval --policy.path={policy}{env}")
         print(f"Go on:      playbyear-train --resume=true --config_path={policy / 'train_config.json'} --steps=...")

@@ -1,0 +1,146 @@
+"""What training predicts beside the action, so that encodings hold more than this action needs. Nothing of it acts.
+
+In comments: B items, K supervised windows of each, D numbers in a joint encoding, A in an action, C actions in a chunk.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.history import newest
+from lerobot_playbyear.policy.spectrogram import POWER_FLOOR, LogSpectrogram, to_float_wave
+
+KINDS = ("onset", "next_sound", "inverse_dynamics", "chunk")
+_HIDDEN = 128
+_ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`
+
+
+@dataclass(frozen=True)
+class AuxiliaryLoss:
+    """One of `KINDS` in one batch.
+
+    Attributes:
+        kind: Its name.
+        factor: Its weight beside the action's loss.
+        error: (B, n) of n predictions per item.
+        weight: (B, n), 0 where there was nothing to predict.
+    """
+
+    kind: str
+    factor: float
+    error: Tensor
+    weight: Tensor
+
+
+class AuxiliaryHeads(nn.Module):
+    """A small head with one hidden layer for every kind that has a weight.
+
+    Args:
+        config: The policy's configuration.
+        n_actions: Numbers in an action, A.
+    """
+
+    def __init__(self, config: PlaybyearConfig, n_actions: int):
+        super().__init__()
+        self.config = config
+        self.factors = {kind: getattr(config, f"auxiliary_{kind}") for kind in KINDS}
+        size, n_later = config.embedding_size, config.auxiliary_chunk_size - 1
+        if self.factors["next_sound"]:
+            # Ears of their own, whatever features the policy hears; their statistics are those of single columns.
+            self.ears = nn.ModuleList(_ear(config) for _ in config.audio_keys)
+        n_heard = config.n_frequency_bins * len(config.audio_keys)
+        sizes = {
+            "onset": (size, 1),
+            "next_sound": (size + n_actions, n_heard),
+            "inverse_dynamics": (2 * size, n_actions),
+            "chunk": (size, n_later * n_actions),
+        }
+        self.heads = nn.ModuleDict({kind: _head(*sizes[kind]) for kind in KINDS if self.factors[kind]})
+
+    def forward(
+        self, batch: dict[str, Tensor], encodings: Tensor, outputs: Tensor, actions: Tensor, weight: Tensor
+    ) -> Iterator[AuxiliaryLoss]:
+        """The losses of a batch.
+
+        Args:
+            batch: As `PlaybyearPolicy.forward` gets it.
+            encodings: (B, K, D) joint encodings of the frames that the windows end at.
+            outputs: (B, K, D) the memory's outputs after the windows.
+            actions: (B, K, A) the actions that were taken there.
+            weight: (B, K), 0 for windows that are not learned from.
+        """
+        both = weight[:, :-1] * weight[:, 1:]  # (B, K - 1): of a frame and the next one
+        for kind in self.heads:
+            if kind == "onset":
+                logits = self._predict(kind, encodings).squeeze(2)  # (B, K)
+                begins = self._onsets(batch, encodings.shape[1])
+                error, counts = functional.binary_cross_entropy_with_logits(logits, begins, reduction="none"), weight
+            elif kind == "next_sound":
+                heard, counts = self._next_columns(batch, both), both  # (B, K - 1, bins)
+                error = _squared(self._predict(kind, outputs[:, :-1], actions[:, :-1]), heard)
+            elif kind == "inverse_dynamics":
+                error = _squared(self._predict(kind, encodings[:, :-1], encodings[:, 1:]), actions[:, :-1])
+                counts = both
+            else:
+                later = actions[:, 1:].unfold(1, self.config.auxiliary_chunk_size - 1, 1)  # (B, K - C + 1, A, C - 1)
+                counts = weight.unfold(1, self.config.auxiliary_chunk_size, 1).prod(dim=2)  # (B, K - C + 1)
+                error = _squared(self._predict(kind, outputs[:, : later.shape[1]]), later.flatten(2))
+            yield AuxiliaryLoss(kind, self.factors[kind], error, counts)
+
+    def _predict(self, kind: str, *inputs: Tensor) -> Tensor:
+        return self.heads[kind](torch.cat(inputs, dim=2)).float()  # whatever autocast computed in
+
+    def _onsets(self, batch: dict[str, Tensor], n_windows: int) -> Tensor:
+        """Whether a sudden sound begins, at any microphone, in each of the last frames: 0 or 1, (B, n_windows)."""
+        louder = []
+        for key in self.config.audio_keys:
+            sound = self._sound(batch, key, self.config.n_audio_frames)
+            level = torch.log10(sound.square().mean(dim=2) + POWER_FLOOR)  # (B, n_audio_frames)
+            louder.append(level - level.sort(dim=1).values[:, (level.shape[1] - 1) // 2, None])
+        loud = torch.stack(louder).amax(dim=0) > _ONSET
+        return (loud[:, 1:] & ~loud[:, :-1])[:, -n_windows:].float()
+
+    def _next_columns(self, batch: dict[str, Tensor], weight: Tensor) -> Tensor:
+        """The last spectrogram column of every frame after the first of K, without augmentation, (B, K - 1, bins)."""
+        columns = []
+        for ear, key in zip(self.ears, self.config.audio_keys, strict=True):
+            assert isinstance(ear, LogSpectrogram)
+            n_samples = self.config.feature_shape(key)[0]
+            n_frames = weight.shape[1] - 1 + math.ceil(ear.segment / n_samples)
+            wave = self._sound(batch, key, n_frames).flatten(1)
+            wave = wave[:, wave.shape[1] - ear.segment - (weight.shape[1] - 1) * n_samples :]
+            ends = wave.unfold(1, ear.segment, n_samples).flatten(0, 1)  # (B * (K - 1), segment)
+            begun = (weight.flatten() > 0).unsqueeze(1).expand_as(ends)
+            columns.append(ear(ends, begun).squeeze(2).unflatten(0, weight.shape))
+        return torch.cat(columns, dim=2).detach()
+
+    def _sound(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        """The newest sound of a microphone, (B, n_frames, S)."""
+        return to_float_wave(newest(batch, key, n_frames, self.config.feature_shape(key)), key)
+
+
+def make_auxiliary(config: PlaybyearConfig, n_actions: int) -> AuxiliaryHeads | None:
+    """The heads that a configuration asks for; None where it asks for none."""
+    asked_for = any(getattr(config, f"auxiliary_{kind}") for kind in KINDS)
+    return AuxiliaryHeads(config, n_actions) if asked_for else None
+
+
+def _squared(predicted: Tensor, target: Tensor) -> Tensor:
+    """(B, n, numbers) -> (B, n)."""
+    return (predicted - target).square().mean(dim=2)
+
+
+def _head(n_in: int, n_out: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(n_in, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, n_out))
+
+
+def _ear(config: PlaybyearConfig) -> LogSpectrogram:
+    assert config.sample_rate is not None
+    return LogSpectrogram(
+        config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins, config.spectrogram_momentum
+    )

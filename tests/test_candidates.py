@@ -1,0 +1,378 @@
+"""What may learn better than the paper's policy: features, fusion, losses beside the action's; off by default."""
+
+import math
+
+import pytest
+import torch
+from test_fake_cuda import Waits, move_to_card, on_card, without_cudnn
+from test_policy_contract import make_config, make_episode, run_ending_at, step_through
+from torch import nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from training_digest import probe, trained
+
+from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.mel_features import LogMel, make_ear
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+RATE, MICROPHONE, N_FRAMES = 16000, "observation.audio.gripper", 16
+TRAINED = {"a7bf4b20725421fc": "19d1c0e2a0191728"}
+"""By the machine's own probe: what the usual options trained before any of this was there."""
+
+SMALL = {"audio_window_s": 0.9, "n_memory_steps": 3, "n_supervised_steps": 5, "n_frame_stack": 2}
+CANDIDATES = {
+    "attention": {"fusion": "attention"},
+    "dropout": {"fusion_dropout": 0.4},
+    "log_mel": {"audio_features": "log_mel"},
+    "pcen": {"audio_features": "pcen"},
+    "onset": {"auxiliary_onset": 0.1},
+    "next_sound": {"auxiliary_next_sound": 0.1},
+    "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
+    "chunk": {"auxiliary_chunk": 0.5},
+}
+EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}
+HEADS = ("onset", "next_sound", "inverse_dynamics", "chunk")
+
+
+def make_policy(**options) -> PlaybyearPolicy:
+    """A small policy that has seen one batch."""
+    torch.manual_seed(0)
+    policy = PlaybyearPolicy(make_config(**(SMALL | options))).train()
+    with torch.no_grad():
+        policy.forward(batch_of(policy, seed=9))
+    return policy
+
+
+def batch_of(policy, seed=1, last=N_FRAMES - 1):
+    return run_ending_at(make_episode(seed, policy.config, N_FRAMES), last, policy.config)
+
+
+def test_with_the_usual_options_training_is_what_it_was_bit_for_bit():
+    if probe() not in TRAINED:
+        pytest.skip(f"no digest for this machine ({probe()}): python tests/training_digest.py")
+    assert trained() == TRAINED[probe()]
+
+
+def test_the_usual_options_make_no_new_module_and_say_nothing_new():
+    policy = make_policy()
+    assert policy.model.auxiliary is None
+    assert not any(isinstance(module, nn.Dropout) for module in policy.modules())
+    assert policy.forward(batch_of(policy))[1] == {}
+    assert make_ear(policy.config).state_dict().keys() == {"mean", "variance", "n_batches"}
+
+
+@pytest.mark.parametrize("options", CANDIDATES.values(), ids=CANDIDATES)
+def test_stepping_equals_training_windows(options):
+    policy = make_policy(**options).eval()
+    episode = make_episode(1, policy.config, N_FRAMES)
+    with torch.no_grad():
+        stepped = step_through(policy, [episode])
+    for last in (2, N_FRAMES - 1):  # the first windows begin before the episode
+        predicted = policy.predict_run(run_ending_at(episode, last, policy.config))
+        n = min(policy.config.n_supervised_steps, last + 1)
+        torch.testing.assert_close(predicted[:, -n:], stepped[:, last + 1 - n : last + 1], atol=1e-5, rtol=0)
+
+
+def test_a_checkpoint_keeps_it_all_and_one_with_heads_acts_without_them(tmp_path):
+    policy = make_policy(**EVERYTHING).eval()
+    policy.save_pretrained(tmp_path)
+    again = PlaybyearPolicy.from_pretrained(tmp_path, strict=True)
+    assert {name: getattr(again.config, name) for name in EVERYTHING} == EVERYTHING
+    episode = make_episode(2, policy.config, 6)
+    assert torch.equal(step_through(again, [episode]), step_through(policy, [episode]))
+    off = {name: 0.0 for name in EVERYTHING if name.startswith("auxiliary_")}
+    bare = PlaybyearPolicy.from_pretrained(tmp_path, config=make_config(**(SMALL | EVERYTHING | off)))
+    assert bare.model.auxiliary is None
+    assert torch.equal(step_through(bare, [episode]), step_through(policy, [episode]))
+
+
+def test_a_training_step_with_everything_traces_as_one_graph():
+    policy = make_policy(**EVERYTHING, audio_noise_db=0.0, audio_colour_db=3.0)
+    batch = batch_of(policy, last=4)
+    with torch._dynamo.config.patch(allow_rnn=True):
+        explained = torch._dynamo.explain(lambda batch: policy.forward(batch)[0])(batch)
+    assert explained.break_reasons == []
+    assert (explained.graph_count, explained.graph_break_count) == (1, 0)
+
+
+def test_on_a_gpu_everything_lies_on_the_card_and_the_host_never_waits():
+    policy = PlaybyearPolicy(make_config(**(SMALL | EVERYTHING)))
+    real = batch_of(policy, last=4)
+    with FakeTensorMode():
+        move_to_card(policy)
+        batch = {key: on_card(value) for key, value in real.items()}
+        with Waits() as waits, without_cudnn():
+            loss, figures = policy.train().forward(batch)
+    assert {value.device.type for value in (loss, *figures.values())} == {"cuda"}
+    assert waits.lines == []
+
+
+def test_in_bfloat16_it_learns_the_same():
+    """The preset `cpu` learns in it where the processor can; energies and targets stay exact."""
+    losses = []
+    for enabled in (False, True):
+        policy = make_policy(**{**EVERYTHING, "fusion_dropout": 0.0}, use_vision=False)
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            losses.append(policy.forward(batch_of(policy))[1])
+    for name, value in losses[0].items():
+        assert losses[1][name].dtype == torch.float32
+        torch.testing.assert_close(losses[1][name], value, rtol=0.05, atol=0.01)
+
+
+# Heads
+
+
+@pytest.mark.parametrize("kind", HEADS)
+def test_a_head_changes_the_loss_by_its_weight_and_its_gradient_reaches_the_senses(kind):
+    policy = make_policy(**CANDIDATES[kind], use_vision=False)
+    batch = batch_of(policy)
+    loss, figures = policy.forward(batch)
+    factor = CANDIDATES[kind][f"auxiliary_{kind}"]
+    torch.testing.assert_close(loss, figures["loss_action"] + factor * figures[f"loss_{kind}"])
+    network = policy.model
+    weight = (batch["action"] * 0 + 1)[..., 0]
+    encodings = network.encode_run(batch, policy.config.n_run_frames)
+    outputs = network.memory_head.recall(encodings)
+    (other,) = network.auxiliary(batch, encodings[:, -weight.shape[1] :], outputs, batch["action"], weight)
+    policy.zero_grad()
+    other.error.sum().backward()
+    ear = next(iter(network.hearing.parameters())).grad
+    assert ear is not None
+    assert ear.abs().max() > 0
+    assert all(parameter.grad is None for parameter in network.memory_head.head.parameters())
+
+
+def test_heads_are_used_neither_for_a_held_out_loss_nor_to_act():
+    policy = make_policy(**EVERYTHING).eval()
+    plain = make_policy(**{name: value for name, value in EVERYTHING.items() if "auxiliary" not in name}).eval()
+    plain.model.load_state_dict({k: v for k, v in policy.model.state_dict().items() if "auxiliary" not in k})
+    for module in policy.modules():
+        if isinstance(module, AuxiliaryHeads):
+            module.register_forward_pre_hook(lambda *_: pytest.fail("a head was asked"))
+    with torch.no_grad():
+        loss, figures = policy.forward(batch_of(policy))
+        assert figures == {}
+        assert torch.equal(loss, plain.forward(batch_of(plain))[0])
+        step_through(policy, [make_episode(3, policy.config, 3)])
+
+
+def test_the_network_begins_as_without_heads():
+    policies = [PlaybyearPolicy((torch.manual_seed(4), make_config(**(SMALL | options)))[1]) for options in
+                ({}, {f"auxiliary_{kind}": 1.0 for kind in HEADS})]  # fmt: skip
+    plain, with_heads = (policy.model.state_dict() for policy in policies)
+    assert all(torch.equal(with_heads[name], value) for name, value in plain.items())
+    assert len(with_heads) > len(plain)
+
+
+def test_sample_weights_get_every_part_of_the_loss_per_item():
+    policy = make_policy(**{f"auxiliary_{kind}": 0.5 for kind in HEADS}, use_vision=False)
+    policy.keep_normalization()
+    one, other = batch_of(policy, 1), batch_of(policy, 2, last=3)
+    both = {key: torch.cat([one[key], other[key]]) for key in one}
+    losses, _ = policy.forward(both, reduction="none")
+    for loss, batch in zip(losses, (one, other), strict=True):
+        torch.testing.assert_close(policy.forward(batch)[0], loss, rtol=1e-4, atol=1e-5)
+
+
+def clicks(policy, frames, seed=1):
+    """An episode of faint noise with a click in some frames."""
+    episode = make_episode(seed, policy.config, N_FRAMES)
+    generator = torch.Generator().manual_seed(seed)
+    sound = 30 * torch.randn(N_FRAMES, 800, generator=generator)
+    for frame in frames:
+        sound[frame, 300:340] += 8000
+    episode[MICROPHONE] = sound.to(torch.int16)
+    return episode
+
+
+def test_an_onset_is_a_click_and_not_what_rings_on_nor_steady_noise():
+    policy = make_policy(auxiliary_onset=1.0)
+    batch = run_ending_at(clicks(policy, (12, 13, 15)), N_FRAMES - 1, policy.config)
+    assert policy.model.auxiliary._onsets(batch, 5).tolist() == [[0, 1, 0, 0, 1]]  # frames 11 to 15
+    louder = {**batch, MICROPHONE: run_ending_at(clicks(policy, ()), 15, policy.config)[MICROPHONE] * 40}
+    assert policy.model.auxiliary._onsets(louder, 5).sum() == 0
+
+
+def test_the_next_sound_is_the_end_of_the_next_frame():
+    policy = make_policy(auxiliary_next_sound=1.0).eval()
+    heads = policy.model.auxiliary
+    weight = torch.ones(1, 4)
+    before = heads._next_columns(run_ending_at(clicks(policy, ()), 15, policy.config), weight)
+    episode = clicks(policy, ())
+    episode[MICROPHONE][13, 500:540] += 8000  # the last 640 samples of 800 are looked at
+    moved = heads._next_columns(run_ending_at(episode, 15, policy.config), weight)
+    assert (moved - before).abs().amax(dim=2)[0].gt(0.1).tolist() == [False, True, False, False]  # of frames 12 to 15
+    for frame, column in zip(range(12, 16), moved[0], strict=True):
+        wave = episode[MICROPHONE][frame, -640:].float()[None] / 32768
+        torch.testing.assert_close(column[:, None], heads.ears[0](wave, wave < 2)[0])
+
+
+def test_a_chunk_is_the_actions_after_the_one_that_is_executed():
+    policy = make_policy(auxiliary_chunk=1.0, auxiliary_chunk_size=3)
+    network, batch = policy.model, batch_of(policy)
+    encodings, outputs = torch.rand(1, 5, 50), torch.rand(1, 5, 50)
+    actions, weight = batch["action"], torch.tensor([[0.0, 1, 1, 1, 1]])
+    with torch.no_grad():
+        (loss,) = network.auxiliary(batch, encodings, outputs, actions, weight)
+        predicted = network.auxiliary.heads["chunk"](outputs).unflatten(2, (4, 2))  # (1, K, A, later)
+    assert loss.weight.tolist() == [[0, 1, 1]]
+    for start in range(3):
+        for later in range(2):
+            predicted[:, start, :, later] -= actions[:, start + 1 + later]
+    torch.testing.assert_close(loss.error, predicted[:, :3].square().mean(dim=(2, 3)))
+
+
+# Dropout and attention
+
+
+def test_dropout_is_for_training_alone_and_takes_its_share():
+    policy = make_policy(fusion_dropout=0.4)
+    encodings = [torch.rand(400, size) for size in (32, 8, 7)]
+    sizes = [encoding.shape[1] for encoding in encodings]
+    fusion = type(policy.model.fusion)(sizes, policy.config).train()
+    dropped = (fusion(encodings) == 0).float().mean()
+    assert 0.37 < dropped < 0.43
+    assert torch.equal(fusion.eval()(encodings), fusion(encodings))
+    assert (fusion(encodings) == 0).float().mean() < 0.01
+
+
+def test_attention_weighs_a_sense_by_what_the_others_say():
+    """In the mean of tokens alone the effect of one sense would not depend on another."""
+    policy = make_policy(fusion="attention")
+    fusion = policy.model.fusion.eval()
+    fusion.layers = nn.Identity()
+    torch.manual_seed(0)
+    seen, heard, felt = (3 * torch.randn(2, linear.in_features) for linear in fusion.tokens)
+    with torch.no_grad():
+        effects = [fusion([s, heard, felt]) - fusion([s, 0 * heard, felt]) for s in (seen, 0 * seen)]
+    assert (effects[0] - effects[1]).abs().max() > 1e-2
+
+
+# Features
+
+
+def ear_of(kind: str, **options) -> LogSpectrogram:
+    return make_ear(make_config(audio_features=kind, **options))
+
+
+def raw(ear: LogSpectrogram, wave: torch.Tensor) -> torch.Tensor:
+    """Columns before they are normalised by statistics."""
+    n_segments = (wave.shape[1] - ear.segment) // ear.hop + 1
+    return ear.levels(wave, torch.ones(len(wave), 1, n_segments, dtype=torch.bool), None)
+
+
+def noise(n_items: int = 8, seconds: float = 2.0, seed: int = 0) -> torch.Tensor:
+    return 1e-3 * torch.randn(n_items, round(seconds * RATE), generator=torch.Generator().manual_seed(seed))
+
+
+def test_forty_bands_cover_the_kept_bins_and_a_tone_is_in_its_band():
+    ear = ear_of("log_mel")
+    assert ear.mel.shape == (160, 40)
+    torch.testing.assert_close(ear.mel.sum(dim=0), torch.ones(40))
+    assert ear.mel[1:-1].sum(dim=1).min() > 0
+    time = torch.arange(2 * RATE) / RATE
+    loudest = [int(raw(ear, torch.sin(2 * math.pi * hz * time)[None]).mean(dim=2).argmax()) for hz in (200, 1000, 3500)]
+    assert loudest == [int(ear.mel[round(hz * 0.04)].argmax()) for hz in (200, 1000, 3500)]
+
+
+def test_steady_noise_eight_times_as_loud_moves_log_mel_and_hardly_pcen():
+    mel, pcen = ear_of("log_mel"), ear_of("pcen")
+    moved = [(raw(ear, 8 * noise()) - raw(ear, noise())).mean() for ear in (mel, pcen)]
+    torch.testing.assert_close(moved[0], torch.tensor(2 * math.log10(8)), rtol=0.02, atol=0)  # 18 dB
+    spread = [raw(ear, noise()).std() for ear in (mel, pcen)]
+    assert moved[0] / spread[0] > 5
+    assert moved[1] / spread[1] < 0.2
+
+
+@pytest.mark.parametrize("factor", [1.0, 8.0])
+def test_what_begins_stands_out_of_pcen_in_any_noise(factor):
+    pcen, wave = ear_of("pcen"), factor * noise()
+    burst = factor * 0.02 * torch.randn(8, 800, generator=torch.Generator().manual_seed(1))
+    wave[:, 20000:20800] += burst
+    levels = raw(pcen, wave).mean(dim=1)  # (B, n_segments)
+    column = 20000 // 560
+    assert levels.mean(dim=0)[column - 1 : column + 3].amax() > 4 * levels.mean(dim=0)[10:30].mean()
+
+
+def test_pcens_average_becomes_the_published_smoother():
+    """M(t) = (1 - s) M(t - 1) + s E(t), once what came before the window has faded."""
+    pcen = ear_of("pcen")
+    energies = torch.rand(1, 3, 400, generator=torch.Generator().manual_seed(0))
+    keep = math.exp(-pcen.hop / RATE / 0.4)
+    smooth = energies[..., 0]
+    for t in range(1, 400):
+        smooth = keep * smooth + (1 - keep) * energies[..., t]
+    ours = pcen._average(energies, torch.ones(1, 1, 400))
+    torch.testing.assert_close(ours[..., -1], smooth, rtol=1e-4, atol=0)
+    torch.testing.assert_close(ours[..., 0], energies[..., 0])
+
+
+def test_what_precedes_the_episode_does_not_matter_to_pcen():
+    pcen, wave = ear_of("pcen").eval(), noise(2)
+    begun = torch.arange(wave.shape[1]).expand(2, -1) >= 16000
+    louder = torch.where(begun, wave, 100 * wave)
+    first = math.ceil(16000 / 560)
+    torch.testing.assert_close(pcen(wave, begun)[..., first:], pcen(louder, begun)[..., first:])
+    assert (pcen(louder, begun)[..., :first] == 0).all()
+
+
+def test_windows_that_begin_elsewhere_share_no_column_in_pcen():
+    """The adversary: with stretches shared as for the spectrogram a window would hear more past in training than acting."""
+    pcen, wave = ear_of("pcen").eval(), noise(1, 3.0)
+    wave[:, :14000] *= 30
+    begun = torch.ones_like(wave, dtype=torch.bool)
+    for is_apart, agrees in ((True, True), (False, False)):
+        shared = SharedStretches(16, 800, 32000, pcen.hop, is_apart)
+        together = shared.windows(pcen(shared.stretches(wave), shared.stretches(begun)), 57)
+        alone = wave[:, -32000 - 15 * 800 :].unfold(1, 32000, 800).flatten(0, 1)
+        alone = pcen(alone, torch.ones_like(alone, dtype=torch.bool))
+        assert torch.allclose(together, alone, atol=1e-4) == agrees
+    assert pcen.is_per_window
+    assert not LogMel.is_per_window
+
+
+@pytest.mark.parametrize("kind", ["log_mel", "pcen"])
+def test_another_microphones_gain_is_one_of_the_bins_below_the_bands(kind):
+    ear, wave = ear_of(kind), noise(2)
+    colour = torch.full((2, 160), 1.2)  # 12 dB
+    real = torch.ones(2, 1, 57, dtype=torch.bool)
+    torch.testing.assert_close(ear.levels(wave, real, colour), raw(ear, wave * 10**0.6), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"audio_features": "mfcc"}, r"audio_features must be one of spectrogram, log_mel, pcen, got 'mfcc'"),
+        ({"fusion": "sum"}, r"fusion must be one of concatenation, attention, got 'sum'"),
+        ({"fusion_dropout": 1.0}, r"fusion_dropout must be at least 0 \(none\) and below 1, got 1.0"),
+        (
+            {"audio_features": "pcen", "n_mels": 161},
+            r"n_mels must be from 1 to --policy.n_frequency_bins \(160\), got 161",
+        ),
+        ({"auxiliary_onset": -1.0}, r"auxiliary_onset must be at least 0 \(off\) and finite, got -1.0"),
+        ({"auxiliary_chunk": math.inf}, r"auxiliary_chunk must be at least 0"),
+        ({"auxiliary_onset": 1.0, "use_audio": False}, r"auxiliary_onset=1.0 needs sound.*use_audio is false"),
+        ({"auxiliary_next_sound": 1.0, "n_supervised_steps": 1}, r"needs runs of at least 2.*n_supervised_steps is 1"),
+        ({"auxiliary_chunk": 1.0, "n_supervised_steps": 3}, r"needs runs of at least 4 windows"),
+        ({"auxiliary_chunk_size": 1}, r"auxiliary_chunk_size must be at least 2"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_option(options, message):
+    with pytest.raises(ValueError, match=rf"--policy\.{message}" if "needs" not in message else message):
+        make_config(**options)
+
+
+@pytest.mark.filterwarnings("ignore:At least one mel filterbank")
+def test_bands_narrower_than_bins_are_refused():
+    with pytest.raises(ValueError, match=r"--policy.n_mels=160: some bands are narrower than the 25 Hz of a bin"):
+        ear_of("log_mel", n_mels=160)
+
+
+def test_an_old_checkpoints_options_are_todays_defaults():
+    assert PlaybyearConfig(device="cpu").n_audio_channels == 160
+    assert (
+        PlaybyearConfig(device="cpu", n_frequency_bins=16).n_audio_channels == 16
+    )  # fewer than a default that is unused
