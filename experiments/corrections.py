@@ -152,8 +152,8 @@ def _evaluations(job: Job, commands: list[str], name: str, checkpoint: Path, is_
         times["in_task_time"] = ()
     rates = {}
     for key, options in times.items():
-        successes = evaluate(job, commands, *options, name=f"{STUDY}-{name}-{key}", checkpoint=checkpoint)
-        rates[key] = 100 * sum(successes) / len(successes)
+        told = evaluate(job, commands, *options, name=f"{STUDY}-{name}-{key}", checkpoint=checkpoint)
+        rates[key] = 100 * sum(told.successes) / len(told.successes)
     return rates
 
 

@@ -48,7 +48,7 @@ def over_demonstrations(task: str, n_jobs: int, threads: int) -> None:
         jobs += [Job(study, task, condition, TRAINING_SEEDS[0], n, threads=threads) for condition in ("full", "deaf")]
     for result in side_by_side(jobs, n_jobs):
         what = f"{result.task} {result.condition} {result.n_demonstrations} demonstrations"
-        print(f"{what}: {result.rate:.0%}", flush=True)
+        print(f"{what}: {result.summary}", flush=True)
 
 
 def under_conditions(study: str, task: str, seeds: Sequence[int], conditions: Sequence[dict[str, str]]) -> None:
@@ -64,10 +64,10 @@ def under_conditions(study: str, task: str, seeds: Sequence[int], conditions: Se
             if not path.exists():
                 commands = trained.commands[:1]
                 options = [f"--env.{option}={value}" for option, value in condition.items()]
-                successes = evaluate(job, commands, *options, name=f"{study}-{label}")
+                attempts = evaluate(job, commands, *options, name=f"{study}-{label}")
                 told = {option: shown([value]) for option, value in condition.items()}
-                save(path, asdict(replace(trained, successes=successes, environment=told, commands=commands)))
-            print(f"{path.stem}: {Result(**load(path)).rate:.0%}", flush=True)
+                save(path, asdict(replace(trained, **asdict(attempts), environment=told, commands=commands)))
+            print(f"{path.stem}: {Result(**load(path)).summary}", flush=True)
 
 
 def rooms() -> list[dict[str, str]]:

@@ -3,20 +3,23 @@
     python -m experiments.lottery --task=OccludedGrasp-v1 --jobs=2
     python -m experiments.lottery --task=OccludedGrasp-v1 --variants colour weight_decay
 
-The variant `ema` is evaluated twice, by the average of its weights and by those of the last update, which are the policy that
-`plain` would train: so the two are compared on the same trainings. The episodes are of seeds on which choices are made, not of
-those that are reported elsewhere. Resumes.
+Some trainings are evaluated again as other policies that they hold (`POLICIES`): that of `ema` by the weights of its last
+update, which are the policy that `plain` would train, and by their mean over the last three checkpoints; that of `held_out`
+by its last checkpoint instead of the one with the lowest held-out loss. So these are compared on the same trainings. The
+episodes are of seeds on which choices are made, not of those that are reported elsewhere. Resumes.
 """
 
 from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 
-from experiments.protocol import N_DEMONSTRATIONS, RESULTS, Result, command_line, load, record, save
+from experiments.protocol import N_DEMONSTRATIONS, RESULTS, RUNS, Result, command_line, load, record, save, shown
 from experiments.training import Job, evaluate, side_by_side
+from lerobot_playbyear.training.checkpoints import average_checkpoints, last_checkpoints
 
 STUDY = "lottery"
-PLAIN, EMA = "plain", "ema"
+PLAIN, EMA, HELD_OUT, LAST_THREE, NEWEST = "plain", "ema", "held_out", "last_three", "held_out_last"
 VARIANTS: dict[str, tuple[str, ...]] = {
     EMA: ("--policy.ema_decay=0.998",),
     "weight_decay": ("--policy.optimizer_weight_decay=1e-4",),
@@ -26,24 +29,51 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "more_noise_on_the_arm": ("--policy.low_dimensional_noise=0.06",),
     "twice_the_runs": ("--policy.n_supervised_steps=8", "--batch_size=24"),
     "longer_memory": ("--policy.n_memory_steps=20",),
+    HELD_OUT: ("--dataset.eval_split=0.1", "--save_best=true"),
+    "dropout": ("--policy.fusion_dropout=0.1",),
+    "attention": ("--policy.fusion=attention",),
+    "log_mel": ("--policy.audio_features=log_mel",),
+    "pcen": ("--policy.audio_features=pcen",),
+    "onset": ("--policy.auxiliary_onset=0.03",),
+    "next_sound": ("--policy.auxiliary_next_sound=0.01",),
+    "inverse_dynamics": ("--policy.auxiliary_inverse_dynamics=0.3",),
+    "action_chunk": ("--policy.auxiliary_chunk=0.5",),
 }
+POLICIES: dict[str, tuple[str, ...]] = {EMA: (PLAIN, LAST_THREE), HELD_OUT: (NEWEST,)}
+"""By the variant that is trained: the other policies that its checkpoints hold."""
 CHOICE_SEEDS = range(50000, 50100)
 SEEDS = (1, 2, 3, 4, 5)
 
 
 def job_of(task: str, variant: str, seed: int) -> Job:
     """One training."""
-    return Job(STUDY, task, "full", seed, evaluation_seeds=CHOICE_SEEDS, options=VARIANTS[variant], variant=variant)
+    chosen = "best" if variant == HELD_OUT else "last"
+    options = VARIANTS[variant]
+    return Job(
+        STUDY, task, "full", seed, evaluation_seeds=CHOICE_SEEDS, options=options, variant=variant, chosen=chosen
+    )
 
 
-def by_last_weights(job: Job, averaged: Result) -> Result:
-    """The policy of an `ema` training as it would be without an average."""
-    plain = replace(job, variant=PLAIN)
-    if not plain.result_path.exists():
-        commands = averaged.commands[:1]
-        successes = evaluate(job, commands, "--policy.ema_decay=0", name=f"{STUDY}-last")
-        save(plain.result_path, asdict(replace(averaged, successes=successes, commands=commands)))
-    return Result(**load(plain.result_path))
+def evaluated_as(policy: str, job: Job, trained: Result) -> Result:
+    """One of the `POLICIES` of a training; the saved result if there is one."""
+    other = replace(job, variant=policy)
+    if not other.result_path.exists():
+        commands, checkpoint = trained.commands[:1], job.checkpoint
+        if policy == LAST_THREE:
+            checkpoint = average_of_last(job, 3, commands)
+        elif policy == NEWEST:
+            checkpoint = replace(job, chosen="last").checkpoint
+        options = ["--policy.ema_decay=0"] if job.variant == EMA else []
+        attempts = evaluate(job, commands, *options, name=f"{STUDY}-{policy}", checkpoint=checkpoint)
+        save(other.result_path, asdict(replace(trained, **asdict(attempts), commands=commands)))
+    return Result(**load(other.result_path))
+
+
+def average_of_last(job: Job, n: int, commands: list[str]) -> Path:
+    """The mean of a training's last n checkpoints; how it is made is appended to the commands."""
+    run, output = RUNS / "train" / job.name, RUNS / "train" / f"{job.name}-last{n}"
+    commands.append(shown([f"average_checkpoints(last_checkpoints({run}, {n}), {output})"]))
+    return output if output.exists() else average_checkpoints(last_checkpoints(run, n), output)
 
 
 def main() -> None:
@@ -54,15 +84,19 @@ def main() -> None:
     record(options.task, N_DEMONSTRATIONS)
     jobs = [job_of(options.task, variant, seed) for seed in options.seeds for variant in options.variants]
     for job, result in zip(jobs, side_by_side(jobs, options.jobs), strict=True):
-        print(f"{job.name}: {result.rate:.0%}, {result.minutes} min", flush=True)
-        if job.variant == EMA:
-            print(f"{job.name}, last weights: {by_last_weights(job, result).rate:.0%}", flush=True)
-    for variant in (PLAIN, *VARIANTS):
-        paths = sorted((RESULTS / STUDY).glob(f"{options.task}-full-{variant}-*.json"))
-        rates = [Result(**load(path)).rate for path in paths]
-        if rates:
+        print(f"{job.name}: {result.summary}, {result.minutes} min", flush=True)
+        for policy in POLICIES.get(job.variant, ()):
+            print(f"{job.name}, {policy}: {evaluated_as(policy, job, result).summary}", flush=True)
+    for variant in (PLAIN, LAST_THREE, NEWEST, *VARIANTS):
+        results = [
+            Result(**load(path)) for path in sorted((RESULTS / STUDY).glob(f"{options.task}-full-{variant}-*.json"))
+        ]
+        if results:
+            rates = [result.rate for result in results]
+            spread = f"worst {min(rates):.0%}, spread {np.std(rates):.1%} of {len(rates)}"
+            early = [result.early_rate for result in results if result.early_rate is not None]
             print(
-                f"{variant}: mean {np.mean(rates):.0%}, worst {min(rates):.0%}, spread {np.std(rates):.1%} of {len(rates)}"
+                f"{variant}: mean {np.mean(rates):.0%}, {spread}{f', acted early {np.mean(early):.0%}' if early else ''}"
             )
 
 

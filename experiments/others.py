@@ -199,11 +199,11 @@ def train_and_evaluate(
     command, spent = train(job, setting)
     commands = [shown(command)]
     shown_sound = [f"--env.spectrogram={attached}"] if condition == "picture" else []
-    successes = evaluate(job, commands, *shown_sound, name=f"{STUDY}{chosen_by}")
+    attempts = evaluate(job, commands, *shown_sound, name=f"{STUDY}{chosen_by}")
     result = OtherResult(
         **job.learned,
         first_seed=job.evaluation_seeds.start,
-        successes=successes,
+        **asdict(attempts),
         minutes=round(spent, 1),
         threads=threads,
         commands=commands,

@@ -66,6 +66,8 @@ class Result:
         successes: Of each episode.
         minutes: Of training, on `threads` threads.
         commands: What was run, in order.
+        acted_early: Of each episode: the hand acted before anything was heard. Empty where nobody looked: in results from
+            before, and in tasks that do not tell.
         environment: Options of the environment where they differ from the task's own.
         versions: Of the libraries that matter.
     """
@@ -80,12 +82,24 @@ class Result:
     minutes: float
     threads: int
     commands: list[str]
+    acted_early: list[bool] = field(default_factory=list)
     environment: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=lambda: library_versions())
 
     @property
     def rate(self) -> float:
         return sum(self.successes) / len(self.successes)
+
+    @property
+    def early_rate(self) -> float | None:
+        """Share of the episodes in which the hand acted before anything was heard; None: nobody looked."""
+        return sum(self.acted_early) / len(self.acted_early) if self.acted_early else None
+
+    @property
+    def summary(self) -> str:
+        """Success, and how often the hand acted early, in a few words."""
+        early = "" if self.early_rate is None else f" (acted early: {self.early_rate:.0%})"
+        return f"{self.rate:.0%}{early}"
 
 
 def save(path: Path, content: Any, indent: int | None = None) -> None:

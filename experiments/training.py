@@ -1,5 +1,6 @@
 """Train and evaluate one policy with the commands that everybody has; what is there already is kept."""
 
+import json
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -27,6 +28,14 @@ from experiments.protocol import (
 
 
 @dataclass(frozen=True)
+class Evaluation:
+    """What a policy's attempts came to, in the order of their seeds; the names are those of `Result`."""
+
+    successes: list[bool]
+    acted_early: list[bool]
+
+
+@dataclass(frozen=True)
 class Job:
     """One policy to train and to evaluate.
 
@@ -36,6 +45,7 @@ class Job:
         options: Further ones.
         variant: What the options do, for the names of files; empty without any.
         dataset: Folder of a dataset that holds the demonstrations and no more. None: the first ones of the task's own.
+        chosen: Name of the checkpoint that is evaluated: "last", or "best" with `--save_best=true`.
     """
 
     study: str
@@ -50,6 +60,7 @@ class Job:
     options: tuple[str, ...] = ()
     variant: str = ""
     dataset: Path | None = None
+    chosen: str = "last"
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -64,7 +75,7 @@ class Job:
 
     @property
     def checkpoint(self) -> Path:
-        return RUNS / "train" / self.name / "checkpoints" / "last" / "pretrained_model"
+        return RUNS / "train" / self.name / "checkpoints" / self.chosen / "pretrained_model"
 
     @property
     def result_path(self) -> Path:
@@ -79,7 +90,7 @@ def train_and_evaluate(job: Job) -> Result:
         result = Result(
             **job.learned,
             first_seed=job.evaluation_seeds.start,
-            successes=evaluate(job, commands),
+            **asdict(evaluate(job, commands)),
             minutes=round(minutes, 1),
             threads=job.threads,
             commands=commands,
@@ -150,7 +161,7 @@ def clocked(command: list[str], folder: Path, threads: int) -> float:
 
 def evaluate(
     job: Job, commands: list[str], *environment: str, name: str | None = None, checkpoint: Path | None = None
-) -> list[bool]:
+) -> Evaluation:
     """Rolls a trained policy out over the job's evaluation seeds.
 
     Args:
@@ -162,11 +173,14 @@ def evaluate(
     """
     label = f"{name or job.study}-{job.name}"
     output = RUNS / "eval" / label
+    attempts = output / "attempts.jsonl"
+    attempts.unlink(missing_ok=True)
     command = [
         "lerobot-eval",
         f"--policy.path={checkpoint or job.checkpoint}",
         "--env.type=playbyear",
         f"--env.task={job.task}",
+        f"--env.attempts_file={attempts}",
         f"--eval.n_episodes={len(job.evaluation_seeds)}",
         "--eval.batch_size=25",
         "--eval.use_async_envs=false",
@@ -177,4 +191,12 @@ def evaluate(
     run(command, f"eval-{label}", job.threads)
     commands.append(shown(command))
     report = load(output / "eval_info.json")
-    return [bool(success) for success in report["per_task"][0]["metrics"]["successes"]]
+    successes = [bool(success) for success in report["per_task"][0]["metrics"]["successes"]]
+    return Evaluation(successes, early_attempts(attempts, job.evaluation_seeds))
+
+
+def early_attempts(path: Path, seeds: range) -> list[bool]:
+    """Of the attempts with these seeds, in their order, whether the hand acted early; empty where one does not tell."""
+    lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    told = {line["seed"]: line["acted_early"] for line in lines if "acted_early" in line}
+    return [told[seed] for seed in seeds] if all(seed in told for seed in seeds) else []

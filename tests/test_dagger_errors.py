@@ -12,7 +12,7 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import DaggerConfig, loop
+from lerobot_playbyear.dagger import DaggerConfig, attempt
 from lerobot_playbyear.dagger.config import DatasetSource
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes import frames, saving
@@ -157,7 +157,7 @@ def test_a_fault_of_the_program_shows_where_it_happened(monkeypatch, tmp_path):
     def play(*args, **kwargs):
         raise ValueError("a fault")
 
-    monkeypatch.setattr(loop, "play", play)
+    monkeypatch.setattr(attempt, "play", play)
     monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(tmp_path, *QUICK)])
     with pytest.raises(ValueError, match=r"^a fault$") as error:
         dagger_script.main()

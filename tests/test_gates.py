@@ -253,3 +253,60 @@ def test_the_same_seed_gives_the_same_interventions():
     env.close()
     np.testing.assert_array_equal(first[1], again[1])
     assert first[2] == again[2]
+
+
+# Where somebody else decides
+
+
+class Wanders:
+    """The task's expert, but for its first steps, in which it goes anywhere with open fingers."""
+
+    def __init__(self, task_env, seed, n_steps):
+        self.rng, self.expert, self.n = np.random.default_rng(seed), task_env.scripted_expert(), 0
+        self.n_steps = n_steps
+
+    def act(self):
+        self.n += 1
+        wandering = np.append(self.rng.uniform(-0.5, 0.5, 3), -1.0)
+        return wandering if self.n < self.n_steps else self.expert.act()
+
+
+@pytest.mark.parametrize(("task", "n"), [("OccludedGrasp-v1", 30), ("OccludedPickPlace-v1", 30)])
+def test_labels_solve_the_task_from_wherever_the_policy_went(task, n):
+    """Of DAgger: the policy acts for a while, and then whoever follows the labels succeeds, though the expert never acted."""
+    env, solved = make(task), 0
+    for seed in range(4):
+        env.reset(seed=seed)
+        task_env = env.unwrapped
+        gate, policy, done, step = task_env.intervention_gate(), Wanders(task_env, seed, n), False, 0
+        while not done:
+            action = policy.act()
+            gate.wants_control(action)
+            label = gate.label()
+            assert gate.reason is None
+            _, terminated, truncated, info = task_env.advance(action if step < n + 10 else label)
+            done, step = terminated or truncated, step + 1
+        solved += info["is_success"]
+    env.close()
+    assert solved >= 3
+
+
+def test_an_expert_that_was_asked_stays_until_it_is_told():
+    env = make("OccludedGrasp-v1")
+    env.reset(seed=2)
+    task_env = env.unwrapped
+    gate, policy = task_env.intervention_gate(), task_env.scripted_expert()
+    acts, done, n, info = [], False, 0, {}
+    while not done:
+        action = policy.act()
+        acts.append(gate.wants_control(action))
+        if n == 10:
+            assert not acts[-1]  # nothing was wrong
+            gate.take_over()
+        _, terminated, truncated, info = task_env.advance(gate.act() if n >= 10 else action)
+        done, n = terminated or truncated, n + 1
+    env.close()
+    assert all(acts[11:])
+    assert info["is_success"]
+    gate.hand_back()
+    assert gate.reason is None

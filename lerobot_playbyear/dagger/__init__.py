@@ -6,7 +6,8 @@ from lerobot_playbyear import lazy_names
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig
+from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
+from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
 
 if TYPE_CHECKING:
     from lerobot_playbyear.dagger.run import run_dagger

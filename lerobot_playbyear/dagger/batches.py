@@ -75,19 +75,19 @@ class BalancedBatches:
             action is not to be learned.
         """
         assert self._interventions is not None
-        last = _draw(self._from_interventions, number, self._n_half)
+        last = draw(self._from_interventions, number, self._n_half)
         interventions = self._windows.batch(self._interventions, last)
         demonstrations = self._windows.batch(
-            self._demonstrations, _draw(self._from_demonstrations, number, self._n_half)
+            self._demonstrations, draw(self._from_demonstrations, number, self._n_half)
         )
         if len(self._windows.action_deltas) > 1:
             by_expert = self._by_expert(self._interventions, last)  # (B/2, K)
             is_learned = ~demonstrations[_IS_PAD]
             n, generator = int(min(is_learned.sum(), by_expert.sum())), self._generator(number)
-            demonstrations[_IS_PAD] = ~_keep(is_learned, n, generator)
-            interventions[_IS_PAD] = ~_keep(by_expert, n, generator)
+            demonstrations[_IS_PAD] = ~keep(is_learned, n, generator)
+            interventions[_IS_PAD] = ~keep(by_expert, n, generator)
         common = [key for key in demonstrations if key in interventions]
-        return {key: _concatenate(demonstrations[key], interventions[key]) for key in common}
+        return {key: concatenated(demonstrations[key], interventions[key]) for key in common}
 
     def halves(self, number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """A batch of demonstrations and one of interventions, to tell their losses apart."""
@@ -137,12 +137,13 @@ def frames_by_expert(store: EpisodeStore) -> Tensor:
     return store.column(INTERVENTION).reshape(len(store), -1)[:, 0].bool()
 
 
-def _draw(sampler: RunSampler, number: int, n: int) -> Tensor:
+def draw(sampler: RunSampler, number: int, n: int) -> Tensor:
+    """The last frames (n,) of the runs of the batch of that number, counted from 0."""
     sampler.load_state_dict({**sampler.state_dict(), "n_batches": number})
     return sampler.draw(n)
 
 
-def _keep(mask: Tensor, n: int, generator: torch.Generator) -> Tensor:
+def keep(mask: Tensor, n: int, generator: torch.Generator) -> Tensor:
     """`mask` with only n of its True left, chosen at random; all if there are fewer."""
     chosen = mask.flatten().nonzero().squeeze(1)
     chosen = chosen[torch.randperm(len(chosen), generator=generator)[:n].to(chosen.device)]
@@ -151,5 +152,6 @@ def _keep(mask: Tensor, n: int, generator: torch.Generator) -> Tensor:
     return kept.view_as(mask)
 
 
-def _concatenate(first: Any, second: Any) -> Any:
+def concatenated(first: Any, second: Any) -> Any:
+    """Two batches' values of one key as one."""
     return torch.cat([first, second]) if isinstance(first, Tensor) else [*first, *second]

@@ -1,7 +1,5 @@
 """What `playbyear-dagger` can be told."""
 
-import dataclasses
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -14,8 +12,10 @@ from lerobot.configs.default import DatasetConfig, EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_playbyear.dagger.methods import HgDaggerConfig, MethodConfig
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.expert import ExpertConfig, ScriptedExpertConfig
+from lerobot_playbyear.episodes.expert import ExpertConfig
+from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 
 CONFIG_NAME = "dagger_config.json"
@@ -63,6 +63,11 @@ class DaggerConfig:
             `--policy.repo_id` as in lerobot-train.
         env: Where it acts, as in lerobot-eval.
         expert: Who corrects it, `--expert.type=scripted` or another registered one.
+        method: How attempts are made and what is learned of them, `--method.type=hg_dagger` or another registered one.
+        takeover_delay_s: How much later than it would the expert takes over [s]. Below 0 it is earlier, the first time in an
+            attempt, which is played twice for that: only in simulation and with a script.
+        learn_from: "expert": of attempts only what the expert chose; "all": all frames of those that are kept.
+        new_weights: With `episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation stays.
         episodes: Attempts that the intervention dataset shall hold in the end. 0: none are collected and no environment is
             needed, see `updates`.
         updates_per_episode: Updates after each kept attempt.
@@ -95,6 +100,10 @@ class DaggerConfig:
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
     expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
+    method: MethodConfig = field(default_factory=HgDaggerConfig)
+    takeover_delay_s: float = 0.0
+    learn_from: str = "expert"
+    new_weights: bool = False
     episodes: int = 25
     updates_per_episode: int = 100
     warmup_episodes: int = 5
@@ -146,6 +155,7 @@ class DaggerConfig:
             raise InputError("--updates is for --episodes=0; with episodes give --updates_per_episode.")
         if not self.is_online and not self.updates:
             raise InputError("--episodes=0 collects nothing: give --updates, how many to make from what is there.")
+        self._check_method()
         takes_a_person = self.eval_every > 0 and getattr(self.env, "is_real_time", False)
         if takes_a_person and self.eval.n_episodes > _MOST_WATCHED:
             raise InputError(
@@ -156,6 +166,27 @@ class DaggerConfig:
             raise InputError(
                 "No environment: give --env.type and --env.task, or --episodes=0 --updates=N to learn from recorded "
                 "corrections alone."
+            )
+
+    def _check_method(self) -> None:
+        self.method.check()
+        if self.learn_from not in ("expert", "all"):
+            raise InputError(f"--learn_from={self.learn_from!r}: give expert or all.")
+        if self.learn_from == "all" and self.method.chooses_frames:
+            raise InputError(
+                f"--learn_from=all: --method.type={self.method.type} says by itself what is learned from; leave it out."
+            )
+        if not math.isfinite(self.takeover_delay_s):
+            raise InputError(f"--takeover_delay_s={self.takeover_delay_s}: give a number of seconds.")
+        if self.takeover_delay_s and not self.method.expert_decides:
+            raise InputError(
+                f"--takeover_delay_s={self.takeover_delay_s}: with --method.type={self.method.type} the expert does not decide "
+                "when it takes over; leave it out."
+            )
+        if self.new_weights and self.is_online:
+            raise InputError(
+                "--new_weights=true: a policy that knows nothing cannot be corrected. Collect attempts first, and then learn "
+                "from all of them with --episodes=0 --updates=N --new_weights=true and another --output_dir."
             )
 
     def rate(self, step: int, number: int, n_updates: int) -> float:
@@ -218,34 +249,3 @@ def with_saved_options(args: Sequence[str]) -> list[str]:
     if is_resumed and parser.parse_arg("config_path", args) is None and (folder / CONFIG_NAME).is_file():
         return [f"--config_path={folder / CONFIG_NAME}", *args]
     return args
-
-
-def differences(folder: Path, cfg: DaggerConfig) -> list[str]:
-    """What tells a run apart from the one in an output folder: another task, other data, another expert."""
-    saved = json.loads((folder / CONFIG_NAME).read_text())
-    options = json.loads(json.dumps(cfg.options()))
-    names = ("demos", "interventions", "env", "expert", "seed", "episode_seed", "warmup_episodes", "rename_map")
-    for name in names:
-        _fill_in(saved.get(name), options.get(name), getattr(cfg, name))
-    return [
-        f"--{name} was {_brief(saved.get(name))} and is {_brief(options.get(name))}"
-        for name in names
-        if saved.get(name) != options.get(name)
-    ]
-
-
-def _fill_in(saved: Any, options: Any, config: Any) -> None:
-    """What an older version did not know, and is as it is by default, was so then."""
-    if not (isinstance(saved, dict) and isinstance(options, dict) and dataclasses.is_dataclass(config)):
-        return
-    for option in dataclasses.fields(config):
-        make: Any = option.default_factory
-        default = option.default if make is dataclasses.MISSING else make()
-        if option.name in options and option.name not in saved and getattr(config, option.name) == default:
-            saved[option.name] = options[option.name]
-
-
-def _brief(value: Any) -> str:
-    if not isinstance(value, dict):
-        return str(value)
-    return str({key: item for key, item in value.items() if key not in ("features", "features_map", "video_backend")})

@@ -4,9 +4,12 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.utils.constants import SUCCESS
 
+from lerobot_playbyear.dagger.batches import frames_by_expert
 from lerobot_playbyear.dagger.checks import check_corrections
 from lerobot_playbyear.dagger.config import DatasetSource
 from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
@@ -80,8 +83,8 @@ class Corrections:
     def _read(self) -> None:
         backend = self._source.video_backend
         dataset = LeRobotDataset(self._source.repo_id, root=self._source.root, video_backend=backend)
-        seeds = [SEED] if SEED in dataset.meta.features else []
-        keys = self._keys and self._keys + seeds
+        further = [key for key in (SEED, SUCCESS) if key in dataset.meta.features]
+        keys = self._keys and self._keys + further
         self.store = EpisodeStore.from_dataset(dataset, keys, self._device, backend, image_size=self._image_size)
 
     @property
@@ -109,6 +112,16 @@ class Corrections:
         share = self.store.column(INTERVENTION)[start:end].float().mean()
         seed = self.store.column(SEED)[end - 1]
         return {"seed": int(seed), "n_frames": end - start, "intervention_share": round(float(share), 4)}
+
+    def last_by_expert(self) -> np.ndarray:
+        """(T,) bool, which frames of the last attempt hold an action of the expert's."""
+        assert self.store is not None
+        return frames_by_expert(self.store)[self.store.starts[-1] :].cpu().numpy()
+
+    def last_success(self) -> bool:
+        """Whether the last attempt solved its task."""
+        assert self.store is not None
+        return bool(self.store.column(SUCCESS)[-1].any()) if SUCCESS in self.store.keys else True
 
     def close(self) -> None:
         """Nothing is appended any more."""

@@ -46,6 +46,7 @@ class RunState:
         success: What it gave [%].
         checkpoint: Folder of the newest weights; None before the first update.
         milestones: Checkpoints that are kept for good.
+        method: What the method keeps, such as what it knew when the round began.
         wandb_run_id: To go on with the same run there.
     """
 
@@ -64,6 +65,7 @@ class RunState:
     success: float | None = None
     checkpoint: str | None = None
     milestones: list[str] = field(default_factory=list)
+    method: dict[str, Any] = field(default_factory=dict)
     wandb_run_id: str | None = None
 
 
@@ -176,6 +178,12 @@ class RunFolder:
         """Add a line to the figures. It holds only once a state that knows of it was committed."""
         with _errors_of_writing(self.path), (self.path / METRICS_NAME).open("a") as file:
             file.write(json.dumps(line) + "\n")
+
+    def metrics(self) -> list[dict[str, Any]]:
+        """All lines of the figures; none before the first."""
+        path = self.path / METRICS_NAME
+        texts = path.read_text().splitlines() if path.is_file() else []
+        return [line for text in texts if (line := figures_in(text))]
 
     def _forget_metrics(self, state: RunState) -> None:
         """Drop lines of what was in progress when the run was killed; it is done again."""

@@ -7,29 +7,31 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.compat import get_step_identifier
+from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.batches import BalancedBatches
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
+from lerobot_playbyear.dagger.figures import attempt_figures, round_figures
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
+from lerobot_playbyear.dagger.methods.base import Method, outcome_of
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.episode import Episode, Verdict
-from lerobot_playbyear.episodes.expert import Expert
-from lerobot_playbyear.episodes.play import Seconds, play
-from lerobot_playbyear.episodes.policy_actor import PolicyActor
+from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.episodes.play import Seconds
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.figures import Figures
 from lerobot_playbyear.training.parts import TrainingParts
 from lerobot_playbyear.training.processes import Orders
 from lerobot_playbyear.training.reach import Reach
 from lerobot_playbyear.training.report import is_due
+
+__all__ = ["Loop", "outcome_of"]
 
 _ATTEMPT, _UPDATES = 0, 1  # what random numbers are for
 _LOSS_BATCHES = 10**9  # numbers from here on are of batches that are only looked at
@@ -53,6 +55,7 @@ class Loop:
         reach: Knows which corrections the policy cannot learn.
         report: Tells how it goes.
         scene: The environment, the policy in it, and the expert; None to learn from recorded corrections alone.
+        method: How attempts are made, kept and learned from.
     """
 
     cfg: DaggerConfig
@@ -66,7 +69,8 @@ class Loop:
     orders: Orders
     reach: Reach
     report: Report
-    scene: tuple[gym.Env, PolicyActor, Expert] | None
+    scene: Scene | None
+    method: Method
 
     def run(self) -> None:
         """Go on until the run is complete, or until the policy needs the expert no more.
@@ -106,7 +110,9 @@ class Loop:
             )
         figures = self.corrections.last()
         state.attempts, state.kept, state.next_seed = state.attempts + 1, state.kept + 1, figures["seed"] + 1
-        self.report.write("attempt", {**figures, "outcome": "kept", "success": True, "recovered": True})
+        cost = self._cost(self.corrections.last_by_expert())
+        success = self.corrections.last_success()
+        self.report.write("attempt", {**figures, "outcome": "kept", "success": success, **cost, "recovered": True})
         self.report.bar.update(1)
         self.folder.commit(state)
 
@@ -117,12 +123,13 @@ class Loop:
             self.report.doing("acting")
             spent = Seconds()
             episode = self._attempt(spent)
-            outcomes.append(outcome_of(episode))
+            outcomes.append(self.method.outcome(episode))
             if outcomes[-1] == "kept":
                 with spent.of("episode_saving"):
                     self.corrections.append(episode)
                     assert self.corrections.store is not None
                     self.batches.set_interventions(self.corrections.store)
+            self.method.note(episode, outcomes[-1])
             self._note(episode, outcomes[-1], spent)
             seconds.add(spent)
             if outcomes[-1] == "kept":
@@ -144,9 +151,9 @@ class Loop:
         assert self.scene is not None
         while self.state.next_seed in self.cfg.eval_seeds:
             self.state.next_seed += 1
-        set_seed(self._random_seed(_ATTEMPT, self.state.next_seed))
-        env, actor, expert = self.scene
-        return play(env, actor, self.state.next_seed, expert=expert, seconds=spent)
+        self.method.prepare()
+        seed = self.state.next_seed
+        return self.method.recorded(self.scene.attempt(seed, self._random_seed(_ATTEMPT, seed), spent))
 
     def _note(self, episode: Episode, outcome: str, spent: Seconds) -> None:
         """Counts an attempt."""
@@ -161,8 +168,17 @@ class Loop:
             "n_frames": len(episode),
             "intervention_share": round(episode.intervention_share, 4),
         }
+        assert episode.interventions is not None
+        figures |= self._cost(episode.interventions) | dict(self.method.figures())
         self.report.write("attempt", figures | _rounded(spent))
         self.folder.commit(state)
+
+    def _cost(self, by_expert: np.ndarray) -> dict[str, Any]:
+        """What an attempt cost, from the column `intervention`, (T,) bool."""
+        assert self.scene is not None
+        fps = self.scene.expert.clock_fps or self.demonstrations.fps
+        control = self.method.control_of(by_expert)
+        return attempt_figures(control, int(by_expert.sum()), fps, self.cfg.method.is_watched)
 
     # Learning
 
@@ -215,7 +231,8 @@ class Loop:
             if is_due(state.round, cfg.eval_every) or is_due(state.round, cfg.save_every):
                 state.milestones.append(name)
         total = time.perf_counter() - start
-        self.report.write("round", {**losses, **_rounded(seconds), "total_s": round(total, 4)})
+        spent = {} if self.scene is None else round_figures(self.folder.metrics(), state.round)
+        self.report.write("round", {**losses, **spent, **_rounded(seconds), "total_s": round(total, 4)})
         self.folder.commit(state)
         self.folder.clean(state)
 
@@ -234,15 +251,6 @@ class Loop:
 
     def _random_seed(self, purpose: int, number: int) -> int:
         return int(np.random.SeedSequence([self.cfg.seed, purpose, number]).generate_state(1)[0])
-
-
-def outcome_of(episode: Episode) -> str:
-    """What becomes of an attempt: `kept` (learned from), `unneeded`, `failed` or `discarded`, as `RunState` counts them."""
-    if episode.verdict is Verdict.DISCARD:
-        return "discarded"
-    if not episode.success:
-        return "failed"
-    return "kept" if episode.intervention_share > 0 else "unneeded"
 
 
 def _rounded(seconds: Seconds) -> dict[str, float]:

@@ -3,6 +3,7 @@
 import logging
 import shlex
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig, parser
@@ -10,15 +11,23 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot.utils.utils import init_logging
 
+from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.batches import BalancedBatches, frames_by_expert
 from lerobot_playbyear.dagger.checks import check_action_range, check_actions_can_be_masked, check_alike, check_dataset
-from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, differences
+from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
+from lerobot_playbyear.dagger.figures import Totals
 from lerobot_playbyear.dagger.folder import RunFolder, RunState
 from lerobot_playbyear.dagger.helpers import help_to_learn, is_first_process
 from lerobot_playbyear.dagger.loop import Loop
+from lerobot_playbyear.dagger.methods import Tools
+from lerobot_playbyear.dagger.methods.base import Method
+from lerobot_playbyear.dagger.methods.beside import Early, shifted
+from lerobot_playbyear.dagger.new_weights import forget_all
 from lerobot_playbyear.dagger.report import Report
-from lerobot_playbyear.datasets import check_dataset_files
+from lerobot_playbyear.dagger.same_run import differences
+from lerobot_playbyear.dagger.weighted_batches import WeightedBatches
+from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
@@ -115,18 +124,22 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     check_dataset_files(cfg.demos.repo_id, cfg.demos.root)
     demos = LeRobotDataset(cfg.demos.repo_id, root=cfg.demos.root, video_backend=cfg.demos.video_backend)
     check_dataset(cfg.policy, demos.meta, cfg.rename_map)
-    env = expert = None
+    method = cfg.method.make(cfg)
+    stack.callback(method.close)
+    env = expert = facts = None
     if cfg.is_online and cfg.env is not None:
         env = env_spec(cfg.env).make()
         stack.callback(env.close)
         expert = cfg.expert.make(env)
         stack.callback(expert.close)
+        on_time = shifted(expert, cfg.takeover_delay_s, env_facts(env).fps, env)
+        expert = method.beside(on_time)
     corrections = Corrections(cfg.interventions)
     stack.callback(corrections.close)
     observed = list(dataset_names(cfg.policy, cfg.rename_map).values())
     if env is not None and cfg.env is not None:
         facts = env_facts(env)
-        features = dataset_features(facts)
+        features = method.features(dataset_features(facts))
         check_alike(observed, demos.meta, features, facts.fps, f"--env.type={cfg.env.type}")
         corrections.open_for_writing(facts.fps, features, getattr(cfg.env, "robot_type", cfg.env.type))
     else:
@@ -139,6 +152,8 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     training = _training_options(cfg, folder, state)
     parts = make_training_parts(training, demos.meta, keep_normalization=True)
     share_of(parts.accelerator, cfg.batch_size)
+    if cfg.new_weights and state.checkpoint is None:
+        forget_all(parts, cfg.seed)
     orders = Orders(parts.accelerator)
     stack.callback(orders.end)
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
@@ -149,16 +164,28 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     reach.warn(demonstrations.column(ACTION), "the demonstrations")
     if corrections.store is not None:
         reach.warn(corrections.store.column(ACTION)[frames_by_expert(corrections.store)], "the corrections")
-    batches = BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed)
+    batches = _make_batches(cfg, method, windows, demonstrations, corrections)
 
+    method.begin(Tools(cfg, folder, state, parts, windows, demonstrations, corrections, facts))
     folder.begin(cfg, state)
     report = stack.enter_context(Report(cfg, training, folder, state))
     scene = None
     if env is not None and cfg.env is not None and expert is not None:
         policy = parts.accelerator.unwrap_model(parts.policy)
         actor = PolicyActor(policy, cfg.env, parts.preprocessor, parts.postprocessor, parts.accelerator.autocast)
-        scene = (env, actor, expert)
-    return Loop(cfg, training, folder, state, parts, demonstrations, corrections, batches, orders, reach, report, scene)
+        scene = Scene(env, actor, expert, on_time if isinstance(on_time, Early) else None)
+    return Loop(
+        cfg, training, folder, state, parts, demonstrations, corrections, batches, orders, reach, report, scene, method
+    )
+
+
+def _make_batches(
+    cfg: DaggerConfig, method: Method, windows: PolicyWindows, demonstrations: EpisodeStore, corrections: Corrections
+) -> BalancedBatches:
+    if not method.weighs_frames:
+        return BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed)
+    learned = partial(method.learned, len(demonstrations))
+    return WeightedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed, learned)
 
 
 def _training_options(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> PlaybyearTrainConfig:
@@ -186,6 +213,11 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> Non
         print(
             f"Attempts:    {state.attempts}: {state.kept} kept in {cfg.interventions.folder}, {state.failed} failed, "
             f"{state.unneeded} needed no help, {state.discarded} thrown away"
+        )
+        totals = Totals.of(folder.metrics())
+        print(
+            f"Expert:      {totals.expert_steps} steps in {totals.takeovers} takeovers, {totals.switches} context switches, "
+            f"autonomy {totals.autonomy:.0%}, {totals.person_seconds / 60:.1f} minutes of a person's time"
         )
     if state.success is not None:
         print(f"Success:     {state.success:.1f} % of {cfg.eval.n_episodes} episodes")

@@ -53,6 +53,7 @@ class Episode:
         successes: (T,) bool, `info["is_success"]` after each action, or what the expert's verdict says.
         interventions: (T,) bool, whether the expert beside the actor chose the action; None if nobody was beside it.
         verdict: How the expert ended it, if so.
+        executed: (T, action dim) what was done, where `actions` are an expert's labels of what the policy met; else None.
         facts: What the environment says about how the episode went, such as drop-outs of its microphones; None if it does not.
         watched: T + 1 values of what `play` was asked to watch, such as pictures; otherwise none.
     """
@@ -67,6 +68,7 @@ class Episode:
     verdict: Verdict | None = None
     watched: list[Any] = field(default_factory=list)
     facts: dict[str, Any] | None = None
+    executed: np.ndarray | None = None
 
     @property
     def success(self) -> bool:

@@ -6,7 +6,7 @@ under a name for `--expert.type` (`examples/own_expert.py`).
 
 import abc
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import draccus
 import gymnasium as gym
@@ -26,7 +26,19 @@ class Expert(abc.ABC):
     In each step `wants_control` is called once with what the policy would do, then `act` if it returned True, then the
     environment steps, then `verdict`. A step may take as long as the expert likes: a person's expert keeps the pace and
     shows a window in `wants_control`.
+
+    The methods of HG-DAgger (`--method.type`) may ask for more: `take_over` and `hand_back` where somebody else decides who
+    acts, `label` where the policy acts all the time, `call` where the robot asks for help.
+
+    Attributes:
+        decides: It takes over when it likes, also where the robot asks, as a person does: then it is only called.
+        can_label: It can say what to do while somebody else acts.
+        clock_fps: Steps per second of the person who corrects; None where nobody's time is spent.
     """
+
+    decides: ClassVar[bool] = False
+    can_label: ClassVar[bool] = True
+    clock_fps: float | None = None
 
     @abc.abstractmethod
     def reset(self, env: gym.Env) -> None:
@@ -48,6 +60,23 @@ class Expert(abc.ABC):
     @abc.abstractmethod
     def act(self) -> np.ndarray:
         """The expert's action (action dim,) for this step."""
+
+    def take_over(self, until_told: bool = True) -> None:  # noqa: B027 (an expert that looks at the present state needs none)
+        """Somebody else says that the expert is in control from this step on. Called after `wants_control`, before `act`.
+
+        Args:
+            until_told: Until `hand_back`, or the end; otherwise until its `wants_control` says no.
+        """
+
+    def hand_back(self) -> None:  # noqa: B027
+        """Somebody else says that the policy is in control again."""
+
+    def label(self) -> np.ndarray:
+        """The expert's action (action dim,) for this step, in which the policy acts. Called after `wants_control`."""
+        return self.act()
+
+    def call(self, is_called: bool) -> None:  # noqa: B027
+        """Whether the robot asks for help in this step. Called before `wants_control` of an expert that `decides`."""
 
     def verdict(self) -> Verdict | None:
         """Whether the attempt ends now; None goes on. Asked after every step."""
@@ -79,32 +108,3 @@ class ExpertConfig(draccus.ChoiceRegistry, abc.ABC):
         Raises:
             ExpertError: It does not go with this environment.
         """
-
-
-@ExpertConfig.register_subclass("scripted")
-@dataclass
-class ScriptedExpertConfig(ExpertConfig):
-    """The script that comes with the environment, `env.unwrapped.intervention_gate()`."""
-
-    def make(self, env: gym.Env) -> Expert:
-        if not callable(getattr(env.unwrapped, "intervention_gate", None)):
-            raise ExpertError(
-                f"--expert.type=scripted needs an environment with `intervention_gate()`, and "
-                f"{type(env.unwrapped).__name__} has none. Give another --expert.type, or write an expert "
-                "(examples/own_expert.py)."
-            )
-        return ScriptedExpert()
-
-
-class ScriptedExpert(Expert):
-    """Lets the environment's gate decide and the environment's script act."""
-
-    def reset(self, env: gym.Env) -> None:
-        task_env: Any = env.unwrapped
-        self._gate = task_env.intervention_gate()
-
-    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
-        return bool(self._gate.wants_control(policy_action))
-
-    def act(self) -> np.ndarray:
-        return np.asarray(self._gate.act(), np.float32)

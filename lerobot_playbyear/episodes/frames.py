@@ -25,6 +25,9 @@ from lerobot_playbyear.episodes.episode import Episode, Observation, Step
 
 INTERVENTION = "intervention"
 SEED = "seed"
+EXECUTED = "executed_action"
+"""Where `action` is an expert's label of what a policy met: what the policy did."""
+
 _STATE_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 
 
@@ -64,10 +67,13 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
     """
     by_expert = np.ones(len(episode), bool) if episode.interventions is None else episode.interventions
     steps = zip(episode.observations, episode.actions, episode.rewards, episode.successes, by_expert, strict=False)
-    return [
+    frames = [
         make_frame(features, Step(*step, is_last=t == len(episode) - 1), episode.seed, episode.task)
         for t, step in enumerate(steps)
     ]
+    for frame, executed in zip(frames, () if episode.executed is None else episode.executed, strict=False):
+        frame[EXECUTED] = executed
+    return frames
 
 
 def make_frame(features: dict[str, dict[str, Any]], step: Step, seed: int, task: str) -> dict[str, Any]:

@@ -16,6 +16,14 @@ What goes in
   --env.type=...               where it acts: playbyear, or playbyear_robot for a real one
   --expert.type=...            who corrects: scripted (the environment's own, default), teleop
   --expert.teleop.type=...     what a person moves the arm with: keyboard_window, gamepad, ...
+  --expert.person=...          with scripted: true for a script that reacts late, trembles and errs
+
+Method
+  --method.type=...            hg_dagger (default), dagger (labels), no_handback,
+                               weighted (IWR, Sirius), robot_gated (the robot asks: ThriftyDAgger)
+  --method.intervention_share=...   with robot_gated: of the steps in which it asks
+  --takeover_delay_s=0.0       the expert takes over later, or below 0 sooner
+  --learn_from=expert          all: of kept attempts every frame is learned from
 
 Attempts
   --interventions.repo_id=...  the dataset of attempts with corrections, made or appended to; needed
@@ -28,6 +36,7 @@ Training
   --updates_per_episode=100    updates after each attempt that is kept
   --warmup_episodes=5          attempts before the first update
   --updates=0                  with --episodes=0: updates on the corrections that are there
+  --new_weights=false          with --episodes=0: begin anew, with all data at once
   --batch_size=24              runs of windows per update, half of them demonstrations
   --learning_rate=null         the largest of each round; else the policy's own
   --seed=1000                  of training, and of the first evaluation episode

@@ -43,6 +43,7 @@ What comes of it
   --log_freq=200               updates between two lines of figures
   --save_freq=20000            updates between two checkpoints
   --eval_steps=0               updates between two losses of the held-out episodes; 0: none
+  --save_best=false            checkpoints/best is the one with the lowest of these losses
   --env.type=...               environment to try the policy in, like playbyear
   --env_eval_freq=20000        updates between two such trials; 0: none
   --eval.n_episodes=50         episodes of a trial

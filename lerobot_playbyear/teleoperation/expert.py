@@ -2,7 +2,7 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -62,9 +62,14 @@ class TeleopExpert(Expert):
     override: str = OVERRIDE
     robot: Any = None
 
+    decides: ClassVar[bool] = True
+    can_label: ClassVar[bool] = False
+
     def __post_init__(self) -> None:
         self._controls = Controls(self.teleop, self.window.keys, self.toggles, self.override)
+        self.clock_fps = self.pace.fps
         self._wish = Wish({})
+        self._is_called = self._stays = False
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
         waiting = "The next attempt is being prepared" if self.demonstrates else "The policy is learning or evaluated"
@@ -84,7 +89,7 @@ class TeleopExpert(Expert):
         if self._look()[0].leaves:  # all else that was pressed meanwhile was not meant for this attempt
             raise PersonLeftError
         self._controls.reset()
-        self._acts = False
+        self._acts = self._is_called = self._stays = False
         self.gripper.reset()
         self.pace.start()
         self.speaker.clear()
@@ -117,7 +122,7 @@ class TeleopExpert(Expert):
         self._read()
         if self._is_paused and self._verdict is None:
             self._pause()
-        acts = self.demonstrates or self._wish.overrides
+        acts = self.demonstrates or self._wish.overrides or self._stays
         if acts and not self._acts and self.robot is not None and self.mapping.moves_joints and self._verdict is None:
             self._meet()
         if self.robot is not None and self._verdict is not None:  # the arm holds at once; this step moves nothing
@@ -125,11 +130,24 @@ class TeleopExpert(Expert):
             return False
         self._acts = acts
         self._last_command = self._gripper_command() if acts else float(policy_action[-1])
-        status.control = Control.PERSON if acts else Control.POLICY
+        status.control = Control.PERSON if acts else Control.CALLED if self._is_called else Control.POLICY
         return acts
 
     def act(self) -> np.ndarray:
         return self.mapping.vector(self._wish.action, self._gripper_command())
+
+    def take_over(self, until_told: bool = True) -> None:
+        self._stays = until_told
+
+    def hand_back(self) -> None:
+        self._stays = False
+
+    def call(self, is_called: bool) -> None:
+        if is_called and not self._is_called and not self._acts:
+            self.speaker.ring()
+        self._is_called = is_called
+        if not self._acts:
+            self._status.control = Control.CALLED if is_called else Control.POLICY
 
     def verdict(self) -> Verdict | None:
         return self._verdict

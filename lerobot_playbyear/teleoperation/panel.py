@@ -18,6 +18,7 @@ SCENE = (_BORDER, _BANNER, _VIEW, _VIEW)
 
 _LOOKS = {
     Control.POLICY: ("#0072b2", "#ffffff", "The policy is in control"),
+    Control.CALLED: ("#d55e00", "#ffffff", "The robot asks for help"),
     Control.PERSON: ("#e69f00", "#000000", "You are in control"),
     Control.PAUSED: ("#999999", "#000000", "Paused"),
     Control.WAITING: ("#5a5f66", "#ffffff", "Please wait"),

@@ -1,12 +1,14 @@
 """Plays what a microphone hears, if the package `sounddevice` is there."""
 
 import contextlib
+import sys
 import threading
 from typing import Any
 
 import numpy as np
 
 _LATENCY_BLOCKS = 2  # that are there before the first is played, so that a late step leaves no gap
+_BELL_HZ, _BELL_S, _BELL_LEVEL = 880.0, 0.2, 0.3
 _MOST_BLOCKS = 6  # more than this is too late to be played
 
 
@@ -23,8 +25,9 @@ class Speaker:
     """
 
     def __init__(self, sample_rate: int, block_size: int, problem: str = "") -> None:
-        self._block_size = block_size
+        self._block_size, self._sample_rate = block_size, sample_rate
         self._samples: np.ndarray = np.zeros(0, np.float32)
+        self._bell: np.ndarray = np.zeros(0, np.float32)
         self._is_playing = False
         self._lock = threading.Lock()
         self._stream: Any = None
@@ -52,6 +55,17 @@ class Speaker:
             self._samples = np.concatenate([self._samples, block])[-_MOST_BLOCKS * self._block_size :]
             self._is_playing |= len(self._samples) >= _LATENCY_BLOCKS * self._block_size
 
+    def ring(self) -> None:
+        """Rings for a person, above all that is heard; where nothing is played, by the terminal's bell."""
+        if self._stream is None:
+            sys.stderr.write("\a")
+            sys.stderr.flush()
+            return
+        t = np.arange(round(_BELL_S * self._sample_rate)) / self._sample_rate
+        with self._lock:
+            fading = np.linspace(1, 0, len(t))
+            self._bell = (_BELL_LEVEL * fading * np.sin(2 * np.pi * _BELL_HZ * t)).astype(np.float32)
+
     def take(self, n: int) -> np.ndarray:
         """The next n samples, which are then played; silence where there are none."""
         played = np.zeros(n, np.float32)
@@ -60,6 +74,8 @@ class Speaker:
                 head, self._samples = self._samples[:n], self._samples[n:]
                 played[: len(head)] = head
                 self._is_playing = len(head) == n
+            bell, self._bell = self._bell[:n], self._bell[n:]
+            played[: len(bell)] += bell
         return played
 
     def clear(self) -> None:

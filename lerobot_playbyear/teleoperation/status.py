@@ -8,9 +8,10 @@ HISTORY_S = 4.0
 
 
 class Control(StrEnum):
-    """Who acts."""
+    """Who acts; where a person is called, it is the policy that asks them to take over."""
 
     POLICY = "policy"
+    CALLED = "called"
     PERSON = "person"
     PAUSED = "paused"
     WAITING = "waiting"

@@ -1,0 +1,204 @@
+"""What a robot-gated method knows of a state: how new it is to the policy, and how risky (ThriftyDAgger).
+
+Both are small networks on what the policy's LSTM remembers: the policy `playbyear` has neither dropout nor an ensemble, five
+policies would cost five times the training, and passes through other augmentations tell of noise in a picture, not of places
+where no expert was. So several heads learn the expert's actions from the same memory, each from its own draw of the data; where
+they disagree nobody has shown what to do. They are learned anew in every round, because the memory changes with the policy.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+_HIDDEN = 128
+_BATCH = 256
+
+
+@dataclass
+class Played:
+    """An episode as a gate learns from it, T steps.
+
+    Attributes:
+        memories: (T, D) what the policy remembers.
+        actions: (T, action dim) what was done.
+        policy_actions: (T, action dim) what the policy would do.
+        by_expert: (T,) bool.
+        success: Whether the task was solved in the end.
+        is_visited: Whether the policy was at work, so that thresholds are set by it; demonstrations are not.
+        seed: Of the attempt.
+    """
+
+    memories: Tensor
+    actions: Tensor
+    policy_actions: Tensor
+    by_expert: np.ndarray
+    success: bool
+    is_visited: bool
+    seed: int = 0
+
+
+class GateModel:
+    """Novelty and risk.
+
+    Risk is what two success values say on average, each of which has seen every other attempt: of an attempt that was learned
+    from, the one tells that has not seen it. Thresholds would be those of a success that is known by heart otherwise.
+
+    Args:
+        played: Demonstrations and attempts; at least one frame of an expert.
+        n_heads: That tell the expert's actions.
+        n_updates: Of every head, and of each of the two success values.
+        discount: Of a success, per step.
+        seed: Of all that is random.
+    """
+
+    def __init__(self, played: list[Played], n_heads: int, n_updates: int, discount: float, seed: int) -> None:
+        memories = torch.cat([each.memories for each in played]).float()
+        self._mean, self._std = memories.mean(0), memories.std(0).clamp(min=1e-6)
+        with torch.random.fork_rng(devices=[]), torch.enable_grad():
+            torch.manual_seed(seed)
+            self._heads = self._learn_heads(played, n_heads, n_updates)
+            self._values = self._learn_values(played, n_updates, discount)
+
+    @torch.no_grad()
+    def novelty(self, memories: Tensor) -> Tensor:
+        """(N, D) -> (N,), the variance of the heads' actions, averaged over their numbers."""
+        actions = torch.stack([head(self._scaled(memories)) for head in self._heads])  # (heads, N, action dim)
+        return actions.var(dim=0, unbiased=False).mean(dim=-1)
+
+    @torch.no_grad()
+    def risk(self, memories: Tensor, actions: Tensor, seed: int | None = None) -> Tensor:
+        """(N, D), (N, action dim) -> (N,) in [0, 1], one less the discounted success.
+
+        Args:
+            memories, actions: What the policy remembers, and what it would do.
+            seed: Of the attempt that they are of, if there may be something learned from it.
+        """
+        seen = torch.cat([self._scaled(memories), actions.float()], dim=-1)
+        values = self._values if seed not in self._half else [self._values[self._half[seed]]]
+        return 1 - torch.stack([value(seen).sigmoid().squeeze(-1) for value in values]).mean(dim=0)
+
+    def trace(self, played: Played) -> tuple[np.ndarray, np.ndarray]:
+        """Novelty (T,) and risk (T,) of an attempt in which the policy would act."""
+        risk = self.risk(played.memories, played.policy_actions, played.seed)
+        return self.novelty(played.memories).numpy(), risk.numpy()
+
+    def _scaled(self, memories: Tensor) -> Tensor:
+        return (memories.float() - self._mean) / self._std
+
+    def _learn_heads(self, played: list[Played], n_heads: int, n_updates: int) -> list[nn.Module]:
+        masks = [torch.from_numpy(each.by_expert) for each in played]
+        memories = self._scaled(torch.cat([p.memories[mask] for p, mask in zip(played, masks, strict=True)]))
+        actions = torch.cat([p.actions[mask] for p, mask in zip(played, masks, strict=True)]).float()
+        heads = []
+        for _ in range(n_heads):
+            head = _network(memories.shape[1], actions.shape[1])
+            own = torch.randint(
+                len(memories), (len(memories),)
+            )  # a draw with replacement, as ThriftyDAgger's policies have
+            _fit(head, memories[own], actions[own], n_updates, nn.functional.mse_loss)
+            heads.append(head)
+        return heads
+
+    def _learn_values(self, played: list[Played], n_updates: int, discount: float) -> list[nn.Module]:
+        kinds = [[each.seed for each in played if each.is_visited and each.success is kind] for kind in (True, False)]
+        self._half = {seed: number % 2 for seeds in kinds for number, seed in enumerate(seeds)}  # both see both kinds
+        values = []
+        for half in range(2):
+            seen, outcomes = [], []
+            for each in played:
+                if each.is_visited and self._half[each.seed] == half:
+                    continue
+                own = slice(_last_takeover(each.by_expert), None)
+                seen.append(torch.cat([self._scaled(each.memories), each.actions.float()], dim=-1)[own])
+                ahead = torch.arange(len(each.memories) - 1, -1, -1)[own]
+                outcomes.append(each.success * discount ** ahead.float())
+            inputs, targets = torch.cat(seen), torch.cat(outcomes).unsqueeze(-1)
+            values.append(_network(inputs.shape[1], 1))
+            _fit(values[-1], inputs, targets, n_updates, nn.functional.binary_cross_entropy_with_logits)
+        return values
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Above which novelty or risk the robot asks, and below which of both it goes on by itself."""
+
+    novelty: float
+    risk: float
+    calm_novelty: float
+    calm_risk: float
+
+
+class Asking:
+    """Whether the robot asks for help, step by step.
+
+    Args:
+        thresholds: When.
+        n_least: Steps for which it asks at least.
+    """
+
+    def __init__(self, thresholds: Thresholds, n_least: int) -> None:
+        self._thresholds, self._n_least = thresholds, n_least
+        self._asked_for = 0
+
+    def asks(self, novelty: float, risk: float) -> bool:
+        """Whether it asks now."""
+        limits = self._thresholds
+        if not self._asked_for:
+            asks = novelty > limits.novelty or risk > limits.risk
+        else:
+            asks = self._asked_for < self._n_least or novelty >= limits.calm_novelty or risk >= limits.calm_risk
+        self._asked_for = self._asked_for + 1 if asks else 0
+        return asks
+
+
+def thresholds_for(
+    traces: list[tuple[np.ndarray, np.ndarray]], share: float, n_least: int, calm_share: float = 0.5
+) -> Thresholds:
+    """The thresholds with which a robot would have asked in a wanted share of the steps.
+
+    It asks above the same quantile of novelty and of risk, and until both are calm. Of all such quantiles that one is taken
+    which comes nearest.
+
+    Args:
+        traces: Novelty (T,) and risk (T,) of every attempt.
+        share: Of the steps in which the expert shall act.
+        n_least: Steps for which it asks at least.
+        calm_share: Share of the steps whose novelty, or risk, is calm; a half is ThriftyDAgger's, of risk.
+    """
+    novelty, risk = (np.concatenate(parts) for parts in zip(*traces, strict=True))
+    calm = float(np.quantile(novelty, calm_share)), float(np.quantile(risk, calm_share))
+    best, nearest = Thresholds(float(novelty.max()), float(risk.max()), *calm), share
+    for quantile in np.linspace(calm_share, 1.0, 101)[:-1]:
+        limits = Thresholds(float(np.quantile(novelty, quantile)), float(np.quantile(risk, quantile)), *calm)
+        n_asked = 0
+        for each in traces:
+            asking = Asking(limits, n_least)
+            n_asked += sum(asking.asks(float(new), float(risky)) for new, risky in zip(*each, strict=True))
+        if abs(n_asked / len(novelty) - share) < nearest:
+            best, nearest = limits, abs(n_asked / len(novelty) - share)
+    return best
+
+
+def _last_takeover(by_expert: np.ndarray) -> int:
+    """From which step on the outcome of an attempt tells of it: before the last takeover the expert made it what it was."""
+    begins = np.flatnonzero(by_expert[1:] & ~by_expert[:-1]) + 1
+    return int(begins[-1]) if len(begins) else 0
+
+
+def _network(n_in: int, n_out: int) -> nn.Module:
+    sizes = (n_in, _HIDDEN, _HIDDEN)
+    layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU())]
+    return nn.Sequential(*layers, nn.Linear(_HIDDEN, n_out))
+
+
+def _fit(network: nn.Module, inputs: Tensor, targets: Tensor, n_updates: int, loss_of: Callable[..., Tensor]) -> None:
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
+    for _ in range(n_updates):
+        batch = torch.randint(len(inputs), (_BATCH,))
+        optimizer.zero_grad()
+        loss_of(network(inputs[batch]), targets[batch]).backward()
+        optimizer.step()

@@ -1,0 +1,203 @@
+"""Robot-gated queries: the robot asks for help where it is new or risky to it (ThriftyDAgger, Hoque et al., 2021)."""
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from lerobot_playbyear.dagger.methods.base import Method, MethodConfig, Tools
+from lerobot_playbyear.dagger.methods.beside import Beside
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.episodes.episode import Episode, Observation
+from lerobot_playbyear.episodes.expert import Expert
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.dagger.config import DaggerConfig
+    from lerobot_playbyear.dagger.methods.gate_model import Asking
+    from lerobot_playbyear.dagger.methods.remembering import Remembering
+
+
+@MethodConfig.register_subclass("robot_gated")
+@dataclass
+class RobotGatedConfig(MethodConfig):
+    """The robot asks. A script then acts until the robot is calm again; a person is called, and takes over as they like.
+
+    Attributes:
+        intervention_share: Of the steps in which it shall ask; the thresholds follow from it, anew in every round.
+        rollouts: First attempts, in which the policy is alone: from them it learns what failing looks like.
+        calm_share: It asks until novelty and risk both lie among this share of the smallest; larger means earlier hand-backs.
+        least_s: For how long it asks at least [s].
+        n_heads: Whose disagreement is novelty; ThriftyDAgger: 5 policies.
+        gate_updates: Of each head and of each success value, in every round.
+        discount: Of a success, per step; ThriftyDAgger: 0.9999.
+        memory: Last attempts from which thresholds are set.
+    """
+
+    expert_decides: ClassVar[bool] = False
+    is_watched: ClassVar[bool] = False
+
+    intervention_share: float = 0.2
+    rollouts: int = 10
+    calm_share: float = 0.5
+    least_s: float = 0.5
+    n_heads: int = 5
+    gate_updates: int = 400
+    discount: float = 0.9999
+    memory: int = 20
+
+    def check(self) -> None:
+        if not 0 < self.intervention_share < 1:
+            raise InputError(
+                f"--method.intervention_share={self.intervention_share}: give a share above 0 and below 1."
+            )
+        if not 0 < self.calm_share < 1:
+            raise InputError(f"--method.calm_share={self.calm_share}: give a share above 0 and below 1.")
+        for name, least in (("rollouts", 1), ("n_heads", 2), ("gate_updates", 1), ("memory", 1), ("least_s", 0)):
+            if not getattr(self, name) >= least:
+                raise InputError(f"--method.{name}={getattr(self, name)}: give at least {least}.")
+        if not 0 < self.discount <= 1:
+            raise InputError(f"--method.discount={self.discount}: give a number above 0 and at most 1.")
+
+    def make(self, cfg: "DaggerConfig") -> Method:
+        return RobotGated(cfg, self)
+
+
+class RobotGated(Method):
+    """See `RobotGatedConfig`."""
+
+    def __init__(self, cfg: "DaggerConfig", config: RobotGatedConfig) -> None:
+        super().__init__(cfg)
+        self._config = config
+        self._expert: Asked | None = None
+        self._fitted_round = -1
+        self._seconds = 0.0  # that the gate took to learn
+        self._remembered: Remembering | None = None
+
+    def beside(self, expert: Expert) -> Expert:
+        self._expert = Asked(expert, self)
+        return self._expert
+
+    def begin(self, tools: Tools) -> None:
+        if self._expert is None or tools.facts is None:
+            return  # nobody acts
+        from lerobot_playbyear.dagger.methods.remembering import check_memory
+
+        check_memory(tools)
+        self._tools = tools
+        self._n_least = round(self._config.least_s * tools.facts.fps)
+
+    @property
+    def _remembering(self) -> "Remembering":
+        from lerobot_playbyear.dagger.methods.remembering import Remembering
+
+        self._remembered = self._remembered or Remembering(self._tools)
+        return self._remembered
+
+    def close(self) -> None:
+        if self._remembered is not None:
+            self._remembered.close()
+
+    def prepare(self) -> None:
+        """Learns what is new and what is risky to the policy of this round, from what there was when the round began.
+
+        Thresholds are set anew before every attempt, with what was met in those of this round too.
+        """
+        if self._is_alone():
+            return
+        from lerobot_playbyear.dagger.methods.gate_model import thresholds_for
+
+        state = self._tools.state
+        if state.method.get("round") != state.round:
+            state.method = {"round": state.round, "next_seed": state.next_seed}
+            self._tools.folder.commit(state)
+        start = time.perf_counter()
+        begun = state.method["next_seed"]
+        if self._fitted_round != state.round:
+            self._fit(begun)
+        for each in self._remembering.attempts(range(max([begun - 1, *self._traces]) + 1, state.next_seed)):
+            self._traces[each.seed] = self._model.trace(each)
+        latest = [self._traces[seed] for seed in sorted(self._traces)[-self._config.memory :]]
+        share, calm_share = self._config.intervention_share, self._config.calm_share
+        self._thresholds = thresholds_for(latest, share, self._n_least, calm_share)
+        self._seconds = time.perf_counter() - start
+        logging.getLogger(__name__).debug("Round %d: the robot asks beyond %s", state.round, self._thresholds)
+
+    def _fit(self, before_seed: int) -> None:
+        """Learns from all attempts with smaller seeds."""
+        from lerobot_playbyear.dagger.methods.gate_model import GateModel
+
+        config, state = self._config, self._tools.state
+        attempts = self._remembering.attempts(range(before_seed))
+        seed = int(np.random.SeedSequence([self.cfg.seed, 2, state.round]).generate_state(1)[0])
+        played = self._remembering.demonstrations() + attempts
+        self._model = GateModel(played, config.n_heads, config.gate_updates, config.discount, seed)
+        self._traces = {each.seed: self._model.trace(each) for each in attempts[-config.memory :]}
+        self._fitted_round = state.round
+
+    def _is_alone(self) -> bool:
+        return self._tools.state.attempts - self._tools.state.discarded < self._config.rollouts
+
+    def asking(self) -> "Asking | None":
+        """A fresh gate for an attempt; None while the policy is alone."""
+        if self._is_alone():
+            return None
+        from lerobot_playbyear.dagger.methods.gate_model import Asking
+
+        return Asking(self._thresholds, self._n_least)
+
+    def state_of_mind(self, policy_action: np.ndarray) -> tuple[float, float]:
+        """Novelty and risk of the present step, whose action the policy has just chosen."""
+        memory, action = self._remembering.now(), torch.from_numpy(np.asarray(policy_action, np.float32))[None]
+        return float(self._model.novelty(memory)[0]), float(self._model.risk(memory, action)[0])
+
+    def note(self, episode: Episode, outcome: str) -> None:
+        if outcome in ("failed", "unneeded"):
+            self._remembering.keep(episode)
+
+    def figures(self) -> Mapping[str, Any]:
+        assert self._expert is not None
+        seconds, self._seconds = self._seconds, 0.0
+        return {"n_asked_steps": self._expert.n_asked, "n_calls": self._expert.n_calls, "gate_s": round(seconds, 4)}
+
+
+class Asked(Beside):
+    """An expert that acts when the robot asks or, if it is one that decides, that is called then.
+
+    Args:
+        expert: The expert.
+        method: Knows when the robot asks.
+
+    Attributes:
+        n_asked, n_calls: Steps of the attempt in which the robot asked, and how often it began to.
+    """
+
+    def __init__(self, expert: Expert, method: RobotGated) -> None:
+        super().__init__(expert)
+        self._method = method
+        self.n_asked = self.n_calls = 0
+
+    def reset(self, env: gym.Env) -> None:
+        super().reset(env)
+        self._asking, self._asks = self._method.asking(), False
+        self.n_asked = self.n_calls = 0
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        asked_before = self._asks
+        if self._asking is not None:
+            self._asks = self._asking.asks(*self._method.state_of_mind(policy_action))
+        self.n_asked += self._asks
+        self.n_calls += self._asks and not asked_before
+        if self.decides:
+            self.expert.call(self._asks)
+            return self.expert.wants_control(observation, policy_action)
+        self.expert.wants_control(observation, policy_action)  # it looks
+        if self._asks and not asked_before:
+            self.expert.take_over()
+        elif asked_before and not self._asks:
+            self.expert.hand_back()
+        return self._asks

@@ -1,0 +1,156 @@
+"""The expert that comes with an environment, `--expert.type=scripted`; alone, or as a person with a person's imperfections."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.episodes.episode import Observation
+from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
+
+
+@ExpertConfig.register_subclass("scripted")
+@dataclass
+class ScriptedExpertConfig(ExpertConfig):
+    """The script that comes with the environment, `env.unwrapped.intervention_gate()`.
+
+    Attributes:
+        person: Whether it corrects as a person does: late, with an unsteady hand, and now and then without need.
+        reaction_s: For so long it sees nothing yet of a mistake, of a call, or of the mistake's end [s].
+        tremor: Standard deviation of what its hand adds to displacements, in units of actions; the last number of an action,
+            the gripper's, is left alone.
+        tremor_s: How long the hand's error takes to change [s].
+        wrong_per_minute: How often it takes over without need, per minute in which the policy acts.
+        wrong_s: For how long it acts then [s].
+        seed: Of all that is random in it; an attempt with the same seed meets the same person.
+    """
+
+    person: bool = False
+    reaction_s: float = 0.3
+    tremor: float = 0.02
+    tremor_s: float = 0.2
+    wrong_per_minute: float = 1.0
+    wrong_s: float = 1.0
+    seed: int = 0
+
+    def make(self, env: gym.Env) -> Expert:
+        if not callable(getattr(env.unwrapped, "intervention_gate", None)):
+            raise ExpertError(
+                f"--expert.type=scripted needs an environment with `intervention_gate()`, and "
+                f"{type(env.unwrapped).__name__} has none. Give another --expert.type, or write an expert "
+                "(examples/own_expert.py)."
+            )
+        if not self.person:
+            return ScriptedExpert()
+        for name in ("reaction_s", "tremor", "tremor_s", "wrong_per_minute", "wrong_s", "seed"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise InputError(f"--expert.{name}={getattr(self, name)}: give 0 or more.")
+        return ScriptedPerson(self, float(env.metadata.get("render_fps") or 0))
+
+
+class ScriptedExpert(Expert):
+    """Lets the environment's gate decide and the environment's script act."""
+
+    def reset(self, env: gym.Env) -> None:
+        task_env: Any = env.unwrapped
+        self._gate = task_env.intervention_gate()
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        return bool(self._gate.wants_control(policy_action))
+
+    def act(self) -> np.ndarray:
+        return np.asarray(self._gate.act(), np.float32)
+
+    def take_over(self, until_told: bool = True) -> None:
+        if hasattr(self._gate, "take_over"):
+            self._gate.take_over(until_told)
+
+    def hand_back(self) -> None:
+        if hasattr(self._gate, "hand_back"):
+            self._gate.hand_back()
+
+    def label(self) -> np.ndarray:
+        ask = self._gate.label if hasattr(self._gate, "label") else self._gate.act
+        return np.asarray(ask(), np.float32)
+
+
+class ScriptedPerson(ScriptedExpert):
+    """The same as a person: sees a mistake, a call and their end `reaction_s` later, trembles, and is wrong now and then.
+
+    Args:
+        config: How much of each.
+        fps: Steps per second of the environment.
+
+    Raises:
+        ExpertError: The environment does not say its steps per second.
+    """
+
+    decides = True
+
+    def __init__(self, config: ScriptedExpertConfig, fps: float) -> None:
+        if not fps > 0:
+            raise ExpertError(
+                "--expert.person=true needs an environment that says its steps per second, metadata['render_fps']."
+            )
+        self._config, self.clock_fps = config, fps
+        self._n_late = round(config.reaction_s * fps)
+        self._n_wrong = round(config.wrong_s * fps)
+
+    def reset(self, env: gym.Env) -> None:
+        super().reset(env)
+        attempt = max(int(env.unwrapped.np_random_seed or 0), 0)
+        self._rng = np.random.default_rng([self._config.seed, attempt])
+        self._called: bool | None = None
+        self._wishes: list[bool] = []
+        self._wrong_left, self._acts, self._is_held = 0, False, False
+        self._error: np.ndarray | None = None
+
+    def call(self, is_called: bool) -> None:
+        self._called = is_called
+
+    def take_over(self, until_told: bool = True) -> None:
+        super().take_over(until_told)
+        self._acts, self._is_held = True, until_told
+
+    def hand_back(self) -> None:
+        super().hand_back()
+        self._acts = self._is_held = False
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        seen = super().wants_control(observation, policy_action)
+        needs = seen and self._wrong_left == 0  # who took over without need sees none because of that
+        self._wishes.append(needs if self._called is None else self._called)
+        wishes = self._wishes[-1 - self._n_late] if len(self._wishes) > self._n_late else False
+        is_wrong = self._is_wrong(wishes)
+        acts = wishes or is_wrong or self._is_held
+        if acts and not self._acts:
+            super().take_over(until_told=self._called is not None or not wishes)
+        elif self._acts and not acts:
+            super().hand_back()
+        self._acts = acts
+        return acts
+
+    def act(self) -> np.ndarray:
+        return self._by_hand(super().act())
+
+    def label(self) -> np.ndarray:
+        return self._by_hand(super().label())
+
+    def _is_wrong(self, is_needed: bool) -> bool:
+        """Whether it acts although nothing is wrong. A chance is drawn in every step, so that none depends on another."""
+        chance = self._rng.random() * 60 * float(self.clock_fps or 0)
+        if self._wrong_left:
+            self._wrong_left -= 1
+        elif not (is_needed or self._acts) and chance < self._config.wrong_per_minute:
+            self._wrong_left = self._n_wrong
+        return self._wrong_left > 0
+
+    def _by_hand(self, action: np.ndarray) -> np.ndarray:
+        """An action (n,) as an unsteady hand makes it: with noise that changes over `tremor_s` and is as large at all times."""
+        n = len(action) - 1
+        kept = float(np.exp(-1 / max(self._config.tremor_s * float(self.clock_fps or 0), 1e-6)))
+        fresh = self._rng.normal(0.0, self._config.tremor, n)
+        self._error = fresh if self._error is None else kept * self._error + np.sqrt(1 - kept**2) * fresh
+        return np.append(action[:-1] + self._error, action[-1:]).astype(np.float32)

@@ -1,0 +1,259 @@
+"""The methods behind `--method.type`: who acts, what is recorded, what is kept, and that each resumes exactly."""
+
+import json
+
+import numpy as np
+import pytest
+from dagger_factory import QUICK, column, command, corrections, dagger, metrics
+from test_dagger import Scripted, scene
+from test_dagger_resume import PowerCut, assert_ended_alike, cut_power
+
+from lerobot_playbyear.dagger import folder as folder_module
+from lerobot_playbyear.dagger.attempt import Scene
+from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource
+from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Staying
+from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
+from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
+from lerobot_playbyear.dagger.same_run import differences
+from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.episodes.play import Seconds, play
+from lerobot_playbyear.training.parts import TrainingParts
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+RUN = (*QUICK, "--episodes=2", "--warmup_episodes=1")
+
+
+class Telling(Scripted):
+    """Remembers what others decided for it."""
+
+    def reset(self, env):
+        super().reset(env)
+        self.told = []
+
+    def take_over(self, until_told=True):
+        self.told.append((self.n, until_told))
+
+    def hand_back(self):
+        self.told.append((self.n, None))
+
+
+def flags(expert):
+    env, actor, _ = scene()
+    episode = play(env, actor, seed=5, expert=expert)
+    env.close()
+    return np.flatnonzero(episode.interventions).tolist(), episode
+
+
+def test_an_expert_that_stays_acts_from_its_first_takeover_to_the_end():
+    expert = Telling(steps=(4, 5, 9))
+    steps, episode = flags(Staying(expert))
+    assert steps == list(range(4, len(episode)))
+    assert expert.told == [(4, True)]
+
+
+def test_a_late_expert_begins_later_from_where_the_hand_is_then():
+    expert = Telling(steps=(3, 10, 11, 12, 13, 14))
+    steps, _ = flags(Late(expert, 2))
+    assert steps == [12, 13, 14]  # by the third step it did not want to any more
+    assert expert.told == [(12, False)]
+
+
+def test_an_early_expert_begins_before_its_first_takeover_and_not_before_its_second():
+    env, actor, _ = scene()
+    expert = Telling(steps=(10, 11, 30))
+    early = Early(expert, 4, env)
+    episode = Scene(env, actor, early, early).attempt(5, 0, Seconds())
+    env.close()
+    assert np.flatnonzero(episode.interventions).tolist() == [6, 7, 8, 9, 10, 11, 30]
+    assert expert.told == [(6, False)]
+    assert len(episode) > 31
+
+
+def test_a_rehearsal_changes_nothing_where_nobody_would_take_over():
+    env, actor, expert = scene()
+    early = Early(expert, 4, env)
+    rehearsed = Scene(env, actor, early, early).attempt(5, 0, Seconds())
+    plain = play(env, actor, 5, expert=expert)
+    env.close()
+    np.testing.assert_array_equal(rehearsed.actions, plain.actions)
+    assert not rehearsed.interventions.any()
+
+
+def test_labels_are_the_experts_and_the_policy_acts():
+    expert = Scripted(steps=range(100))
+    labelling = Labelling(expert)
+    steps, episode = flags(labelling)
+    assert steps == []
+    assert len(labelling.labels) == len(episode)
+    for step, action in expert.actions.items():
+        np.testing.assert_array_equal(labelling.labels[step], np.clip(action, -1, 1))
+    assert not np.allclose(np.stack(labelling.labels), episode.actions)
+
+
+# Runs
+
+
+def test_dagger_records_labels_as_actions_and_what_was_done_beside_them(tmp_path):
+    dagger(tmp_path, *RUN, "--method.type=dagger", "--episode_seed=9999")
+    data, attempts = corrections(tmp_path), metrics(tmp_path, "attempt")
+    assert column(data, "intervention").all()
+    np.testing.assert_allclose(column(data, "action"), np.tile([0.2, 0.1, -0.2, -1.0], (data.num_frames, 1)))
+    assert not np.allclose(column(data, "executed_action"), column(data, "action"))
+    assert [line["outcome"] for line in attempts] == ["kept", "kept"]
+    assert [line["success"] for line in attempts] == [False, True]  # Quick ends seeds that 3 divides as failures
+    assert [(line["autonomy"], line["n_takeovers"]) for line in attempts] == [(1.0, 0)] * 2
+    assert [line["n_expert_steps"] for line in attempts] == [line["n_frames"] for line in attempts] == [8, 8]
+    assert metrics(tmp_path, "round")[-1]["expert_steps"] == data.num_frames
+
+
+def test_without_a_hand_back_an_attempt_ends_with_its_correction(tmp_path):
+    dagger(tmp_path, *RUN, "--method.type=no_handback")
+    marks = column(corrections(tmp_path), "intervention").reshape(2, 8)
+    assert marks.tolist() == [[False, False, *[True] * 6]] * 2
+    assert [line["takeover_steps"] for line in metrics(tmp_path, "attempt") if line["outcome"] == "kept"] == [[6], [6]]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--method.type=weighted", "--method.before_s=0.1"),
+        pytest.param(("--method.type=weighted", "--method.paper=iwr"), marks=pytest.mark.slow),
+        pytest.param(("--learn_from=all", "--takeover_delay_s=-0.1"), marks=pytest.mark.slow),
+    ],
+    ids=["sirius", "iwr", "all, early"],
+)
+def test_other_frames_are_learned_from(tmp_path, options):
+    dagger(tmp_path, *RUN, *options)
+    rounds = metrics(tmp_path, "round")
+    assert [line["step"] for line in rounds] == [2, 4]
+    assert all(line["loss_interventions"] > 0 < line["loss_demonstrations"] for line in rounds)
+
+
+def test_figures_of_the_field_stand_in_every_line(tmp_path, capfd):
+    dagger(tmp_path, *RUN, "--eval_every=1", "--eval.n_episodes=1", "--eval.batch_size=1")
+    kept = next(line for line in metrics(tmp_path, "attempt") if line["outcome"] == "kept")
+    cost = {"n_expert_steps": 3, "n_takeovers": 1, "takeover_steps": [3], "n_switches": 2, "person_seconds": 0.4}
+    assert {key: kept[key] for key in cost} == cost
+    n_attempts = len(metrics(tmp_path, "attempt"))
+    last = metrics(tmp_path, "round")[-1]
+    assert (last["expert_steps"], last["takeovers"], last["switches"]) == (3 * n_attempts, n_attempts, 2 * n_attempts)
+    assert last["autonomy"] == pytest.approx(5 / 8)
+    evaluations = metrics(tmp_path, "eval")
+    assert evaluations[0]["expert_steps"] == 0
+    assert evaluations[-1]["expert_steps"] == last["expert_steps"]
+    assert f"Expert:      {last['expert_steps']} steps in {n_attempts} takeovers" in capfd.readouterr().out
+
+
+GATED = (
+    "--method.type=robot_gated",
+    "--method.rollouts=2",
+    "--method.gate_updates=5",
+    "--method.intervention_share=0.4",
+)
+
+
+@pytest.mark.slow
+def test_a_robot_that_asks_resumes_exactly(tmp_path, monkeypatch):
+    """Killed before it learned from its second round's attempts, after an attempt that is no correction was saved."""
+    run = (*QUICK, *GATED, "--episodes=3", "--warmup_episodes=1")
+    dagger(tmp_path / "calm", *run)
+    attempts = metrics(tmp_path / "calm", "attempt")
+    assert all(line["n_calls"] == 0 for line in attempts[:2])
+    assert any(line["n_calls"] > 0 for line in attempts[2:])
+    assert all(line["n_asked_steps"] == line["n_expert_steps"] for line in attempts)
+    others = [line["seed"] for line in attempts if line["outcome"] in ("failed", "unneeded")]
+    assert others
+    n_commits = len(attempts) + 2
+    for after in (2, 4, n_commits):
+        folder = tmp_path / f"killed{after}"
+        with monkeypatch.context() as patch:
+            cut_power(patch, folder_module.RunFolder, "commit", after)
+            with pytest.raises(PowerCut):
+                dagger(folder, *run)
+        command("--resume=true", f"--output_dir={folder / 'out'}")
+        assert_ended_alike(folder, tmp_path / "calm")
+
+
+@pytest.mark.slow
+def test_a_robot_asks_once_its_first_attempts_are_made(tmp_path):
+    dagger(tmp_path, *QUICK, *GATED, "--episodes=1", "--max_attempts=30")
+    attempts = metrics(tmp_path, "attempt")
+    assert [line["n_asked_steps"] for line in attempts[:2]] == [0, 0]
+    assert attempts[-1]["outcome"] == "kept"
+    assert attempts[-1]["n_expert_steps"] == attempts[-1]["n_asked_steps"] > 0
+    assert attempts[-1]["person_seconds"] == pytest.approx(attempts[-1]["n_expert_steps"] / 20)
+    assert (tmp_path / "out/attempts/meta/info.json").is_file()
+
+
+@pytest.mark.slow
+def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monkeypatch):
+    dagger(tmp_path, *RUN)
+    seen, update = [], TrainingParts.update
+
+    def look(parts, *args):
+        seen.append({key: value.clone() for key, value in parts.policy.state_dict().items()})
+        return update(parts, *args)
+
+    monkeypatch.setattr(TrainingParts, "update", look)
+    offline = ("--episodes=0", "--updates=1", f"--interventions.root={tmp_path / 'corrections'}")
+    for name, options in (("old", ()), ("new", ("--new_weights=true",)), ("again", ("--new_weights=true",))):
+        dagger(tmp_path, *offline, *options, f"--output_dir={tmp_path / name}", env=())
+    old, new, again = seen
+    differ = {key for key in old if not np.array_equal(old[key], new[key])}
+    assert any("lstm" in key for key in differ)
+    assert not any("spectrogram" in key for key in differ)
+    assert all(np.array_equal(new[key], again[key]) for key in new)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--learn_from=everything",), "--learn_from='everything': give expert or all"),
+        (("--method.type=weighted", "--learn_from=all"), "--method.type=weighted says by itself what is learned from"),
+        (("--method.type=dagger", "--takeover_delay_s=1"), "--method.type=dagger the expert does not decide when"),
+        (("--method.type=robot_gated", "--method.intervention_share=1.5"), "intervention_share=1.5: give a share"),
+        (("--new_weights=true",), "--new_weights=true: a policy that knows nothing cannot be corrected"),
+        (
+            ("--expert.type=scripted", "--expert.person=true", "--expert.tremor=-1"),
+            "--expert.tremor=-1.*give 0 or more",
+        ),
+    ],
+)
+def test_options_that_do_not_go_together(tmp_path, options, message):
+    with pytest.raises(PlaybyearError, match=message):
+        dagger(tmp_path, *RUN, *options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_goes_on_with_its_own_method_alone(tmp_path):
+    def config(**options):
+        return DaggerConfig(DatasetSource("a/demos"), DatasetSource("a/corrections"), **options)
+
+    saved = config(method=NoHandbackConfig(), learn_from="all").options()
+    (tmp_path / CONFIG_NAME).write_text(json.dumps(saved))
+    assert differences(tmp_path, config(method=NoHandbackConfig(), learn_from="all")) == []
+    assert differences(tmp_path, config(takeover_delay_s=0.5)) == [
+        "--method was {'type': 'no_handback'} and is {'type': 'hg_dagger'}",
+        "--takeover_delay_s was 0.0 and is 0.5",
+        "--learn_from was all and is expert",
+    ]
+
+
+def test_a_run_of_a_version_without_methods_was_hg_dagger(tmp_path):
+    source = DatasetSource("a/b")
+    saved = DaggerConfig(source, source).options()
+    for name in ("method", "takeover_delay_s", "learn_from", "new_weights"):
+        del saved[name]
+    saved["expert"] = {"type": "scripted"}
+    (tmp_path / CONFIG_NAME).write_text(json.dumps(saved))
+    assert differences(tmp_path, DaggerConfig(source, source)) == []
+    (changed,) = differences(tmp_path, DaggerConfig(source, source, method=WeightedConfig()))
+    assert changed.startswith("--method was {'type': 'hg_dagger'} and is {'type': 'weighted', 'paper': 'sirius'")
+
+
+@pytest.mark.slow
+def test_a_dataset_of_labels_is_no_place_for_corrections(tmp_path):
+    dagger(tmp_path, *RUN, "--method.type=dagger", "--episodes=1")
+    with pytest.raises(PlaybyearError, match="executed_action"):
+        dagger(tmp_path, *RUN, f"--output_dir={tmp_path / 'other'}")
