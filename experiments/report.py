@@ -6,6 +6,7 @@ from experiments.corrections import load_corrections
 from experiments.protocol import (
     ATTEMPT_STEPS,
     CONDITIONS,
+    NEW_TASKS,
     RESULTS,
     RUN_LENGTHS,
     TASKS,
@@ -39,13 +40,18 @@ def percent(results: list[Result]) -> str:
     return f"**{100 * n_successes / n:.0f} %** {interval(n_successes, n)} | {each}"
 
 
+def acted_early(results: list[Result]) -> str:
+    """In what share of the episodes of each policy the hand acted before anything was heard; empty where nobody looked."""
+    return ", ".join("" if result.early_rate is None else f"{result.early_rate:.0%}" for result in results).strip(", ")
+
+
 def ablation_table(task: str) -> list[str]:
     rows = []
     for condition in CONDITIONS:
         results = load_results(f"ablations/{task}-{condition}-*.json")
         if results:
             minutes = ", ".join(f"{result.minutes:.0f}" for result in results)
-            rows.append(f"| {condition} | {percent(results)} | {minutes} |")
+            rows.append(f"| {condition} | {percent(results)} | {acted_early(results)} | {minutes} |")
     if blind_path(task).exists():
         blind = load(blind_path(task))
         first, last = blind["seeds"]
@@ -53,9 +59,10 @@ def ablation_table(task: str) -> list[str]:
         rates = blind["success"]
         expert = rates.pop("expert")
         name, best = max(rates.items(), key=lambda item: item[1])
-        rows.append(f"| best blind script (`{name}`) | **{best:.0%}** {interval(round(n * best), n)} | | |")
-        rows.append(f"| expert that feels contact | {expert:.0%} | | |")
-    return table("| policy | success (95 % interval) | training seeds | minutes of training |", rows, task)
+        rows.append(f"| best blind script (`{name}`) | **{best:.0%}** {interval(round(n * best), n)} | | | |")
+        rows.append(f"| expert that feels contact | {expert:.0%} | | | |")
+    head = "| policy | success (95 % interval) | training seeds | acted early | minutes of training |"
+    return table(head, rows, task)
 
 
 CURVES = {
@@ -146,8 +153,9 @@ def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
 
 
 def main() -> None:
-    lines = [line for task in TASKS for line in ablation_table(task)] + listening_table()
-    for task in TASKS:
+    tasks = NEW_TASKS + TASKS
+    lines = [line for task in tasks for line in ablation_table(task)] + listening_table()
+    for task in tasks:
         lines += demonstration_table(task)
         for study in CURVES:
             lines += curve_table(study, task)

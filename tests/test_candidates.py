@@ -19,8 +19,8 @@ from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 RATE, MICROPHONE, N_FRAMES = 16000, "observation.audio.gripper", 16
-TRAINED = {"a7bf4b20725421fc": "19d1c0e2a0191728"}
-"""By the machine's own probe: what the usual options trained before any of this was there."""
+TRAINED = {"d1a39e5a6f87a521": "43ce973ad6ad79b0"}
+"""By the probe of a machine: what the usual options trained before any of this was there."""
 
 SMALL = {"audio_window_s": 0.9, "n_memory_steps": 3, "n_supervised_steps": 5, "n_frame_stack": 2}
 CANDIDATES = {
@@ -32,6 +32,7 @@ CANDIDATES = {
     "next_sound": {"auxiliary_next_sound": 0.1},
     "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
     "chunk": {"auxiliary_chunk": 0.5},
+    "displacement": {"memory_displacement_gain": 10.0, "low_dimensional_offset": 0.1},
 }
 EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}
 HEADS = ("onset", "next_sound", "inverse_dynamics", "chunk")
@@ -120,6 +121,46 @@ def test_in_bfloat16_it_learns_the_same():
     for name, value in losses[0].items():
         assert losses[1][name].dtype == torch.float32
         torch.testing.assert_close(losses[1][name], value, rtol=0.05, atol=0.01)
+
+
+# Displacement
+
+
+def test_an_offset_moves_all_frames_of_an_item_by_the_same():
+    policy = make_policy(low_dimensional_offset=0.5, use_vision=False, use_audio=False)
+    batch = batch_of(policy)
+    n_frames = policy.config.n_run_frames
+    felt = policy.model._feel(batch, "observation.state", n_frames).unflatten(0, (-1, n_frames))
+    true = policy.config.low_dimensional_gain * batch["observation.state"][:, -n_frames:]
+    moved = felt - true
+    torch.testing.assert_close(moved, moved[:, :1].expand_as(moved), atol=1e-5, rtol=0)
+    assert moved[:, 0].std() > 0.5  # drawn for every item and number
+    policy.eval()
+    torch.testing.assert_close(policy.model._feel(batch, "observation.state", n_frames), true.flatten(0, 1))
+
+
+def test_the_memory_knows_how_far_away_something_was_and_not_where():
+    policy = make_policy(memory_displacement_gain=10.0).eval()
+    head, n_fused = policy.model.memory_head, policy.config.embedding_size
+    frames = torch.randn(2, policy.config.memory_steps, head.lstm.input_size)
+    elsewhere = frames.clone()
+    elsewhere[..., n_fused:] += 3.0  # the whole window at another place
+    torch.testing.assert_close(head(elsewhere), head(frames), atol=1e-5, rtol=0)
+    further = frames.clone()
+    further[:, 0, n_fused:] += 3.0  # only what is remembered
+    assert (head(further) - head(frames)).abs().max() > 1e-3
+
+
+def test_displacements_are_in_normalised_units_times_their_gain():
+    policy = make_policy(memory_displacement_gain=10.0, low_dimensional_gain=4.0, use_vision=False).eval()
+    read = []
+    policy.model.memory_head.lstm.register_forward_pre_hook(lambda _, inputs: read.append(inputs[0]))
+    batch = batch_of(policy)
+    policy.predict_run(batch, n_steps=1)
+    n = policy.config.memory_steps
+    state = batch["observation.state"][:, -n:]
+    displacement = read[0][..., policy.config.embedding_size :]
+    torch.testing.assert_close(displacement, 10 * (state - state[:, -1:]), atol=1e-4, rtol=1e-4)
 
 
 # Heads
@@ -357,6 +398,8 @@ def test_another_microphones_gain_is_one_of_the_bins_below_the_bands(kind):
         ({"auxiliary_onset": 1.0, "use_audio": False}, r"auxiliary_onset=1.0 needs sound.*use_audio is false"),
         ({"auxiliary_next_sound": 1.0, "n_supervised_steps": 1}, r"needs runs of at least 2.*n_supervised_steps is 1"),
         ({"auxiliary_chunk": 1.0, "n_supervised_steps": 3}, r"needs runs of at least 4 windows"),
+        ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
+        ({"memory_displacement_gain": 10.0, "low_dimensional_gain": 0.0}, r"low_dimensional_gain is 0: give 4"),
         ({"auxiliary_chunk_size": 1}, r"auxiliary_chunk_size must be at least 2"),
     ],
 )

@@ -4,6 +4,7 @@ Run it to get the digest of the machine that it runs on, for `TRAINED` in `test_
 """
 
 import hashlib
+from pathlib import Path
 
 import torch
 from test_policy_contract import make_config, make_episode, run_ending_at
@@ -12,13 +13,22 @@ from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 
 def probe() -> str:
-    """What this machine and this torch make of a convolution, an LSTM and a transform, without any code of ours."""
+    """This processor, and what this torch makes of a convolution, an LSTM and a transform on it, without any code of ours."""
     torch.manual_seed(0)
     layers = [torch.nn.Conv2d(3, 4, 3), torch.nn.LSTM(8, 8, batch_first=True), torch.nn.Linear(8, 8)]
     loss = layers[0](torch.rand(2, 3, 16, 16)).square().mean() + layers[2](layers[1](torch.rand(2, 9, 8))[0]).sum()
     loss = loss + torch.stft(torch.rand(2, 999), 640, window=torch.hann_window(640), return_complex=True).abs().mean()
     loss.backward()
-    return _digest(torch.__version__.encode(), [p.grad for layer in layers for p in layer.parameters()])
+    return _digest(
+        f"{torch.__version__} {_processor()}".encode(), [p.grad for layer in layers for p in layer.parameters()]
+    )
+
+
+def _processor() -> str:
+    """Which it is: libraries choose their kernels by maker, model and instructions."""
+    facts = Path("/proc/cpuinfo")
+    lines = facts.read_text().split("\n\n")[0].splitlines() if facts.exists() else []
+    return "\n".join(line for line in lines if line.startswith(("vendor_id", "cpu family", "model", "flags")))
 
 
 def trained(n_updates: int = 3, **options) -> str:

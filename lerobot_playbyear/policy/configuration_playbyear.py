@@ -55,6 +55,8 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             without parameters). Off is the paper's plain concatenation.
         low_dimensional_gain: Factor on the normalised low-dimensional observations before the fusion. With 1, the paper's, the
             seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
+        memory_displacement_gain: The LSTM also reads how far the low-dimensional observations of each remembered frame are from
+            the newest ones, in normalised units times this. 0: it does not (the paper).
         action_range: How far actions reach, in units of the normalised ones. With 1, the paper's, and normalisation to [-1, 1],
             no action lies outside of the demonstrations'; 1.5 reaches a quarter of their range further at both ends.
 
@@ -71,7 +73,10 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             training reads it.
         audio_colour_db: Standard deviation of another microphone's gain, a smooth curve over frequency, drawn per item [dB].
         low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
-            normalisation. The paper has none; without it a few dozen demonstrations are learned by heart.
+            normalisation, drawn anew for every frame. The paper has none; without it a few dozen demonstrations are learned
+            by heart.
+        low_dimensional_offset: Standard deviation of an error besides that all frames of an item share: it hides where a
+            demonstration was recorded, and leaves ways as they are. 0: none (the paper).
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
         ema_decay: Weight of the past in an exponential moving average of the network's weights, which acts in rollouts in place
             of the last update's; both are in a checkpoint. It rises to this in the first updates: (1 + n) / (10 + n) after n.
@@ -125,6 +130,7 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     embedding_size: int = 50
     normalize_encodings: bool = True
     low_dimensional_gain: float = 4.0
+    memory_displacement_gain: float = 0.0
     action_range: float = 1.0
 
     # Training
@@ -139,6 +145,7 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     audio_noise_files: str | None = None
     audio_colour_db: float = 0.0
     low_dimensional_noise: float = 0.0
+    low_dimensional_offset: float = 0.0
     spectrogram_momentum: float = 0.01
     ema_decay: float = 0.0
     auxiliary_onset: float = 0.0

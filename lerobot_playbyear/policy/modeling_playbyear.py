@@ -133,7 +133,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
         if network.auxiliary is None or not self.training:
             return loss, {}
         figures = {"loss_action": loss.detach().mean()}
-        for other in network.auxiliary(batch, encodings[:, -n_windows:], outputs, target, weight):
+        fused = encodings[:, -n_windows:, : self.config.embedding_size]
+        for other in network.auxiliary(batch, fused, outputs, target, weight):
             average = self._average(other.error, other.weight, reduction)
             figures[f"loss_{other.kind}"] = average.detach().mean()
             loss = loss + other.factor * average

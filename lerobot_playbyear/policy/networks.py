@@ -1,6 +1,7 @@
 """The network, from top to bottom: how a frame is encoded, and its blocks (paper, appendix "Architecture Details").
 
-In comments: B items, n frames of each, K windows of H frames, D numbers in a joint encoding, W channels of the first stage.
+In comments: B items, n frames of each, K windows of H frames, D numbers that the memory reads of a frame, W channels of the
+first stage.
 """
 
 import math
@@ -16,9 +17,10 @@ from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.auxiliary import make_auxiliary
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
-from lerobot_playbyear.policy.fusion import FUSIONS, mlp
+from lerobot_playbyear.policy.fusion import FUSIONS
 from lerobot_playbyear.policy.history import before_episode, newest
 from lerobot_playbyear.policy.mel_features import make_ear
+from lerobot_playbyear.policy.memory import MemoryHead
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
 
@@ -53,9 +55,9 @@ class PlaybyearNetwork(nn.Module):
             self.hearing = nn.ModuleDict(encoders)
             self.disturb = SoundAugmentation(config)
             sizes += [encoder.embedding_size for encoder in self.hearing.values()]  # type: ignore[misc]
-        sizes += [math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys]
-        self.fusion = FUSIONS[config.fusion](sizes, config)
-        self.memory_head = MemoryHead(config, config.action_feature.shape[0])
+        felt = [math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys]
+        self.fusion = FUSIONS[config.fusion]([*sizes, *felt], config)
+        self.memory_head = MemoryHead(config, config.action_feature.shape[0], sum(felt))
         # Last, so that all else begins with the weights that it has without.
         self.auxiliary = make_auxiliary(config, config.action_feature.shape[0])
 
@@ -77,12 +79,12 @@ class PlaybyearNetwork(nn.Module):
         return self._encode(run, 1)
 
     def _encode(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
-        """The joint encoding of every frame by itself, (B * n, D)."""
+        """What the memory reads of every frame by itself, (B * n, D): the joint encoding, and what it compares with now."""
         config = self.config
         seen = [self._see(batch, key, n_frames) for key in config.camera_keys if config.use_vision]
         heard = [self._hear(batch, key, n_frames) for key in config.audio_keys if config.use_audio]
         felt = [self._feel(batch, key, n_frames) for key in config.low_dimensional_keys]
-        return self.fusion([*seen, *heard, *felt])
+        return self.memory_head.with_felt(self.fusion([*seen, *heard, *felt]), felt)
 
     def _see(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One camera's embeddings, (B * n, embedding size)."""
@@ -127,10 +129,12 @@ class PlaybyearNetwork(nn.Module):
     def _feel(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One low-dimensional observation, (B * n, its numbers)."""
         values = newest(batch, key, n_frames, self.config.feature_shape(key))  # (B, n, ...)
-        values = values.flatten(0, 1).flatten(1).float()  # (B * n, its numbers)
+        values = values.flatten(2).float()  # (B, n, its numbers)
         if self.training and self.config.low_dimensional_noise > 0:
             values = values + self.config.low_dimensional_noise * torch.randn_like(values)
-        return self.config.low_dimensional_gain * values
+        if self.training and self.config.low_dimensional_offset > 0:
+            values = values + self.config.low_dimensional_offset * torch.randn_like(values[:, :1])
+        return self.config.low_dimensional_gain * values.flatten(0, 1)  # (B * n, its numbers)
 
     def prepare_images(self, images: Tensor, recorded: tuple[int, ...] | None = None) -> Tensor:
         """(B, T, 3, H, W) bytes or in [0, 1] -> (B, T, 3, size, size) in [0, 1], in training augmented.
@@ -236,36 +240,6 @@ class AudioEncoder(nn.Module):
         Extra segments belong to later windows of the same sound; their embeddings are slices of the result.
         """
         return self.layers(spectrogram)
-
-
-class MemoryHead(nn.Module):
-    """One-layer LSTM over a window of joint encodings, fresh for every window, and an MLP from its last output."""
-
-    def __init__(self, config: PlaybyearConfig, n_actions: int):
-        super().__init__()
-        self.memory_steps, self.action_range = config.memory_steps, config.action_range
-        self.lstm = nn.LSTM(config.embedding_size, config.embedding_size, batch_first=True)
-        self.head = mlp(config.embedding_size, config.hidden_size, n_actions)
-
-    def forward(self, encodings: Tensor) -> Tensor:
-        """The action after every full window of consecutive frames' joint encodings, (B, n, D).
-
-        Returns:
-            (B, K, n_actions) with K = n - H + 1, in [-1, 1] times the action range.
-        """
-        return self.act(self.recall(encodings))
-
-    def recall(self, encodings: Tensor) -> Tensor:
-        """(B, n, D) consecutive encodings -> (B, K, D) the memory's output after every full window."""
-        windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
-        outputs, _ = self.lstm(windows.flatten(0, 1))  # (B * K, H, D)
-        return outputs[:, -1].unflatten(0, windows.shape[:2])
-
-    def act(self, memories: Tensor) -> Tensor:
-        """(..., D) of `recall` -> (..., n_actions)."""
-        actions = self.head(memories.flatten(0, -2)).float()  # whatever autocast computed in
-        actions = self.action_range * torch.tanh(actions / self.action_range)
-        return actions.unflatten(0, memories.shape[:-1])
 
 
 @register_vision_encoder("resnet18")

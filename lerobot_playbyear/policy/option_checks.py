@@ -23,6 +23,14 @@ def check_options(config: "PlaybyearConfig") -> None:
             raise ValueError(f"--policy.{name} must be at least 1, got {getattr(config, name)}.")
     if not 0 < config.action_range < math.inf:
         raise ValueError(f"--policy.action_range must be above 0 and finite, got {config.action_range}.")
+    for name in ("memory_displacement_gain", "low_dimensional_noise", "low_dimensional_offset"):
+        if not 0 <= getattr(config, name) < math.inf:
+            raise ValueError(f"--policy.{name} must be at least 0 (none) and finite, got {getattr(config, name)}.")
+    if config.memory_displacement_gain and not config.low_dimensional_gain:
+        raise ValueError(
+            f"--policy.memory_displacement_gain={config.memory_displacement_gain} compares low-dimensional observations, and "
+            "--policy.low_dimensional_gain is 0: give 4, its usual value."
+        )
     if not 0 <= config.ema_decay < 1:
         raise ValueError(f"--policy.ema_decay must be at least 0 (none) and below 1, got {config.ema_decay}.")
     if config.audio_noise_files is not None and config.audio_noise_db is None:
