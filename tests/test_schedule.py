@@ -62,7 +62,9 @@ PUBLISHED = {
     "augmentation_translate": 0.05,
     "augmentation_scale": 0.05,
     "audio_noise_db": None,
+    "memory_displacement_gain": 0.0,
     "low_dimensional_noise": 0.0,
+    "low_dimensional_offset": 0.0,
     # Adam
     "optimizer_lr": 1e-3,
     "optimizer_weight_decay": 0.0,

@@ -23,7 +23,15 @@ PRESETS = {
 }
 """When to choose which. What each is, and what differs from the publication on purpose: docs/training.md."""
 
-_NETWORK = ("type", "device", "image_size", "vision_width", "normalize_encodings", "low_dimensional_gain")
+_NETWORK = (
+    "type",
+    "device",
+    "image_size",
+    "vision_width",
+    "normalize_encodings",
+    "low_dimensional_gain",
+    "memory_displacement_gain",
+)
 """Options of the policy that fix what the network looks like: with `--policy.path` the checkpoint says it."""
 
 
