@@ -5,7 +5,7 @@ set -euo pipefail
 export MUJOCO_GL=${MUJOCO_GL:-egl}
 folder=${1:-outputs/by_hand}
 
-playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v0 \
+playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v1 \
   --dataset.repo_id=me/occluded --dataset.root="$folder/dataset" --dataset.num_episodes=4 --seed=0 --resume=true
 
 lerobot-train --policy.type=playbyear --policy.push_to_hub=false --policy.device=cpu \
@@ -14,4 +14,4 @@ lerobot-train --policy.type=playbyear --policy.push_to_hub=false --policy.device
   --batch_size=4 --steps=8 --num_workers=0 --output_dir="$folder/train"
 
 lerobot-eval --policy.path="$folder/train/checkpoints/last/pretrained_model" \
-  --env.type=playbyear --env.task=OccludedGrasp-v0 --eval.n_episodes=2 --eval.batch_size=2 --output_dir="$folder/eval"
+  --env.type=playbyear --env.task=OccludedGrasp-v1 --eval.n_episodes=2 --eval.batch_size=2 --output_dir="$folder/eval"

@@ -6,7 +6,7 @@ cd "$(dirname "$0")/.."
 export MUJOCO_GL=${MUJOCO_GL:-egl}
 
 DEMO_DIR=${DEMO_DIR:-outputs/demo}
-TASK=${TASK:-OccludedGrasp-v0}
+TASK=${TASK:-OccludedGrasp-v1}
 EPISODES=${EPISODES:-50}
 STEPS=${STEPS:-3000}
 EVAL_EPISODES=${EVAL_EPISODES:-20}

@@ -129,7 +129,7 @@ def test_environments_in_processes_of_their_own_see_the_same():
 
 
 def test_options_reach_the_environment():
-    config = PlaybyearEnvConfig(episode_length=7, image_size=32, variant="paper", visualization_width=96,
+    config = PlaybyearEnvConfig(task="OccludedGrasp-v0", episode_length=7, image_size=32, variant="paper", visualization_width=96,
                                 visualization_height=96)  # fmt: skip
     vec = vector_env(config)
     vec.reset(seed=0)
@@ -170,7 +170,7 @@ def test_the_pouch_is_found_with_its_own_rate_and_options():
     [
         ("task=Nope-v0", "OccludedGrasp-v0, OccludedPickPlace-v0"),
         ("sound=loud", "waveform, contact_force, none"),
-        ("variant=ours", "default, paper"),
+        ("task=OccludedGrasp-v0 variant=ours", "default, paper"),
         ("sample_rate=16001", "a multiple of 20"),
         ("fps=30", "20 Hz"),
         ("microphones=[]", "at least one"),
@@ -179,7 +179,8 @@ def test_the_pouch_is_found_with_its_own_rate_and_options():
 )
 def test_a_wrong_option_says_what_would_work(argument, wanted):
     with pytest.raises(DecodingError) as error:
-        draccus.parse(RecordConfig, args=["--env.type=playbyear", f"--env.{argument}", "--dataset.repo_id=a/b"])
-    name = argument.split("=")[0]
+        options = [f"--env.{option}" for option in argument.split()]
+        draccus.parse(RecordConfig, args=["--env.type=playbyear", *options, "--dataset.repo_id=a/b"])
+    name = argument.split()[-1].split("=")[0]
     assert f"env.{name}" in str(error.value)
     assert wanted in str(error.value)

@@ -104,7 +104,7 @@ def test_resuming_a_complete_dataset_changes_nothing(recorded):
 
 def test_only_successes_are_kept_and_seeds_count_the_attempts(tmp_path):
     """With a horizon that only quick episodes meet, the seeds of the others are missing."""
-    root = record(config(tmp_path / "dataset", num_episodes=3, env=PlaybyearEnvConfig(episode_length=66)))
+    root = record(config(tmp_path / "dataset", num_episodes=3, env=PlaybyearEnvConfig(episode_length=88)))
     dataset = load(root)
     seeds = sorted(set(column(root, "seed").ravel().tolist()))
     assert len(seeds) == 3

@@ -1,6 +1,6 @@
 """Whether a task needs hearing: its expert, everyone who plays it deaf, and what twin worlds give away, in one table.
 
-    python -m gym_playbyear.check OccludedGrasp-v0 --episodes=100 --output=check.json
+    python -m gym_playbyear.check OccludedGrasp-v1 --episodes=100 --output=check.json
 
 The expert must solve the task. Blind scripts, which know what the camera shows and feel nothing, must not, nor must deaf
 scripts, which feel with the arm; and nothing but sound may tell that the hidden object was touched. The exit status is 1
@@ -98,7 +98,7 @@ def check(
     """Plays a task with everyone, and compares twin worlds.
 
     Args:
-        task: Its name, such as `OccludedGrasp-v0`.
+        task: Its name, such as `OccludedGrasp-v1`.
         n_episodes: Of each player, and of the twin test.
         first_seed: Of the episodes; they count up.
         names: Of the players; all by default.
@@ -239,7 +239,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m gym_playbyear.check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("task", help="such as OccludedGrasp-v0")
+    parser.add_argument("task", help="such as OccludedGrasp-v1")
     parser.add_argument("--episodes", type=int, default=100, help="of each player and of the twin test (default: 100)")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"of the first episode (default: {FIRST_SEED})")
     parser.add_argument(

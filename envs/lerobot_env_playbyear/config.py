@@ -63,7 +63,7 @@ class PlaybyearEnvConfig(EnvConfig):
         DecodingError: A value is not one that the tasks know. LeRobot's commands print it as one line and stop.
     """
 
-    task: str | None = "OccludedGrasp-v0"
+    task: str | None = "OccludedGrasp-v1"
     fps: int = 0
     episode_length: int | None = None
     # Observations

@@ -86,7 +86,7 @@ def _section(config: PlaybyearConfig) -> str:
             "",
             "In simulation, with the tasks of `lerobot_env_playbyear`:",
             "",
-            f"```bash\nlerobot-eval --policy.path={name} --env.type=playbyear --env.task=OccludedGrasp-v0\n```",
+            f"```bash\nlerobot-eval --policy.path={name} --env.type=playbyear --env.task=OccludedGrasp-v1\n```",
         ]
     )
 

@@ -65,7 +65,7 @@ class RecordConfig:
     """Options of `playbyear-record`.
 
     Args:
-        env: The environment, `--env.type=playbyear --env.task=OccludedGrasp-v0`.
+        env: The environment, `--env.type=playbyear --env.task=OccludedGrasp-v1`.
         dataset: What is written, and where.
         seed: The first attempt's seed; each further attempt takes the next one.
         resume: Append to a dataset that is there already, up to `num_episodes`, with the seeds after its largest.

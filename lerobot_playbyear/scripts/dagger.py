@@ -6,7 +6,7 @@ policy is trained on demonstrations and corrections.
     playbyear-dagger --policy.path=outputs/train/checkpoints/last/pretrained_model \\
         --demos.repo_id=me/demos --demos.root=outputs/demos \\
         --interventions.repo_id=me/corrections --interventions.root=outputs/corrections \\
-        --env.type=playbyear --env.task=OccludedGrasp-v0 --episodes=25 --output_dir=outputs/dagger
+        --env.type=playbyear --env.task=OccludedGrasp-v1 --episodes=25 --output_dir=outputs/dagger
     playbyear-dagger --resume=true --output_dir=outputs/dagger
 
 What goes in

@@ -2,12 +2,12 @@
 
 Only successful episodes are kept. Each is safe on the disk as soon as it is saved.
 
-    playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v0 --seed=0 \\
+    playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v1 --seed=0 \\
         --dataset.repo_id=me/demos --dataset.root=outputs/demos --dataset.num_episodes=50
     playbyear-record ... --expert.type=teleop          # a person, in a window
 
   --env.type=...               playbyear, or playbyear_robot for a real one; needed
-  --env.task=...               its task: OccludedGrasp-v0 or OccludedPickPlace-v0
+  --env.task=...               its task: OccludedGrasp-v1 or OccludedPickPlace-v1
   --expert.type=...            who demonstrates: scripted (the environment's own, default), teleop
   --expert.teleop.type=...     what a person moves the arm with: keyboard_window, gamepad, ...
   --dataset.repo_id=...        the dataset's name, user/name; needed

@@ -1,10 +1,10 @@
 """playbyear-video: films an episode with its sound, a policy's or the scripted expert's.
 
     playbyear-video --policy.path=outputs/train/checkpoints/last/pretrained_model \\
-        --env.type=playbyear --env.task=OccludedGrasp-v0 --output=outputs/rollout.mp4
+        --env.type=playbyear --env.task=OccludedGrasp-v1 --output=outputs/rollout.mp4
 
   --env.type=...               the environment, like playbyear; needed
-  --env.task=...               its task: OccludedGrasp-v0 or OccludedPickPlace-v0
+  --env.task=...               its task: OccludedGrasp-v1 or OccludedPickPlace-v1
   --policy.path=...            who acts, a checkpoint's folder or a name on the Hub; else a script
   --baseline=null              without a policy, the environment's blind baseline of this name acts
   --output=outputs/rollout.mp4  the film

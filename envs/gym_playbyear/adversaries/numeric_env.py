@@ -30,7 +30,7 @@ class NumericTask(gym.Env):
     steps; the gripper closes above 0.5, opens below -0.5, and stays as it is between.
 
     Args:
-        task: Its name, such as `OccludedGrasp-v0`.
+        task: Its name, such as `OccludedGrasp-v1`.
         hears: Whether the player gets the contact signal. A deaf player gets zeros.
         repeat: Steps of the task for each action; by default as many as fit into a tenth of a second, one at least.
         discount: Of the learner; the reward's shaping is a potential's difference, which changes no best policy.

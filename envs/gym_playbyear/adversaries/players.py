@@ -13,7 +13,7 @@ def players(task: str, **options: Any) -> dict[str, str]:
     """The names of a task's players, each with its kind.
 
     Args:
-        task: Its name, such as `OccludedGrasp-v0`.
+        task: Its name, such as `OccludedGrasp-v1`.
         options: For `gymnasium.make`.
     """
     deaf_task = DeafTask(task, **options)

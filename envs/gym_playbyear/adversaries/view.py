@@ -77,7 +77,7 @@ class DeafTask:
     """A task as a deaf player meets it: nothing is rendered, nothing is heard.
 
     Args:
-        task: Its name, such as `OccludedGrasp-v0`.
+        task: Its name, such as `OccludedGrasp-v1`.
         options: For `gymnasium.make`.
 
     Attributes:
