@@ -129,8 +129,8 @@ def test_environments_in_processes_of_their_own_see_the_same():
 
 
 def test_options_reach_the_environment():
-    config = PlaybyearEnvConfig(task="OccludedGrasp-v0", episode_length=7, image_size=32, variant="paper", visualization_width=96,
-                                visualization_height=96)  # fmt: skip
+    sizes = {"image_size": 32, "visualization_width": 96, "visualization_height": 96}
+    config = PlaybyearEnvConfig(task="OccludedGrasp-v0", variant="paper", episode_length=7, **sizes)
     vec = vector_env(config)
     vec.reset(seed=0)
     assert vec.call("_max_episode_steps") == (7,)
@@ -178,8 +178,8 @@ def test_the_pouch_is_found_with_its_own_rate_and_options():
     ],
 )
 def test_a_wrong_option_says_what_would_work(argument, wanted):
+    options = [f"--env.{option}" for option in argument.split()]
     with pytest.raises(DecodingError) as error:
-        options = [f"--env.{option}" for option in argument.split()]
         draccus.parse(RecordConfig, args=["--env.type=playbyear", *options, "--dataset.repo_id=a/b"])
     name = argument.split()[-1].split("=")[0]
     assert f"env.{name}" in str(error.value)
