@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import draccus
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -137,6 +138,14 @@ class Method:
 
     def figures(self) -> Mapping[str, float]:
         """Further figures of the last attempt."""
+        return {}
+
+    def recovered_figures(self, by_expert: np.ndarray) -> Mapping[str, float]:
+        """The same of an attempt that was written to disk just before the run was killed, as far as that tells.
+
+        Args:
+            by_expert: (T,) bool, the column `intervention`.
+        """
         return {}
 
     @property
