@@ -163,6 +163,17 @@ def test_displacements_are_in_normalised_units_times_their_gain():
     torch.testing.assert_close(displacement, 10 * (state - state[:, -1:]), atol=1e-4, rtol=1e-4)
 
 
+def test_where_nothing_is_felt_there_is_nothing_to_compare():
+    config = make_config(**SMALL, memory_displacement_gain=10.0)
+    for key in config.low_dimensional_keys:
+        del config.input_features[key]
+    policy = PlaybyearPolicy(config).eval()
+    assert policy.model.memory_head.lstm.input_size == config.embedding_size
+    episode = make_episode(3, config, N_FRAMES)
+    last = policy.predict_run(run_ending_at(episode, N_FRAMES - 1, config))[:, -1]
+    torch.testing.assert_close(step_through(policy, [episode])[:, -1], last, atol=1e-5, rtol=0)
+
+
 # Heads
 
 

@@ -110,8 +110,8 @@ class Loop:
             )
         figures = self.corrections.last()
         state.attempts, state.kept, state.next_seed = state.attempts + 1, state.kept + 1, figures["seed"] + 1
-        by_expert = self.corrections.last_by_expert()
-        cost = self._cost(by_expert) | dict(self.method.recovered_figures(by_expert))
+        cost = self._cost(self.corrections.last_by_expert())
+        cost |= self.method.recovered_figures(cost)
         success = self.corrections.last_success()
         self.report.write("attempt", {**figures, "outcome": "kept", "success": success, **cost, "recovered": True})
         self.report.bar.update(1)

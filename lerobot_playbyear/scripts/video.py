@@ -4,7 +4,7 @@
         --env.type=playbyear --env.task=OccludedGrasp-v1 --output=outputs/rollout.mp4
 
   --env.type=...               the environment, like playbyear; needed
-  --env.task=...               its task: OccludedGrasp-v1 or OccludedPickPlace-v1
+  --env.task=...               its task, such as OccludedGrasp-v1 or TellApart-v1
   --policy.path=...            who acts, a checkpoint's folder or a name on the Hub; else a script
   --baseline=null              without a policy, the environment's blind baseline of this name acts
   --output=outputs/rollout.mp4  the film

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import draccus
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -140,11 +139,11 @@ class Method:
         """Further figures of the last attempt."""
         return {}
 
-    def recovered_figures(self, by_expert: np.ndarray) -> Mapping[str, float]:
-        """The same of an attempt that was written to disk just before the run was killed, as far as that tells.
+    def recovered_figures(self, cost: Mapping[str, Any]) -> Mapping[str, float]:
+        """The same of an attempt that was written to disk just before the run was killed, as far as its cost tells.
 
         Args:
-            by_expert: (T,) bool, the column `intervention`.
+            cost: What `attempt_figures` says of it.
         """
         return {}
 

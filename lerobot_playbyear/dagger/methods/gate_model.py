@@ -1,9 +1,10 @@
 """What a robot-gated method knows of a state: how new it is to the policy, and how risky (ThriftyDAgger).
 
-Both are small networks on what the policy's LSTM remembers: the policy `playbyear` has neither dropout nor an ensemble, five
-policies would cost five times the training, and passes through other augmentations tell of noise in a picture, not of places
-where no expert was. So several heads learn the expert's actions from the same memory, each from its own draw of the data; where
-they disagree nobody has shown what to do. They are learned anew in every round, because the memory changes with the policy.
+Both are small networks on what the policy's LSTM remembers: by default the policy `playbyear` has neither dropout nor an
+ensemble, five policies would cost five times the training, and passes through other augmentations tell of noise in a
+picture, not of places where no expert was. So several heads learn the expert's actions from the same memory, each from its
+own draw of the data; where they disagree nobody has shown what to do. They are learned anew in every round, because the
+memory changes with the policy.
 """
 
 from collections.abc import Callable

@@ -164,12 +164,11 @@ class RobotGated(Method):
         seconds, self._seconds = self._seconds, 0.0
         return {"n_asked_steps": self._expert.n_asked, "n_calls": self._expert.n_calls, "gate_s": round(seconds, 4)}
 
-    def recovered_figures(self, by_expert: np.ndarray) -> Mapping[str, Any]:
+    def recovered_figures(self, cost: Mapping[str, Any]) -> Mapping[str, Any]:
         assert self._expert is not None
         if self._expert.decides:
             return {}  # a person who is called may come or not: what was asked is lost
-        n_calls = int((np.diff(by_expert.astype(int), prepend=0) == 1).sum())
-        return {"n_asked_steps": int(by_expert.sum()), "n_calls": n_calls}
+        return {"n_asked_steps": cost["n_expert_steps"], "n_calls": cost["n_takeovers"]}
 
 
 class Asked(Beside):
