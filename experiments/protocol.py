@@ -10,6 +10,7 @@ import math
 import os
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -68,6 +69,8 @@ class Result:
         commands: What was run, in order.
         acted_early: Of each episode: the hand acted before anything was heard. Empty where nobody looked: in results from
             before, and in tasks that do not tell.
+        ends: How each episode ended, the environment's `info["end"]`; empty likewise.
+        n_closings: How often the hand closed in each; empty likewise.
         environment: Options of the environment where they differ from the task's own.
         versions: Of the libraries that matter.
     """
@@ -83,6 +86,8 @@ class Result:
     threads: int
     commands: list[str]
     acted_early: list[bool] = field(default_factory=list)
+    ends: list[str] = field(default_factory=list)
+    n_closings: list[int] = field(default_factory=list)
     environment: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=lambda: library_versions())
 
@@ -94,6 +99,18 @@ class Result:
     def early_rate(self) -> float | None:
         """Share of the episodes in which the hand acted before anything was heard; None: nobody looked."""
         return sum(self.acted_early) / len(self.acted_early) if self.acted_early else None
+
+    @property
+    def first_search_rate(self) -> float | None:
+        """Share of the episodes that were solved by the first closing of the hand; None: nobody counted."""
+        first = [solved and n == 1 for solved, n in zip(self.successes, self.n_closings, strict=False)]
+        return sum(first) / len(first) if first else None
+
+    @property
+    def failures(self) -> str:
+        """How the failures ended, the most frequent first: `7 pressed, 2 time`; empty where nobody looked."""
+        ends = Counter(end for solved, end in zip(self.successes, self.ends, strict=False) if not solved)
+        return ", ".join(f"{n} {end}" for end, n in ends.most_common())
 
     @property
     def summary(self) -> str:

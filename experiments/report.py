@@ -51,7 +51,8 @@ def ablation_table(task: str) -> list[str]:
         results = load_results(f"ablations/{task}-{condition}-*.json")
         if results:
             minutes = ", ".join(f"{result.minutes:.0f}" for result in results)
-            rows.append(f"| {condition} | {percent(results)} | {acted_early(results)} | {minutes} |")
+            failures = "; ".join(result.failures for result in results).strip("; ")
+            rows.append(f"| {condition} | {percent(results)} | {acted_early(results)} | {failures} | {minutes} |")
     if blind_path(task).exists():
         blind = load(blind_path(task))
         first, last = blind["seeds"]
@@ -59,9 +60,9 @@ def ablation_table(task: str) -> list[str]:
         rates = blind["success"]
         expert = rates.pop("expert")
         name, best = max(rates.items(), key=lambda item: item[1])
-        rows.append(f"| best blind script (`{name}`) | **{best:.0%}** {interval(round(n * best), n)} | | | |")
-        rows.append(f"| expert that feels contact | {expert:.0%} | | | |")
-    head = "| policy | success (95 % interval) | training seeds | acted early | minutes of training |"
+        rows.append(f"| best blind script (`{name}`) | **{best:.0%}** {interval(round(n * best), n)} | | | | |")
+        rows.append(f"| expert that feels contact | {expert:.0%} | | | | |")
+    head = "| policy | success (95 % interval) | training seeds | acted early | failures | minutes of training |"
     return table(head, rows, task)
 
 

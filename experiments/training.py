@@ -5,7 +5,7 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,9 @@ class Evaluation:
     """What a policy's attempts came to, in the order of their seeds; the names are those of `Result`."""
 
     successes: list[bool]
-    acted_early: list[bool]
+    acted_early: list[bool] = field(default_factory=list)
+    ends: list[str] = field(default_factory=list)
+    n_closings: list[int] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -192,11 +194,14 @@ def evaluate(
     commands.append(shown(command))
     report = load(output / "eval_info.json")
     successes = [bool(success) for success in report["per_task"][0]["metrics"]["successes"]]
-    return Evaluation(successes, early_attempts(attempts, job.evaluation_seeds))
+    early, ends, n_closings = (
+        told_of_attempts(attempts, key, job.evaluation_seeds) for key in ("acted_early", "end", "n_closings")
+    )
+    return Evaluation(successes, early, ends, n_closings)
 
 
-def early_attempts(path: Path, seeds: range) -> list[bool]:
-    """Of the attempts with these seeds, in their order, whether the hand acted early; empty where one does not tell."""
+def told_of_attempts(path: Path, key: str, seeds: range) -> list[Any]:
+    """What a file of attempts says of those with these seeds, in their order; empty where one does not tell."""
     lines = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    told = {line["seed"]: line["acted_early"] for line in lines if "acted_early" in line}
+    told = {line["seed"]: line[key] for line in lines if key in line}
     return [told[seed] for seed in seeds] if all(seed in told for seed in seeds) else []

@@ -11,7 +11,7 @@ from draccus.utils import DecodingError
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 
 from experiments.protocol import RESULTS, Result, load, load_results
-from experiments.training import early_attempts
+from experiments.training import told_of_attempts
 from gym_playbyear.haste import ClosedUnheard
 from gym_playbyear.task_env import TaskEnv
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -53,7 +53,16 @@ def test_a_hand_that_closes_in_the_air_was_early_and_one_that_stays_open_was_not
     for commands, early in ((((0, 10, OPEN), (0, 10, CLOSE)), True), (((0, 20, OPEN),), False)):
         env = make("OccludedGrasp-v1", horizon=20)
         env.begin_episode(seed=3)
-        assert after(env, *commands) == {"is_success": False, "end": "time", "acted_early": early}
+        told = {"is_success": False, "end": "time", "acted_early": early, "n_closings": int(early)}
+        assert after(env, *commands) == told
+
+
+def test_every_closing_counts_once():
+    env = make("OccludedGrasp-v1", horizon=250)
+    env.begin_episode(seed=3)
+    assert after(env, (0, 20, OPEN), (0, 60, CLOSE), (0, 60, OPEN), (0, 60, CLOSE), (0, 50, OPEN))["n_closings"] == 2
+    env.begin_episode(seed=3)
+    assert finish(env, env.scripted_expert())["n_closings"] == 1
 
 
 def test_only_the_first_closing_counts():
@@ -121,12 +130,13 @@ def test_every_attempt_leaves_one_line_in_the_file(tmp_path):
     envs.close()
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [line["seed"] for line in lines] == [11, 12, 13, 14]
-    assert lines[0].keys() == {"seed", "steps", "is_success", "end", "acted_early"}
+    assert lines[0].keys() == {"seed", "steps", "is_success", "end", "acted_early", "n_closings"}
     assert {(line["steps"], line["end"], line["is_success"]) for line in lines} == {(3, "time", False)}
-    early = early_attempts(path, range(11, 15))
+    early = told_of_attempts(path, "acted_early", range(11, 15))
     assert early[1::2] == [False, False]
-    assert early_attempts(path, range(10, 15)) == []
-    assert early_attempts(tmp_path / "nothing", range(11, 15)) == []
+    assert told_of_attempts(path, "end", range(11, 15)) == ["time"] * 4
+    assert told_of_attempts(path, "acted_early", range(10, 15)) == []
+    assert told_of_attempts(tmp_path / "nothing", "end", range(11, 15)) == []
 
 
 def test_the_file_changes_nothing_that_is_observed(tmp_path):

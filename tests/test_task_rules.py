@@ -55,7 +55,7 @@ def test_a_finger_that_comes_down_on_the_cube_stops_the_arm(task, speed):
     env = begin(task, horizon=1000)
     go(env, over(env, 0.03, 0.07), OPEN)
     info = go(env, over(env, 0.03, 0.03), OPEN, speed=speed, n_steps=300)
-    assert info == {"is_success": False, "end": "pressed", "acted_early": False}
+    assert info == {"is_success": False, "end": "pressed", "acted_early": False, "n_closings": 0}
 
 
 @pytest.mark.parametrize("task", V1)
@@ -100,7 +100,7 @@ def test_a_cube_that_is_up_for_less_than_half_a_second_is_not_held():
 
 def test_time_ends_an_attempt_without_success():
     env = begin("OccludedGrasp-v1", horizon=2)
-    assert wait(env, OPEN, 5) == {"is_success": False, "end": "time", "acted_early": False}
+    assert wait(env, OPEN, 5) == {"is_success": False, "end": "time", "acted_early": False, "n_closings": 0}
 
 
 @pytest.mark.parametrize("task", V1)

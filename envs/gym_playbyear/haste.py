@@ -28,13 +28,15 @@ class Haste:
     def look(self, env: Any) -> None:
         """Once after every control step. What sounds in a step is heard after it, when its action was long chosen."""
 
-    def info(self) -> dict[str, bool]:
+    def info(self) -> dict[str, bool | int]:
         """What the environment's `info` says of the attempt when it is over."""
         return {} if self.acted_early is None else {"acted_early": self.acted_early}
 
 
 class ClosedUnheard(Haste):
     """The hand began to close before it had ever touched a thing; what its closing itself touches comes too late.
+
+    `info` also says how often the hand closed, `n_closings`: a success with one is a success of the first search.
 
     Args:
         prop: What has to be heard.
@@ -45,14 +47,21 @@ class ClosedUnheard(Haste):
 
     def begin(self, env: Any) -> None:
         self.acted_early, self._is_decided = _at_the_beginning(env, self.prop)
-        self._was_heard = False
+        self._was_heard, self._is_closed, self._n_closings = False, False, 0
 
     def look(self, env: Any) -> None:
+        was_closed = self._is_closed
+        self._is_closed = bool(env.finger_positions.sum() < _OPEN * env.definition.arm.max_opening)
+        self._n_closings += self._is_closed and not was_closed
         if self._is_decided:
             return
-        if env.finger_positions.sum() < _OPEN * env.definition.arm.max_opening:
+        if self._is_closed:
             self.acted_early, self._is_decided = not self._was_heard, True
         self._was_heard |= bool(env.contact_forces[f"gripper-{self.prop}"] > _TOUCHES)
+
+    def info(self) -> dict[str, bool | int]:
+        told = super().info()
+        return told and {**told, "n_closings": self._n_closings}
 
 
 class MovedUnheard(Haste):

@@ -188,7 +188,8 @@ class TaskEnv(PrivilegedState, gym.Env):
         """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise.
 
         `info["is_success"]` says whether the task is solved, and at the last step `info["end"]` how the attempt ended:
-        "success", the name of a rule, or "time". By then the task's secrets are there, and "acted_early" (`haste.py`).
+        "success", the name of a rule, or "time". By then the task's secrets are there, and "acted_early" and "n_closings"
+        (`haste.py`).
         """
         self._check_is_running("step")
         action = np.asarray(action, dtype=float)

@@ -13,8 +13,8 @@ class AttemptsFile(gym.Wrapper):
     """Appends one line of JSON to a file at the end of every attempt.
 
     A line has `seed` (null where the environment drew it), `steps`, and what the environment's `info` says at the end:
-    `is_success`, `end`, `acted_early` where the task tells it, and what the task kept secret. Attempts that are broken off
-    leave none. Several environments, also in processes of their own, may share a file.
+    `is_success`, `end`, `acted_early` and `n_closings` where the task tells them, and what the task kept secret. Attempts
+    that are broken off leave none. Several environments, also in processes of their own, may share a file.
 
     Args:
         env: The environment.
