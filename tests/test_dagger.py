@@ -215,6 +215,14 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
     assert cfg.rate(17, 7, 10) == 1
 
 
+def test_from_recorded_corrections_alone_the_rate_falls_once():
+    cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), learning_rate=1.0, warmup_updates=0)
+    cfg.episodes, cfg.updates, cfg.updates_per_episode = 0, 50, 10
+    rates = [cfg.rate(step, step % 10, 10) for step in range(50)]
+    assert rates == sorted(rates, reverse=True)
+    assert (rates[0], rates[25], rates[-1]) == pytest.approx((1.0, 0.5, 0.001), abs=1e-3)
+
+
 def test_without_a_rate_the_policy_says_it():
     cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), policy=PlaybyearConfig(optimizer_lr=2e-3))
     assert cfg.training().optimizer.lr == cfg.largest_rate == 2e-3

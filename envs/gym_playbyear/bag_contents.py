@@ -55,10 +55,10 @@ def _keys() -> str:
         _geom("capsule", (_WIRE,), 0.002, _STEEL, f'fromto="{a} {b} 0 {c} {e} 0"')
         for (a, b), (c, e) in itertools.pairwise(corners)
     )
-    lever = _geom("box", (0.022, 0.006, 0.0025), 0.020, _STEEL, 'pos="0.025 0 0"')
-    opener = _geom("box", (0.015, 0.011, 0.0025), 0.017, _STEEL, 'pos="-0.018 0 0"')
-    medallion = _geom("cylinder", (0.012, 0.002), 0.015, _BRASS, 'pos="0 0.015 0"')
-    whistle = _geom("cylinder", (0.0075, 0.015), 0.020, _STEEL, 'pos="0 -0.019 0" euler="1.5708 0 0"')
+    lever = _geom("box", (0.010, 0.005, 0.003), 0.020, _STEEL, 'pos="0.011 0 0"')
+    opener = _geom("box", (0.008, 0.008, 0.003), 0.017, _STEEL, 'pos="-0.009 0 0"')
+    medallion = _geom("cylinder", (0.008, 0.0025), 0.015, _BRASS, 'pos="0 0.009 0"')
+    whistle = _geom("cylinder", (0.0065, 0.009), 0.020, _STEEL, 'pos="0 -0.010 0" euler="1.5708 0 0"')
     r = _RING_RADIUS
     hung = (
         _hanging("lever", f"{r} 0 0", lever)

@@ -1,7 +1,9 @@
-"""Who takes things out of a bag: an expert that feels contact and knows where they are, and scripts that do neither.
+"""Who takes things out of a bag: an expert that knows what it felt and no more.
 
-The expert goes down until it feels something, searches along the bottom where it must, rises, centres, goes down around the
-thing, closes, lifts and holds; after an empty grasp it tries again. Speeds, pauses and places are drawn anew for every episode.
+The expert goes down slowly until a finger feels something. Which finger it was tells on which side the things lie, and where
+the hand was tells how high. It goes around them, closes, lifts and holds; after an empty grasp it tries again. Everything it
+acts on can be heard: what is touched, by which finger, and when. (One that goes to where the things are, without having felt
+it, shows what nobody can learn.) Speeds, pauses and places are drawn anew for every episode.
 """
 
 from dataclasses import dataclass
@@ -9,21 +11,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP
-from gym_playbyear.arm import ACTION_SCALE, FINGER_THICKNESS, FINGER_WIDTH
-from gym_playbyear.bag import BAG, RIM, bottom_height
-from gym_playbyear.bag_contents import CONTENTS, points_of
+from gym_playbyear.arm import ACTION_SCALE
+from gym_playbyear.bag import BAG, BAG_MIDDLE, RIM
+from gym_playbyear.bag_contents import CONTENTS
 
 TIP_BELOW_HAND = 0.0086  # m: how far the fingers' tips are below the point that is controlled
+TALLEST = 0.02  # m: nothing in the bag is higher above its bottom
 _GRIP, _ON_BAG = f"gripper-{CONTENTS}", f"gripper-{BAG}"
-_OFFSETS = np.stack(np.meshgrid(*[np.arange(-0.04, 0.041, 0.005)] * 2), axis=-1).reshape(-1, 2)  # m: places to close at
-_TALLEST = 0.02  # m: nothing in the bag is higher above its bottom
+FINGERS = ("left_finger", "right_finger")
+"""Parts of the arm, and the microphones on them: with both, one hears which of them touched something."""
+_LEFT, _RIGHT = -1, 1  # along y
 
 
 @dataclass(frozen=True)
 class BagExpertConfig:
-    """Where the expert moves and how much chance there is in it. Lengths in metres, durations in control steps.
+    """Where the expert moves and how much chance there is in it. Lengths in metres, durations in control steps, forces in N.
 
-    The pairs are ranges of uniform draws. fast, slow: displacement per step; pause_probability: per step of descent and search.
+    The pairs are ranges of uniform draws. fast, slow, search_step: displacement per step; pause_probability: per step of
+    descent and search; contact_force, bottom_force: what counts as a touch of the things, and of the bag; firm: a bag that is
+    pressed so hard is at its bottom; landed: the fingers came down on a thing, not around it, after which it goes further
+    aside by `further`, `n_landed` times at most; hover: how high above the last touch it goes aside; deep: how far below a
+    touch of the things it goes at most; aside: how much further than the middle of where they may lie it goes to the side on
+    which it felt them; aim: how far from the bag's middle it goes in; above_bottom: in a search; closing: for so long before
+    it looks whether it holds something; empty: opening of fingers that hold nothing; out: the hand above the rim, at the end.
     """
 
     fast: tuple[float, float] = (0.020, 0.030)
@@ -33,20 +43,24 @@ class BagExpertConfig:
     pause: tuple[int, int] = (1, 2)
     dwell: tuple[int, int] = (0, 1)
     noise: float = 0.001
-    contact_force: float = 0.15  # N
-    bottom_force: float = 0.3  # N
-    low: float = 0.008  # the tips above the bottom: fingers that close there take hold, too
-    landed: float = 6.0  # N: the fingers came down on a thing, not around it
-    aim: float = 0.005  # how far from the bag's middle it goes in
-    hover: float = 0.025  # the tips above the bottom, on the way to a grasp
-    above_bottom: float = 0.003  # the tips, in a search
+    contact_force: float = 0.15
+    bottom_force: float = 0.3
+    firm: float = 0.8
+    landed: float = 6.0
+    further: float = 0.010
+    n_landed: int = 4
+    hover: float = 0.022
+    deep: float = 0.020
+    aside: float = -0.004
+    aim: float = 0.005
+    above_bottom: float = 0.003
     closing: int = 5
-    empty: float = 0.004  # opening of fingers that hold nothing
-    out: float = 0.055  # the hand above the rim, at the end
+    empty: float = 0.004
+    out: float = 0.055
 
 
-FOR_TALLER_THINGS = BagExpertConfig(hover=0.045)
-"""For what is higher than a heap of keys: fingers that move to its place pass over it."""
+FOR_TALLER_THINGS = BagExpertConfig(hover=0.045, deep=0.03)
+"""For what is higher than a heap of keys: fingers that go to its other side pass over it."""
 
 
 class BagExpert:
@@ -64,16 +78,18 @@ class BagExpert:
         self.fast, self.slow, self.search_step = (
             draw(*limits) for limits in (self.config.fast, self.config.slow, self.config.search_step)
         )
-        self.entry: np.ndarray = draw(-self.config.aim, self.config.aim, 2)
-        self.turn = 1 if draw() < 0.5 else -1
-        self.phase, self._wait, self._closed_for = "enter", 0, 0
-        self._way: list[np.ndarray] = []
-        self._aim, self._n_landed = self.entry, 0
+        self.entry: np.ndarray = BAG_MIDDLE + draw(-self.config.aim, self.config.aim, 2)
+        self.turn = int(self.rng.choice(env.variant.sides))  # where it looks for the things first
+        self.phase, self._wait, self._closed_for, self._n_landed = "enter", 0, 0, 0
+        self._aim = self.entry
+        self._touched_at = float(env.eef_position[2])  # height of the hand at the last touch [m, world]
+        self._bottom: float | None = None  # and where it felt the bag's bottom
 
     def begin_at(self, phase: str) -> None:
         """Goes on in the middle of an attempt: from where the hand is now, in `phase`."""
         self.phase, self._wait, self._closed_for = phase, 0, 0
-        self.entry = self.env.eef_position[:2]
+        self.entry = self._aim = self.env.eef_position[:2]
+        self._touched_at = float(self.env.eef_position[2])
 
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
@@ -89,76 +105,81 @@ class BagExpert:
     # One method per phase: it returns where to (3,) [m, world], or None to stay, how fast, and whether the fingers shall close.
 
     def _enter(self):
-        upper = TABLE_TOP + self.env.variant.bottom[1] + _TALLEST + TIP_BELOW_HAND
+        upper = TABLE_TOP + self.env.variant.bottom[1] + TALLEST + TIP_BELOW_HAND
         if self.env.eef_position[2] < upper + 0.005:
             self.phase = "descend"
         return np.array([*self.entry, upper]), self.fast, False
 
     def _descend(self):
         if self._feels_contents():
-            return self._touched()
-        if self._feels_bottom():
-            if self._worth(self.env.eef_position[None, :2])[0] > 0.1:
-                return self._begin_grasp()
-            self._plan_search()
+            return self._touched((self._side() or self.turn) * (np.mean(self.env.variant.sideways) + self.config.aside))
+        if self._feels_bottom(self.config.bottom_force):
+            self._bottom = self._touched_at = float(self.env.eef_position[2])
+            self.phase, self._way = "search", [self.turn * 0.03, -self.turn * 0.03]
             return self._search()
         if self._pauses():
             return None, 0.0, False
         return np.array([*self.entry, TABLE_TOP]), self.slow, False
 
-    def _plan_search(self) -> None:
-        """Lines along y, along which the fingers open: a finger that moves so meets what lies before it."""
-        self.phase = "search"
-        reach = self.env.variant.offset[1] + 0.005
-        x = self.env.eef_position[0]
-        first, second = self.turn * 0.02, -self.turn * 0.02
-        lines = [(x, reach), (x, -reach), (first, -reach), (first, reach), (second, reach), (second, -reach)]
-        self._way = [np.array([a, self.turn * b]) for a, b in lines]
-
     def _search(self):
+        """Along the line on which the fingers open: a finger that moves so meets what lies before it."""
+        ahead = np.sign(self._way[0] - self.env.eef_position[1]) if self._way else 0
         if self._feels_contents():
-            return self._touched()
-        height = bottom_height(self.env) + TIP_BELOW_HAND + self.config.above_bottom
-        if self._pauses():
-            return None, 0.0, False
-        if self._way and np.linalg.norm(self._way[0] - self.env.eef_position[:2]) < 0.004:
+            outside = self._side() == ahead  # what the other finger meets lies between them
+            return self._touched(ahead * self.env.variant.arm.max_opening * 0.7) if outside else self._begin_grasp()
+        if self._way and abs(self._way[0] - self.env.eef_position[1]) < 0.004:
             self._way.pop(0)
         if not self._way:
-            self._plan_search()
-        return np.array([*self._way[0], height]), self.search_step, False
+            return self._begin_grasp()
+        if self._pauses():
+            return None, 0.0, False
+        assert self._bottom is not None
+        return np.array([self.entry[0], self._way[0], self._bottom + self.config.above_bottom]), self.search_step, False
 
-    def _touched(self):
-        self.phase = "dwell"
-        self._wait = int(self.rng.integers(*self.config.dwell, endpoint=True))
+    def _touched(self, sideways: float):
+        """Goes around what it felt: up, so far along y, and down again."""
+        here = self.env.eef_position
+        self._touched_at, self._aim = float(here[2]), here[:2] + np.array([0.0, sideways])
+        self.phase, self._wait = "dwell", int(self.rng.integers(*self.config.dwell, endpoint=True))
         return self._dwell()
 
     def _dwell(self):
-        if self._has_waited():
-            self.phase = "rise"
-            return self._rise()
-        return None, 0.0, False
+        if not self._has_waited():
+            return None, 0.0, False
+        if np.linalg.norm(self._aim - self.env.eef_position[:2]) < 0.004:
+            self.phase = "lower"
+            return self._lower()
+        self.phase = "rise"
+        return self._rise()
 
     def _rise(self):
-        height = bottom_height(self.env) + TIP_BELOW_HAND + self.config.hover
+        height = self._touched_at + self.config.hover
         if self.env.eef_position[2] > height - 0.004:
-            self.phase, self._aim = "centre", self._best_place()
+            self.phase = "centre"
         return np.array([*self.env.eef_position[:2], height]), self.fast, False
 
     def _centre(self):
-        goal = self._above(self.config.hover)
+        goal = np.array([*self._aim, self._touched_at + self.config.hover])
         if np.linalg.norm(goal - self.env.eef_position) < 0.004 and self._is_open():
             self.phase = "lower"
         return goal, self.fast, False
 
     def _lower(self):
-        goal = self._above(-0.002)
-        if self.env.contact_forces[_GRIP] > self.config.landed + min(self._n_landed, 4):  # with more force, if it must
+        height, force = self.env.eef_position[2], self.env.contact_forces[_GRIP]
+        if force > self.config.landed and self._n_landed < self.config.n_landed:
             self._n_landed += 1
-            low = self.env.eef_position[2] < self._above(self.config.low)[2]
-            return self._begin_grasp() if low else self._touched()
-        if self._feels_bottom() or self.env.eef_position[2] < goal[2] + 0.0015:
+            return self._touched((self._side() or self._guessed_side()) * self.config.further)
+        lowest = self._bottom if self._bottom is not None else self._touched_at - self.config.deep + 0.003
+        is_low = height < self._touched_at + 0.012
+        if (
+            (is_low and self._feels_bottom(self.config.firm))
+            or height < lowest - 0.003
+            or force > self.config.landed + 2
+        ):
             return self._begin_grasp()
-        return goal, float(np.clip(0.6 * (self.env.eef_position[2] - goal[2]), 0.004, 0.012)), False
+        guess = self._bottom if self._bottom is not None else self._touched_at - 0.014
+        fastest = 0.005 if height < self._touched_at + 0.006 else 0.012
+        return np.array([*self._aim, TABLE_TOP]), float(np.clip(0.5 * (height - guess), 0.003, fastest)), False
 
     def _begin_grasp(self):
         self.phase, self._closed_for = "grasp", 0
@@ -167,13 +188,22 @@ class BagExpert:
     def _grasp(self):
         self._closed_for += 1
         if self._closed_for > self.config.closing:
-            self.phase = "rise" if self._is_empty() else "lift"
-        height = bottom_height(self.env) + TIP_BELOW_HAND + 0.001  # less pressure on the bag, step by step
-        return np.array([*self.env.eef_position[:2], height]), 0.002, True
+            if self._is_empty():
+                self._try_elsewhere()
+            else:
+                self.phase = "lift"
+        up = np.array([0.0, 0.0, 0.0008])  # less pressure on the bag, step by step
+        return self.env.eef_position + up, 0.002, True
+
+    def _try_elsewhere(self) -> None:
+        here = self.env.eef_position
+        self._touched_at = float(here[2])
+        self._aim = here[:2] + self.rng.uniform(-self.config.further, self.config.further, 2)
+        self.phase = "rise"
 
     def _lift(self):
         if self._is_empty():
-            self.phase = "rise"
+            self._try_elsewhere()
             return None, 0.0, False
         height = RIM + self.config.out
         if self.env.eef_position[2] > height - 0.005:
@@ -183,39 +213,26 @@ class BagExpert:
     def _hold(self):
         return self._lift() if self._is_empty() else (None, 0.0, True)
 
-    # What it feels and knows
+    # What it feels
 
     def _feels_contents(self) -> bool:
-        return self.env.contact_forces[_GRIP] > self.config.contact_force
+        return bool(self.env.contact_forces[_GRIP] > self.config.contact_force)
 
-    def _feels_bottom(self) -> bool:
-        low = self.env.eef_position[2] < bottom_height(self.env) + TIP_BELOW_HAND + 0.002
-        return low and self.env.contact_forces[_ON_BAG] > self.config.bottom_force
+    def _side(self) -> int:
+        """Which finger felt the things in the last step, -1 or 1; 0: both, or the hand itself, or nobody can hear which."""
+        parts = self.env.definition.arm.touching
+        forces = np.linalg.norm(self.env.hand_forces(CONTENTS), axis=2).max(axis=0)
+        left, right = (forces[parts.index(finger)] for finger in FINGERS)
+        if min(left, right) > 0.3 * max(left, right) or not set(FINGERS) <= set(self.env.microphones):
+            return 0
+        return _LEFT if left > right else _RIGHT
 
-    def _above(self, height: float) -> np.ndarray:
-        return np.array([*self._aim, bottom_height(self.env) + TIP_BELOW_HAND + height])
+    def _guessed_side(self) -> int:
+        """Further to the side where the things may be, then twice as far back."""
+        return self.turn if self._n_landed < 3 else -2 * self.turn
 
-    def _best_place(self) -> np.ndarray:
-        """Where fingers that come down land on nothing, and most lies between them (2,) [m, world]."""
-        middle = points_of(self.env)[:, :2].mean(axis=0)
-        (low, high) = (np.array(corner)[:2] for corner in self.env.variant.arm.workspace)
-        places = np.clip(middle + _OFFSETS, low, high)
-        worth = self._worth(places) - 0.5 * np.linalg.norm(_OFFSETS, axis=1)
-        worth += min(self._n_landed, 5) * 0.1 * self.rng.uniform(size=len(worth))  # elsewhere, after a bad landing
-        return places[np.argmax(worth)]
-
-    def _worth(self, places: np.ndarray) -> np.ndarray:
-        """How good it is to close at some places (N, 2) [m, world]: the share of the things that is between the fingers,
-        less what is under them (N,)."""
-        points = points_of(self.env)
-        across, along = np.abs(points[:, None, :2] - places).transpose(2, 0, 1)  # (P, N) each: x, y
-        thick = np.clip((points[:, 2] - bottom_height(self.env)) / 0.01, 0.2, 1.0)[:, None]  # what is flat slips away
-        inner = self.env.variant.arm.max_opening / 2
-        between = (across < 0.007) & (along < inner - 0.004)
-        under = (
-            (across < FINGER_WIDTH / 2 + 0.002) & (along > inner - 0.003) & (along < inner + FINGER_THICKNESS + 0.003)
-        )
-        return np.asarray((between * thick).mean(axis=0) - 5.0 * under.mean(axis=0))
+    def _feels_bottom(self, force: float) -> bool:
+        return bool(self.env.contact_forces[_ON_BAG] > force)
 
     def _is_open(self) -> bool:
         return bool(self.env.finger_positions.sum() > self.env.variant.arm.max_opening - 0.002)
@@ -234,67 +251,3 @@ class BagExpert:
             return True
         self._wait -= 1
         return False
-
-
-STRATEGIES = ("straight", "random", "spiral")
-
-
-class BlindBag(BagExpert):
-    """Goes to where it guesses that the things are, closes, and lifts what is between the fingers.
-
-    `straight` goes down in the middle, first to a greater and then to a smaller height; `random` guesses place and height;
-    `spiral` stays at the middle height and goes on along a spiral.
-
-    Args:
-        env: The unwrapped environment, after `reset`.
-        strategy: One of `STRATEGIES`.
-    """
-
-    def __init__(self, env, strategy: str):
-        super().__init__(env)
-        self.strategy, self.n_attempts = strategy, 0
-        self._guess()
-
-    def _guess(self) -> None:
-        (low, high), radius = self.env.variant.bottom, self.env.variant.offset[1]
-        place, share = np.zeros(2), 0.5
-        match self.strategy:
-            case "straight":
-                share = (2 / 3, 1 / 3)[self.n_attempts % 2]
-            case "random":
-                angle = self.rng.uniform(-np.pi, np.pi)
-                place = radius * np.sqrt(self.rng.uniform()) * np.array([np.cos(angle), np.sin(angle)])
-                share = self.rng.uniform()
-            case "spiral":
-                angle = 2.4 * self.n_attempts
-                place = radius * np.sqrt(self.n_attempts / 3) * np.array([np.cos(angle), np.sin(angle)])
-        height = TABLE_TOP + low + share * (high - low) + TIP_BELOW_HAND + 0.006
-        self.guess = np.array([*place, height])
-        self.n_attempts += 1
-        self.phase = "rise"
-
-    def _rise(self):
-        height = TABLE_TOP + self.env.variant.bottom[1] + _TALLEST + TIP_BELOW_HAND
-        goal = np.array([*self.guess[:2], height])
-        if np.linalg.norm(goal - self.env.eef_position) < 0.004 and self._is_open():
-            self.phase = "lower"
-        return goal, 0.02, False
-
-    def _lower(self):
-        if np.linalg.norm(self.guess - self.env.eef_position) < 0.003:
-            return self._begin_grasp()
-        return self.guess, 0.012, False
-
-    def _grasp(self):
-        self._closed_for += 1
-        if self._closed_for > self.config.closing:
-            if self._is_empty():
-                self._guess()
-            else:
-                self.phase = "lift"
-        return None, 0.0, True
-
-    def _lift(self):
-        if self._is_empty():
-            self._guess()
-        return super()._lift()

@@ -10,8 +10,9 @@ from gym_playbyear.adversaries.groping import GROPES, GropingScript
 from gym_playbyear.arena import TABLE, TABLE_TOP
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.bag import BAG_MIDDLE, BOTTOM_THICKNESS, RIM, Torn, bag, set_bottom, walls_seen
+from gym_playbyear.bag_blind import STRATEGIES, BlindBag
 from gym_playbyear.bag_contents import CONTENTS, FRICTION, contents_prop, drop, middle_of
-from gym_playbyear.bag_experts import FOR_TALLER_THINGS, STRATEGIES, BagExpert, BlindBag
+from gym_playbyear.bag_experts import FINGERS, FOR_TALLER_THINGS, BagExpert
 from gym_playbyear.bag_gate import BagGate
 from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.haste import ClosedUnheard
@@ -28,14 +29,17 @@ _HOLDS = 0.5  # N
 class BagNumbers:
     """A bag task's numbers, which decide whether it can be solved without hearing.
 
-    offset: how far from the bag's middle the things are dropped, least and most [m]; bottom: height of the bag's bottom above
+    sides: of the bag's middle, along the line on which the fingers open, on which the things may be dropped, -1 or 1; sideways:
+    how far from it, least and most [m]; around: and around that place, at most [m]; bottom: height of the bag's bottom above
     the table, least and most [m]; max_press: largest force with which the hand may come down on the things [N]; max_tear:
     largest force on the bag [N]; closings: the how-manieth closing on nothing ends the attempt; hold_s: for how long the
     things have to be held in sight [s]; horizon: steps of an episode; arm, sensors: their numbers.
     """
 
-    offset: tuple[float, float]
-    bottom: tuple[float, float]
+    sides: tuple[int, ...]
+    sideways: tuple[float, float] = (0.02, 0.03)
+    around: float = 0.008
+    bottom: tuple[float, float] = (0.025, 0.10)
     max_press: float = 30.0
     max_tear: float = 12.0
     closings: int = 2
@@ -43,23 +47,35 @@ class BagNumbers:
     horizon: int = 75
     arm: ArmConfig = field(
         default_factory=lambda: ArmConfig(
-            max_opening=0.056, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
+            max_opening=0.068, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
         )
     )
     sensors: SensorNoise = field(default_factory=lambda: SensorNoise(wander=0.0006))
 
+    @property
+    def middles(self) -> list[np.ndarray]:
+        """Of the sides on which the things may lie, the middle of where they are dropped, (2,) each [m, world]."""
+        return [BAG_MIDDLE + np.array([0.0, side * np.mean(self.sideways)]) for side in self.sides]
 
-EASY = BagNumbers(offset=(0.0, 0.008), bottom=(0.025, 0.10))
-HARD = BagNumbers(offset=(0.02, 0.03), bottom=(0.025, 0.10))
+    def draw_place(self, rng: np.random.Generator) -> np.ndarray:
+        """Where the things are dropped, (2,) [m, world]."""
+        radius, angle = self.around * np.sqrt(rng.uniform()), rng.uniform(-np.pi, np.pi)
+        sideways = rng.choice(self.sides) * rng.uniform(*self.sideways)
+        return BAG_MIDDLE + np.array([radius * np.cos(angle), radius * np.sin(angle) + sideways])
+
+
+EASY = BagNumbers(sides=(1,))
+HARD = BagNumbers(sides=(-1, 1), sideways=(0.028, 0.038))
 
 
 def key_bag_easy(*, contents: str = "keys") -> Task:
     """
     ## Description
     An opaque bag stands on the table, and in it lies a ring with four metal things: a lever opener, a cap opener, a
-    medallion and a whistle. The camera sees the arm and the bag's outside. The keys lie below the gripper, but how high they
-    lie nobody sees: the bag's bottom rests on a springy heap of paper. The arm has to go down until it hears that it touches
-    them, grasp them, and lift them out. After Du et al., "Play it by Ear" (RSS 2022), who did it with a real robot.
+    medallion and a whistle. The camera sees the arm and the bag's outside. The keys lie below the right finger, but how high
+    they lie nobody sees: the bag's bottom rests on a springy heap of paper. The arm has to go down until it hears that it
+    touches them, go around them, grasp them, and lift them out. After Du et al., "Play it by Ear" (RSS 2022), who did it with
+    a real robot.
 
     ## Action Space
     `Box(-1, 1, (4,), float32)`: displacement of the end effector along x, y, z in units of 0.05 m per step, and the gripper
@@ -84,8 +100,9 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
     0.4 s. `info["is_success"]` says so at every step.
 
     ## Starting State
-    The gripper is open above the bag, within 1 cm of the same point. The keys fell into the bag, up to 8 mm from its middle;
-    its bottom is 2.5 to 10 cm above the table. `reset(options={"contents_position": (x, y), "bottom": height})` sets them.
+    The gripper is open above the bag, within 1 cm of the same point. The keys fell into the bag, 2 to 3 cm to the right of
+    its middle, and up to 8 mm from there; its bottom is 2.5 to 10 cm above the table.
+    `reset(options={"contents_position": (x, y), "bottom": height})` sets them.
 
     ## Episode Termination
     Terminated, and `info["end"]` says why: "success"; "pressed", when the hand came down on the keys with more than 30 N;
@@ -98,7 +115,7 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
     - `sample_rate=48000`: samples per second; a multiple of 5.
     - `sound="waveform"`: or `"contact_force"` (the paper's stand-in for sound), or `"none"`.
     - `noise_level=1.0`: scales background noise and motor hum.
-    - `microphones=("gripper",)`: `"table"` is the other one.
+    - `microphones=("gripper",)`: others are `"left_finger"`, `"right_finger"` and `"table"`.
     - `horizon=None`: steps of an episode; None is the task's.
     - `hidden_object=True`: False is the twin world, in which the hand passes through the keys, and nothing else differs.
     - `render_mode=None`: or `"rgb_array"`, `"human"`; `render_size=480`: pixels of the picture that `render()` returns.
@@ -111,10 +128,11 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
 
 def key_bag_hard(*, contents: str = "keys") -> Task:
     """
-    As `KeyBag-Easy-v1` (`key_bag_easy`), except that the keys fell 2 to 3 cm beside the bag's middle: the arm has to
-    move around in the bag until it touches them, and to tell their sound from the bag's.
+    As `KeyBag-Easy-v1` (`key_bag_easy`), except that the keys fell 2.8 to 3.8 cm to one side of the bag's middle or to the
+    other: the arm has to hear which finger touches them. So there are two microphones,
+    `microphones=("left_finger", "right_finger")`.
     """
-    return _task("KeyBag-Hard-v1", HARD, contents)
+    return _task("KeyBag-Hard-v1", HARD, contents, microphones=FINGERS)
 
 
 def _task(name: str, numbers: BagNumbers, contents: str, **more: Any) -> Task:
@@ -136,7 +154,9 @@ def _task(name: str, numbers: BagNumbers, contents: str, **more: Any) -> Task:
         gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in STRATEGIES},
         deaf={
-            name: partial(GropingScript, grope=grope, bottom=numbers.bottom, sensors=numbers.sensors)
+            name: partial(
+                GropingScript, grope=grope, bottom=numbers.bottom, sensors=numbers.sensors, middles=numbers.middles
+            )
             for name, grope in GROPES.items()
         },
         sees=walls_seen,
@@ -155,11 +175,10 @@ def _task(name: str, numbers: BagNumbers, contents: str, **more: Any) -> Task:
 
 
 def _place(env: Any, options: dict[str, Any]) -> dict[str, Any]:
-    """Sets the bag's bottom and drops the things into the bag, uniformly in a ring around its middle."""
+    """Sets the bag's bottom and drops the things into the bag."""
     numbers, rng = env.variant, env.np_random
     bottom = rng.uniform(*numbers.bottom)
-    radius, angle = np.sqrt(rng.uniform(*np.square(numbers.offset))), rng.uniform(-np.pi, np.pi)
-    place = np.array(BAG_MIDDLE) + radius * np.array([np.cos(angle), np.sin(angle)])
+    place = numbers.draw_place(rng)
     bottom, place = options.get("bottom", bottom), np.array(options.get("contents_position", place), dtype=float)
     set_bottom(env, bottom)
     drop(env, place, rng.uniform(-np.pi, np.pi), TABLE_TOP + bottom + BOTTOM_THICKNESS, rng)

@@ -82,7 +82,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._max_episode_steps = int(horizon or definition.horizon)
         self.render_mode, self._render_size = render_mode, render_size
         self._image_size, self._sound_mode, self._hidden_object = image_size, sound, hidden_object
-        self._microphones = tuple(microphones or definition.microphones)
+        self.microphones = tuple(microphones or definition.microphones)
         self._sample_rate = int(sample_rate or definition.sample_rate)
         self.shown, self.secrets, self.materials = {}, {}, {}
         # Rules remember things of an episode.
@@ -93,8 +93,8 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._sound: Any = None
         if sound == "waveform":
             rates = (self._sample_rate, definition.control_hz, definition.physics_dt)
-            ears = MaterialEars(definition.sound, self.contacts.heard(), self._microphones, *rates, noise_level)
-            self._sound = in_room(ears, self._microphones, self._sample_rate, room or {})
+            ears = MaterialEars(definition.sound, self.contacts.heard(), self.microphones, *rates, noise_level)
+            self._sound = in_room(ears, self.microphones, self._sample_rate, room or {})
         spec = compose(definition, max(render_size, image_size), hidden_object)
         self.contacts.add_sensors(spec, definition.felt)
         if self._sound is not None:
@@ -127,7 +127,7 @@ class TaskEnv(PrivilegedState, gym.Env):
             "agent_pos": spaces.Box(-np.inf, np.inf, (7,), np.float32),
         }
         if self._sound is not None:
-            for microphone in self._microphones:
+            for microphone in self.microphones:
                 shape = (self._sample_rate // self.control_hz,)
                 observation[f"audio.{microphone}"] = spaces.Box(-32768, 32767, shape, np.int16)
         if self._sound_mode == "contact_force":
@@ -282,7 +282,7 @@ class TaskEnv(PrivilegedState, gym.Env):
             speeds[:, : self._fingers.start].mean(axis=1),
             speeds[:, self._fingers].mean(axis=1),
             self._rollout_state[0],
-            {microphone: self._place_of(links.get(microphone)) for microphone in self._microphones},
+            {microphone: self._place_of(links.get(microphone)) for microphone in self.microphones},
             {n: Bending(speeds[:, dofs] @ factors, self.position(n)) for n, (dofs, factors) in self._bends.items()},
         )
 

@@ -200,6 +200,8 @@ class DaggerConfig:
         rate = self.largest_rate * min(1.0, (step + 1) / max(self.warmup_updates, 1))
         if not self.anneal:
             return rate
+        if not self.is_online:  # rounds are there to be saved; nobody acts in between
+            number, n_updates = step, self.total_updates
         done = min(1.0, (step - number) / self.total_updates)
         return rate * (1 - 0.9 * done) * 0.5 * (1 + math.cos(math.pi * number / n_updates))
 

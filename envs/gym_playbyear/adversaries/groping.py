@@ -6,6 +6,7 @@ constant speed so that the lag is the same but for that, and closes where the th
 the fingers measure tells whether they hold something; if not, it goes on, as long as the attempt lasts.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,7 @@ from gym_playbyear.adversaries.script import TIP_BELOW_HAND, Actions, DeafScript
 from gym_playbyear.adversaries.view import TaskFacts
 from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.arm import FINGER_THICKNESS
-from gym_playbyear.bag import BAG_MIDDLE, RIM
+from gym_playbyear.bag import RIM
 from gym_playbyear.proprioception import SensorNoise
 
 _RESOLUTION = 0.001  # m
@@ -40,7 +41,8 @@ class Grope:
         finger: Pokes with one of the open fingers first, which costs no closing.
         step: What the hand goes down per control step.
         rests: Steps of rest after each, in which the lag is measured; 0: it is measured on the way.
-        places: Where it closes, beside the bag's middle (x, y); the next one after every closing on nothing.
+        places: Where it closes, beside the middle of where the things may lie (x, y); the next one after every closing on
+            nothing.
         sure: It closes where the things are between the fingers with this probability.
         dares: It does not go on with so much risk of pressing too hard.
         feels: Without, it goes by what it was not stopped by.
@@ -150,6 +152,7 @@ class GropingScript(DeafScript):
         grope: How to grope.
         bottom: Between which heights the bag's bottom is [m, above the table].
         sensors: What is wrong with what the arm measures.
+        middles: Where the things may lie (x, y) [m, world]; it goes to another one after every closing on nothing.
     """
 
     def __init__(
@@ -159,14 +162,15 @@ class GropingScript(DeafScript):
         grope: Grope,
         bottom: tuple[float, float],
         sensors: SensorNoise,
+        middles: Sequence[np.ndarray],
     ):
-        self.grope, self.bottom, self.sensors = grope, bottom, sensors
+        self.grope, self.bottom, self.sensors, self.middles = grope, bottom, sensors, middles
         super().__init__(facts, rng)
 
     def _plan(self) -> Actions:
         things = 0.9 if self._pokes else 0.5
         self.belief = DepthBelief(*self.bottom, things, self.sensors, self.facts.control_hz)
-        self._n_closings = 0
+        self._n_closings, self._first = 0, int(self.rng.integers(len(self.middles)))
         self._shift = np.zeros(2)
         if self.grope.finger:
             self._shift = np.array(
@@ -218,7 +222,7 @@ class GropingScript(DeafScript):
     def _entry(self) -> np.ndarray:
         """(2,) where to go down [m, world]."""
         place = self.grope.places[self._n_closings % len(self.grope.places)]
-        return np.array(BAG_MIDDLE) + place + self._shift
+        return self.middles[(self._first + self._n_closings) % len(self.middles)] + place + self._shift
 
     def _tips(self) -> float:
         """Where the fingers' tips were sent [m, above the table]."""
