@@ -67,14 +67,14 @@ SCENES = (
         "KeyBag-Easy-v1",
         {},
         0.95,
-        "Keys below the hand, at a depth that nobody sees: it goes down until it hears them.",
+        "Keys below a finger, at a depth that nobody sees: the hand goes down until it hears them, and around them.",
     ),
     Scene(
         "key_bag_hard",
         "KeyBag-Hard-v1",
-        {},
+        {"microphones": ("gripper",)},
         0.95,
-        "Keys beside the middle of the bag: the hand searches along the bottom. The crackle is the bag's.",
+        "Keys below one finger or the other: two microphones tell which (here one is heard). The crackle is the bag's.",
     ),
 )
 

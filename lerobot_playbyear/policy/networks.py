@@ -21,11 +21,14 @@ from lerobot_playbyear.policy.fusion import FUSIONS
 from lerobot_playbyear.policy.history import before_episode, newest
 from lerobot_playbyear.policy.mel_features import make_ear
 from lerobot_playbyear.policy.memory import MemoryHead
+from lerobot_playbyear.policy.precision import computes_512_bits
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
+_HAS_512_BITS = computes_512_bits()
+_SAFE_EMBEDDING = 64  # 8 channels in the first stage, and multiples of them
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
 
 
@@ -178,6 +181,8 @@ class VisionEncoder(nn.Module):
     def normalize(self, stacks: Tensor) -> Tensor:
         """(N, 3 * n_stacked, size, size) in [0, 1] -> the same shape, as networks for images want it."""
         stacks = (stacks - self.mean) / self.std
+        if stacks.device.type == "cpu" and self.embedding_size % _SAFE_EMBEDDING and not _HAS_512_BITS:
+            return stacks  # there oneDNN writes gradients of 4 channels beyond their memory (torch 2.11)
         # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
         return stacks.contiguous(memory_format=torch.channels_last)
 

@@ -34,8 +34,17 @@ def training_dtype(asked: str | None, use_amp: bool, device: str) -> str | None:
 
 def computes_bfloat16() -> bool:
     """Whether this CPU multiplies in bfloat16 by itself; elsewhere autocast costs more time than it saves."""
+    return _has_any("avx512_bf16", "amx_bf16")
+
+
+def computes_512_bits() -> bool:
+    """Whether this CPU has AVX-512."""
+    return _has_any("avx512_f")
+
+
+def _has_any(*names: str) -> bool:
     capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
-    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16"))
+    return any(capabilities.get(name, False) for name in names)
 
 
 def _fastest(kind: str) -> str:
