@@ -54,6 +54,8 @@ METHODS: dict[str, tuple[str, ...]] = {
     "person": ("--expert.person=true",),
     "person_robot_gated": ("--method.type=robot_gated", "--expert.person=true"),
 }
+WEIGHING = ("sirius", "iwr", "all_frames")
+"""Those that say what is learned from; the others say who acts, and what is kept."""
 COURSES = {"own": {}, "paper": {"KeyBag-Easy-v1": 12}}
 """Attempts that are kept in other tasks before the task itself; the paper's order for the bag."""
 BATCH_SIZE = 12
@@ -176,7 +178,7 @@ class Study:
 
     def _collect(self, policy: Path, number: int, kept: int) -> None:
         """Attempts of a policy that stays as it is, until the dataset holds so many."""
-        course = {**COURSES[self.options.course], self.job.task: kept}
+        course = {**(COURSES[self.options.course] if number == 1 else {}), self.job.task: kept}
         for task, n in course.items():
             name = f"collect{number}-{task}"
             folder = self._dagger(
@@ -196,7 +198,7 @@ class Study:
             "--episodes=0",
             "--new_weights=true",
         ]
-        weights = [option for option in METHODS[self.options.method] if option.startswith(("--learn_from", "--method"))]
+        weights = METHODS[self.options.method] if self.options.method in WEIGHING else ()
         folder = self._dagger(job.checkpoint, f"learn{number}", *learned, *weights)
         return folder / "checkpoints" / "last" / "pretrained_model"
 

@@ -6,6 +6,7 @@ import pytest
 
 from gym_playbyear.bag import BAG, HALF_SIZE, RIM
 from gym_playbyear.bag_contents import CONTENTS, CONTENTS_KINDS, middle_of, points_of
+from gym_playbyear.bag_experts import BagExpert
 from lerobot_env_playbyear import PlaybyearEnvConfig
 
 EASY, HARD = "KeyBag-Easy-v1", "KeyBag-Hard-v1"
@@ -161,19 +162,31 @@ def test_one_hears_which_finger_touches_the_keys():
     env.close()
 
 
-def test_the_expert_acts_on_what_it_felt_alone():
-    """Things that lie elsewhere, and have not been touched yet, change nothing of what it does."""
-    env, paths = make(HARD, sound="none"), []
-    for sideways in (0.02, 0.06):
-        env.begin_episode(seed=3, options={"contents_position": (0.0, sideways), "bottom": 0.05})
-        expert, actions = env.scripted_expert(), []
-        while env.contact_forces[f"gripper-{CONTENTS}"] == 0 and len(actions) < 20:
-            actions.append(expert.act())
-            env.advance(actions[-1])
-        paths.append(actions)
-    n = min(map(len, paths))
-    assert n > 5
-    np.testing.assert_allclose(paths[0][:n], paths[1][:n], atol=0.02)
+class Felt:
+    """An environment of which one gets what the hand feels, and what is the same in every episode."""
+
+    FELT = ("contact_forces", "hand_forces", "eef_position", "finger_positions")
+    KNOWN = ("expert_rng", "variant", "definition", "microphones")
+
+    def __init__(self, env):
+        self._env = env
+
+    def __getattr__(self, name):
+        assert name in (*self.FELT, *self.KNOWN), f"the expert looks at {name}"
+        return getattr(self._env, name)
+
+
+@pytest.mark.parametrize("task", [EASY, HARD])
+def test_the_expert_acts_on_what_it_felt_alone(task):
+    env, solved = make(task, sound="none"), 0
+    for seed in range(4):
+        env.begin_episode(seed=seed)
+        expert, done = BagExpert(Felt(env)), False
+        while not done:
+            _, terminated, truncated, info = env.advance(expert.act())
+            done = terminated or truncated
+        solved += info["is_success"]
+    assert solved >= 3
 
 
 def test_a_cloth_is_mute():

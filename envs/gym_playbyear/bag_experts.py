@@ -1,9 +1,8 @@
 """Who takes things out of a bag: an expert that knows what it felt and no more.
 
 The expert goes down slowly until a finger feels something. Which finger it was tells on which side the things lie, and where
-the hand was tells how high. It goes around them, closes, lifts and holds; after an empty grasp it tries again. Everything it
-acts on can be heard: what is touched, by which finger, and when. (One that goes to where the things are, without having felt
-it, shows what nobody can learn.) Speeds, pauses and places are drawn anew for every episode.
+the hand was tells how high. It goes around them, closes, lifts and holds; after an empty grasp it tries again. (One that goes
+to where the things are, without having felt it, shows what nobody can learn.) Speeds, pauses and places are drawn anew for every episode.
 """
 
 from dataclasses import dataclass
@@ -81,13 +80,13 @@ class BagExpert:
         self.entry: np.ndarray = BAG_MIDDLE + draw(-self.config.aim, self.config.aim, 2)
         self.turn = int(self.rng.choice(env.variant.sides))  # where it looks for the things first
         self.phase, self._wait, self._closed_for, self._n_landed = "enter", 0, 0, 0
-        self._aim = self.entry
+        self._aim, self._way = self.entry, list[float]()
         self._touched_at = float(env.eef_position[2])  # height of the hand at the last touch [m, world]
         self._bottom: float | None = None  # and where it felt the bag's bottom
 
     def begin_at(self, phase: str) -> None:
         """Goes on in the middle of an attempt: from where the hand is now, in `phase`."""
-        self.phase, self._wait, self._closed_for = phase, 0, 0
+        self.phase, self._wait, self._closed_for, self._n_landed = phase, 0, 0, 0
         self.entry = self._aim = self.env.eef_position[:2]
         self._touched_at = float(self.env.eef_position[2])
 

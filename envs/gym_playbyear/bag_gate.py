@@ -39,7 +39,7 @@ class BagGateConfig:
     missed_height: float = 0.07
     still_steps: int = 18
     still_distance: float = 0.01
-    search_steps: int = 55
+    search_steps: int = 45
     grasp_steps: int = 32
 
 
