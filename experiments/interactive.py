@@ -27,7 +27,6 @@ from experiments.protocol import (
     RESULTS,
     RUNS,
     STEPS,
-    Result,
     command_line,
     dataset_root,
     library_versions,
@@ -137,7 +136,7 @@ class Study:
         record(job.task, job.n_demonstrations, self.demonstrations)
         command, _ = train(job)
         self.commands.append(command)
-        outcomes = [self._outcome("first", job, job.checkpoint, 0, 0)]
+        outcomes = [self._outcome("first", job, job.checkpoint, 0)]
         policy = job.checkpoint
         for number in range(1, options.rounds + 1):
             kept = options.kept * number // options.rounds
@@ -146,7 +145,7 @@ class Study:
             else:
                 self._collect(policy, number, kept)
                 policy, updates = self._learn_anew(job, number), options.updates * number
-            outcomes.append(self._outcome(f"round{number}", job, policy, kept, updates))
+            outcomes.append(self._outcome(f"round{number}", job, policy, updates, self.folders))
             print(f"{self.name}: {outcomes[-1]}", flush=True)
         controls = {name: self._control(name, outcomes[-1]) for name in options.controls}
         return Interactive(
@@ -213,17 +212,18 @@ class Study:
         state = json.loads((folder / "dagger_state.json").read_text())
         return folder / "checkpoints" / "last" / "pretrained_model", state["step"]
 
-    def _outcome(self, name: str, job: Job, policy: Path, kept: int, updates: int) -> Outcome:
+    def _outcome(self, name: str, job: Job, policy: Path, updates: int, folders: Iterable[Path] = ()) -> Outcome:
+        """Evaluates a policy; `folders`: the runs whose corrections it learned from, none for controls."""
         path = RUNS / "interactive" / f"{self.name}-{name}.json"
         if not path.exists():
             commands: list[str] = []
             told = evaluate(job, commands, name=f"{STUDY}-{self.name}-{name}", checkpoint=policy)
-            result = Result(**job.learned, first_seed=0, **asdict(told), minutes=0, threads=1, commands=commands)
-            rate = result.first_search_rate
-            totals = Totals.of(_metrics(self.folders))
+            rate = told.first_search_rate
+            lines = list(_metrics(folders))
+            totals, kept = Totals.of(lines), sum(line.get("outcome") == "kept" for line in lines)
             outcome = Outcome(
                 *(kept, totals.expert_steps, updates, job.n_demonstrations),
-                *(100 * result.rate, None if rate is None else 100 * rate, result.failures),
+                *(100 * told.rate, None if rate is None else 100 * rate, told.failures),
                 *(totals.takeovers, totals.switches, totals.person_seconds, totals.autonomy),
             )
             save(path, {**asdict(outcome), "commands": commands})
@@ -249,7 +249,7 @@ class Study:
             record(job.task, more, control.dataset)
         command, _ = train(control)
         self.commands.append(command)
-        return self._outcome(f"control-{name}", control, control.checkpoint, 0, last.updates)
+        return self._outcome(f"control-{name}", control, control.checkpoint, last.updates)
 
 
 def demonstrations(task: str, n: int) -> Path:

@@ -55,8 +55,44 @@ def command_line(doc: str | None, *options: str) -> argparse.ArgumentParser:
     return parser
 
 
+class Tally:
+    """What is counted in the attempts of an evaluation; the attributes are those of `Result`."""
+
+    successes: list[bool]
+    acted_early: list[bool]
+    ends: list[str]
+    n_closings: list[int]
+
+    @property
+    def rate(self) -> float:
+        return sum(self.successes) / len(self.successes)
+
+    @property
+    def early_rate(self) -> float | None:
+        """Share of the episodes in which the hand acted before anything was heard; None: nobody looked."""
+        return sum(self.acted_early) / len(self.acted_early) if self.acted_early else None
+
+    @property
+    def first_search_rate(self) -> float | None:
+        """Share of the episodes that were solved by the first closing of the hand; None: nobody counted."""
+        first = [solved and n == 1 for solved, n in zip(self.successes, self.n_closings, strict=False)]
+        return sum(first) / len(first) if first else None
+
+    @property
+    def failures(self) -> str:
+        """How the failures ended, the most frequent first: `7 pressed, 2 time`; empty where nobody looked."""
+        ends = Counter(end for solved, end in zip(self.successes, self.ends, strict=False) if not solved)
+        return ", ".join(f"{n} {end}" for end, n in ends.most_common())
+
+    @property
+    def summary(self) -> str:
+        """Success, and how often the hand acted early, in a few words."""
+        early = "" if self.early_rate is None else f" (acted early: {self.early_rate:.0%})"
+        return f"{self.rate:.0%}{early}"
+
+
 @dataclass
-class Result:
+class Result(Tally):
     """Success of one policy over the evaluation seeds.
 
     Attributes:
@@ -90,33 +126,6 @@ class Result:
     n_closings: list[int] = field(default_factory=list)
     environment: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=lambda: library_versions())
-
-    @property
-    def rate(self) -> float:
-        return sum(self.successes) / len(self.successes)
-
-    @property
-    def early_rate(self) -> float | None:
-        """Share of the episodes in which the hand acted before anything was heard; None: nobody looked."""
-        return sum(self.acted_early) / len(self.acted_early) if self.acted_early else None
-
-    @property
-    def first_search_rate(self) -> float | None:
-        """Share of the episodes that were solved by the first closing of the hand; None: nobody counted."""
-        first = [solved and n == 1 for solved, n in zip(self.successes, self.n_closings, strict=False)]
-        return sum(first) / len(first) if first else None
-
-    @property
-    def failures(self) -> str:
-        """How the failures ended, the most frequent first: `7 pressed, 2 time`; empty where nobody looked."""
-        ends = Counter(end for solved, end in zip(self.successes, self.ends, strict=False) if not solved)
-        return ", ".join(f"{n} {end}" for end, n in ends.most_common())
-
-    @property
-    def summary(self) -> str:
-        """Success, and how often the hand acted early, in a few words."""
-        early = "" if self.early_rate is None else f" (acted early: {self.early_rate:.0%})"
-        return f"{self.rate:.0%}{early}"
 
 
 def save(path: Path, content: Any, indent: int | None = None) -> None:

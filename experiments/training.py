@@ -18,6 +18,7 @@ from experiments.protocol import (
     RUNS,
     STEPS,
     Result,
+    Tally,
     dataset_root,
     load,
     options_of,
@@ -28,7 +29,7 @@ from experiments.protocol import (
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class Evaluation(Tally):
     """What a policy's attempts came to, in the order of their seeds; the names are those of `Result`."""
 
     successes: list[bool]

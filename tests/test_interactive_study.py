@@ -32,7 +32,13 @@ def ran(monkeypatch, tmp_path):
     def clocked(command, folder, threads):
         told["dagger"].append(command)
         folder.mkdir(parents=True, exist_ok=True)
-        attempt = {"kind": "attempt", "n_frames": 40, "intervention_share": 0.25, "n_expert_steps": 10}
+        attempt = {
+            "kind": "attempt",
+            "outcome": "kept",
+            "n_frames": 40,
+            "intervention_share": 0.25,
+            "n_expert_steps": 10,
+        }
         if "--episodes=0" not in command:
             (folder / "metrics.jsonl").write_text(
                 json.dumps(attempt | {"takeover_steps": [10], "n_takeovers": 1}) + "\n"
@@ -73,6 +79,7 @@ def test_rounds_collect_with_the_newest_policy_and_learn_anew(ran, tmp_path):
     assert (first.success, first.first_search, first.failures) == (50, 25, "1 pressed, 1 time")
     assert [outcome.expert_steps for outcome in result.outcomes] == [0, 10, 20]
     assert [outcome.updates for outcome in result.outcomes] == [0, 30, 60]
+    assert [outcome.kept for outcome in result.outcomes] == [0, 1, 2]
     assert "learn1" in next(o for o in collected[1] if o.startswith("--policy.path"))
 
 

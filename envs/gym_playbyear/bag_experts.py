@@ -2,7 +2,8 @@
 
 The expert goes down slowly until a finger feels something. Which finger it was tells on which side the things lie, and where
 the hand was tells how high. It goes around them, closes, lifts and holds; after an empty grasp it tries again. (One that goes
-to where the things are, without having felt it, shows what nobody can learn.) Speeds, pauses and places are drawn anew for every episode.
+to where the things are, without having felt it, shows what nobody can learn.) Speeds, pauses and places are drawn anew for
+every episode.
 """
 
 from dataclasses import dataclass
