@@ -189,13 +189,14 @@ class BagExpert:
         self._closed_for += 1
         if self._closed_for > self.config.closing:
             if self._is_empty():
-                self._try_elsewhere()
+                self.try_elsewhere()
             else:
                 self.phase = "lift"
         up = np.array([0.0, 0.0, 0.0008])  # less pressure on the bag, step by step
         return self.env.eef_position + up, 0.002, True
 
-    def _try_elsewhere(self) -> None:
+    def try_elsewhere(self) -> None:
+        """Goes on with a grasp near the one that was empty."""
         here = self.env.eef_position
         self._touched_at = float(here[2])
         self._aim = here[:2] + self.rng.uniform(-self.config.further, self.config.further, 2)
@@ -203,7 +204,7 @@ class BagExpert:
 
     def _lift(self):
         if self._is_empty():
-            self._try_elsewhere()
+            self.try_elsewhere()
             return None, 0.0, False
         height = RIM + self.config.out
         if self.env.eef_position[2] > height - 0.005:

@@ -99,6 +99,8 @@ class BagGate(StagedGate):
         else:
             phase = "enter" if self.env.eef_position[2] > RIM else "descend"
         self.expert.begin_at(phase)
+        if phase == "rise" and self._empty_for:
+            self.expert.try_elsewhere()  # where it closed is nothing
         self._hands_back_at = LIFT + 1 if self.reason == "opens" else _STAGES[phase] + 1
 
     def _follow(self) -> None:
