@@ -26,7 +26,7 @@ _COLOURS = ("0.70 0.52 0.33 1", "0.75 0.57 0.38 1")  # of the lower and the uppe
 _PARTS = ("foot", "half")
 _SEEN = 0.005  # rad
 _BOTTOM_STIFFNESS, _BOTTOM_DAMPING = 1500.0, 40.0  # N/m, Ns/m
-_BOTTOM_PRESSED = 0.05  # m: so far down it crackles as a wall that bends by one radian
+_BOTTOM_PRESSED = 0.004  # m: so far down it crackles as a wall that bends by one radian
 
 
 def bag() -> Prop:

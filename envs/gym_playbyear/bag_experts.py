@@ -52,7 +52,7 @@ class BagExpertConfig:
     hover: float = 0.022
     deep: float = 0.020
     aside: float = -0.004
-    aim: float = 0.005
+    aim: float = 0.004
     above_bottom: float = 0.003
     closing: int = 5
     empty: float = 0.004
@@ -178,7 +178,7 @@ class BagExpert:
         ):
             return self._begin_grasp()
         guess = self._bottom if self._bottom is not None else self._touched_at - 0.014
-        fastest = 0.005 if height < self._touched_at + 0.006 else 0.012
+        fastest = 0.0035 if height < self._touched_at + 0.008 else 0.012
         return np.array([*self._aim, TABLE_TOP]), float(np.clip(0.5 * (height - guess), 0.003, fastest)), False
 
     def _begin_grasp(self):

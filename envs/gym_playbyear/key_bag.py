@@ -38,7 +38,7 @@ class BagNumbers:
 
     sides: tuple[int, ...]
     sideways: tuple[float, float] = (0.02, 0.03)
-    around: float = 0.008
+    around: float = 0.004
     bottom: tuple[float, float] = (0.025, 0.10)
     max_press: float = 30.0
     max_tear: float = 12.0
@@ -101,7 +101,7 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
 
     ## Starting State
     The gripper is open above the bag, within 1 cm of the same point. The keys fell into the bag, 2 to 3 cm to the right of
-    its middle, and up to 8 mm from there; its bottom is 2.5 to 10 cm above the table.
+    its middle, and up to 4 mm from there; its bottom is 2.5 to 10 cm above the table.
     `reset(options={"contents_position": (x, y), "bottom": height})` sets them.
 
     ## Episode Termination
