@@ -27,18 +27,20 @@ _LEFT, _RIGHT = -1, 1  # along y
 class BagExpertConfig:
     """Where the expert moves and how much chance there is in it. Lengths in metres, durations in control steps, forces in N.
 
-    The pairs are ranges of uniform draws. fast, slow, search_step: displacement per step; pause_probability: per step of
-    descent and search; contact_force, bottom_force: what counts as a touch of the things, and of the bag; firm: a bag that is
-    pressed so hard is at its bottom; landed: the fingers came down on a thing, not around it, after which it goes further
-    aside by `further`, `n_landed` times at most; hover: how high above the last touch it goes aside; deep: how far below a
-    touch of the things it goes at most; aside: how much further than the middle of where they may lie it goes to the side on
-    which it felt them; aim: how far from the bag's middle it goes in; above_bottom: in a search; closing: for so long before
-    it looks whether it holds something; empty: opening of fingers that hold nothing; out: the hand above the rim, at the end.
+    The pairs are ranges of uniform draws. fast, slow, search_step: displacement per step; lowering: its limits on the way down
+    to the bottom; pause_probability: per step of descent and search; contact_force, bottom_force: what counts as a touch of
+    the things, and of the bag; firm: a bag that is pressed so hard is at its bottom; landed: the fingers came down on a thing,
+    not around it, after which it goes further aside by `further`, `n_landed` times at most; hover: how high above the last
+    touch it goes aside; deep: how far below a touch of the things it goes at most; aside: how much further than the middle of
+    where they may lie it goes to the side on which it felt them; aim: how far from the bag's middle it goes in; above_bottom:
+    in a search; closing: for so long before it looks whether it holds something; empty: opening of fingers that hold nothing;
+    out: the hand above the rim, at the end.
     """
 
     fast: tuple[float, float] = (0.020, 0.030)
     slow: tuple[float, float] = (0.0045, 0.0065)
     search_step: tuple[float, float] = (0.010, 0.014)
+    lowering: tuple[float, float] = (0.003, 0.010)
     pause_probability: float = 0.04
     pause: tuple[int, int] = (1, 2)
     dwell: tuple[int, int] = (0, 1)
@@ -178,8 +180,8 @@ class BagExpert:
         ):
             return self._begin_grasp()
         guess = self._bottom if self._bottom is not None else self._touched_at - 0.014
-        fastest = 0.0035 if height < self._touched_at + 0.008 else 0.012
-        return np.array([*self._aim, TABLE_TOP]), float(np.clip(0.5 * (height - guess), 0.003, fastest)), False
+        speed = np.clip(0.25 * (height - guess), *self.config.lowering)  # slower the nearer the bottom may be
+        return np.array([*self._aim, TABLE_TOP]), float(speed), False
 
     def _begin_grasp(self):
         self.phase, self._closed_for = "grasp", 0
