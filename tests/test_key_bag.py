@@ -214,7 +214,7 @@ def test_a_bad_policy_is_corrected():
     """Someone who closes far above the keys, and waits."""
     env = make(EASY, sound="none")
     rescued = 0
-    for seed in range(2):
+    for seed in range(4):
         env.begin_episode(seed=seed)
         gate, done, info = env.intervention_gate(), False, {}
         while not done:

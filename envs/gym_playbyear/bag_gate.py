@@ -39,8 +39,8 @@ class BagGateConfig:
     missed_height: float = 0.07
     still_steps: int = 18
     still_distance: float = 0.01
-    search_steps: int = 45
-    grasp_steps: int = 32
+    search_steps: int = 48
+    grasp_steps: int = 38
 
 
 class BagGate(StagedGate):
