@@ -147,6 +147,21 @@ def test_keys_sound_other_than_the_bag():
     assert np.median(heard_keys) > np.median(heard_bag) + 300
 
 
+def test_one_hears_the_bottom():
+    """Pressed as slowly as the expert does; at the usual background, and beside the keys."""
+    env, louder = make(EASY, image_size=8), []
+    for seed in range(4):
+        observation, peaks = env.reset(seed=seed, options={"contents_position": (-0.05, -0.10), "bottom": 0.06})[0], []
+        while env.contact_forces[f"gripper-{BAG}"] < 0.5:
+            down = -0.08 if env.eef_position[2] < RIM else -0.5
+            observation = env.step(np.array([0.0, 0.0, down, -1.0]))[0]
+            peaks.append(np.abs(observation["audio.gripper"].astype(float)).max())
+        louder.append(20 * np.log10(peaks[-1] / np.median(peaks[-9:-1])))
+    env.close()
+    assert np.median(louder) > 20  # dB
+    assert min(louder) > 10
+
+
 def test_one_hears_which_finger_touches_the_keys():
     env, louder = make(HARD, image_size=8), []
     for seed in (3, 4, 5):
