@@ -29,8 +29,8 @@ class BagExpertConfig:
 
     The pairs are ranges of uniform draws. fast, slow, search_step: displacement per step; lowering: its limits on the way down
     to the bottom; pause_probability: per step of descent and search; contact_force, bottom_force: what counts as a touch of
-    the things, and of the bag; firm: a bag that is pressed so hard is at its bottom; landed: the fingers came down on a thing,
-    not around it, after which it goes further aside by `further`, `n_landed` times at most; hover: how high above the last
+    the things, and of the bag; firm: a bag that is pressed so hard is at its bottom; landed: on a thing that is pressed so hard
+    the hand closes; further: how far from a grasp that was empty it tries again, along x and y; hover: how high above the last
     touch it goes aside; deep: how far below a touch of the things it goes at most; aside: how much further than the middle of
     where they may lie it goes to the side on which it felt them; aim: how far from the bag's middle it goes in; above_bottom:
     in a search; closing: for so long before it looks whether it holds something; empty: opening of fingers that hold nothing;
@@ -48,9 +48,8 @@ class BagExpertConfig:
     contact_force: float = 0.15
     bottom_force: float = 0.3
     firm: float = 0.8
-    landed: float = 6.0
+    landed: float = 8.0
     further: float = 0.010
-    n_landed: int = 4
     hover: float = 0.022
     deep: float = 0.020
     aside: float = -0.004
@@ -82,16 +81,23 @@ class BagExpert:
         )
         self.entry: np.ndarray = BAG_MIDDLE + draw(-self.config.aim, self.config.aim, 2)
         self.turn = int(self.rng.choice(env.variant.sides))  # where it looks for the things first
-        self.phase, self._wait, self._closed_for, self._n_landed = "enter", 0, 0, 0
+        self.phase, self._wait, self._closed_for = "enter", 0, 0
         self._aim, self._way = self.entry, list[float]()
         self._touched_at = float(env.eef_position[2])  # height of the hand at the last touch [m, world]
         self._bottom: float | None = None  # and where it felt the bag's bottom
 
-    def begin_at(self, phase: str) -> None:
-        """Goes on in the middle of an attempt: from where the hand is now, in `phase`."""
-        self.phase, self._wait, self._closed_for, self._n_landed = phase, 0, 0, 0
-        self.entry = self._aim = self.env.eef_position[:2]
-        self._touched_at = float(self.env.eef_position[2])
+    def begin_at(self, phase: str, aim: np.ndarray | None = None, touched_at: float | None = None) -> None:
+        """Goes on in the middle of an attempt, in a phase.
+
+        Args:
+            phase: Which one.
+            aim: (2,) where the things are [m, world]; where the hand is, if None.
+            touched_at: Height of the hand when it touched them [m, world]; as it is now, if None.
+        """
+        self.phase, self._wait, self._closed_for = phase, 0, 0
+        self.entry = self.env.eef_position[:2]
+        self._aim = self.entry if aim is None else aim
+        self._touched_at = float(self.env.eef_position[2]) if touched_at is None else touched_at
 
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
@@ -167,16 +173,13 @@ class BagExpert:
         return goal, self.fast, False
 
     def _lower(self):
-        height, force = self.env.eef_position[2], self.env.contact_forces[_GRIP]
-        if force > self.config.landed and self._n_landed < self.config.n_landed:
-            self._n_landed += 1
-            return self._touched((self._side() or self._guessed_side()) * self.config.further)
+        height = self.env.eef_position[2]
         lowest = self._bottom if self._bottom is not None else self._touched_at - self.config.deep + 0.003
         is_low = height < self._touched_at + 0.012
         if (
             (is_low and self._feels_bottom(self.config.firm))
             or height < lowest - 0.003
-            or force > self.config.landed + 2
+            or self.env.contact_forces[_GRIP] > self.config.landed
         ):
             return self._begin_grasp()
         guess = self._bottom if self._bottom is not None else self._touched_at - 0.014
@@ -229,10 +232,6 @@ class BagExpert:
         if min(left, right) > 0.3 * max(left, right) or not set(FINGERS) <= set(self.env.microphones):
             return 0
         return _LEFT if left > right else _RIGHT
-
-    def _guessed_side(self) -> int:
-        """Further to the side where the things may be, then twice as far back."""
-        return self.turn if self._n_landed < 3 else -2 * self.turn
 
     def _feels_bottom(self, force: float) -> bool:
         return bool(self.env.contact_forces[_ON_BAG] > force)

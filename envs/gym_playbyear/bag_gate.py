@@ -10,7 +10,7 @@ import numpy as np
 
 from gym_playbyear.arm import ACTION_SCALE
 from gym_playbyear.bag import BAG, RIM, bottom_height
-from gym_playbyear.bag_contents import CONTENTS
+from gym_playbyear.bag_contents import CONTENTS, middle_of
 from gym_playbyear.bag_experts import TIP_BELOW_HAND, BagExpert
 from gym_playbyear.staged_gate import StagedGate
 
@@ -50,12 +50,12 @@ class BagGate(StagedGate):
 
     def __init__(self, env, expert: BagExpert, config: BagGateConfig | None = None):
         super().__init__(env, expert, config or BagGateConfig())
-        self._empty_for = 0
+        self._empty_for, self._height_at_touch = 0, 0.0
         self._places: list[np.ndarray] = []
 
     def _look(self) -> None:
         if self.env.contact_forces[f"gripper-{CONTENTS}"] > self.expert.config.contact_force:
-            self._touched_at = self._n_steps
+            self._touched_at, self._height_at_touch = self._n_steps, float(self.env.eef_position[2])
         empty = self.env.finger_positions.sum() < self.expert.config.empty
         self._empty_for = self._empty_for + 1 if empty else 0
         self._places = [*self._places[-self.config.still_steps :], self.env.eef_position]
@@ -98,9 +98,12 @@ class BagGate(StagedGate):
             phase = "rise"
         else:
             phase = "enter" if self.env.eef_position[2] > RIM else "descend"
-        self.expert.begin_at(phase)
-        if phase == "rise" and self._empty_for:
-            self.expert.try_elsewhere()  # where it closed is nothing
+        if phase == "rise" and heard:  # who heard a touch knows how high, and on which side
+            self.expert.begin_at(phase, middle_of(self.env)[:2], self._height_at_touch)
+        else:
+            self.expert.begin_at(phase)
+            if phase == "rise":  # where it closed is nothing
+                self.expert.try_elsewhere()
         self._hands_back_at = LIFT + 1 if self.reason == "opens" else _STAGES[phase] + 1
 
     def _follow(self) -> None:

@@ -47,7 +47,7 @@ class BagNumbers:
     horizon: int = 75
     arm: ArmConfig = field(
         default_factory=lambda: ArmConfig(
-            max_opening=0.068, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
+            max_opening=0.074, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
         )
     )
     sensors: SensorNoise = field(default_factory=lambda: SensorNoise(wander=0.0006))
