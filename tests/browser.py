@@ -28,6 +28,7 @@ _FLAGS = [
     "--disable-sync",
     "--disable-extensions",
     "--hide-scrollbars",
+    "--disable-audio-output",  # the machine may have a sound server that comes and goes; the film keeps its time without
     "--remote-debugging-port=0",
 ]
 _KEY_CODES = {" ": 32, "End": 35, "Home": 36, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}
