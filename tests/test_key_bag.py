@@ -240,6 +240,27 @@ def test_a_bad_policy_is_corrected():
     assert rescued >= 1
 
 
+def test_who_lands_on_the_keys_and_goes_on_is_led_beside_them():
+    """Someone who comes down as the expert does, and then presses on; with something in the hand they lift it."""
+    env = make(HARD, sound="none")
+    rescued = 0
+    for seed in range(4):
+        env.begin_episode(seed=seed)
+        policy, gate, done, info = env.scripted_expert(), env.intervention_gate(), False, {}
+        while not done:
+            if env.finger_positions.sum() < 0.9 * env.variant.arm.max_opening:
+                action = np.array([0, 0, 0.4, 1.0]) if env.eef_position[2] < RIM + 0.05 else np.array([0, 0, 0, 1.0])
+            elif policy.phase in ("enter", "descend"):
+                action = policy.act()
+            else:
+                action = np.array([0, 0, -0.08, -1.0])
+            action = gate.act() if gate.wants_control(action) else action
+            _, terminated, truncated, info = env.advance(action)
+            done = terminated or truncated
+        rescued += info["is_success"]
+    assert rescued >= 3
+
+
 def test_a_policy_as_good_as_the_expert_is_left_alone():
     env = make(EASY, sound="none")
     env.begin_episode(seed=2)
