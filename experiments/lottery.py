@@ -37,6 +37,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "log_mel": ("--policy.audio_features=log_mel",),
     "pcen": ("--policy.audio_features=pcen",),
     "onset": ("--policy.auxiliary_onset=0.03",),
+    "onset_more": ("--policy.auxiliary_onset=0.3",),
     "next_sound": ("--policy.auxiliary_next_sound=0.01",),
     "inverse_dynamics": ("--policy.auxiliary_inverse_dynamics=0.3",),
     "action_chunk": ("--policy.auxiliary_chunk=0.5",),
