@@ -257,7 +257,7 @@ def test_who_lands_on_the_keys_and_goes_on_is_led_beside_them():
             action = gate.act() if gate.wants_control(action) else action
             _, terminated, truncated, info = env.advance(action)
             done = terminated or truncated
-        rescued += info["is_success"]
+        rescued += info["is_success"] and info["n_closings"] == 1  # beside them, at once
     assert rescued >= 3
 
 

@@ -93,18 +93,20 @@ class BagGate(StagedGate):
         self._places = []
         heard = self._touched_at is not None and self._n_steps - self._touched_at <= self.config.memory_steps
         if self._holds():
-            phase = "lift"
-        elif heard or self._empty_for:
-            phase = "rise"
+            self.expert.begin_at("lift")
+        elif heard:
+            self.expert.begin_at("rise", self._heard_place(), self._height_at_touch)
+        elif self._empty_for:
+            self.expert.begin_at("rise")
+            self.expert.try_elsewhere()  # where it closed is nothing
         else:
-            phase = "enter" if self.env.eef_position[2] > RIM else "descend"
-        if phase == "rise" and heard:  # who heard a touch knows how high, and on which side
-            self.expert.begin_at(phase, middle_of(self.env)[:2], self._height_at_touch)
-        else:
-            self.expert.begin_at(phase)
-            if phase == "rise":  # where it closed is nothing
-                self.expert.try_elsewhere()
-        self._hands_back_at = LIFT + 1 if self.reason == "opens" else _STAGES[phase] + 1
+            self.expert.begin_at("enter" if self.env.eef_position[2] > RIM else "descend")
+        self._hands_back_at = LIFT + 1 if self.reason == "opens" else _STAGES[self.expert.phase] + 1
+
+    def _heard_place(self) -> np.ndarray:
+        """(2,) the middle of where the things may lie on their side [m, world]: who heard a touch knows no more."""
+        things = middle_of(self.env)[:2]
+        return min(self.env.variant.middles, key=lambda middle: float(np.linalg.norm(middle - things)))
 
     def _follow(self) -> None:
         phase, stage = self.expert.phase, _STAGES[self.expert.phase]
