@@ -35,13 +35,13 @@ def blind_floor(task: str) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__, "task", "seeds", "jobs", "threads")
+    parser = command_line(__doc__, "task", "seeds", "jobs", "threads", "steps")
     parser.add_argument("--conditions", nargs="+", choices=CONDITIONS, default=list(CONDITIONS))
     options = parser.parse_args()
 
     record(options.task, N_DEMONSTRATIONS)
     jobs = [
-        Job(STUDY, options.task, condition, seed, threads=options.threads)
+        Job(STUDY, options.task, condition, seed, steps=options.steps, threads=options.threads)
         for seed in options.seeds
         for condition in options.conditions
     ]

@@ -40,6 +40,7 @@ _OPTIONS: dict[str, dict[str, Any]] = {
     "seeds": {"nargs": "+", "type": int, "default": TRAINING_SEEDS, "help": "of the policies' training"},
     "jobs": {"type": int, "default": 1, "help": "policies that are trained side by side"},
     "threads": {"type": int, "default": 1, "help": "per policy"},
+    "steps": {"type": int, "default": STEPS, "help": "updates of a training"},
     "output": {"type": Path, "default": Path("docs/media")},
 }
 

@@ -9,6 +9,7 @@ from experiments.protocol import (
     NEW_TASKS,
     RESULTS,
     RUN_LENGTHS,
+    STEPS,
     TASKS,
     Result,
     blind_path,
@@ -47,9 +48,11 @@ def acted_early(results: list[Result]) -> str:
 
 def ablation_table(task: str) -> list[str]:
     rows = []
-    for condition in CONDITIONS:
-        results = load_results(f"ablations/{task}-{condition}-*.json")
+    found = {condition: load_results(f"ablations/{task}-{condition}-*.json") for condition in CONDITIONS}
+    found["full, preset of before, without `auxiliary_onset`"] = load_results(f"presets/{task}-full-no_onset-*.json")
+    for condition, results in found.items():
         if results:
+            condition += _updates(results)
             minutes = ", ".join(f"{result.minutes:.0f}" for result in results)
             failures = "; ".join(result.failures for result in results).strip("; ")
             rows.append(f"| {condition} | {percent(results)} | {acted_early(results)} | {failures} | {minutes} |")
@@ -64,6 +67,12 @@ def ablation_table(task: str) -> list[str]:
         rows.append(f"| expert that feels contact | {expert:.0%} | | | | |")
     head = "| policy | success (95 % interval) | training seeds | acted early | failures | minutes of training |"
     return table(head, rows, task)
+
+
+def _updates(results: list[Result]) -> str:
+    """How many updates were made, where they are not the preset's."""
+    steps = sorted({result.steps for result in results})
+    return "" if steps == [STEPS] or results[0].task in TASKS else f", {' and '.join(map(str, steps))} updates"
 
 
 CURVES = {

@@ -408,7 +408,6 @@ def test_another_microphones_gain_is_one_of_the_bins_below_the_bands(kind):
         ),
         ({"auxiliary_onset": -1.0}, r"auxiliary_onset must be at least 0 \(off\) and finite, got -1.0"),
         ({"auxiliary_chunk": math.inf}, r"auxiliary_chunk must be at least 0"),
-        ({"auxiliary_onset": 1.0, "use_audio": False}, r"auxiliary_onset=1.0 needs sound.*use_audio is false"),
         ({"auxiliary_next_sound": 1.0, "n_supervised_steps": 1}, r"needs runs of at least 2.*n_supervised_steps is 1"),
         ({"auxiliary_chunk": 1.0, "n_supervised_steps": 3}, r"needs runs of at least 4 windows"),
         ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
@@ -425,6 +424,17 @@ def test_what_cannot_be_is_refused_with_the_option(options, message):
 def test_bands_narrower_than_bins_are_refused():
     with pytest.raises(ValueError, match=r"--policy.n_mels=160: some bands are narrower than the 25 Hz of a bin"):
         ear_of("log_mel", n_mels=160)
+
+
+def test_a_deaf_policy_learns_as_if_nobody_had_asked_for_what_needs_sound():
+    deaf, asked = (
+        make_policy(use_audio=False),
+        make_policy(use_audio=False, auxiliary_onset=0.3, auxiliary_next_sound=1),
+    )
+    assert asked.model.auxiliary is None
+    torch.testing.assert_close(asked.state_dict(), deaf.state_dict(), rtol=0, atol=0)
+    kept = make_policy(use_audio=False, auxiliary_onset=0.3, auxiliary_chunk=0.5).model.auxiliary
+    assert list(kept.heads) == ["chunk"]
 
 
 def test_an_old_checkpoints_options_are_todays_defaults():

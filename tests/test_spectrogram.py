@@ -132,3 +132,9 @@ def test_seventeen_frames_at_20_hz_cost_half_the_segments():
     assert (shared.period, shared.n_stretches, shared.windows_per_stretch) == (7, 7, 3)
     segments = shared.n_stretches * ((32000 + 2 * 7 * 800 - 640) // 560 + 1)
     assert segments < 17 * 57 * 0.56
+
+
+def test_sound_that_is_taken_apart_to_fit_a_cache_gives_the_same_bits():
+    wave, ear = 0.1 * torch.randn(9, 400_000, generator=torch.Generator().manual_seed(0)), make_spectrogram(48000)
+    assert torch.equal(ear.power(wave), torch.cat([ear.power(row[None]) for row in wave]))
+    assert torch.equal(ear.power(wave), ear._power(wave))

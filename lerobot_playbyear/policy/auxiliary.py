@@ -16,6 +16,7 @@ from lerobot_playbyear.policy.history import newest
 from lerobot_playbyear.policy.spectrogram import POWER_FLOOR, LogSpectrogram, to_float_wave
 
 KINDS = ("onset", "next_sound", "inverse_dynamics", "chunk")
+_HEARD = ("onset", "next_sound")  # a deaf policy is trained without
 _HIDDEN = 128
 _ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`
 
@@ -48,7 +49,7 @@ class AuxiliaryHeads(nn.Module):
     def __init__(self, config: PlaybyearConfig, n_actions: int):
         super().__init__()
         self.config = config
-        self.factors = {kind: getattr(config, f"auxiliary_{kind}") for kind in KINDS}
+        self.factors = weights_of(config)
         size, n_later = config.embedding_size, config.auxiliary_chunk_size - 1
         if self.factors["next_sound"]:
             # Ears of their own, whatever features the policy hears; their statistics are those of single columns.
@@ -126,8 +127,14 @@ class AuxiliaryHeads(nn.Module):
 
 def make_auxiliary(config: PlaybyearConfig, n_actions: int) -> AuxiliaryHeads | None:
     """The heads that a configuration asks for; None where it asks for none."""
-    asked_for = any(getattr(config, f"auxiliary_{kind}") for kind in KINDS)
-    return AuxiliaryHeads(config, n_actions) if asked_for else None
+    return AuxiliaryHeads(config, n_actions) if any(weights_of(config).values()) else None
+
+
+def weights_of(config: PlaybyearConfig) -> dict[str, float]:
+    """The weight of each of `KINDS`; a deaf policy leaves out what needs sound, so that it takes the same preset."""
+    return {
+        kind: getattr(config, f"auxiliary_{kind}") if config.use_audio or kind not in _HEARD else 0.0 for kind in KINDS
+    }
 
 
 def _squared(predicted: Tensor, target: Tensor) -> Tensor:

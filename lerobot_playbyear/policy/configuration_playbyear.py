@@ -85,7 +85,8 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame
             [cross entropy, nats]; next_sound: the last spectrogram column of the next frame [squared standard deviations];
             inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that is
-            executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss].
+            executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves
+            out the first two.
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.

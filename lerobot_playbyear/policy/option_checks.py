@@ -66,21 +66,12 @@ def _check_candidates(config: "PlaybyearConfig") -> None:
         )
     if not 0 <= config.fusion_dropout < 1:
         raise ValueError(f"--policy.fusion_dropout must be at least 0 (none) and below 1, got {config.fusion_dropout}.")
-    # By kind: how many windows of a run it needs, and whether it needs sound.
-    needs = {
-        "onset": (1, True),
-        "next_sound": (2, True),
-        "inverse_dynamics": (2, False),
-        "chunk": (config.auxiliary_chunk_size, False),
-    }
-    for kind, (n_windows, is_heard) in needs.items():
+    # By kind: how many windows of a run it needs.
+    needs = {"onset": 1, "next_sound": 2, "inverse_dynamics": 2, "chunk": config.auxiliary_chunk_size}
+    for kind, n_windows in needs.items():
         option, weight = f"--policy.auxiliary_{kind}", getattr(config, f"auxiliary_{kind}")
         if not 0 <= weight < math.inf:
             raise ValueError(f"{option} must be at least 0 (off) and finite, got {weight}.")
-        if weight and is_heard and not config.use_audio:
-            raise ValueError(
-                f"{option}={weight} needs sound, and --policy.use_audio is false: leave one of the two out."
-            )
         if weight and config.n_supervised_steps < n_windows:
             raise ValueError(
                 f"{option}={weight} needs runs of at least {n_windows} windows: --policy.n_supervised_steps is "

@@ -1,5 +1,7 @@
 """What training does to sound, so that the policy bears other rooms and other microphones."""
 
+import math
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -14,6 +16,7 @@ _HUM_HZ = (45.0, 75.0)
 _HUM_HARMONICS = 4
 _HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
 _RECORDED_SHARE = 0.5  # of the items that get recorded noise
+_LEAKAGE = 8  # bins above the highest one that is kept, whose noise still reaches it
 _COLOUR_POINTS = 6  # of a microphone's response, evenly spaced in octaves
 
 
@@ -27,6 +30,7 @@ class SoundAugmentation(nn.Module):
         assert config.sample_rate is not None
         self.sample_rate, self.max_db = config.sample_rate, config.audio_noise_db
         self.files, self.colour_db = config.audio_noise_files, config.audio_colour_db
+        self.highest_hz = (config.n_frequency_bins + _LEAKAGE) / config.segment_s
         self._recorded: RecordedNoise | None = None
         octaves = torch.log2(torch.arange(1, config.n_frequency_bins + 1).float())
         place = octaves / octaves.max().clamp(min=1e-6) * (_COLOUR_POINTS - 1)  # of a bin, in points
@@ -41,7 +45,7 @@ class SoundAugmentation(nn.Module):
         """
         if self.max_db is None:
             return wave
-        mixed = mix_in_noise(wave, self.max_db, self.sample_rate)
+        mixed = mix_in_noise(wave, self.max_db, self.sample_rate, self.highest_hz)
         if self.files is None:
             return mixed
         if self._recorded is None:
@@ -59,7 +63,7 @@ class SoundAugmentation(nn.Module):
         return self.colour_db / 10 * points @ self.response.T
 
 
-def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int) -> Tensor:
+def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int, highest_hz: float = math.inf) -> Tensor:
     """Adds a room's noise to training sound: broadband, of another colour and level in every item, with a mains-like hum.
 
     White noise alone teaches nothing about rooms, whose noise is louder the lower it is. Drawn per item, uniformly: the
@@ -71,6 +75,7 @@ def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int) -> Tensor:
         wave: (B, samples), in [-1, 1].
         max_db: Loudest broadband noise relative to the floor [dB].
         sample_rate: Of the waveform [Hz].
+        highest_hz: Noise above it is left out, for an ear that does not hear it; levels are still those of all of it [Hz].
 
     Returns:
         (B, samples).
@@ -82,16 +87,26 @@ def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int) -> Tensor:
         for (low, high), draw in zip(((_FAINTEST_DB, max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
     )
     resolution = sample_rate / n_samples  # [Hz] of a bin
-    frequency = resolution * torch.arange(1, n_samples // 2 + 1, device=wave.device)  # without the constant part
-    power = frequency.clamp(min=_NOISE_LOWEST_HZ) ** -tilt  # (B, bins)
-    power = power / power.sum(dim=1, keepdim=True)
+    n_bins = n_samples // 2  # without the constant part
+    n_drawn = min(n_bins, math.ceil(min(highest_hz, sample_rate) / resolution))
+    frequency = resolution * torch.arange(1, n_drawn + 1, device=wave.device)
+    power = frequency.clamp(min=_NOISE_LOWEST_HZ) ** -tilt  # (B, drawn)
+    power = power * (resolution / _power_below(sample_rate / 2, tilt))
     overtones = torch.arange(1, _HUM_HARMONICS + 1, device=wave.device)
-    bins = (pitch * overtones / resolution).round().long().clamp(1, n_samples // 2) - 1  # (B, harmonics)
+    bins = (pitch * overtones / resolution).round().long().clamp(1, n_drawn) - 1  # (B, harmonics)
     power = power.scatter_add(1, bins, (10 ** (hum / 10) / _HUM_HARMONICS).expand(-1, _HUM_HARMONICS))
-    spectrum = torch.randn(n_items, n_samples // 2, 2, device=wave.device) * power.sqrt().unsqueeze(2)
-    spectrum = functional.pad(spectrum, (0, 0, 1, 0))  # (B, bins + 1, 2)
-    noise = torch.fft.irfft(torch.view_as_complex(spectrum), n=n_samples) * (n_samples / 2)  # broadband power 1
-    return wave + noise_floor(wave) * 10 ** (level / 20) * noise
+    amplitude = noise_floor(wave) * 10 ** (level / 20) * power.sqrt() / 2  # as of both signs of a frequency
+    spectrum = torch.randn(n_items, n_drawn, 2, device=wave.device) * amplitude.unsqueeze(2)
+    spectrum = functional.pad(spectrum, (0, 0, 1, n_bins - n_drawn))  # (B, bins + 1, 2)
+    return wave + torch.fft.irfft(torch.view_as_complex(spectrum), n=n_samples, norm="forward")
+
+
+def _power_below(highest_hz: float, tilt: Tensor) -> Tensor:
+    """Integral of the noise's power over frequency, in its own units."""
+    rise = 1 - tilt
+    rise = torch.where(rise.abs() < 1e-3, 1e-3, rise)  # pink noise itself has a logarithm there
+    octaves = math.log(highest_hz / _NOISE_LOWEST_HZ)
+    return _NOISE_LOWEST_HZ**-tilt * _NOISE_LOWEST_HZ * (1 + torch.expm1(rise * octaves) / rise)
 
 
 def noise_floor(wave: Tensor) -> Tensor:

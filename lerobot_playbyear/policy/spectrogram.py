@@ -11,6 +11,7 @@ from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 from lerobot_playbyear.policy.window_lengths import segment_and_hop
 
 POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
+_IN_CACHE = 1_000_000  # samples of overlapping segments that a processor's cache holds with what becomes of them
 
 
 def to_float_wave(wave: Tensor, key: str) -> Tensor:
@@ -151,6 +152,12 @@ class LogSpectrogram(nn.Module):
 
     def power(self, wave: Tensor) -> Tensor:
         """(B, samples) in [-1, 1] -> (B, n_bins, n_segments); times `scale` a full-scale sine has 1 in its bin."""
+        if wave.device.type != "cpu" or torch.compiler.is_compiling():
+            return self._power(wave)
+        together = max(1, _IN_CACHE * self.hop // (wave.shape[1] * self.segment))
+        return torch.cat([self._power(part) for part in wave.split(together)])
+
+    def _power(self, wave: Tensor) -> Tensor:
         spectrum = torch.stft(wave, self.segment, self.hop, window=self.window, center=False, return_complex=True)
         spectrum = torch.view_as_real(spectrum[:, : self.n_bins])
         return spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root

@@ -31,6 +31,7 @@ _NETWORK = (
     "normalize_encodings",
     "low_dimensional_gain",
     "memory_displacement_gain",
+    "auxiliary_onset",
 )
 """Options of the policy that fix what the network looks like: with `--policy.path` the checkpoint says it."""
 
