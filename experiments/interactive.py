@@ -2,25 +2,44 @@
 
     python -m experiments.interactive --task=OccludedGrasp-v1 --kept=100
     python -m experiments.interactive --task=OccludedGrasp-v1 --n_demonstrations=5 --kept=100 --rounds=2
-    python -m experiments.interactive --task=KeyBag-Hard-v1 --course=paper
+    python -m experiments.interactive --task=KeyBag-Hard-v1 --course=paper --policy.auxiliary_onset=0
 
-1. A policy is trained on demonstrations.
+1. A policy is trained on demonstrations, with the preset `cpu` and what is given as `--policy.NAME=VALUE`. Where
+   `experiments.ablations` has trained it, that one is taken. All policies that follow have the same options.
 2. In each round `playbyear-dagger` collects attempts that the expert had to help in, by one of the `METHODS`, and a policy
    learns from all demonstrations and corrections: with `--learn=new_weights` from the beginning, with `--learn=online` as
-   attempts come.
-3. The first control makes as many further updates on the demonstrations alone. The second learns, for as many updates, from
-   further demonstrations instead: as many as have the expert's steps that the corrections took.
+   attempts come. A collection ends early where the policy needs no help in 200 attempts in a row.
+3. The control `updates` learns from the demonstrations alone, and begins as the corrected policy does: with new weights, or
+   with the first policy. The control `demonstrations` learns from further ones, too: as many as have the expert's steps that
+   the corrections took. The weights of both get as many updates in all as those of the corrected policy.
 
 All are evaluated on the same seeds, which nothing else uses; `first_search` counts the successes of the hand's first closing.
-Resumes where it was interrupted.
+
+What takes time are updates; collecting makes none, and takes as long as its attempts.
+
+| part | updates | is made once for all methods of a training seed |
+|---|---|---|
+| first policy | 2,500 | yes |
+| corrected policy | new_weights: `--updates` (2,500) a round; online: these, less those of 4 kept attempts | no |
+| `updates` | new_weights: `--updates`, but none if they are 2,500; online: as many as the corrections | if it is as many |
+| `demonstrations` | new_weights: `--updates`; online: 2,500, and as many as the corrections | if it has as many of both |
+
+So with one round the first method takes 7,500, and each further one 2,500 to 5,000; online they take 12,500, and 2,500 to
+10,000.
+
+Resumes where it was interrupted. Studies may run at the same time; those of one training wait for each other. They wait for
+`experiments.ablations`, too, but that does not wait for them: do not start it while a study trains the same policy.
 """
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from experiments.interactive_methods import COURSES, METHODS, WEIGHING, check
+from experiments.interactive_parts import alone, demonstrated, finished, first_job, trained
 from experiments.protocol import (
     N_DEMONSTRATIONS,
     NEW_TASKS,
@@ -28,35 +47,15 @@ from experiments.protocol import (
     RUNS,
     STEPS,
     command_line,
-    dataset_root,
     library_versions,
     load,
     options_of,
-    record,
     save,
-    shown,
 )
-from experiments.training import Job, clocked, evaluate, train
+from experiments.training import Job, evaluate
 from lerobot_playbyear.dagger.figures import Totals
 
 STUDY = "interactive"
-METHODS: dict[str, tuple[str, ...]] = {
-    "hg_dagger": (),
-    "dagger": ("--method.type=dagger",),
-    "no_handback": ("--method.type=no_handback",),
-    "sirius": ("--method.type=weighted",),
-    "iwr": ("--method.type=weighted", "--method.paper=iwr"),
-    "robot_gated": ("--method.type=robot_gated",),
-    "early": ("--takeover_delay_s=-0.5",),
-    "late": ("--takeover_delay_s=0.5",),
-    "all_frames": ("--learn_from=all",),
-    "person": ("--expert.person=true",),
-    "person_robot_gated": ("--method.type=robot_gated", "--expert.person=true"),
-}
-WEIGHING = ("sirius", "iwr", "all_frames")
-"""Those that say what is learned from; the others say who acts, and what is kept."""
-COURSES = {"own": {}, "paper": {"KeyBag-Easy-v1": 12}}
-"""Attempts that are kept in other tasks before the task itself; the paper's order for the bag."""
 BATCH_SIZE = 12
 CONTROLS = ("updates", "demonstrations")
 
@@ -66,25 +65,29 @@ class Outcome:
     """A policy's evaluation, and what it took to get there.
 
     Attributes:
-        kept, expert_steps: Kept attempts, and steps in which the expert acted, in these and in those that were not kept.
-        takeovers, switches, person_seconds, autonomy: As in `metrics.jsonl`, of all attempts so far.
-        updates: Since the first policy.
+        updates: That its weights got in all, those on demonstrations alone included.
         n_demonstrations: That it learned from.
         success, first_search: Percentages of the evaluation's episodes.
         failures: How the others ended.
+        kept: Attempts that were kept.
+        expert_steps: Steps in which the expert acted, in these and in those that were not kept; of the control
+            `demonstrations`, in the further ones.
+        takeovers, switches, person_seconds, autonomy: As in `metrics.jsonl`, of all attempts so far.
+        ends: How each episode of the evaluation ended, in the order of the seeds.
     """
 
-    kept: int
-    expert_steps: int
     updates: int
     n_demonstrations: int
     success: float
     first_search: float | None
     failures: str
+    kept: int = 0
+    expert_steps: int = 0
     takeovers: int = 0
     switches: int = 0
     person_seconds: float = 0.0
     autonomy: float = 1.0
+    ends: list[str] = field(default_factory=list, repr=False)
 
 
 @dataclass
@@ -92,11 +95,11 @@ class Interactive:
     """One policy's way through corrections, and what else the effort would have brought.
 
     Attributes:
-        task, method, learn, course, training_seed: What was done.
+        task, method, learn, course, training_seed, training_options: What was done.
         first_seed, n_episodes: Of every evaluation.
-        outcomes: Of the first policy, and after every round (or every so many kept attempts).
+        outcomes: Of the first policy, and after every round.
         controls: By their names.
-        commands: In order.
+        commands: In order; what several parts share is named once.
     """
 
     task: str
@@ -104,6 +107,7 @@ class Interactive:
     learn: str
     course: str
     training_seed: int
+    training_options: list[str]
     first_seed: int
     n_episodes: int
     outcomes: list[Outcome]
@@ -121,36 +125,35 @@ class Study:
     """
 
     def __init__(self, job: Job, options: Any):
-        assert job.dataset is not None
-        self.job, self.options, self.demonstrations = job, options, job.dataset
+        self.job, self.options = job, options
         how = [options.method, options.learn, *([] if options.course == "own" else [options.course])]
-        size = [f"{options.kept}kept", f"{options.rounds}rounds", f"{options.updates}updates"]
-        self.name = "-".join([job.name, *how, *size])
+        self.how = "-".join([*how, f"{options.kept}kept", f"{options.rounds}rounds", f"{options.updates}updates"])
+        self.name = f"{job.name}-{self.how}"
         self.path = RESULTS / STUDY / f"{self.name}.json"
-        self.corrections = RUNS / "datasets" / f"interactive-{self.name}"
+        self.corrections = RUNS / "datasets" / f"{STUDY}-{self.name}"
         self.commands: list[str] = []
         self.folders: list[Path] = []
 
     def run(self) -> Interactive:
         options, job = self.options, self.job
-        record(job.task, job.n_demonstrations, self.demonstrations)
-        command, _ = train(job)
-        self.commands.append(command)
-        outcomes = [self._outcome("first", job, job.checkpoint, 0)]
-        policy = job.checkpoint
+        self.demonstrations, self.n_frames = demonstrated(job.task, job.n_demonstrations)
+        outcomes = [self._outcome_of(job)]
+        policy, updates = job.checkpoint, job.steps
         for number in range(1, options.rounds + 1):
             kept = options.kept * number // options.rounds
             if options.learn == "online":
-                policy, updates = self._learn_online(policy, kept)
+                policy, updates = self._learn_online(kept)
             else:
                 self._collect(policy, number, kept)
-                policy, updates = self._learn_anew(job, number), options.updates * number
-            outcomes.append(self._outcome(f"round{number}", job, policy, updates, self.folders))
+                if any(line.get("outcome") == "kept" for line in _metrics(self.folders)):
+                    policy, updates = self._learn_anew(number), options.updates
+            outcomes.append(self._outcome_of_round(number, policy, updates))
             print(f"{self.name}: {outcomes[-1]}", flush=True)
         controls = {name: self._control(name, outcomes[-1]) for name in options.controls}
         return Interactive(
-            *(job.task, options.method, options.learn, options.course, job.training_seed),
-            *(job.evaluation_seeds.start, len(job.evaluation_seeds), outcomes, controls, self.commands),
+            *(job.task, options.method, options.learn, options.course, job.training_seed, list(job.options)),
+            *(job.evaluation_seeds.start, len(job.evaluation_seeds), outcomes, controls),
+            list(dict.fromkeys(self.commands)),
         )
 
     def _dagger(self, policy: Path, name: str, *options: str) -> Path:
@@ -168,93 +171,95 @@ class Study:
             "--resume=true",
             *options,
         ]
-        clocked(command, folder, self.job.threads)
-        self.commands.append(shown(command))
+        self.commands.append(finished(command, folder, self.job.threads))
         return folder
 
-    def _environment(self, task: str) -> tuple[str, ...]:
-        return ("--env.type=playbyear", f"--env.task={task}", *METHODS[self.options.method])
-
-    def _collect(self, policy: Path, number: int, kept: int) -> None:
-        """Attempts of a policy that stays as it is, until the dataset holds so many."""
-        course = {**(COURSES[self.options.course] if number == 1 else {}), self.job.task: kept}
-        for task, n in course.items():
-            name = f"collect{number}-{task}"
-            folder = self._dagger(
-                policy,
-                name,
-                *self._environment(task),
-                f"--episodes={n}",
-                "--updates_per_episode=0",
-                "--max_attempts=200",
-            )
-            self.folders.append(folder)
-
-    def _learn_anew(self, job: Job, number: int) -> Path:
-        learned = [
-            f"--updates={self.options.updates}",
-            "--updates_per_episode=500",
-            "--episodes=0",
-            "--new_weights=true",
-        ]
-        weights = METHODS[self.options.method] if self.options.method in WEIGHING else ()
-        folder = self._dagger(job.checkpoint, f"learn{number}", *learned, *weights)
-        return folder / "checkpoints" / "last" / "pretrained_model"
-
-    def _learn_online(self, policy: Path, kept: int) -> tuple[Path, int]:
-        """HG-DAgger as it is meant: updates after every kept attempt; a further round goes on with the same run."""
-        per_episode = self.options.updates * self.options.rounds // self.options.kept
-        updates = (f"--updates_per_episode={per_episode}", f"--save_every={self.options.kept // self.options.rounds}")
-        first = self.job.checkpoint
-        folder = self._dagger(first, "online", *self._environment(self.job.task), f"--episodes={kept}", *updates)
+    def _attempts(self, policy: Path, name: str, task: str, kept: int, updates_per_episode: int) -> Path:
+        """Attempts at a task until the dataset holds so many. Returns the run's folder."""
+        environment = ("--env.type=playbyear", f"--env.task={task}", *METHODS[self.options.method])
+        how = (f"--episodes={kept}", f"--updates_per_episode={updates_per_episode}", "--max_attempts=200")
+        folder = self._dagger(policy, name, *environment, *how)
         if folder not in self.folders:
             self.folders.append(folder)
-        state = json.loads((folder / "dagger_state.json").read_text())
-        return folder / "checkpoints" / "last" / "pretrained_model", state["step"]
+        return folder
 
-    def _outcome(self, name: str, job: Job, policy: Path, updates: int, folders: Iterable[Path] = ()) -> Outcome:
-        """Evaluates a policy; `folders`: the runs whose corrections it learned from, none for controls."""
-        path = RUNS / "interactive" / f"{self.name}-{name}.json"
-        if not path.exists():
-            commands: list[str] = []
-            told = evaluate(job, commands, name=f"{STUDY}-{self.name}-{name}", checkpoint=policy)
-            rate = told.first_search_rate
-            lines = list(_metrics(folders))
-            totals, kept = Totals.of(lines), sum(line.get("outcome") == "kept" for line in lines)
-            outcome = Outcome(
-                *(kept, totals.expert_steps, updates, job.n_demonstrations),
-                *(100 * told.rate, None if rate is None else 100 * rate, told.failures),
-                *(totals.takeovers, totals.switches, totals.person_seconds, totals.autonomy),
-            )
-            save(path, {**asdict(outcome), "commands": commands})
+    def _collect(self, policy: Path, number: int, kept: int) -> None:
+        """Attempts of a policy that stays as it is."""
+        course = {**(COURSES[self.options.course] if number == 1 else {}), self.job.task: kept}
+        for task, n in course.items():
+            self._attempts(policy, f"collect{number}-{task}", task, n, 0)
+
+    def _learn_anew(self, number: int) -> Path:
+        """A policy that learns everything; the first one gives its options and its normalisation. Returns its checkpoint."""
+        learned = (f"--updates={self.options.updates}", "--updates_per_episode=500", "--episodes=0")
+        weights = METHODS[self.options.method] if self.options.method in WEIGHING else ()
+        folder = self._dagger(self.job.checkpoint, f"learn{number}", *learned, "--new_weights=true", *weights)
+        return _newest(folder)
+
+    def _learn_online(self, kept: int) -> tuple[Path, int]:
+        """HG-DAgger as it is meant: updates after every kept attempt; a further round goes on with the same runs.
+
+        Returns:
+            The checkpoint, and the updates of its weights; those of the first policy where none were made.
+        """
+        per_episode = self.options.updates * self.options.rounds // self.options.kept
+        policy, updates = self.job.checkpoint, self.job.steps
+        for task, n in {**COURSES[self.options.course], self.job.task: kept}.items():
+            folder = self._attempts(policy, f"online-{task}", task, n, per_episode)
+            state = load(folder / "dagger_state.json")
+            if state["checkpoint"] is not None:
+                policy, updates = _newest(folder), updates + state["step"]
+        return policy, updates
+
+    def _control(self, name: str, last: Outcome) -> Outcome:
+        """What as many updates bring without corrections."""
+        job = self.job
+        if name == "demonstrations":
+            n = job.n_demonstrations + math.ceil(last.expert_steps * job.n_demonstrations / self.n_frames)
+            n_frames = demonstrated(job.task, n)[1]
+            control = replace(first_job(job.task, job.training_seed, n, job.options, job.threads), steps=last.updates)
+            return self._outcome_of(control, n_frames - self.n_frames)
+        if self.options.learn == "new_weights":
+            return self._outcome_of(replace(job, steps=last.updates))
+        further = last.updates - job.steps
+        if not further:
+            return self._outcome_of(job)
+        start = (f"--policy.path={job.checkpoint}", "--policy.push_to_hub=false", f"--batch_size={BATCH_SIZE}")
+        variant = "-".join(filter(None, [job.variant, f"control-of-{job.steps}steps"]))
+        control = replace(job, steps=further, variant=variant, start=(*start, f"--save_freq={further}"))
+        return replace(self._outcome_of(control), updates=last.updates)
+
+    def _outcome_of(self, job: Job, expert_steps: int = 0) -> Outcome:
+        """Trains and evaluates a policy that other studies may have trained and evaluated."""
+        self.commands.append(trained(job))
+        outcome = self._evaluated(job, "", job.checkpoint, job.steps)
+        return replace(outcome, expert_steps=expert_steps)  # depends on what it is a control of
+
+    def _outcome_of_round(self, number: int, policy: Path, updates: int) -> Outcome:
+        lines = list(_metrics(self.folders))
+        totals, figures = Totals.of(lines), ("expert_steps", "takeovers", "switches", "person_seconds", "autonomy")
+        spent = {figure: getattr(totals, figure) for figure in figures}
+        kept = sum(line.get("outcome") == "kept" for line in lines)
+        return self._evaluated(self.job, f"-{self.how}-round{number}", policy, updates, kept=kept, **spent)
+
+    def _evaluated(self, job: Job, name: str, policy: Path, updates: int, **spent: Any) -> Outcome:
+        """Evaluates a policy, unless that was done; what it had taken by then is kept with it."""
+        path = RUNS / STUDY / f"{job.name}{name}.json"
+        with alone(path):
+            if not path.exists():
+                commands: list[str] = []
+                told = evaluate(job, commands, name=f"{STUDY}{name}", checkpoint=policy)
+                first = None if told.first_search_rate is None else 100 * told.first_search_rate
+                figures = (100 * told.rate, first, told.failures)
+                outcome = Outcome(updates, job.n_demonstrations, *figures, ends=told.ends, **spent)
+                save(path, {**asdict(outcome), "commands": commands})
         saved = load(path)
         self.commands += saved.pop("commands")
         return Outcome(**saved)
 
-    def _control(self, name: str, last: Outcome) -> Outcome:
-        job = self.job
-        if name == "updates":
-            start = (f"--policy.path={job.checkpoint}", "--policy.push_to_hub=false", f"--batch_size={BATCH_SIZE}")
-            control = replace(
-                job,
-                steps=last.updates,
-                variant=f"control-of-{job.steps}steps",
-                start=(*start, f"--save_freq={last.updates}"),
-            )
-        else:
-            meta = load(self.demonstrations / "meta" / "info.json")
-            further = max(1, round(last.expert_steps * meta["total_episodes"] / meta["total_frames"]))
-            more = job.n_demonstrations + further
-            control = replace(job, n_demonstrations=more, dataset=demonstrations(job.task, more))
-            record(job.task, more, control.dataset)
-        command, _ = train(control)
-        self.commands.append(command)
-        return self._outcome(f"control-{name}", control, control.checkpoint, last.updates)
 
-
-def demonstrations(task: str, n: int) -> Path:
-    """A dataset of the first n demonstrations and no more: `playbyear-dagger` learns from all that it is given."""
-    return dataset_root(task) if n == N_DEMONSTRATIONS else RUNS / "datasets" / f"{task}-{n}"
+def _newest(folder: Path) -> Path:
+    return folder / "checkpoints" / "last" / "pretrained_model"
 
 
 def _metrics(folders: Iterable[Path]) -> Iterable[dict[str, Any]]:
@@ -274,17 +279,20 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=1, help="in which they are collected and learned from")
     parser.add_argument("--updates", type=int, default=STEPS, help="of each round")
     parser.add_argument("--controls", nargs="*", choices=CONTROLS, default=CONTROLS)
-    options = parser.parse_args()
+    options, training = parser.parse_known_args()
+    try:
+        check(options, training)
+    except ValueError as error:
+        parser.error(str(error))
     for seed in options.seeds:
-        n = options.n_demonstrations
-        dataset = demonstrations(options.task, n)
-        job = Job("ablations", options.task, "full", seed, n, threads=options.threads, dataset=dataset)
+        job = first_job(options.task, seed, options.n_demonstrations, training, options.threads)
         study = Study(job, options)
-        if not study.path.exists():
-            save(study.path, asdict(study.run()))
+        with alone(RUNS / STUDY / study.name):
+            if not study.path.exists():
+                save(study.path, asdict(study.run()))
         result = load(study.path)
-        for line in (*result["outcomes"], *result["controls"].items()):
-            print(f"{study.name}: {line}", flush=True)
+        for name, outcome in (*enumerate(result["outcomes"]), *result["controls"].items()):
+            print(f"{study.name}, {name}: {Outcome(**outcome)}", flush=True)
 
 
 if __name__ == "__main__":

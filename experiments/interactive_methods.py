@@ -1,0 +1,50 @@
+"""What the study of corrections compares, and which of its options go together."""
+
+from argparse import Namespace
+from collections.abc import Sequence
+
+METHODS: dict[str, tuple[str, ...]] = {
+    "hg_dagger": (),
+    "dagger": ("--method.type=dagger",),
+    "no_handback": ("--method.type=no_handback",),
+    "sirius": ("--method.type=weighted",),
+    "iwr": ("--method.type=weighted", "--method.paper=iwr"),
+    "robot_gated": ("--method.type=robot_gated",),
+    "early": ("--takeover_delay_s=-0.5",),
+    "late": ("--takeover_delay_s=0.5",),
+    "all_frames": ("--learn_from=all",),
+    "person": ("--expert.person=true",),
+    "person_robot_gated": ("--method.type=robot_gated", "--expert.person=true"),
+}
+WEIGHING = ("sirius", "iwr", "all_frames")
+"""Those that say what is learned from; the others say who acts, and what is kept."""
+COURSES = {"own": {}, "paper": {"KeyBag-Easy-v1": 12}}
+"""Attempts that are kept in other tasks before the task itself; the paper's order for the bag."""
+
+
+def check(options: Namespace, training: Sequence[str]) -> None:
+    """Looks at a command line of the study before any work is done.
+
+    Args:
+        options: Its own.
+        training: What is passed on to trainings.
+
+    Raises:
+        ValueError: They do not go together.
+    """
+    for option in training:
+        if not option.startswith("--policy.") or "=" not in option or option.startswith("--policy.path"):
+            raise ValueError(
+                f"{option} is not passed on, only --policy.NAME=VALUE are: those a checkpoint holds, and so the policies that "
+                "learn from corrections have them, too."
+            )
+    if options.course != "own" and not options.task.startswith("KeyBag"):
+        raise ValueError(f"--course={options.course} is for the bags, and not for --task={options.task}.")
+    first, others = options.kept // options.rounds, {**COURSES[options.course], options.task: 0}
+    if first <= max(others.values()):
+        raise ValueError(
+            f"--kept={options.kept} with --rounds={options.rounds} and --course={options.course}: {first} attempts in the "
+            f"first round are too few; give more than {max(others.values())} a round."
+        )
+    if options.learn == "online" and options.updates * options.rounds < options.kept:
+        raise ValueError(f"--updates={options.updates}: give at least one for every attempt that is kept.")
