@@ -62,6 +62,7 @@ def make_model(arguments: Any) -> RecurrentPPO:
         target_kl=0.02,
         seed=arguments.seed,
         device="cpu",
+        policy_kwargs={"deviation": arguments.deviation},
     )
 
 
@@ -179,6 +180,7 @@ def parser():
     made.add_argument("--updates_per_trial", type=int, default=10, help="between two points of the curve")
     made.add_argument("--trial_episodes", type=int, default=40, help="of a point of the curve")
     made.add_argument("--learning_rate", type=float, default=1e-4)
+    made.add_argument("--deviation", type=float, default=0.04, help="of the actions it explores with, to begin with")
     made.add_argument("--output", type=Path, help="of the result; by default in experiments/results/adversaries")
     return made
 

@@ -24,13 +24,14 @@ def checks(folder: Path = FOLDER) -> dict[str, dict[str, Any]]:
 
 
 def learned(task: str, sense: str, folder: Path = FOLDER) -> str:
-    """What the learned adversaries of a task reach, `deaf` or `hears`, each with its teacher where there are several."""
+    """What a task's learned adversaries reach, `deaf` or `hears`, after how many steps; of several, each with its teacher."""
     results = [load(path) for path in sorted(folder.glob(f"{task}-{sense}-*.json"))]
-    rates = [_percent(result["successes"] / result["n_episodes"]) for result in results]
-    if len(results) > 1:
-        teachers = [result["options"]["teacher"] for result in results]
-        rates = [f"{rate} ({teacher})" for rate, teacher in zip(rates, teachers, strict=True)]
-    return ", ".join(rates) or NOT_RUN
+    cells = []
+    for result in results:
+        teacher = f"{result['options']['teacher']}, " if len(results) > 1 else ""
+        rate = _percent(result["successes"] / result["n_episodes"])
+        cells.append(f"{rate} ({teacher}{result['steps'] / 1000:,.0f}k steps)")
+    return "; ".join(cells) or NOT_RUN
 
 
 def table(folder: Path = FOLDER) -> str:

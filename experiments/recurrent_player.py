@@ -1,6 +1,7 @@
 """The learned adversary's parts: a recurrent player whose critic sees the truth, imitation to begin with, checkpoints."""
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,14 @@ class _PlayerOnly(BaseFeaturesExtractor):
 
 
 class RecurrentPlayer(RecurrentActorCriticPolicy):
-    """An LSTM that sees the player's numbers, and a critic without memory that sees the truth."""
+    """An LSTM that sees the player's numbers, and a critic without memory that sees the truth.
 
-    def __init__(self, *args: Any, **kwargs: Any):
+    Args:
+        deviation: Of the actions that it explores with, to begin with. With 0.135 (3 mm in each step) who hears the cube and
+            solves 16 of 40 episodes without chance solves 5, and learns that it is best not to try; with 0.04 it is 21.
+    """
+
+    def __init__(self, *args: Any, deviation: float = 0.04, **kwargs: Any):
         super().__init__(
             *args,
             share_features_extractor=False,
@@ -45,7 +51,7 @@ class RecurrentPlayer(RecurrentActorCriticPolicy):
             enable_critic_lstm=False,
             lstm_hidden_size=64,
             net_arch={"pi": [64], "vf": [128, 128]},
-            log_std_init=-2.0,
+            log_std_init=math.log(deviation),
             **kwargs,
         )
         self.pi_features_extractor = self.features_extractor = _PlayerOnly(self.observation_space)

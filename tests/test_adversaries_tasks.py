@@ -212,9 +212,9 @@ def test_a_table_says_what_was_not_run(tmp_path):
     assert made.splitlines()[2] == "| episodes |" + " not run |" * len(adversary_table.checks())
     save(
         tmp_path / f"{EASY}-deaf-expert-seed1.json",
-        {"successes": 3, "n_episodes": 10, "options": {"teacher": "expert"}},
+        {"successes": 3, "n_episodes": 10, "steps": 2_000_000, "options": {"teacher": "expert"}},
     )
     line = next(line for line in adversary_table.table(tmp_path).splitlines() if line.startswith("| learned, deaf"))
-    assert "30 %" in line
+    assert "30 % (2,000k steps)" in line
     with pytest.raises(ValueError, match="has no lines"):
         adversary_table.with_table("a page", made)
