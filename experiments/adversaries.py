@@ -30,7 +30,7 @@ from experiments.recurrent_player import (
     play_episode,
     save_checkpoint,
 )
-from gym_playbyear.adversaries.numeric_env import NumericTask
+from gym_playbyear.adversaries.numeric_env import DISCOUNT, NumericTask
 from gym_playbyear.adversaries.players import EXPERT
 
 DEMONSTRATION_SEED = 10000
@@ -55,7 +55,7 @@ def make_model(arguments: Any) -> RecurrentPPO:
         batch_size=arguments.n_envs * arguments.n_steps // 4,
         n_epochs=4,
         learning_rate=arguments.learning_rate,
-        gamma=0.99,
+        gamma=DISCOUNT,
         gae_lambda=0.95,
         ent_coef=0.0,
         vf_coef=0.5,

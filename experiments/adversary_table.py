@@ -23,14 +23,19 @@ def checks(folder: Path = FOLDER) -> dict[str, dict[str, Any]]:
     return {task: load(path) if path.exists() else {} for task, path in paths.items()}
 
 
-def learned(task: str, sense: str, folder: Path = FOLDER) -> str:
-    """What a task's learned adversaries reach, `deaf` or `hears`, after how many steps; of several, each with its teacher."""
+def learned(task: str, sense: str, check: dict[str, Any], folder: Path = FOLDER) -> str:
+    """What a task's learned adversaries reach, `deaf` or `hears`, after how many steps; of several, each with its teacher.
+
+    Bold where a deaf one reaches more than the deaf may, or one that hears does not.
+    """
     results = [load(path) for path in sorted(folder.glob(f"{task}-{sense}-*.json"))]
     cells = []
     for result in results:
         teacher = f"{result['options']['teacher']}, " if len(results) > 1 else ""
-        rate = _percent(result["successes"] / result["n_episodes"])
-        cells.append(f"{rate} ({teacher}{result['steps'] / 1000:,.0f}k steps)")
+        rate = result["successes"] / result["n_episodes"]
+        is_above = bool(check) and rate > _most_of_the_deaf(check)
+        text = _percent(rate) if is_above == (sense == "hears") or not check else f"**{_percent(rate)}**"
+        cells.append(f"{text} ({teacher}{result['steps'] / 1000:,.0f}k steps)")
     return "; ".join(cells) or NOT_RUN
 
 
@@ -41,7 +46,10 @@ def table(folder: Path = FOLDER) -> str:
     for kind, name in _players(found):
         label = name if kind == name else f"{kind}: `{name}`"
         rows.append((label, [_rate(check, kind, name) for check in found.values()]))
-    rows += [(label, [learned(task, sense, folder) for task in found]) for sense, label in _LEARNED.items()]
+    rows += [
+        (label, [learned(task, sense, check, folder) for task, check in found.items()])
+        for sense, label in _LEARNED.items()
+    ]
     rows.append(("most that is allowed to the deaf", [_allowed(check) for check in found.values()]))
     rows += _twin_rows(list(found.values()))
     rows.append(("limits that are broken", [_broken(check) for check in found.values()]))
@@ -71,8 +79,13 @@ def _rate(check: dict[str, Any], kind: str, name: str) -> str:
 
 
 def _allowed(check: dict[str, Any]) -> str:
-    blind = [row["successes"] / row["n_episodes"] for row in check.get("rows", []) if row["kind"] == "blind"]
-    return _percent(max(blind) + check["limits"]["deaf_margin"]) if blind else NOT_THERE
+    return _percent(_most_of_the_deaf(check)) if check else NOT_THERE
+
+
+def _most_of_the_deaf(check: dict[str, Any]) -> float:
+    """The best blind script's success, and the margin."""
+    blind = [row["successes"] / row["n_episodes"] for row in check["rows"] if row["kind"] == "blind"]
+    return max(blind) + float(check["limits"]["deaf_margin"])
 
 
 def _twin_rows(found: list[dict[str, Any]]) -> list[tuple[str, list[str]]]:

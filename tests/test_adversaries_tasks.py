@@ -218,3 +218,16 @@ def test_a_table_says_what_was_not_run(tmp_path):
     assert "30 % (2,000k steps)" in line
     with pytest.raises(ValueError, match="has no lines"):
         adversary_table.with_table("a page", made)
+
+
+def test_a_table_shows_which_learner_breaks_the_tasks_claim(tmp_path):
+    rows = [{"name": "straight", "kind": "blind", "successes": 1, "n_episodes": 10}]
+    check = {"rows": rows, "limits": {"deaf_margin": 0.1}}
+    shown = {}
+    for sense in ("deaf", "hears"):
+        for successes in (2, 3):
+            result = {"successes": successes, "n_episodes": 10, "steps": 5000, "options": {"teacher": "expert"}}
+            save(tmp_path / f"{EASY}-{sense}-expert-seed1.json", result)
+            shown[sense, successes] = adversary_table.learned(EASY, sense, check, tmp_path)
+    assert shown["deaf", 2] == shown["hears", 3].replace("30", "20") == "20 % (5k steps)"
+    assert shown["deaf", 3] == shown["hears", 2].replace("20", "30") == "**30 %** (5k steps)"

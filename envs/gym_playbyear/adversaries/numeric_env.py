@@ -18,7 +18,8 @@ from gym_playbyear.arm import ACTION_SCALE
 N_HEARD = 4
 N_PLAYER = 17 + N_SHOWN + N_HEARD
 _SPEED = 0.5  # m/s per unit of action: what a hand covers that searches and grasps
-_SUCCESS, _FAILURE = 5.0, -1.0
+_SUCCESS = 5.0  # a failure costs nothing: else who seldom succeeds learns not to try
+DISCOUNT = 0.995  # half of it is left after 140 actions, most of an episode: patience must be worth while
 _HEARD = 0.2  # N: what the scripted expert takes for a touch
 
 
@@ -37,7 +38,7 @@ class NumericTask(gym.Env):
         options: For `gymnasium.make`.
     """
 
-    def __init__(self, task: str, *, hears: bool, repeat: int | None = None, discount: float = 0.99, **options: Any):
+    def __init__(self, task: str, *, hears: bool, repeat: int | None = None, discount: float = DISCOUNT, **options: Any):
         self.task = DeafTask(task, **options)
         self.hears, self.discount = hears, discount
         self.repeat = repeat or max(1, round(self.task.facts.control_hz / 10))
@@ -117,10 +118,7 @@ class NumericTask(gym.Env):
         if done:
             self._potential = 0.0
         earned = self.discount * self._potential - before
-        if done:
-            solved, late = info["is_success"], info["end"] == "time"
-            earned += _SUCCESS if solved else 0.0 if late else _FAILURE
-        return float(earned)
+        return float(earned + (_SUCCESS if done and info["is_success"] else 0.0))
 
     def close(self):
         self.task.close()
