@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.protocol import N_DEMONSTRATIONS, RESULTS, RUNS, Result, command_line, load, record, save, shown
+from experiments.protocol import N_DEMONSTRATIONS, RESULTS, RUNS, STEPS, Result, command_line, load, record, save, shown
 from experiments.training import Job, evaluate, side_by_side
 from lerobot_playbyear.training.checkpoints import average_checkpoints, last_checkpoints
 
 STUDY = "lottery"
 PLAIN, EMA, HELD_OUT, LAST_THREE, NEWEST = "plain", "ema", "held_out", "last_three", "held_out_last"
 VARIANTS: dict[str, tuple[str, ...]] = {
+    "preset": (),
     EMA: ("--policy.ema_decay=0.998",),
     "weight_decay": ("--policy.optimizer_weight_decay=1e-4",),
     "colour": ("--policy.audio_colour_db=4",),
@@ -47,13 +48,12 @@ CHOICE_SEEDS = range(50000, 50100)
 SEEDS = (1, 2, 3, 4, 5)
 
 
-def job_of(task: str, variant: str, seed: int) -> Job:
+def job_of(task: str, variant: str, seed: int, steps: int = STEPS) -> Job:
     """One training."""
     chosen = "best" if variant == HELD_OUT else "last"
     options = VARIANTS[variant]
-    return Job(
-        STUDY, task, "full", seed, evaluation_seeds=CHOICE_SEEDS, options=options, variant=variant, chosen=chosen
-    )
+    names = {"steps": steps, "variant": variant, "chosen": chosen}
+    return Job(STUDY, task, "full", seed, evaluation_seeds=CHOICE_SEEDS, options=options, **names)
 
 
 def evaluated_as(policy: str, job: Job, trained: Result) -> Result:
@@ -79,19 +79,22 @@ def average_of_last(job: Job, n: int, commands: list[str]) -> Path:
 
 
 def main() -> None:
-    parser = command_line(__doc__, "task", "jobs")
+    parser = command_line(__doc__, "task", "jobs", "steps")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=[EMA])
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS, help="of the trainings")
     options = parser.parse_args()
     record(options.task, N_DEMONSTRATIONS)
-    jobs = [job_of(options.task, variant, seed) for seed in options.seeds for variant in options.variants]
+    jobs = [
+        job_of(options.task, variant, seed, options.steps) for seed in options.seeds for variant in options.variants
+    ]
     for job, result in zip(jobs, side_by_side(jobs, options.jobs), strict=True):
         print(f"{job.name}: {result.summary}, {result.minutes} min", flush=True)
         for policy in POLICIES.get(job.variant, ()):
             print(f"{job.name}, {policy}: {evaluated_as(policy, job, result).summary}", flush=True)
     for variant in (PLAIN, LAST_THREE, NEWEST, *VARIANTS):
         results = [
-            Result(**load(path)) for path in sorted((RESULTS / STUDY).glob(f"{options.task}-full-{variant}-*.json"))
+            Result(**load(path))
+            for path in sorted((RESULTS / STUDY).glob(f"{options.task}-full-{variant}-*-{options.steps}steps-*.json"))
         ]
         if results:
             rates = [result.rate for result in results]
