@@ -30,6 +30,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "less_noise_on_the_arm": ("--policy.low_dimensional_noise=0.01",),
     "no_offset": ("--policy.low_dimensional_offset=0",),
     "no_displacement": ("--policy.memory_displacement_gain=0",),
+    "half_the_runs": ("--batch_size=6",),
     "twice_the_runs": ("--policy.n_supervised_steps=8", "--batch_size=24"),
     "shorter_memory": ("--policy.n_memory_steps=10",),
     HELD_OUT: ("--dataset.eval_split=0.1", "--save_best=true"),
