@@ -38,7 +38,9 @@ class NumericTask(gym.Env):
         options: For `gymnasium.make`.
     """
 
-    def __init__(self, task: str, *, hears: bool, repeat: int | None = None, discount: float = DISCOUNT, **options: Any):
+    def __init__(
+        self, task: str, *, hears: bool, repeat: int | None = None, discount: float = DISCOUNT, **options: Any
+    ):
         self.task = DeafTask(task, **options)
         self.hears, self.discount = hears, discount
         self.repeat = repeat or max(1, round(self.task.facts.control_hz / 10))
