@@ -17,6 +17,7 @@ from gym_playbyear.adversaries.players import deaf_scripts, players
 from gym_playbyear.adversaries.scripts import play
 from gym_playbyear.adversaries.twin import twin_test
 from gym_playbyear.adversaries.view import DeafTask
+from gym_playbyear.bag_experts import finger_forces
 from gym_playbyear.check import check
 from gym_playbyear.proprioception import Proprioception, SensorNoise
 
@@ -158,6 +159,25 @@ def test_other_tasks_in_numbers(name, options):
     assert earned > 1
     assert max(worth) > worth[0] + 3
     assert heard[[0, 2, 3]].all()
+
+
+def test_who_hears_a_bag_with_two_ears_hears_which_finger_touched():
+    env = NumericTask("KeyBag-Hard-v1", hears=True)
+    sides = set()
+    for seed in range(6):
+        env.reset(seed=seed)
+        expert = env.task.env.scripted_expert()
+        while True:
+            env.begin_action()
+            control = expert.act()
+            done, _ = env.advance(control)
+            told = env.end_action(control)[N_PLAYER - N_HEARD + 2]
+            if told or done:
+                break
+        sides.add(float(np.sign(told)))
+        left, right = finger_forces(env.task.env)
+        assert (told > 0) == (right > left)
+    assert sides == {-1.0, 1.0}
 
 
 def test_peanuts_are_not_heard_and_screws_are():

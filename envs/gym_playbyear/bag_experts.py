@@ -7,6 +7,7 @@ every episode.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,19 @@ _GRIP, _ON_BAG = f"gripper-{CONTENTS}", f"gripper-{BAG}"
 FINGERS = ("left_finger", "right_finger")
 """Parts of the arm, and the microphones on them: with both, one hears which of them touched something."""
 _LEFT, _RIGHT = -1, 1  # along y
+
+
+def finger_forces(env: Any) -> tuple[float, float]:
+    """Largest force of the left and of the right finger on the things in the last control step [N]."""
+    parts = env.definition.arm.touching
+    forces = np.linalg.norm(env.hand_forces(CONTENTS), axis=2).max(axis=0)
+    left, right = (float(forces[parts.index(finger)]) for finger in FINGERS)
+    return left, right
+
+
+def has_two_ears(env: Any) -> bool:
+    """Whether each finger has a microphone, so that one can hear which of them touched."""
+    return set(FINGERS) <= set(env.microphones)
 
 
 @dataclass(frozen=True)
@@ -226,10 +240,8 @@ class BagExpert:
 
     def _side(self) -> int:
         """Which finger felt the things in the last step, -1 or 1; 0: both, or the hand itself, or nobody can hear which."""
-        parts = self.env.definition.arm.touching
-        forces = np.linalg.norm(self.env.hand_forces(CONTENTS), axis=2).max(axis=0)
-        left, right = (forces[parts.index(finger)] for finger in FINGERS)
-        if min(left, right) > 0.3 * max(left, right) or not set(FINGERS) <= set(self.env.microphones):
+        left, right = finger_forces(self.env)
+        if min(left, right) > 0.3 * max(left, right) or not has_two_ears(self.env):
             return 0
         return _LEFT if left > right else _RIGHT
 

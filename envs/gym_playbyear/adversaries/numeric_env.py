@@ -52,6 +52,7 @@ class NumericTask(gym.Env):
         self._view: DeafView
         self._sent: np.ndarray
         self._touch: np.ndarray
+        self._side: float
         self._closes = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
@@ -62,7 +63,7 @@ class NumericTask(gym.Env):
         self._last_action: np.ndarray = np.zeros(4)
         self._closes, self._changed_at = False, -(10**6)
         self._sent = self._hand()
-        self._touch = np.zeros(2)
+        self.begin_action()
         self._potential = self.terms.worth(self._view.shown, self._closes)
         return self._observe(), {}
 
@@ -87,7 +88,7 @@ class NumericTask(gym.Env):
 
     def begin_action(self) -> None:
         """A new action's touches are counted from here."""
-        self._touch = np.zeros(2)
+        self._touch, self._side = np.zeros(2), 0.0
 
     def end_action(self, action: np.ndarray) -> np.ndarray:
         """The observation after an action (4,) that was taken step by step."""
@@ -111,7 +112,10 @@ class NumericTask(gym.Env):
         lag = self._hand() - self._sent
         if np.abs(lag).max() < 0.001:
             self._sent = self._sent + 0.1 * lag
-        self._touch = np.maximum(self._touch, self.terms.heard())
+        heard = self.terms.heard()
+        self._touch = np.maximum(self._touch, heard)
+        if heard[0] > _HEARD:
+            self._side = self.terms.side()
         return done, info
 
     def reward(self, done: bool, info: dict[str, Any]) -> float:
@@ -142,7 +146,7 @@ class NumericTask(gym.Env):
                 shown,
                 np.zeros(N_SHOWN - len(shown)),
                 np.log1p(self._touch / _HEARD) / 3 if self.hears else np.zeros(2),
-                [float(self._touch[0] > _HEARD) if self.hears else 0.0, float(self.hears)],
+                [self._side if self.hears else 0.0, float(self.hears)],
             ]
         )
         return np.concatenate([player, self.terms.truth(self._closes), [self._potential]]).astype(np.float32)

@@ -12,6 +12,7 @@ from gym_playbyear.adversaries.view import DeafTask
 from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.bag import BAG, RIM, bottom_height
 from gym_playbyear.bag_contents import CONTENTS, middle_of
+from gym_playbyear.bag_experts import finger_forces, has_two_ears
 
 N_SHOWN = 10
 N_TRUTH = 8
@@ -63,6 +64,10 @@ class Terms:
         forces = self.env.contact_forces
         elsewhere = [force for pair, force in forces.items() if pair.startswith("gripper-") and self.name not in pair]
         return np.array([self.task.touch_force, max(elsewhere, default=0.0)])
+
+    def side(self) -> float:
+        """On which side of the hand what is hidden was touched, from -1 to 1, where two ears tell; 1 where they need not."""
+        return 1.0
 
     def truth(self, closes: bool) -> list[float]:
         """`N_TRUTH` - 1 numbers of about unit size that the player does not know."""
@@ -118,6 +123,10 @@ class BagTerms(Terms):
     def heard(self) -> np.ndarray:
         forces = self.env.contact_forces
         return np.array([forces[f"gripper-{CONTENTS}"], forces[f"gripper-{BAG}"]])
+
+    def side(self) -> float:
+        left, right = finger_forces(self.env)
+        return (right - left) / max(right + left, 1e-9) if has_two_ears(self.env) else super().side()
 
     def holds(self, closes: bool) -> bool:
         caught = self.env.finger_positions.sum() > 0.004
