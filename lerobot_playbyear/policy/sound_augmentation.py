@@ -103,10 +103,10 @@ def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int, highest_hz: floa
 
 def _power_below(highest_hz: float, tilt: Tensor) -> Tensor:
     """Integral of the noise's power over frequency, in its own units."""
-    rise = 1 - tilt
+    rise = -tilt + 1
     rise = torch.where(rise.abs() < 1e-3, 1e-3, rise)  # pink noise itself has a logarithm there
-    octaves = math.log(highest_hz / _NOISE_LOWEST_HZ)
-    return _NOISE_LOWEST_HZ**-tilt * _NOISE_LOWEST_HZ * (1 + torch.expm1(rise * octaves) / rise)
+    times = highest_hz / _NOISE_LOWEST_HZ
+    return _NOISE_LOWEST_HZ**-tilt * _NOISE_LOWEST_HZ * (1 + (times**rise - 1) / rise)
 
 
 def noise_floor(wave: Tensor) -> Tensor:
