@@ -11,9 +11,14 @@ CAMERA, MICROPHONE, STATE = "observation.images.front", "observation.audio.gripp
 SAMPLES, PIXELS = 800, 84  # of a frame: 16 kHz at 20 Hz, and the simulation's pictures
 
 
-def make_policy(n_cameras: int = 1, n_microphones: int = 1, **options) -> PlaybyearPolicy:
+def make_policy(
+    n_cameras: int = 1, n_microphones: int = 1, sample_rate: int = 16000, fps: int = 20, **options
+) -> PlaybyearPolicy:
     """A new policy on the simulation's observations, of the paper's sizes where the options do not say otherwise."""
-    image, sound = PolicyFeature(FeatureType.VISUAL, (3, PIXELS, PIXELS)), PolicyFeature(FeatureType.STATE, (SAMPLES,))
+    image, sound = (
+        PolicyFeature(FeatureType.VISUAL, (3, PIXELS, PIXELS)),
+        PolicyFeature(FeatureType.STATE, (sample_rate // fps,)),
+    )
     inputs = {
         **{CAMERA + str(i or ""): image for i in range(n_cameras)},
         **{MICROPHONE + str(i or ""): sound for i in range(n_microphones)},
@@ -21,7 +26,13 @@ def make_policy(n_cameras: int = 1, n_microphones: int = 1, **options) -> Playby
     }
     action = {"action": PolicyFeature(FeatureType.ACTION, (4,))}
     config = PlaybyearConfig(
-        input_features=inputs, output_features=action, sample_rate=16000, device="cpu", push_to_hub=False, **options
+        input_features=inputs,
+        output_features=action,
+        sample_rate=sample_rate,
+        fps=fps,
+        device="cpu",
+        push_to_hub=False,
+        **options,
     )
     return PlaybyearPolicy(config)
 
@@ -40,7 +51,7 @@ def random_runs(config: PlaybyearConfig, n: int) -> dict[str, Tensor]:
     for key in config.camera_keys:
         batch[key] = torch.randint(0, 256, (n, config.n_image_frames, 3, PIXELS, PIXELS), dtype=torch.uint8)
     for key in config.audio_keys:
-        batch[key] = (500 * torch.randn(n, config.n_audio_frames, SAMPLES)).to(torch.int16)
+        batch[key] = (500 * torch.randn(n, config.n_audio_frames, *config.feature_shape(key))).to(torch.int16)
     batch["action"] = torch.rand(n, config.n_supervised_steps, 4) * 2 - 1
     return batch
 

@@ -49,7 +49,8 @@ def acted_early(results: list[Result]) -> str:
 def ablation_table(task: str) -> list[str]:
     rows = []
     found = {condition: load_results(f"ablations/{task}-{condition}-*.json") for condition in CONDITIONS}
-    found["full, preset of before, without `auxiliary_onset`"] = load_results(f"presets/{task}-full-no_onset-*.json")
+    for name, variant in PRESETS_OF_BEFORE.items():
+        found[f"full, preset of before: {name}"] = load_results(f"presets/{task}-full-{variant}-*.json")
     for condition, results in found.items():
         if results:
             condition += _updates(results)
@@ -75,6 +76,7 @@ def _updates(results: list[Result]) -> str:
     return "" if steps == [STEPS] or results[0].task in TASKS else f", {' and '.join(map(str, steps))} updates"
 
 
+PRESETS_OF_BEFORE = {"steps of 35 ms": "hop_35ms", "and without `auxiliary_onset`": "no_onset"}
 CURVES = {
     "noise": "noise",
     "noise_white": "noise, trained with white noise up to the recordings' own floor",

@@ -35,11 +35,11 @@ class LogMel(LogSpectrogram):
         self.register_buffer("mel", mel / mel.sum(dim=0), persistent=False)  # (n_bins, n_mels)
 
     def levels(self, wave: Tensor, real: Tensor, colour: Tensor | None) -> Tensor:
-        """(B, samples) -> (B, n_mels, n_segments), in units of 10 dB re full scale."""
+        """(..., samples) -> (all of them, n_mels, n_segments), in units of 10 dB re full scale."""
         return torch.log10(self.energies(wave, colour) + POWER_FLOOR)
 
     def energies(self, wave: Tensor, colour: Tensor | None) -> Tensor:
-        """(B, samples) -> mean power in every band (B, n_mels, n_segments), in which a full-scale sine's bin has 1."""
+        """(..., samples) -> mean power in every band (all, n_mels, n_segments), in which a full-scale sine's bin has 1."""
         power = self.power(wave) * self.scale  # (B, n_bins, n_segments)
         if colour is not None:
             power = power * 10 ** colour.unsqueeze(2)
@@ -59,7 +59,7 @@ class Pcen(LogMel):
     is_per_window = True
 
     def levels(self, wave: Tensor, real: Tensor, colour: Tensor | None) -> Tensor:
-        """One window each, (B, samples) -> (B, n_mels, n_segments)."""
+        """One window each, (..., samples) -> (all of them, n_mels, n_segments)."""
         energies = _PCM_STEP_POWER * self.energies(wave, colour)
         smooth = self._average(energies, real.to(energies.dtype))
         return (energies / (_EPSILON + smooth) ** _GAIN + _BIAS) ** _ROOT - _BIAS**_ROOT

@@ -28,6 +28,7 @@ from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
 _HAS_512_BITS = computes_512_bits()
+_IN_CACHE = 16  # stacks of small pictures that a processor's cache holds
 _SAFE_EMBEDDING = 64  # 8 channels in the first stage, and multiples of them
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
 
@@ -146,7 +147,7 @@ class PlaybyearNetwork(nn.Module):
         """
         size = self.config.image_size
         with torch.autocast(images.device.type, enabled=False):  # colours keep their 8 bits
-            images = images.float() / 255 if images.dtype == torch.uint8 else images
+            images = images.float().div_(255) if images.dtype == torch.uint8 else images
             return self.augment(images, size, recorded) if self.training else resize(images, size)
 
     def _normalize(self, embeddings: Tensor) -> Tensor:
@@ -180,11 +181,18 @@ class VisionEncoder(nn.Module):
 
     def normalize(self, stacks: Tensor) -> Tensor:
         """(N, 3 * n_stacked, size, size) in [0, 1] -> the same shape, as networks for images want it."""
-        stacks = (stacks - self.mean) / self.std
         if stacks.device.type == "cpu" and self.embedding_size % _SAFE_EMBEDDING and not _HAS_512_BITS:
-            return stacks  # there oneDNN writes gradients of 4 channels beyond their memory (torch 2.11)
+            return (stacks - self.mean).div_(
+                self.std
+            )  # oneDNN writes gradients of 4 channels beyond their memory (torch 2.11)
         # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
-        return stacks.contiguous(memory_format=torch.channels_last)
+        normalized = torch.empty_like(stacks, memory_format=torch.channels_last)
+        together = (
+            _IN_CACHE if stacks.device.type == "cpu" and not torch.compiler.is_compiling() else max(1, len(stacks))
+        )
+        for part, place in zip(stacks.split(together), normalized.split(together), strict=True):
+            place.copy_((part - self.mean).div_(self.std))
+        return normalized
 
 
 class SlimResNet(ResNet):

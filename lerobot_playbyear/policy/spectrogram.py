@@ -72,12 +72,12 @@ class SharedStretches:
         return math.ceil(self.n_windows / self.period)
 
     def stretches(self, sound: Tensor) -> Tensor:
-        """(B, samples) -> (B * n_stretches, samples of a stretch); zeros, or False, where one reaches past the end."""
+        """(B, samples) -> (B, n_stretches, samples of a stretch), a view; zeros, or False, where one reaches past the end."""
         stretch = self.length + (self.windows_per_stretch - 1) * self.period * self.step
         start = sound.shape[1] - self.length - (self.n_windows - 1) * self.step
         end = start + (self.n_stretches - 1) * self.step + stretch
         padded = functional.pad(sound[:, start:], (0, end - sound.shape[1]))
-        return padded.unfold(1, stretch, self.step).flatten(0, 1)
+        return padded.unfold(1, stretch, self.step)
 
     def windows(self, columns: Tensor, n_columns: int) -> Tensor:
         """The windows' parts of what was computed from the stretches' segments.
@@ -147,31 +147,34 @@ class LogSpectrogram(nn.Module):
         self.register_buffer("n_batches", torch.zeros((), dtype=torch.long))
 
     def log_power(self, wave: Tensor) -> Tensor:
-        """(B, samples) in [-1, 1] -> (B, n_bins, n_segments), in units of 10 dB re full scale."""
+        """(..., samples) in [-1, 1] -> (all of them, n_bins, n_segments), in units of 10 dB re full scale."""
         return torch.log10(self.power(wave) * self.scale + POWER_FLOOR)
 
     def power(self, wave: Tensor) -> Tensor:
-        """(B, samples) in [-1, 1] -> (B, n_bins, n_segments); times `scale` a full-scale sine has 1 in its bin."""
+        """(..., samples) in [-1, 1] -> (all of them, n_bins, n_segments); times `scale` a full-scale sine has 1 in its bin."""
         if wave.device.type != "cpu" or torch.compiler.is_compiling():
-            return self._power(wave)
-        together = max(1, _IN_CACHE * self.hop // (wave.shape[1] * self.segment))
-        return torch.cat([self._power(part) for part in wave.split(together)])
+            return self._power(wave.flatten(0, -2))
+        together = max(1, _IN_CACHE * self.hop // (wave.shape[-1] * self.segment))
+        items = (
+            wave if wave.dim() == 3 and wave.shape[1] > 1 else [wave.flatten(0, -2)]
+        )  # stretches overlap: never copied
+        return torch.cat([self._power(part) for item in items for part in item.split(together)])
 
     def _power(self, wave: Tensor) -> Tensor:
         spectrum = torch.stft(wave, self.segment, self.hop, window=self.window, center=False, return_complex=True)
-        spectrum = torch.view_as_real(spectrum[:, : self.n_bins])
-        return spectrum.square().sum(dim=-1)  # of the bins kept alone, and without a root
+        spectrum = spectrum[:, : self.n_bins]  # of the bins kept alone, and without a root
+        return spectrum.real.square().addcmul_(spectrum.imag, spectrum.imag)
 
     def levels(self, wave: Tensor, real: Tensor, colour: Tensor | None) -> Tensor:
         """What a column is before it is normalised.
 
         Args:
-            wave: (B, samples), in [-1, 1].
-            real: (B, 1, n_segments) bool, False for segments before the episode.
-            colour: (B, n_bins), gains of another microphone [10 dB].
+            wave: (B, samples) or (B, n, samples), in [-1, 1].
+            real: (B * n, 1, n_segments) bool, False for segments before the episode.
+            colour: (B * n, n_bins), gains of another microphone [10 dB].
 
         Returns:
-            (B, channels of a column, n_segments).
+            (B * n, channels of a column, n_segments).
         """
         levels = self.log_power(wave)
         return levels if colour is None else levels + colour.unsqueeze(2)
@@ -180,15 +183,16 @@ class LogSpectrogram(nn.Module):
         """Spectrograms in which what precedes the episode is the average sound: zero.
 
         Args:
-            wave: (B, samples), in [-1, 1].
-            begun: (B, samples) bool, False where the episode had not begun.
-            colour: (B, n_bins), gains of another microphone [10 dB].
+            wave: (B, samples) or (B, n, samples), in [-1, 1].
+            begun: As many bool, False where the episode had not begun.
+            colour: (B * n, n_bins), gains of another microphone [10 dB].
 
         Returns:
-            (B, channels of a column, n_segments).
+            (B * n, channels of a column, n_segments).
         """
         # A segment counts if its first sample does: the episode, once begun, goes on.
-        real = begun[:, : wave.shape[1] - self.segment + 1 : self.hop].unsqueeze(1)  # (B, 1, n_segments)
+        real = begun[..., : wave.shape[-1] - self.segment + 1 : self.hop]
+        real = real.flatten(0, -2).unsqueeze(1)  # (B * n, 1, n_segments)
         levels = self.levels(wave, real, colour)
         if self.training and not self.keeps_statistics:
             self._update(levels.detach(), real)

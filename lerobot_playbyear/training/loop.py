@@ -206,7 +206,7 @@ def read_store(
         cfg.dataset.video_backend,
         progress=not inside_slurm(),
         place=place,
-        image_size=windows.image_size if place == "disk" or cfg.mix else None,  # those of several are equally large
+        image_size=windows.image_size,
         cache=None if options.cache is None else Path(options.cache),
         sample_rates=windows.sample_rates,
     )

@@ -30,6 +30,7 @@ _NETWORK = (
     "vision_width",
     "normalize_encodings",
     "low_dimensional_gain",
+    "hop_s",
     "memory_displacement_gain",
     "auxiliary_onset",
 )
