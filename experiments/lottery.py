@@ -41,6 +41,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "log_mel": ("--policy.audio_features=log_mel",),
     "pcen": ("--policy.audio_features=pcen",),
     "no_onset": ("--policy.auxiliary_onset=0",),
+    "onset_place": ("--policy.auxiliary_onset_place=1",),
     "next_sound": ("--policy.auxiliary_next_sound=0.01",),
     "inverse_dynamics": ("--policy.auxiliary_inverse_dynamics=0.3",),
     "action_chunk": ("--policy.auxiliary_chunk=0.5",),

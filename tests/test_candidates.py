@@ -30,13 +30,14 @@ CANDIDATES = {
     "log_mel": {"audio_features": "log_mel"},
     "pcen": {"audio_features": "pcen"},
     "onset": {"auxiliary_onset": 0.1},
+    "onset_place": {"auxiliary_onset_place": 0.4},
     "next_sound": {"auxiliary_next_sound": 0.1},
     "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
     "chunk": {"auxiliary_chunk": 0.5},
     "displacement": {"memory_displacement_gain": 10.0, "low_dimensional_offset": 0.1},
 }
 EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}
-HEADS = ("onset", "next_sound", "inverse_dynamics", "chunk")
+HEADS = ("onset", "onset_place", "next_sound", "inverse_dynamics", "chunk")
 
 
 def make_policy(**options) -> PlaybyearPolicy:
@@ -248,6 +249,24 @@ def test_an_onset_is_a_click_and_not_what_rings_on_nor_steady_noise():
     assert policy.model.auxiliary._onsets(batch, 5).tolist() == [[0, 1, 0, 0, 1]]  # frames 11 to 15
     louder = {**batch, MICROPHONE: run_ending_at(clicks(policy, ()), 15, policy.config)[MICROPHONE] * 40}
     assert policy.model.auxiliary._onsets(louder, 5).sum() == 0
+
+
+def test_the_place_of_an_onset_is_the_way_back_to_it_as_long_as_it_is_remembered():
+    policy = make_policy(auxiliary_onset_place=1.0)
+    heads, episode = policy.model.auxiliary, clicks(policy, (12,))
+    ways, is_known = heads._ways(run_ending_at(episode, N_FRAMES - 1, policy.config), 5)
+    assert is_known.tolist() == [[False, True, True, True, False]]  # of frames 11 to 15, which remember three
+    felt = episode["observation.state"]
+    for window in (1, 2, 3):
+        torch.testing.assert_close(ways[0, window], felt[12] - felt[11 + window])
+    twice = heads._ways(run_ending_at(clicks(policy, (12, 14)), N_FRAMES - 1, policy.config), 5)[0]
+    torch.testing.assert_close(twice[0, 4], felt[14] - felt[15])  # the last one counts
+
+
+def test_the_first_sound_of_an_episode_is_no_onset_to_go_back_to():
+    policy = make_policy(auxiliary_onset_place=1.0)
+    batch = run_ending_at(clicks(policy, (0,)), 2, policy.config)
+    assert not policy.model.auxiliary._ways(batch, 5)[1].any()
 
 
 def test_the_next_sound_is_the_end_of_the_next_frame():

@@ -83,10 +83,11 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             0: none (the paper).
         auxiliary_*: Weights, beside the action's loss, of what training predicts besides (`auxiliary.py`); 0: not at all (the
             paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame
-            [cross entropy, nats]; next_sound: the last spectrogram column of the next frame [squared standard deviations];
-            inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that is
-            executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves
-            out the first two.
+            [cross entropy, nats]; onset_place: the way from the arm to where it was at the last sudden sound that its memory
+            holds [squared, in what the low-dimensional observations are given in]; next_sound: the last spectrogram column of
+            the next frame [squared standard deviations]; inverse_dynamics: the action between two neighbouring encodings;
+            chunk: the actions after the one that is executed, so that they are `auxiliary_chunk_size` together [both as the
+            action's own loss]. A deaf policy leaves out the first three.
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
@@ -150,6 +151,7 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     spectrogram_momentum: float = 0.01
     ema_decay: float = 0.0
     auxiliary_onset: float = 0.0
+    auxiliary_onset_place: float = 0.0
     auxiliary_next_sound: float = 0.0
     auxiliary_inverse_dynamics: float = 0.0
     auxiliary_chunk: float = 0.0

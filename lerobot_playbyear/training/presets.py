@@ -33,6 +33,7 @@ _NETWORK = (
     "hop_s",
     "memory_displacement_gain",
     "auxiliary_onset",
+    "auxiliary_onset_place",
 )
 """Options of the policy that fix what the network looks like: with `--policy.path` the checkpoint says it."""
 
