@@ -31,6 +31,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "more_noise_on_the_arm": ("--policy.low_dimensional_noise=0.05",),
     "no_offset": ("--policy.low_dimensional_offset=0",),
     "no_displacement": ("--policy.memory_displacement_gain=0",),
+    "memory_attention": ("--policy.memory_attention_heads=4",),
     "half_the_runs": ("--batch_size=6",),
     "twice_the_runs": ("--policy.n_supervised_steps=8", "--batch_size=24"),
     "shorter_memory": ("--policy.n_memory_steps=10",),

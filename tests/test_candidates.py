@@ -34,6 +34,7 @@ CANDIDATES = {
     "next_sound": {"auxiliary_next_sound": 0.1},
     "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
     "chunk": {"auxiliary_chunk": 0.5},
+    "memory_attention": {"memory_displacement_gain": 10.0, "memory_attention_heads": 3},
     "displacement": {"memory_displacement_gain": 10.0, "low_dimensional_offset": 0.1},
 }
 EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}

@@ -57,6 +57,8 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
         memory_displacement_gain: The LSTM also reads how far the low-dimensional observations of each remembered frame are from
             the newest ones, in normalised units times this. 0: it does not (the paper).
+        memory_attention_heads: Heads of an attention over the remembered frames that reads these displacements beside the LSTM;
+            needs `memory_displacement_gain`. 0: none (the paper).
         action_range: How far actions reach, in units of the normalised ones. With 1, the paper's, and normalisation to [-1, 1],
             no action lies outside of the demonstrations'; 1.5 reaches a quarter of their range further at both ends.
 
@@ -133,6 +135,7 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     normalize_encodings: bool = True
     low_dimensional_gain: float = 4.0
     memory_displacement_gain: float = 0.0
+    memory_attention_heads: int = 0
     action_range: float = 1.0
 
     # Training

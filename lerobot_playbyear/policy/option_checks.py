@@ -31,6 +31,15 @@ def check_options(config: "PlaybyearConfig") -> None:
             f"--policy.memory_displacement_gain={config.memory_displacement_gain} compares low-dimensional observations, and "
             "--policy.low_dimensional_gain is 0: give 4, its usual value."
         )
+    if config.memory_attention_heads < 0:
+        raise ValueError(
+            f"--policy.memory_attention_heads must be at least 0 (none), got {config.memory_attention_heads}."
+        )
+    if config.memory_attention_heads and not config.memory_displacement_gain:
+        raise ValueError(
+            f"--policy.memory_attention_heads={config.memory_attention_heads} reads displacements, and "
+            "--policy.memory_displacement_gain is 0: give 10, its usual value."
+        )
     if not 0 <= config.ema_decay < 1:
         raise ValueError(f"--policy.ema_decay must be at least 0 (none) and below 1, got {config.ema_decay}.")
     if config.audio_noise_files is not None and config.audio_noise_db is None:

@@ -32,6 +32,7 @@ _NETWORK = (
     "low_dimensional_gain",
     "hop_s",
     "memory_displacement_gain",
+    "memory_attention_heads",
     "auxiliary_onset",
     "auxiliary_onset_place",
 )
