@@ -13,6 +13,7 @@ from training_digest import probe, trained
 from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.mel_features import LogMel, make_ear
+from lerobot_playbyear.policy.memory import DisplacementAttention
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.precision import computes_512_bits
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
@@ -165,6 +166,19 @@ def test_displacements_are_in_normalised_units_times_their_gain():
     state = batch["observation.state"][:, -n:]
     displacement = read[0][..., policy.config.embedding_size :]
     torch.testing.assert_close(displacement, 10 * (state - state[:, -1:]), atol=1e-4, rtol=1e-4)
+
+
+def test_attention_reads_the_displacement_of_the_moment_that_it_looks_at():
+    attention = DisplacementAttention(n_heads=2, n_steps=6, size=50, n_compared=7)
+    memories, fused, displacement = torch.rand(3, 50), torch.rand(3, 6, 50), torch.rand(3, 6, 7)
+    with torch.no_grad():
+        attention.age[0, 2] = attention.age[1, 5] = 1000.0
+        looked_at = torch.cat([displacement[:, 2], displacement[:, 5]], dim=1)
+        torch.testing.assert_close(attention(memories, fused, displacement), memories + attention.read(looked_at))
+        attention.age.zero_()
+        assert (
+            attention(memories, fused.flip(1), displacement) - attention(memories, fused, displacement)
+        ).abs().max() > 0
 
 
 def test_where_nothing_is_felt_there_is_nothing_to_compare():
@@ -432,6 +446,8 @@ def test_another_microphones_gain_is_one_of_the_bins_below_the_bands(kind):
         ({"auxiliary_chunk": 1.0, "n_supervised_steps": 3}, r"needs runs of at least 4 windows"),
         ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
         ({"memory_displacement_gain": 10.0, "low_dimensional_gain": 0.0}, r"low_dimensional_gain is 0: give 4"),
+        ({"memory_attention_heads": 2}, r"memory_attention_heads=2 reads displacements.*memory_displacement_gain is 0"),
+        ({"memory_attention_heads": -1}, r"memory_attention_heads must be at least 0"),
         ({"auxiliary_chunk_size": 1}, r"auxiliary_chunk_size must be at least 2"),
     ],
 )

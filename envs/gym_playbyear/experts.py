@@ -19,7 +19,8 @@ class ExpertConfig:
     """Where the expert moves and how much chance there is in it. Lengths in metres, durations in control steps.
 
     gain: share of the remaining distance covered per step; max_step: longest displacement per step; noise: uniform, either
-    way, added to every displacement. The pairs are ranges of uniform draws, `pause_probability` is per step of the sweep.
+    way, added to every displacement; hop_tolerance: how exactly the hand is above the cube, along the sweep, before it comes
+    down, None: as at every other goal. The pairs are ranges of uniform draws, `pause_probability` is per step of the sweep.
     """
 
     sweep_height: float = 0.022  # of the controlled point above the table
@@ -38,9 +39,13 @@ class ExpertConfig:
     dwell: tuple[int, int] = (0, 10)
     rise_step: tuple[float, float] = (0.008, 0.018)
     hover: tuple[int, int] = (0, 8)
+    hop_tolerance: float | None = None
     descent_step: float = 0.014
     back_off: float = 0.004
 
+
+EXACT_EXPERT = ExpertConfig(hop_tolerance=0.002)
+"""Version 1's: it shows that the hand comes down where it is above the cube, and not on the way there."""
 
 CORRECTING_EXPERT = ExpertConfig(
     sweep_step=(0.008, 0.011),
@@ -52,7 +57,7 @@ CORRECTING_EXPERT = ExpertConfig(
 )
 """An expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
 
-PATIENT_EXPERT = replace(CORRECTING_EXPERT, sweep_step=None)
+PATIENT_EXPERT = replace(CORRECTING_EXPERT, sweep_step=None, hop_tolerance=EXACT_EXPERT.hop_tolerance)
 """Where there is time, it corrects without haste: it sweeps as one that demonstrates."""
 
 
@@ -158,6 +163,9 @@ class GraspExpert:
         return self._towards(self._on_line(self.contact_y - self.config.back_off, self.config.clear_height)), False
 
     def _hop(self):
+        exactly = self.config.hop_tolerance
+        if exactly is not None and abs(self._grasp_y() - self.env.eef_position[1]) > exactly:
+            return self._towards(self._on_line(self._grasp_y(), self.config.clear_height)), False
         return self._go(self._on_line(self._grasp_y(), self.config.clear_height), self.config.tolerance, "descend")
 
     def _grasp_y(self) -> float:

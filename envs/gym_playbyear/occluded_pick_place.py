@@ -9,7 +9,7 @@ from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
-from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, PickPlaceExpert
+from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, PATIENT_EXPERT, PickPlaceExpert
 from gym_playbyear.looks_props import wall_on_the_table
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
@@ -96,7 +96,11 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     - v0: first version.
     """
     correcting = partial(PickPlaceExpert, config=PATIENT_EXPERT)
-    traits: dict[str, Any] = {"correcting_expert": correcting, "sound": SyntheticEars}
+    traits: dict[str, Any] = {
+        "expert": partial(PickPlaceExpert, config=EXACT_EXPERT),
+        "correcting_expert": correcting,
+        "sound": SyntheticEars,
+    }
     return _task("OccludedPickPlace-v1", NUMBERS, cube_material, (rails(0.0, 0.38),), **traits)
 
 
@@ -109,7 +113,8 @@ def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cu
     """
     check_option("variant", variant, tuple(VARIANTS))
     correcting = partial(PickPlaceExpert, config=CORRECTING_EXPERT)
-    return _task("OccludedPickPlace-v0", VARIANTS[variant], cube_material, correcting_expert=correcting, is_old=True)
+    traits: dict[str, Any] = {"expert": PickPlaceExpert, "correcting_expert": correcting, "is_old": True}
+    return _task("OccludedPickPlace-v0", VARIANTS[variant], cube_material, **traits)
 
 
 def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **traits: Any) -> Task:
@@ -119,7 +124,6 @@ def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...
         description="Find the cube behind the wall by touch and sound, grasp it and put it into the tray.",
         props=(wall, tray("bin", BIN_HALF_WIDTH, BIN_WALL_HALF_HEIGHT), *more, cube(numbers, cube_material)),
         place=_place,
-        expert=PickPlaceExpert,
         blind={name: partial(BlindPickPlace, strategy=name) for name in BLIND_STRATEGIES},
         **cube_task(numbers, _is_in_the_tray),
         **traits,
