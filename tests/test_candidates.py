@@ -13,7 +13,6 @@ from training_digest import probe, trained
 from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.mel_features import LogMel, make_ear
-from lerobot_playbyear.policy.memory import DisplacementAttention
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.precision import computes_512_bits
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
@@ -31,15 +30,13 @@ CANDIDATES = {
     "log_mel": {"audio_features": "log_mel"},
     "pcen": {"audio_features": "pcen"},
     "onset": {"auxiliary_onset": 0.1},
-    "onset_place": {"auxiliary_onset_place": 0.4},
     "next_sound": {"auxiliary_next_sound": 0.1},
     "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
     "chunk": {"auxiliary_chunk": 0.5},
-    "memory_attention": {"memory_displacement_gain": 10.0, "memory_attention_heads": 3},
     "displacement": {"memory_displacement_gain": 10.0, "low_dimensional_offset": 0.1},
 }
 EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}
-HEADS = ("onset", "onset_place", "next_sound", "inverse_dynamics", "chunk")
+HEADS = ("onset", "next_sound", "inverse_dynamics", "chunk")
 
 
 def make_policy(**options) -> PlaybyearPolicy:
@@ -168,19 +165,6 @@ def test_displacements_are_in_normalised_units_times_their_gain():
     torch.testing.assert_close(displacement, 10 * (state - state[:, -1:]), atol=1e-4, rtol=1e-4)
 
 
-def test_attention_reads_the_displacement_of_the_moment_that_it_looks_at():
-    attention = DisplacementAttention(n_heads=2, n_steps=6, size=50, n_compared=7)
-    memories, fused, displacement = torch.rand(3, 50), torch.rand(3, 6, 50), torch.rand(3, 6, 7)
-    with torch.no_grad():
-        attention.age[0, 2] = attention.age[1, 5] = 1000.0
-        looked_at = torch.cat([displacement[:, 2], displacement[:, 5]], dim=1)
-        torch.testing.assert_close(attention(memories, fused, displacement), memories + attention.read(looked_at))
-        attention.age.zero_()
-        assert (
-            attention(memories, fused.flip(1), displacement) - attention(memories, fused, displacement)
-        ).abs().max() > 0
-
-
 def test_where_nothing_is_felt_there_is_nothing_to_compare():
     config = make_config(**SMALL, memory_displacement_gain=10.0)
     for key in config.low_dimensional_keys:
@@ -264,24 +248,6 @@ def test_an_onset_is_a_click_and_not_what_rings_on_nor_steady_noise():
     assert policy.model.auxiliary._onsets(batch, 5).tolist() == [[0, 1, 0, 0, 1]]  # frames 11 to 15
     louder = {**batch, MICROPHONE: run_ending_at(clicks(policy, ()), 15, policy.config)[MICROPHONE] * 40}
     assert policy.model.auxiliary._onsets(louder, 5).sum() == 0
-
-
-def test_the_place_of_an_onset_is_the_way_back_to_it_as_long_as_it_is_remembered():
-    policy = make_policy(auxiliary_onset_place=1.0)
-    heads, episode = policy.model.auxiliary, clicks(policy, (12,))
-    ways, is_known = heads._ways(run_ending_at(episode, N_FRAMES - 1, policy.config), 5)
-    assert is_known.tolist() == [[False, True, True, True, False]]  # of frames 11 to 15, which remember three
-    felt = episode["observation.state"]
-    for window in (1, 2, 3):
-        torch.testing.assert_close(ways[0, window], felt[12] - felt[11 + window])
-    twice = heads._ways(run_ending_at(clicks(policy, (12, 14)), N_FRAMES - 1, policy.config), 5)[0]
-    torch.testing.assert_close(twice[0, 4], felt[14] - felt[15])  # the last one counts
-
-
-def test_the_first_sound_of_an_episode_is_no_onset_to_go_back_to():
-    policy = make_policy(auxiliary_onset_place=1.0)
-    batch = run_ending_at(clicks(policy, (0,)), 2, policy.config)
-    assert not policy.model.auxiliary._ways(batch, 5)[1].any()
 
 
 def test_the_next_sound_is_the_end_of_the_next_frame():
@@ -446,8 +412,6 @@ def test_another_microphones_gain_is_one_of_the_bins_below_the_bands(kind):
         ({"auxiliary_chunk": 1.0, "n_supervised_steps": 3}, r"needs runs of at least 4 windows"),
         ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
         ({"memory_displacement_gain": 10.0, "low_dimensional_gain": 0.0}, r"low_dimensional_gain is 0: give 4"),
-        ({"memory_attention_heads": 2}, r"memory_attention_heads=2 reads displacements.*memory_displacement_gain is 0"),
-        ({"memory_attention_heads": -1}, r"memory_attention_heads must be at least 0"),
         ({"auxiliary_chunk_size": 1}, r"auxiliary_chunk_size must be at least 2"),
     ],
 )

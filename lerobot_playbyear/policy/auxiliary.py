@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.history import before_episode, newest
+from lerobot_playbyear.policy.history import newest
 from lerobot_playbyear.policy.spectrogram import POWER_FLOOR, LogSpectrogram, to_float_wave
 
-KINDS = ("onset", "onset_place", "next_sound", "inverse_dynamics", "chunk")
-_HEARD = ("onset", "onset_place", "next_sound")  # a deaf policy is trained without
+KINDS = ("onset", "next_sound", "inverse_dynamics", "chunk")
+_HEARD = ("onset", "next_sound")  # a deaf policy is trained without
 _HIDDEN = 128
 _ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`
 
@@ -57,7 +57,6 @@ class AuxiliaryHeads(nn.Module):
         n_heard = config.n_frequency_bins * len(config.audio_keys)
         sizes = {
             "onset": (size, 1),
-            "onset_place": (size, sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)),
             "next_sound": (size + n_actions, n_heard),
             "inverse_dynamics": (2 * size, n_actions),
             "chunk": (size, n_later * n_actions),
@@ -82,9 +81,6 @@ class AuxiliaryHeads(nn.Module):
                 logits = self._predict(kind, encodings).squeeze(2)  # (B, K)
                 begins = self._onsets(batch, encodings.shape[1])
                 error, counts = functional.binary_cross_entropy_with_logits(logits, begins, reduction="none"), weight
-            elif kind == "onset_place":
-                way, is_known = self._ways(batch, outputs.shape[1])
-                error, counts = _squared(self._predict(kind, outputs), way), weight * is_known
             elif kind == "next_sound":
                 heard, counts = self._next_columns(batch, both), both  # (B, K - 1, bins)
                 error = _squared(self._predict(kind, outputs[:, :-1], actions[:, :-1]), heard)
@@ -109,28 +105,6 @@ class AuxiliaryHeads(nn.Module):
             louder.append(level - level.sort(dim=1).values[:, (level.shape[1] - 1) // 2, None])
         loud = torch.stack(louder).amax(dim=0) > _ONSET
         return (loud[:, 1:] & ~loud[:, :-1])[:, -n_windows:].float()
-
-    def _ways(self, batch: dict[str, Tensor], n_windows: int) -> tuple[Tensor, Tensor]:
-        """From where the arm is at the end of each of the last windows, to where it was at the window's last sudden sound.
-
-        Returns:
-            (B, n_windows, numbers) in what the low-dimensional observations are given in, and (B, n_windows) bool, whether the
-            window has a sudden sound.
-        """
-        config = self.config
-        n_frames = n_windows + config.memory_steps - 1
-        begins = self._onsets(batch, n_frames) > 0  # (B, n_frames)
-        is_pad = before_episode(batch, n_frames)
-        if is_pad is not None:  # nor is the episode's first sound one that began then
-            begins = begins & ~functional.pad(is_pad[:, :-1], (1, 0), value=True)
-        number = torch.arange(1, n_frames + 1, device=begins.device)
-        last = (begins * number).unfold(1, config.memory_steps, 1).amax(dim=2)  # (B, n_windows), 0: none
-        shapes = {key: config.feature_shape(key) for key in config.low_dimensional_keys}
-        felt = torch.cat(
-            [newest(batch, key, n_frames, shape).flatten(2).float() for key, shape in shapes.items()], dim=2
-        )
-        then = felt.gather(1, (last - 1).clamp(min=0).unsqueeze(2).expand(-1, -1, felt.shape[2]))
-        return then - felt[:, -n_windows:], last > 0
 
     def _next_columns(self, batch: dict[str, Tensor], weight: Tensor) -> Tensor:
         """The last spectrogram column of every frame after the first of K, without augmentation, (B, K - 1, bins)."""

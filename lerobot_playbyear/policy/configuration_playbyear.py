@@ -57,8 +57,6 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
         memory_displacement_gain: The LSTM also reads how far the low-dimensional observations of each remembered frame are from
             the newest ones, in normalised units times this. 0: it does not (the paper).
-        memory_attention_heads: Heads of an attention over the remembered frames that reads these displacements beside the LSTM;
-            needs `memory_displacement_gain`. 0: none (the paper).
         action_range: How far actions reach, in units of the normalised ones. With 1, the paper's, and normalisation to [-1, 1],
             no action lies outside of the demonstrations'; 1.5 reaches a quarter of their range further at both ends.
 
@@ -85,11 +83,10 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             0: none (the paper).
         auxiliary_*: Weights, beside the action's loss, of what training predicts besides (`auxiliary.py`); 0: not at all (the
             paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame
-            [cross entropy, nats]; onset_place: the way from the arm to where it was at the last sudden sound that its memory
-            holds [squared, in what the low-dimensional observations are given in]; next_sound: the last spectrogram column of
-            the next frame [squared standard deviations]; inverse_dynamics: the action between two neighbouring encodings;
-            chunk: the actions after the one that is executed, so that they are `auxiliary_chunk_size` together [both as the
-            action's own loss]. A deaf policy leaves out the first three.
+            [cross entropy, nats]; next_sound: the last spectrogram column of the next frame [squared standard deviations];
+            inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that is
+            executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves
+            out the first two.
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
@@ -135,7 +132,6 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     normalize_encodings: bool = True
     low_dimensional_gain: float = 4.0
     memory_displacement_gain: float = 0.0
-    memory_attention_heads: int = 0
     action_range: float = 1.0
 
     # Training
@@ -154,7 +150,6 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     spectrogram_momentum: float = 0.01
     ema_decay: float = 0.0
     auxiliary_onset: float = 0.0
-    auxiliary_onset_place: float = 0.0
     auxiliary_next_sound: float = 0.0
     auxiliary_inverse_dynamics: float = 0.0
     auxiliary_chunk: float = 0.0

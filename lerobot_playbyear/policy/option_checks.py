@@ -31,15 +31,6 @@ def check_options(config: "PlaybyearConfig") -> None:
             f"--policy.memory_displacement_gain={config.memory_displacement_gain} compares low-dimensional observations, and "
             "--policy.low_dimensional_gain is 0: give 4, its usual value."
         )
-    if config.memory_attention_heads < 0:
-        raise ValueError(
-            f"--policy.memory_attention_heads must be at least 0 (none), got {config.memory_attention_heads}."
-        )
-    if config.memory_attention_heads and not config.memory_displacement_gain:
-        raise ValueError(
-            f"--policy.memory_attention_heads={config.memory_attention_heads} reads displacements, and "
-            "--policy.memory_displacement_gain is 0: give 10, its usual value."
-        )
     if not 0 <= config.ema_decay < 1:
         raise ValueError(f"--policy.ema_decay must be at least 0 (none) and below 1, got {config.ema_decay}.")
     if config.audio_noise_files is not None and config.audio_noise_db is None:
@@ -76,7 +67,7 @@ def _check_candidates(config: "PlaybyearConfig") -> None:
     if not 0 <= config.fusion_dropout < 1:
         raise ValueError(f"--policy.fusion_dropout must be at least 0 (none) and below 1, got {config.fusion_dropout}.")
     # By kind: how many windows of a run it needs.
-    needs = {"onset": 1, "onset_place": 1, "next_sound": 2, "inverse_dynamics": 2, "chunk": config.auxiliary_chunk_size}
+    needs = {"onset": 1, "next_sound": 2, "inverse_dynamics": 2, "chunk": config.auxiliary_chunk_size}
     for kind, n_windows in needs.items():
         option, weight = f"--policy.auxiliary_{kind}", getattr(config, f"auxiliary_{kind}")
         if not 0 <= weight < math.inf:

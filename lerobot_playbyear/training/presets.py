@@ -32,9 +32,7 @@ _NETWORK = (
     "low_dimensional_gain",
     "hop_s",
     "memory_displacement_gain",
-    "memory_attention_heads",
     "auxiliary_onset",
-    "auxiliary_onset_place",
 )
 """Options of the policy that fix what the network looks like: with `--policy.path` the checkpoint says it."""
 
