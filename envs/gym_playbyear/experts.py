@@ -20,7 +20,8 @@ class ExpertConfig:
 
     gain: share of the remaining distance covered per step; max_step: longest displacement per step; noise: uniform, either
     way, added to every displacement; hop_tolerance: how exactly the hand is above the cube, along the sweep, before it comes
-    down, None: as at every other goal. The pairs are ranges of uniform draws, `pause_probability` is per step of the sweep.
+    down, None: as at every other goal; hop_step: of a hop at an even speed, None: it slows down as on every other way. The
+    pairs are ranges of uniform draws, `pause_probability` is per step of the sweep, and of a hop at an even speed.
     """
 
     sweep_height: float = 0.022  # of the controlled point above the table
@@ -40,12 +41,13 @@ class ExpertConfig:
     rise_step: tuple[float, float] = (0.008, 0.018)
     hover: tuple[int, int] = (0, 8)
     hop_tolerance: float | None = None
+    hop_step: tuple[float, float] | None = None
     descent_step: float = 0.014
     back_off: float = 0.004
 
 
-EXACT_EXPERT = ExpertConfig(hop_tolerance=0.002)
-"""Version 1's: it shows that the hand comes down where it is above the cube, and not on the way there."""
+EXACT_EXPERT = ExpertConfig(hop_tolerance=0.002, hop_step=(0.008, 0.02))
+"""Version 1's. It shows that the hand comes down where it is above the cube: not on the way there, nor where it slows down."""
 
 CORRECTING_EXPERT = ExpertConfig(
     sweep_step=(0.008, 0.011),
@@ -89,6 +91,7 @@ class GraspExpert:
         self.sweep_end = upper - self.reach + 0.02
         self.sweep_step = rng.uniform(*(config.sweep_step or self.env.variant.sweep_step))
         self.rise_step = rng.uniform(*config.rise_step)
+        self.hop_step = None if config.hop_step is None else rng.uniform(*config.hop_step)
         self.phase = "approach"
 
     def begin_at(self, phase: str) -> None:
@@ -136,9 +139,7 @@ class GraspExpert:
             return self._dwell()
         if eef[1] > self.sweep_end:
             self._begin()
-        if self._wait == 0 and self.rng.random() < self.config.pause_probability:
-            self._wait = int(self.rng.integers(*self.config.pause, endpoint=True))
-        step = self.sweep_step if self._has_waited() else 0.0
+        step = self.sweep_step if self._goes_on() else 0.0
         hold = self._on_line(eef[1], self.config.sweep_height)
         return self._towards(hold) + np.array([0, step, 0]), False
 
@@ -163,10 +164,14 @@ class GraspExpert:
         return self._towards(self._on_line(self.contact_y - self.config.back_off, self.config.clear_height)), False
 
     def _hop(self):
-        exactly = self.config.hop_tolerance
-        if exactly is not None and abs(self._grasp_y() - self.env.eef_position[1]) > exactly:
-            return self._towards(self._on_line(self._grasp_y(), self.config.clear_height)), False
-        return self._go(self._on_line(self._grasp_y(), self.config.clear_height), self.config.tolerance, "descend")
+        config, y = self.config, float(self.env.eef_position[1])
+        missing = self._grasp_y() - y
+        if config.hop_tolerance is None or abs(missing) < config.hop_tolerance:
+            return self._go(self._on_line(self._grasp_y(), config.clear_height), config.tolerance, "descend")
+        if self.hop_step is None:
+            return self._towards(self._on_line(self._grasp_y(), config.clear_height)), False
+        step = float(np.clip(missing, -self.hop_step, self.hop_step)) if self._goes_on() else 0.0
+        return self._towards(self._on_line(y, config.clear_height)) + np.array([0, step, 0]), False
 
     def _grasp_y(self) -> float:
         return float(self.env.cube_position[1])
@@ -203,6 +208,12 @@ class GraspExpert:
         if self._near(goal, tolerance):
             self.phase = next_phase
         return self._towards(goal), False
+
+    def _goes_on(self) -> bool:
+        """Whether it moves in this step, or pauses as people do."""
+        if self._wait == 0 and self.rng.random() < self.config.pause_probability:
+            self._wait = int(self.rng.integers(*self.config.pause, endpoint=True))
+        return self._has_waited()
 
     def _has_waited(self) -> bool:
         """Whether the pause is over; if not, this is one step of it."""
