@@ -20,8 +20,8 @@ class ExpertConfig:
 
     gain: share of the remaining distance covered per step; max_step: longest displacement per step; noise: uniform, either
     way, added to every displacement; hop_tolerance: how exactly the hand is above the cube, along the sweep, before it comes
-    down, None: as at every other goal; hop_step: of a hop at an even speed, None: it slows down as on every other way. The
-    pairs are ranges of uniform draws, `pause_probability` is per step of the sweep, and of a hop at an even speed.
+    down, None: as at every other goal; hop_step: the longest displacement of a hop, None: `max_step`; back_off: how far it
+    draws back from a touch. The pairs are ranges of uniform draws, `pause_probability` is per step of the sweep.
     """
 
     sweep_height: float = 0.022  # of the controlled point above the table
@@ -43,11 +43,15 @@ class ExpertConfig:
     hop_tolerance: float | None = None
     hop_step: tuple[float, float] | None = None
     descent_step: float = 0.014
-    back_off: float = 0.004
+    back_off: float | tuple[float, float] = 0.004
 
 
-EXACT_EXPERT = ExpertConfig(hop_tolerance=0.002, hop_step=(0.008, 0.02))
-"""Version 1's. It shows that the hand comes down where it is above the cube: not on the way there, nor where it slows down."""
+EXACT_EXPERT = ExpertConfig(
+    dwell=(0, 4), back_off=(0.002, 0.014), hover=(0, 3), hop_tolerance=0.002, hop_step=(0.012, 0.02)
+)
+"""Version 1's. It shows that the hand comes down where it is above the cube and not on the way there, and that only the touch
+tells where that is: how far it draws back before it rises differs from search to search. It waits no longer than a policy of
+twenty frames remembers the touch."""
 
 CORRECTING_EXPERT = ExpertConfig(
     sweep_step=(0.008, 0.011),
@@ -59,7 +63,9 @@ CORRECTING_EXPERT = ExpertConfig(
 )
 """An expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
 
-PATIENT_EXPERT = replace(CORRECTING_EXPERT, sweep_step=None, hop_tolerance=EXACT_EXPERT.hop_tolerance)
+PATIENT_EXPERT = replace(
+    CORRECTING_EXPERT, sweep_step=None, hop_tolerance=EXACT_EXPERT.hop_tolerance, back_off=EXACT_EXPERT.back_off
+)
 """Where there is time, it corrects without haste: it sweeps as one that demonstrates."""
 
 
@@ -91,6 +97,7 @@ class GraspExpert:
         self.sweep_end = upper - self.reach + 0.02
         self.sweep_step = rng.uniform(*(config.sweep_step or self.env.variant.sweep_step))
         self.rise_step = rng.uniform(*config.rise_step)
+        self.back_off = rng.uniform(*config.back_off) if isinstance(config.back_off, tuple) else config.back_off
         self.hop_step = None if config.hop_step is None else rng.uniform(*config.hop_step)
         self.phase = "approach"
 
@@ -99,7 +106,7 @@ class GraspExpert:
         self._begin()
         self.phase = phase
         self._wait = 0
-        self.contact_y = float(self.env.eef_position[1]) + self.config.back_off
+        self.contact_y = float(self.env.eef_position[1]) + self.back_off
 
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
@@ -139,7 +146,9 @@ class GraspExpert:
             return self._dwell()
         if eef[1] > self.sweep_end:
             self._begin()
-        step = self.sweep_step if self._goes_on() else 0.0
+        if self._wait == 0 and self.rng.random() < self.config.pause_probability:
+            self._wait = int(self.rng.integers(*self.config.pause, endpoint=True))
+        step = self.sweep_step if self._has_waited() else 0.0
         hold = self._on_line(eef[1], self.config.sweep_height)
         return self._towards(hold) + np.array([0, step, 0]), False
 
@@ -149,10 +158,10 @@ class GraspExpert:
     def _dwell(self):
         if self._has_waited():
             self.phase = "rise"
-        return self._towards(self._on_line(self.contact_y - self.config.back_off, self.config.sweep_height)), False
+        return self._towards(self._on_line(self.contact_y - self.back_off, self.config.sweep_height)), False
 
     def _rise(self):
-        goal = self._on_line(self.contact_y - self.config.back_off, self.config.clear_height)
+        goal = self._on_line(self.contact_y - self.back_off, self.config.clear_height)
         if self.env.eef_position[2] > goal[2] - self.config.tolerance:
             self.phase = "hover"
             self._wait = int(self.rng.integers(*self.config.hover, endpoint=True))
@@ -161,17 +170,13 @@ class GraspExpert:
     def _hover(self):
         if self._has_waited():
             self.phase = "hop"
-        return self._towards(self._on_line(self.contact_y - self.config.back_off, self.config.clear_height)), False
+        return self._towards(self._on_line(self.contact_y - self.back_off, self.config.clear_height)), False
 
     def _hop(self):
-        config, y = self.config, float(self.env.eef_position[1])
-        missing = self._grasp_y() - y
-        if config.hop_tolerance is None or abs(missing) < config.hop_tolerance:
-            return self._go(self._on_line(self._grasp_y(), config.clear_height), config.tolerance, "descend")
-        if self.hop_step is None:
-            return self._towards(self._on_line(self._grasp_y(), config.clear_height)), False
-        step = float(np.clip(missing, -self.hop_step, self.hop_step)) if self._goes_on() else 0.0
-        return self._towards(self._on_line(y, config.clear_height)) + np.array([0, step, 0]), False
+        config, goal = self.config, self._on_line(self._grasp_y(), self.config.clear_height)
+        if config.hop_tolerance is None or abs(goal[1] - self.env.eef_position[1]) < config.hop_tolerance:
+            return self._go(goal, config.tolerance, "descend")
+        return self._towards(goal, self.hop_step), False
 
     def _grasp_y(self) -> float:
         return float(self.env.cube_position[1])
@@ -208,12 +213,6 @@ class GraspExpert:
         if self._near(goal, tolerance):
             self.phase = next_phase
         return self._towards(goal), False
-
-    def _goes_on(self) -> bool:
-        """Whether it moves in this step, or pauses as people do."""
-        if self._wait == 0 and self.rng.random() < self.config.pause_probability:
-            self._wait = int(self.rng.integers(*self.config.pause, endpoint=True))
-        return self._has_waited()
 
     def _has_waited(self) -> bool:
         """Whether the pause is over; if not, this is one step of it."""
