@@ -26,6 +26,7 @@ class ExpertConfig:
 
     sweep_height: float = 0.022  # of the controlled point above the table
     clear_height: float = 0.072  # fingertips above the cube
+    higher: tuple[float, float] | None = None  # by which sweeps, and hops, are higher than that
     travel_height: float = 0.12
     margin: float = 0.015  # between finger and the nearest possible cube at the start of the sweep
     gain: float = 0.5
@@ -47,7 +48,12 @@ class ExpertConfig:
 
 
 EXACT_EXPERT = ExpertConfig(
-    dwell=(0, 4), back_off=(0.002, 0.014), hover=(0, 3), hop_tolerance=0.002, hop_step=(0.012, 0.02)
+    higher=(0.0, 0.012),
+    dwell=(0, 4),
+    back_off=(0.002, 0.014),
+    hover=(0, 3),
+    hop_tolerance=0.002,
+    hop_step=(0.012, 0.02),
 )
 """Version 1's. It shows that the hand comes down where it is above the cube and not on the way there, and that only the touch
 tells where that is: how far it draws back before it rises differs from search to search. It waits no longer than a policy of
@@ -97,6 +103,8 @@ class GraspExpert:
         self.sweep_end = upper - self.reach + 0.02
         self.sweep_step = rng.uniform(*(config.sweep_step or self.env.variant.sweep_step))
         self.rise_step = rng.uniform(*config.rise_step)
+        higher = np.zeros(2) if config.higher is None else rng.uniform(*config.higher, 2)
+        self.sweep_height, self.clear_height = np.array([config.sweep_height, config.clear_height]) + higher
         self.back_off = rng.uniform(*config.back_off) if isinstance(config.back_off, tuple) else config.back_off
         self.hop_step = None if config.hop_step is None else rng.uniform(*config.hop_step)
         self.phase = "approach"
@@ -131,7 +139,7 @@ class GraspExpert:
         return self._go(self._on_line(self.sweep_start, self.config.travel_height), 0.02, "lower")
 
     def _lower(self):
-        goal = self._on_line(self.sweep_start, self.config.sweep_height)
+        goal = self._on_line(self.sweep_start, self.sweep_height)
         if self._near(goal, self.config.tolerance):
             self.phase = "sweep"
             self._wait = int(self.rng.integers(*self.config.pause))
@@ -149,7 +157,7 @@ class GraspExpert:
         if self._wait == 0 and self.rng.random() < self.config.pause_probability:
             self._wait = int(self.rng.integers(*self.config.pause, endpoint=True))
         step = self.sweep_step if self._has_waited() else 0.0
-        hold = self._on_line(eef[1], self.config.sweep_height)
+        hold = self._on_line(eef[1], self.sweep_height)
         return self._towards(hold) + np.array([0, step, 0]), False
 
     def _feels_contact(self) -> bool:
@@ -158,10 +166,10 @@ class GraspExpert:
     def _dwell(self):
         if self._has_waited():
             self.phase = "rise"
-        return self._towards(self._on_line(self.contact_y - self.back_off, self.config.sweep_height)), False
+        return self._towards(self._on_line(self.contact_y - self.back_off, self.sweep_height)), False
 
     def _rise(self):
-        goal = self._on_line(self.contact_y - self.back_off, self.config.clear_height)
+        goal = self._on_line(self.contact_y - self.back_off, self.clear_height)
         if self.env.eef_position[2] > goal[2] - self.config.tolerance:
             self.phase = "hover"
             self._wait = int(self.rng.integers(*self.config.hover, endpoint=True))
@@ -170,10 +178,10 @@ class GraspExpert:
     def _hover(self):
         if self._has_waited():
             self.phase = "hop"
-        return self._towards(self._on_line(self.contact_y - self.back_off, self.config.clear_height)), False
+        return self._towards(self._on_line(self.contact_y - self.back_off, self.clear_height)), False
 
     def _hop(self):
-        config, goal = self.config, self._on_line(self._grasp_y(), self.config.clear_height)
+        config, goal = self.config, self._on_line(self._grasp_y(), self.clear_height)
         if config.hop_tolerance is None or abs(goal[1] - self.env.eef_position[1]) < config.hop_tolerance:
             return self._go(goal, config.tolerance, "descend")
         return self._towards(goal, self.hop_step), False

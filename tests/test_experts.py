@@ -1,0 +1,59 @@
+"""What the cube tasks' experts show: version 1's that the touch alone tells where the cube is, version 0's what it always did."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from gym_playbyear.experts import EXACT_EXPERT, ExpertConfig, GraspExpert
+
+
+def searches(task: str, seeds: range) -> list[dict[str, float]]:
+    """Of the expert's first search in every episode: lengths [m], and steps from the touch to the descent."""
+    env = gym.make(f"gym_playbyear:gym_playbyear/{task}", image_size=8, sound="none", disable_env_checker=True)
+    told = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        task_env, steps, heights = env.unwrapped, 0, []
+        expert = task_env.scripted_expert()
+        while expert.phase != "descend":
+            if expert.phase == "sweep":
+                heights.append(task_env.eef_position[2])
+            steps += expert.phase in ("dwell", "rise", "hover", "hop")
+            env.step(expert.act())
+        beside = abs(task_env.cube_position[1] - task_env.eef_position[1])
+        told.append({"beside": beside, "steps": steps, "height": np.median(heights)})
+    env.close()
+    return told
+
+
+@pytest.mark.parametrize("task", ["OccludedGrasp-v1", "OccludedPickPlace-v1"])
+def test_version_1_comes_down_above_the_cube_while_the_touch_is_remembered(task):
+    told = searches(task, range(12))
+    assert np.mean([each["beside"] for each in told]) < 0.003
+    assert np.mean([each["steps"] <= 20 for each in told]) > 0.7
+    assert np.ptp([each["height"] for each in told]) > 0.005
+
+
+def test_version_1_draws_back_from_the_cube_by_another_way_in_every_search():
+    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", image_size=8, sound="none", disable_env_checker=True)
+    env.reset(seed=1)
+    expert = env.unwrapped.scripted_expert()
+    ways = []
+    for _ in range(50):
+        expert._begin()
+        ways.append(expert.back_off)
+    low, high = EXACT_EXPERT.back_off
+    assert low <= min(ways) < low + 0.003
+    assert high - 0.003 < max(ways) <= high
+    env.close()
+
+
+def test_version_0_is_shown_as_it_always_was():
+    assert ExpertConfig() == ExpertConfig(back_off=0.004, higher=None, hop_step=None, hop_tolerance=None)
+    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0", image_size=8, sound="none", disable_env_checker=True)
+    env.reset(seed=1)
+    expert = env.unwrapped.scripted_expert()
+    assert type(expert) is GraspExpert
+    assert expert.config == ExpertConfig()
+    assert (expert.back_off, expert.hop_step, expert.sweep_height) == (0.004, None, 0.022)
+    env.close()
