@@ -1,4 +1,4 @@
-"""What the cube tasks' experts show: version 1's that the touch alone tells where the cube is, version 0's what it always did."""
+"""What the experts of the cube tasks show: that the touch alone tells where the cube is; in version 0, what they always did."""
 
 import gymnasium as gym
 import numpy as np
