@@ -31,7 +31,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def finished(tmp_path_factory):
     """A run of three kept attempts with an evaluation before, after the second round, and at the end."""
     folder = tmp_path_factory.mktemp("dagger")
-    dagger(folder, "--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1")
+    time = "--env.episode_length=200"  # enough to rescue a policy that has learned nothing
+    dagger(folder, "--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1", time)
     return folder
 
 
