@@ -319,7 +319,7 @@ def test_an_expert_that_rescues_nothing_is_an_error(tmp_path):
 
 def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
     before = seeds(finished)
-    dagger(finished, "--episodes=4", f"--output_dir={tmp_path / 'out'}")
+    dagger(finished, "--episodes=4", "--env.episode_length=200", f"--output_dir={tmp_path / 'out'}")
     after = seeds(finished)
     assert after[:3] == before
     assert len(after) == 4
