@@ -1,5 +1,6 @@
 """The policy's ear: the grid of the paper, the same picture at every sample rate, statistics of real sound only."""
 
+import json
 import math
 
 import pytest
@@ -8,6 +9,8 @@ from torchaudio.functional import resample
 
 from lerobot_playbyear.policy.networks import AudioEncoder
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
+from lerobot_playbyear.policy.window_lengths import segment_and_hop
+from lerobot_playbyear.training.presets import RECIPES
 
 SEGMENT_S, HOP_S, N_BINS, WINDOW_S = 0.040, 0.035, 160, 2.0
 
@@ -132,6 +135,14 @@ def test_seventeen_frames_at_20_hz_cost_half_the_segments():
     assert (shared.period, shared.n_stretches, shared.windows_per_stretch) == (7, 7, 3)
     segments = shared.n_stretches * ((32000 + 2 * 7 * 800 - 640) // 560 + 1)
     assert segments < 17 * 57 * 0.56
+
+
+@pytest.mark.parametrize(("sample_rate", "fps"), [(16000, 20), (48000, 5)])
+def test_with_the_step_of_the_preset_neighbouring_windows_share_all_columns(sample_rate, fps):
+    hop_s = json.loads((RECIPES / "cpu.json").read_text())["policy"]["hop_s"]
+    _, hop = segment_and_hop(sample_rate, SEGMENT_S, hop_s)
+    shared = SharedStretches(35, sample_rate // fps, 2 * sample_rate, hop)
+    assert (shared.period, shared.n_stretches) == (1, 1)
 
 
 def test_sound_that_is_taken_apart_to_fit_a_cache_gives_the_same_bits():

@@ -155,9 +155,8 @@ class LogSpectrogram(nn.Module):
         if wave.device.type != "cpu" or torch.compiler.is_compiling():
             return self._power(wave.flatten(0, -2))
         together = max(1, _IN_CACHE * self.hop // (wave.shape[-1] * self.segment))
-        items = (
-            wave if wave.dim() == 3 and wave.shape[1] > 1 else [wave.flatten(0, -2)]
-        )  # stretches overlap: never copied
+        overlaps = wave.dim() == 3 and wave.shape[1] > 1  # stretches: never copied, so one item after the other
+        items = wave if overlaps else [wave.flatten(0, -2)]
         return torch.cat([self._power(part) for item in items for part in item.split(together)])
 
     def _power(self, wave: Tensor) -> Tensor:
