@@ -76,7 +76,11 @@ def _updates(results: list[Result]) -> str:
     return "" if steps == [STEPS] or results[0].task in TASKS else f", {' and '.join(map(str, steps))} updates"
 
 
-PRESETS_OF_BEFORE = {"steps of 35 ms": "hop_35ms", "and without `auxiliary_onset`": "no_onset"}
+PRESETS_OF_BEFORE = {
+    "swells count as onsets": "swells_are_onsets",
+    "steps of 35 ms": "hop_35ms",
+    "and without `auxiliary_onset`": "no_onset",
+}
 CURVES = {
     "noise": "noise",
     "noise_white": "noise, trained with white noise up to the recordings' own floor",

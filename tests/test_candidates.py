@@ -30,6 +30,9 @@ CANDIDATES = {
     "log_mel": {"audio_features": "log_mel"},
     "pcen": {"audio_features": "pcen"},
     "onset": {"auxiliary_onset": 0.1},
+    "balance": {"auxiliary_balance": 0.1},
+    "past_onsets": {"auxiliary_onset": 0.1, "auxiliary_onset_s": 0.2},
+    "envelope": {"audio_envelope_gain": 0.3},
     "next_sound": {"auxiliary_next_sound": 0.1},
     "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
     "chunk": {"auxiliary_chunk": 0.5},
@@ -242,12 +245,128 @@ def clicks(policy, frames, seed=1):
     return episode
 
 
+def onsets(policy, batch):
+    """Of the last five frames."""
+    heads = policy.model.auxiliary
+    return heads._onsets(heads._levels(batch), 5).tolist()
+
+
 def test_an_onset_is_a_click_and_not_what_rings_on_nor_steady_noise():
     policy = make_policy(auxiliary_onset=1.0)
     batch = run_ending_at(clicks(policy, (12, 13, 15)), N_FRAMES - 1, policy.config)
-    assert policy.model.auxiliary._onsets(batch, 5).tolist() == [[0, 1, 0, 0, 1]]  # frames 11 to 15
+    assert onsets(policy, batch) == [[0, 1, 0, 0, 1]]  # frames 11 to 15
     louder = {**batch, MICROPHONE: run_ending_at(clicks(policy, ()), 15, policy.config)[MICROPHONE] * 40}
-    assert policy.model.auxiliary._onsets(louder, 5).sum() == 0
+    assert onsets(policy, louder) == [[0] * 5]
+
+
+def test_what_swells_is_no_onset():
+    """It crosses the threshold all the same: each frame is 7 dB louder than the one before."""
+    policy = make_policy(auxiliary_onset=1.0)
+    episode = clicks(policy, ())
+    for k, frame in enumerate(range(12, 16), start=1):
+        episode[MICROPHONE][frame] = (episode[MICROPHONE][frame] * 2.2**k).to(torch.int16)
+    batch = run_ending_at(episode, 15, policy.config)
+    assert onsets(policy, batch) == [[0, 0, 0, 0, 0]]
+    episode[MICROPHONE][14] = episode[MICROPHONE][11]  # what comes after a pause is one
+    assert onsets(policy, run_ending_at(episode, 15, policy.config)) == [[0, 0, 0, 0, 1]]
+
+
+def test_onsets_of_the_past_are_told_newest_first():
+    policy = make_policy(auxiliary_onset=1.0, auxiliary_onset_s=0.15)  # four frames
+    batch = run_ending_at(clicks(policy, (12, 15)), N_FRAMES - 1, policy.config)
+    heads, weight = policy.model.auxiliary, torch.ones(1, 5)
+    head = heads.heads["onset"]
+    for parameter in head.parameters():
+        torch.nn.init.zeros_(parameter)
+    encodings, errors = torch.zeros(1, 5, policy.config.embedding_size), []
+    for k in range(4):  # sure that a sound began k frames ago, and that none did in the others
+        head[-1].bias.data = torch.full((4,), -20.0).index_fill(0, torch.tensor(k), 20.0)
+        (loss,) = heads(batch, encodings, encodings, batch["action"], weight)
+        errors.append(loss.error[0] < 0.1)
+    told = torch.stack(errors, dim=1).int().tolist()  # of frames 11 to 15
+    assert told == [[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]]  # at the last: now, and 3 ago
+    with pytest.raises(
+        ValueError, match=r"auxiliary_onset_s=0.9 must be .* at most 0.8 s of .*audio_window_s=0.9 at 20 Hz"
+    ):
+        make_config(**SMALL, auxiliary_onset=1.0, auxiliary_onset_s=0.9)
+
+
+def test_an_envelope_keeps_how_loud_it_was():
+    """Brought to the same size, the encodings of a faint and of a loud click are nearly the same."""
+    policy = make_policy(audio_envelope_gain=0.3).eval()
+    n = policy.config.n_segments
+    heard = []
+    for factor in (1, 4):
+        episode = clicks(policy, ())
+        episode[MICROPHONE][15, 300:340] += 2000 * factor
+        heard.append(policy.model._hear(run_ending_at(episode, 15, policy.config), MICROPHONE, 2))
+    faint, loud = (one.detach() for one in heard)
+    assert faint.shape == (2, policy.model.hearing["audio_gripper"].embedding_size + n)
+    louder = (loud - faint)[:, -n:] / 0.3
+    assert louder[0].abs().max() < 1e-4  # the frame before
+    assert louder[1, :-3].abs().max() < 1e-4
+    spread = policy.model.spectrogram["audio_gripper"].variance.sqrt()
+    assert float(louder[1, -1]) == pytest.approx(float((1.2 / spread).mean()), rel=0.1)  # 12 dB, in deviations of a bin
+    step_by_step = step_through(policy, [clicks(policy, (12,))])
+    at_once = policy.predict_run(run_ending_at(clicks(policy, (12,)), 15, policy.config))
+    torch.testing.assert_close(step_by_step[:, -1], at_once[:, -1], atol=1e-5, rtol=0)
+
+
+LEFT, RIGHT = (f"observation.audio.{side}" for side in ("left", "right"))
+
+
+def two_ears(**options):
+    torch.manual_seed(0)
+    return PlaybyearPolicy(make_config(microphones=("left", "right"), use_vision=False, **(SMALL | options))).train()
+
+
+def clicks_of_two(policy, clicked):
+    """An episode of faint noise with a click in some frames, a tenth as loud at the other microphone: {frame: microphone}."""
+    episode = make_episode(1, policy.config, N_FRAMES)
+    generator = torch.Generator().manual_seed(1)
+    for key in (LEFT, RIGHT):
+        sound = 30 * torch.randn(N_FRAMES, 800, generator=generator)
+        for frame, loudest in clicked.items():
+            sound[frame, 300:340] += 8000 if key == loudest else 800
+        episode[key] = sound.to(torch.int16)
+    return run_ending_at(episode, N_FRAMES - 1, policy.config)
+
+
+def test_the_balance_is_who_hears_an_onset_louder():
+    policy = two_ears(auxiliary_balance=1.0)
+    batch = clicks_of_two(policy, {12: LEFT, 15: RIGHT})
+    heads, weight = policy.model.auxiliary, torch.ones(1, 5)
+    head = heads.heads["balance"]
+    for parameter in head.parameters():
+        torch.nn.init.zeros_(parameter)
+    encodings = torch.zeros(1, 5, policy.config.embedding_size)
+
+    def errors(logits):
+        head[-1].bias.data = torch.tensor(logits)
+        (loss,) = heads(batch, encodings, encodings, batch["action"], weight)
+        assert loss.weight.tolist() == [[0, 1, 0, 0, 1]]  # of frames 11 to 15
+        return loss.error[0, [1, 4]].tolist()
+
+    for_left, for_right = errors([math.log(100.0), 0.0])  # the click is 20 dB louder there
+    assert for_left < 0.02 < 3 < for_right
+    assert errors([0.0, math.log(100.0)]) == pytest.approx([for_right, for_left], abs=0.05)
+
+
+def test_the_balance_is_learned_from_the_ears_and_needs_two_of_them():
+    policy = two_ears(auxiliary_balance=1.0)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
+    batches = [clicks_of_two(policy, {frame: side}) for frame in (11, 13, 15) for side in (LEFT, RIGHT)]
+    batch = {key: torch.cat([one[key] for one in batches]) for key in batches[0]}
+    losses = []
+    for _ in range(90):
+        loss, figures = policy.forward(batch)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(float(figures["loss_balance"]))
+    assert losses[-1] < 0.1 * losses[0]
+    assert make_policy(auxiliary_balance=1.0).model.auxiliary is None
+    assert two_ears(auxiliary_balance=1.0, use_audio=False).model.auxiliary is None
 
 
 def test_the_next_sound_is_the_end_of_the_next_frame():

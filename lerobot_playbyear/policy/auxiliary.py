@@ -1,6 +1,7 @@
 """What training predicts beside the action, so that encodings hold more than this action needs. Nothing of it acts.
 
-In comments: B items, K supervised windows of each, D numbers in a joint encoding, A in an action, C actions in a chunk.
+In comments: B items, K supervised windows of each, M microphones, D numbers in a joint encoding, A in an action, C actions in
+a chunk.
 """
 
 import math
@@ -15,10 +16,10 @@ from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.history import newest
 from lerobot_playbyear.policy.spectrogram import POWER_FLOOR, LogSpectrogram, to_float_wave
 
-KINDS = ("onset", "next_sound", "inverse_dynamics", "chunk")
-_HEARD = ("onset", "next_sound")  # a deaf policy is trained without
+KINDS = ("onset", "balance", "next_sound", "inverse_dynamics", "chunk")
+_HEARD = ("onset", "balance", "next_sound")  # a deaf policy is trained without
 _HIDDEN = 128
-_ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`
+_ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`, and above the frame before
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ class AuxiliaryHeads(nn.Module):
             self.ears = nn.ModuleList(_ear(config) for _ in config.audio_keys)
         n_heard = config.n_frequency_bins * len(config.audio_keys)
         sizes = {
-            "onset": (size, 1),
+            "onset": (size, config.onset_frames),
+            "balance": (size, len(config.audio_keys)),
             "next_sound": (size + n_actions, n_heard),
             "inverse_dynamics": (2 * size, n_actions),
             "chunk": (size, n_later * n_actions),
@@ -78,9 +80,19 @@ class AuxiliaryHeads(nn.Module):
         both = weight[:, :-1] * weight[:, 1:]  # (B, K - 1): of a frame and the next one
         for kind in self.heads:
             if kind == "onset":
-                logits = self._predict(kind, encodings).squeeze(2)  # (B, K)
-                begins = self._onsets(batch, encodings.shape[1])
-                error, counts = functional.binary_cross_entropy_with_logits(logits, begins, reduction="none"), weight
+                logits = self._predict(kind, encodings)  # (B, K, n), of the newest frame and the n - 1 before it
+                n_frames = logits.shape[2]
+                begins = (
+                    self._onsets(self._levels(batch), encodings.shape[1] + n_frames - 1).unfold(1, n_frames, 1).flip(2)
+                )
+                error = functional.binary_cross_entropy_with_logits(logits, begins, reduction="none").mean(dim=2)
+                counts = weight
+            elif kind == "balance":
+                levels = self._levels(batch)
+                counts = weight * self._onsets(levels, encodings.shape[1])
+                shares = (levels[:, -encodings.shape[1] :] * math.log(10)).softmax(dim=2)  # of the power, (B, K, M)
+                logits = self._predict(kind, encodings).log_softmax(dim=2)
+                error = functional.kl_div(logits, shares, reduction="none").sum(dim=2)
             elif kind == "next_sound":
                 heard, counts = self._next_columns(batch, both), both  # (B, K - 1, bins)
                 error = _squared(self._predict(kind, outputs[:, :-1], actions[:, :-1]), heard)
@@ -96,15 +108,21 @@ class AuxiliaryHeads(nn.Module):
     def _predict(self, kind: str, *inputs: Tensor) -> Tensor:
         return self.heads[kind](torch.cat(inputs, dim=2)).float()  # whatever autocast computed in
 
-    def _onsets(self, batch: dict[str, Tensor], n_windows: int) -> Tensor:
-        """Whether a sudden sound begins, at any microphone, in each of the last frames: 0 or 1, (B, n_windows)."""
-        louder = []
-        for key in self.config.audio_keys:
-            sound = self._sound(batch, key, self.config.n_audio_frames)
-            level = torch.log10(sound.square().mean(dim=2) + POWER_FLOOR)  # (B, n_audio_frames)
-            louder.append(level - level.sort(dim=1).values[:, (level.shape[1] - 1) // 2, None])
-        loud = torch.stack(louder).amax(dim=0) > _ONSET
-        return (loud[:, 1:] & ~loud[:, :-1])[:, -n_windows:].float()
+    def _levels(self, batch: dict[str, Tensor]) -> Tensor:
+        """How loud each frame is at each of M microphones, without augmentation, (B, frames, M) [10 dB]."""
+        sounds = (self._sound(batch, key, self.config.n_audio_frames) for key in self.config.audio_keys)
+        return torch.stack([torch.log10(sound.square().mean(dim=2) + POWER_FLOOR) for sound in sounds], dim=2)
+
+    @staticmethod
+    def _onsets(levels: Tensor, n_windows: int) -> Tensor:
+        """Whether a sudden sound begins, at any microphone, in each of the last frames: 0 or 1, (B, n_windows).
+
+        What swells, as the rubbing of a thing that is carried, crosses the first threshold up and down by chance: it has to be
+        a jump, too, or nobody could learn to tell it.
+        """
+        louder = levels - levels.sort(dim=1).values[:, (levels.shape[1] - 1) // 2, None]
+        loud, sudden = ((rise > _ONSET).any(dim=2) for rise in (louder, levels.diff(dim=1)))
+        return (loud[:, 1:] & ~loud[:, :-1] & sudden)[:, -n_windows:].float()
 
     def _next_columns(self, batch: dict[str, Tensor], weight: Tensor) -> Tensor:
         """The last spectrogram column of every frame after the first of K, without augmentation, (B, K - 1, bins)."""
@@ -131,10 +149,10 @@ def make_auxiliary(config: PlaybyearConfig, n_actions: int) -> AuxiliaryHeads | 
 
 
 def weights_of(config: PlaybyearConfig) -> dict[str, float]:
-    """The weight of each of `KINDS`; a deaf policy leaves out what needs sound, so that it takes the same preset."""
-    return {
-        kind: getattr(config, f"auxiliary_{kind}") if config.use_audio or kind not in _HEARD else 0.0 for kind in KINDS
-    }
+    """The weight of each of `KINDS`; a policy leaves out what needs more ears than it has, so that all take the same preset."""
+    n_ears = len(config.audio_keys) if config.use_audio else 0
+    needs = {kind: 2 if kind == "balance" else int(kind in _HEARD) for kind in KINDS}
+    return {kind: getattr(config, f"auxiliary_{kind}") if n_ears >= needs[kind] else 0.0 for kind in KINDS}
 
 
 def _squared(predicted: Tensor, target: Tensor) -> Tensor:

@@ -53,6 +53,9 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
         embedding_size: Of the fused encoding and of the LSTM, D.
         normalize_encodings: Bring every camera's and microphone's encoding to the same size before the fusion (a layer norm
             without parameters). Off is the paper's plain concatenation.
+        audio_envelope_gain: The fusion also reads how loud each column of a microphone's spectrogram is, the mean of its bins,
+            times this: next to the convolutions, and not brought to the same size, so that two microphones can be compared.
+            0: it does not (the paper).
         low_dimensional_gain: Factor on the normalised low-dimensional observations before the fusion. With 1, the paper's, the
             seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
         memory_displacement_gain: The LSTM also reads how far the low-dimensional observations of each remembered frame are from
@@ -82,11 +85,13 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             of the last update's; both are in a checkpoint. It rises to this in the first updates: (1 + n) / (10 + n) after n.
             0: none (the paper).
         auxiliary_*: Weights, beside the action's loss, of what training predicts besides (`auxiliary.py`); 0: not at all (the
-            paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame
-            [cross entropy, nats]; next_sound: the last spectrogram column of the next frame [squared standard deviations];
-            inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that is
-            executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves
-            out the first two.
+            paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame, and in
+            each of those of the `auxiliary_onset_s` before it [cross entropy, nats]; balance: at an onset in the newest frame,
+            each microphone's share of the power that they hear, which tells where it was [Kullback-Leibler divergence, nats];
+            next_sound: the last spectrogram column of the next frame [squared standard deviations]; inverse_dynamics: the
+            action between two neighbouring encodings; chunk: the actions after the one that is executed, so that they are
+            `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves out the first three, and one
+            with a single microphone the second.
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
@@ -131,6 +136,7 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     embedding_size: int = 50
     normalize_encodings: bool = True
     low_dimensional_gain: float = 4.0
+    audio_envelope_gain: float = 0.0
     memory_displacement_gain: float = 0.0
     action_range: float = 1.0
 
@@ -150,6 +156,8 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     spectrogram_momentum: float = 0.01
     ema_decay: float = 0.0
     auxiliary_onset: float = 0.0
+    auxiliary_onset_s: float = 0.0
+    auxiliary_balance: float = 0.0
     auxiliary_next_sound: float = 0.0
     auxiliary_inverse_dynamics: float = 0.0
     auxiliary_chunk: float = 0.0

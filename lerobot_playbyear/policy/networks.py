@@ -58,7 +58,8 @@ class PlaybyearNetwork(nn.Module):
             encoders = {_module_name(key): make_encoder("audio_encoder", config) for key in config.audio_keys}
             self.hearing = nn.ModuleDict(encoders)
             self.disturb = SoundAugmentation(config)
-            sizes += [encoder.embedding_size for encoder in self.hearing.values()]  # type: ignore[misc]
+            n_columns = config.n_segments if config.audio_envelope_gain else 0
+            sizes += [encoder.embedding_size + n_columns for encoder in self.hearing.values()]  # type: ignore[misc, operator]
         felt = [math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys]
         self.fusion = FUSIONS[config.fusion]([*sizes, *felt], config)
         self.memory_head = MemoryHead(config, config.action_feature.shape[0], sum(felt))
@@ -100,7 +101,7 @@ class PlaybyearNetwork(nn.Module):
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
     def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
-        """One microphone's embeddings, (B * n, embedding size)."""
+        """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` its columns' means besides."""
         config = self.config
         n_heard = n_frames + config.audio_frames - 1
         sound = newest(batch, key, n_heard, config.feature_shape(key))  # (B, n_heard, S)
@@ -128,7 +129,11 @@ class PlaybyearNetwork(nn.Module):
             embeddings = shared.windows(encoder(levels), n_columns)  # (B * n, channels, n_columns)
         else:
             embeddings = encoder(shared.windows(levels, config.n_segments))
-        return self._normalize(embeddings.flatten(1))
+        heard = self._normalize(embeddings.flatten(1))
+        if config.audio_envelope_gain == 0:
+            return heard
+        envelope = shared.windows(levels.mean(dim=1, keepdim=True), config.n_segments).flatten(1)  # (B * n, n_segments)
+        return torch.cat([heard, config.audio_envelope_gain * envelope], dim=1)
 
     def _feel(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
         """One low-dimensional observation, (B * n, its numbers)."""

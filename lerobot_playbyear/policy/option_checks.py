@@ -67,7 +67,7 @@ def _check_candidates(config: "PlaybyearConfig") -> None:
     if not 0 <= config.fusion_dropout < 1:
         raise ValueError(f"--policy.fusion_dropout must be at least 0 (none) and below 1, got {config.fusion_dropout}.")
     # By kind: how many windows of a run it needs.
-    needs = {"onset": 1, "next_sound": 2, "inverse_dynamics": 2, "chunk": config.auxiliary_chunk_size}
+    needs = {"onset": 1, "balance": 1, "next_sound": 2, "inverse_dynamics": 2, "chunk": config.auxiliary_chunk_size}
     for kind, n_windows in needs.items():
         option, weight = f"--policy.auxiliary_{kind}", getattr(config, f"auxiliary_{kind}")
         if not 0 <= weight < math.inf:
@@ -77,6 +77,12 @@ def _check_candidates(config: "PlaybyearConfig") -> None:
                 f"{option}={weight} needs runs of at least {n_windows} windows: --policy.n_supervised_steps is "
                 f"{config.n_supervised_steps}, give {n_windows} or more."
             )
+    if not 0 <= config.auxiliary_onset_s <= (config.audio_frames - 2) / config.fps:
+        raise ValueError(
+            f"--policy.auxiliary_onset_s={config.auxiliary_onset_s} must be at least 0, the newest frame alone, and leave two "
+            f"frames of what is heard: at most {max(0, config.audio_frames - 2) / config.fps:g} s of "
+            f"--policy.audio_window_s={config.audio_window_s} at {config.fps} Hz."
+        )
     if config.auxiliary_chunk_size < 2:
         raise ValueError(
             f"--policy.auxiliary_chunk_size must be at least 2, the action that is executed and one more, got "

@@ -27,6 +27,7 @@ class WindowLengths:
     audio_features: str
     n_mels: int
     n_supervised_steps: int
+    auxiliary_onset_s: float
 
     @property
     def memory_steps(self) -> int:
@@ -42,6 +43,11 @@ class WindowLengths:
     def audio_frames(self) -> int:
         """Frames whose sound one encoding hears."""
         return math.ceil(round(self.audio_window_s * self.fps, 6))
+
+    @property
+    def onset_frames(self) -> int:
+        """Frames of which training tells, from one encoding, whether a sudden sound begins in them; the newest is one."""
+        return 1 + round(self.auxiliary_onset_s * self.fps)
 
     @property
     def n_run_frames(self) -> int:

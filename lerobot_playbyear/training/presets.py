@@ -31,8 +31,11 @@ _NETWORK = (
     "normalize_encodings",
     "low_dimensional_gain",
     "hop_s",
+    "audio_envelope_gain",
     "memory_displacement_gain",
     "auxiliary_onset",
+    "auxiliary_onset_s",
+    "auxiliary_balance",
 )
 """Options of the policy that fix what the network looks like: with `--policy.path` the checkpoint says it."""
 
