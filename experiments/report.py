@@ -77,7 +77,7 @@ def _updates(results: list[Result]) -> str:
 
 
 PRESETS_OF_BEFORE = {
-    "swells count as onsets": "swells_are_onsets",
+    "no envelope, and an expert that hops more slowly": "no_envelope_slower_expert",
     "steps of 35 ms": "hop_35ms",
     "and without `auxiliary_onset`": "no_onset",
 }

@@ -219,6 +219,8 @@ def test_weighted_starts_are_drawn_more_often():
 def test_a_sudden_sound_marks_the_frames_after_it():
     sound = torch.randint(-30, 30, (40, 100), dtype=torch.int16, generator=torch.Generator().manual_seed(0))
     sound[10:16] *= 100  # begins at frame 10 and lasts
+    for k, frame in enumerate(range(20, 24), start=1):  # 7 dB more in each: 14 above the median, and no jump
+        sound[frame] = (sound[frame] * 2.2**k).to(torch.int16)
     sound[39] *= 100  # the episode ends with it
 
     mask = loud_frames(make_store(30, 10, sound=sound), threshold_db=12, n_frames=3)

@@ -107,7 +107,7 @@ def loud_frames(
     """Which frames follow a sudden sound: something was touched, dropped or switched.
 
     A frame is loud when its power is more than `threshold_db` above the median of all frames of that microphone;
-    a sound begins at a loud frame after one that is not.
+    a sound begins at a loud frame that is as much louder than the one before, and that was not: what swells is not sudden.
 
     Args:
         store: The episodes.
@@ -124,7 +124,7 @@ def loud_frames(
         loud = level > level.median() + threshold_db
         for start, end in zip(store.starts, store.ends, strict=True):
             begins = loud[start:end].clone()
-            begins[1:] &= ~loud[start : end - 1]
+            begins[1:] &= ~loud[start : end - 1] & (level[start:end].diff() > threshold_db)
             for frame in begins.nonzero().squeeze(1).tolist():
                 mask[start + frame : min(start + frame + n_frames, end)] = True
     return mask
