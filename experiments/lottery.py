@@ -44,7 +44,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "past_onsets": ("--policy.auxiliary_onset_s=0.75",),
     "no_envelope": ("--policy.audio_envelope_gain=0",),
     "fainter_envelope": ("--policy.audio_envelope_gain=0.3",),
-    "loud": ("--sampling.loud_weight=4",),
     "longer_memory": ("--policy.n_memory_steps=30",),
     "no_balance": ("--policy.auxiliary_balance=0",),
     "more_balance": ("--policy.auxiliary_balance=0.3",),

@@ -106,7 +106,7 @@ def test_time_ends_an_attempt_without_success():
 @pytest.mark.parametrize("task", V1)
 def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
     env = make(task)
-    solved = 0
+    ends = []
     for seed in range(4):
         env.begin_episode(seed=seed)
         expert = env.scripted_expert()
@@ -121,9 +121,10 @@ def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
                 corrector.phase = "approach"  # until the fingers obey and open
             _, terminated, truncated, info = env.advance(corrector.act())
             done = terminated or truncated
-        solved += info["is_success"]
+        ends.append(info["end"])
     env.close()
-    assert solved >= 3
+    assert "time" not in ends
+    assert ends.count("success") >= 2  # of 20 attempts three shove the cube, which both searches move
 
 
 @pytest.mark.parametrize("task", V1)
