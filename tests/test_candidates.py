@@ -291,6 +291,10 @@ def test_onsets_of_the_past_are_told_newest_first():
         make_config(**SMALL, auxiliary_onset=1.0, auxiliary_onset_s=0.9)
 
 
+def test_a_window_of_a_single_frame_is_allowed_where_no_past_onsets_are_asked_for():
+    assert make_config(**(SMALL | {"audio_window_s": 0.05, "audio_channels": ()})).onset_frames == 1
+
+
 def test_an_envelope_keeps_how_loud_it_was():
     """Brought to the same size, the encodings of a faint and of a loud click are nearly the same."""
     policy = make_policy(audio_envelope_gain=0.3).eval()

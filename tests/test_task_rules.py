@@ -107,7 +107,7 @@ def test_time_ends_an_attempt_without_success():
 def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
     env = make(task)
     ends = []
-    for seed in range(4):
+    for seed in range(10):
         env.begin_episode(seed=seed)
         expert = env.scripted_expert()
         while expert.phase != "hop":
@@ -124,7 +124,7 @@ def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
         ends.append(info["end"])
     env.close()
     assert "time" not in ends
-    assert ends.count("success") >= 2  # of 20 attempts three shove the cube, which both searches move
+    assert ends.count("success") >= 0.75 * len(ends)  # the others shove the cube, which both searches move
 
 
 @pytest.mark.parametrize("task", V1)

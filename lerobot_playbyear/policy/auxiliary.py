@@ -78,17 +78,17 @@ class AuxiliaryHeads(nn.Module):
             weight: (B, K), 0 for windows that are not learned from.
         """
         both = weight[:, :-1] * weight[:, 1:]  # (B, K - 1): of a frame and the next one
+        levels = self._levels(batch) if "onset" in self.heads or "balance" in self.heads else None
         for kind in self.heads:
             if kind == "onset":
+                assert levels is not None
                 logits = self._predict(kind, encodings)  # (B, K, n), of the newest frame and the n - 1 before it
                 n_frames = logits.shape[2]
-                begins = (
-                    self._onsets(self._levels(batch), encodings.shape[1] + n_frames - 1).unfold(1, n_frames, 1).flip(2)
-                )
+                begins = self._onsets(levels, encodings.shape[1] + n_frames - 1).unfold(1, n_frames, 1).flip(2)
                 error = functional.binary_cross_entropy_with_logits(logits, begins, reduction="none").mean(dim=2)
                 counts = weight
             elif kind == "balance":
-                levels = self._levels(batch)
+                assert levels is not None
                 counts = weight * self._onsets(levels, encodings.shape[1])
                 shares = (levels[:, -encodings.shape[1] :] * math.log(10)).softmax(dim=2)  # of the power, (B, K, M)
                 logits = self._predict(kind, encodings).log_softmax(dim=2)

@@ -23,7 +23,7 @@ def check_options(config: "PlaybyearConfig") -> None:
             raise ValueError(f"--policy.{name} must be at least 1, got {getattr(config, name)}.")
     if not 0 < config.action_range < math.inf:
         raise ValueError(f"--policy.action_range must be above 0 and finite, got {config.action_range}.")
-    for name in ("memory_displacement_gain", "low_dimensional_noise", "low_dimensional_offset"):
+    for name in ("audio_envelope_gain", "memory_displacement_gain", "low_dimensional_noise", "low_dimensional_offset"):
         if not 0 <= getattr(config, name) < math.inf:
             raise ValueError(f"--policy.{name} must be at least 0 (none) and finite, got {getattr(config, name)}.")
     if config.memory_displacement_gain and not config.low_dimensional_gain:
@@ -77,7 +77,7 @@ def _check_candidates(config: "PlaybyearConfig") -> None:
                 f"{option}={weight} needs runs of at least {n_windows} windows: --policy.n_supervised_steps is "
                 f"{config.n_supervised_steps}, give {n_windows} or more."
             )
-    if not 0 <= config.auxiliary_onset_s <= (config.audio_frames - 2) / config.fps:
+    if not 0 <= config.auxiliary_onset_s <= max(0, config.audio_frames - 2) / config.fps:
         raise ValueError(
             f"--policy.auxiliary_onset_s={config.auxiliary_onset_s} must be at least 0, the newest frame alone, and leave two "
             f"frames of what is heard: at most {max(0, config.audio_frames - 2) / config.fps:g} s of "
