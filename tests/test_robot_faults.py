@@ -112,16 +112,10 @@ def test_the_microphone_is_pulled_out_and_only_zeros_come(caplog):
 def test_the_process_is_stopped_for_two_seconds(caplog):
     with heard_through_a_server(max_step=None, max_relative_target=None) as (env, _):
         script = f"sleep 0.2; kill -STOP {os.getpid()}; sleep 2; kill -CONT {os.getpid()}"
-        # Stopped while it waits for sound, it takes the microphone for silent, and ends the attempt all the same.
-        for seed in (1, 2, 3):
-            caplog.clear()
-            for _ in range(3):
-                env.step(np.full(3, 1, np.float32))
-            with subprocess.Popen(["sh", "-c", script]):
-                _, info = until_it_ends(env)
-            if "stood still" in " ".join(errors_of(caplog)):
-                break
-            env.reset(seed=seed)
+        for _ in range(3):
+            env.step(np.full(3, 1, np.float32))
+        with subprocess.Popen(["sh", "-c", script]):
+            _, info = until_it_ends(env)
         assert "stood still" in " ".join(errors_of(caplog))
         assert len(errors_of(caplog)) == 1
         assert info["verdict"] == "discard"

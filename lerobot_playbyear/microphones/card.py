@@ -42,7 +42,7 @@ class CardRecording:
         self.channels = dict(channels)
         self.drop_outs: list[DropOut] = []
         self._columns = list(channels.values())
-        self._rate, self._timeout = sample_rate, timeout_s
+        self._rate, self.timeout_s = sample_rate, timeout_s
         self._size = samples_per_frame(sample_rate, fps)
         self._clock = CardClock(sample_rate, tolerance_s=min(_LATE_S, 0.5 / fps))
         self._changed = threading.Condition()
@@ -87,14 +87,14 @@ class CardRecording:
         """For each microphone (S,) int16: what was heard since the block before, up to `until_s` [s of time.perf_counter]."""
         with self._changed:
             if not self._clock.is_set:
-                self._changed.wait_for(lambda: self._clock.is_set, self._timeout)
+                self._changed.wait_for(lambda: self._clock.is_set, self.timeout_s)
             if not self._clock.is_set:
                 self._note_nothing()
                 return {name: np.zeros(self._size, np.int16) for name in self.channels}
             if self._stop is None:
                 self._stop = self._place(until_s) - self._size
             self._changed.wait_for(
-                lambda: self._written >= self._span(until_s)[1], max(until_s - time.perf_counter(), 0) + self._timeout
+                lambda: self._written >= self._span(until_s)[1], max(until_s - time.perf_counter(), 0) + self.timeout_s
             )
             start, stop = self._span(until_s)
             if start > self._stop:

@@ -103,6 +103,11 @@ class Ears:
         return max((card.latency_s for card in self._cards), default=0.0)
 
     @property
+    def patience_s(self) -> float:
+        """The longest that `read` may take [s]."""
+        return self.latency_s + sum(card.recording.timeout_s for card in self._cards)
+
+    @property
     def problem(self) -> str:
         """What is wrong, if no more sound comes; empty while all is well."""
         return next(filter(None, map(self._problem_of, self._cards)), "")
