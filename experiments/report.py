@@ -78,6 +78,7 @@ def _updates(results: list[Result]) -> str:
 
 PRESETS_OF_BEFORE = {
     "no envelope, and an expert that hops more slowly": "no_envelope_slower_expert",
+    "envelope times 3": "envelope",
     "steps of 35 ms": "hop_35ms",
     "and without `auxiliary_onset`": "no_onset",
 }
