@@ -57,8 +57,8 @@ EXACT_EXPERT = ExpertConfig(
     hop_step=(0.015, 0.022),
 )
 """That of `OccludedGrasp-v1`. It shows that the hand comes down where it is above the cube and not on the way there, and that
-only the touch tells where that is: how far it draws back before it rises differs from search to search. Nine of ten hops end within
-18 steps of the touch, while a policy of twenty frames remembers where it was."""
+only the touch tells where that is: how far it draws back before it rises differs from search to search. Nine of ten hops end
+within 18 steps of the touch, while a policy of twenty frames remembers where it was."""
 
 CORRECTING_EXPERT = ExpertConfig(
     sweep_step=(0.008, 0.011),
