@@ -29,7 +29,7 @@ def searches(task: str, seeds: range) -> list[dict[str, float]]:
 def test_grasp_s_comes_down_above_the_cube_while_the_touch_is_remembered():
     told = searches("OccludedGrasp-v1", range(12))
     assert np.mean([each["beside"] for each in told]) < 0.003
-    assert np.mean([each["steps"] <= 18 for each in told]) > 0.8
+    assert np.mean([each["steps"] <= 20 for each in told]) > 0.75
     assert np.ptp([each["height"] for each in told]) > 0.005
 
 
@@ -47,11 +47,33 @@ def test_grasp_s_draws_back_from_the_cube_by_another_way_in_every_search():
     env.close()
 
 
+def test_grasp_s_hops_miss_the_cube_on_both_sides_and_are_mended():
+    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", image_size=8, sound="none", disable_env_checker=True)
+    missed = []
+    for seed in range(8):
+        env.reset(seed=seed)
+        task_env = env.unwrapped
+        expert = task_env.scripted_expert()
+        while expert.phase != "hop":
+            env.step(expert.act())
+        while expert.phase == "hop" and expert.hop_error:
+            error, beside = expert.hop_error, task_env.eef_position[1] - task_env.cube_position[1]
+            env.step(expert.act())
+        missed.append(error)
+        assert abs(beside - error) < 0.004
+    low, high = EXACT_EXPERT.hop_error
+    assert min(missed) < low / 2
+    assert max(missed) > high / 2
+    env.close()
+
+
 @pytest.mark.parametrize(
     ("task", "kind"), [("OccludedGrasp-v0", GraspExpert), ("OccludedPickPlace-v1", PickPlaceExpert)]
 )
 def test_others_show_what_they_always_showed(task, kind):
-    assert ExpertConfig() == ExpertConfig(back_off=0.004, higher=None, hop_step=None, hop_tolerance=None)
+    assert ExpertConfig() == ExpertConfig(
+        back_off=0.004, higher=None, hop_step=None, hop_error=None, hop_tolerance=None
+    )
     env = gym.make(f"gym_playbyear:gym_playbyear/{task}", image_size=8, sound="none", disable_env_checker=True)
     env.reset(seed=1)
     expert = env.unwrapped.scripted_expert()
