@@ -221,6 +221,20 @@ def test_ticks_do_not_drift_and_a_long_delay_moves_them():
     assert ticks.n_late == 2
 
 
+def test_a_standstill_before_a_tick_and_one_after_it_are_both_told():
+    now = [0.0]
+    ticks = Ticks(10, clock=lambda: now[0], sleep=lambda seconds: now.__setitem__(0, now[0] + seconds))
+    ticks.wait()
+    now[0] += 0.15  # of which 0.2 may be spent on waiting for sound
+    assert ticks.standstill_s(0.2) == 0
+    now[0] += 2
+    assert ticks.standstill_s(0.2) == pytest.approx(1.95)
+    ticks.wait()
+    assert ticks.standstill_s(0.2) == pytest.approx(2.05)  # the tick came late
+    ticks.wait()
+    assert ticks.standstill_s(0.2) == 0
+
+
 def test_lerobot_makes_one_robot_however_many_environments_it_asks_for(wav):
     from lerobot.envs import make_env
 

@@ -1,6 +1,5 @@
 """Occluded Pick and Place (paper, section "Simulated Domain and Tasks")."""
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -10,7 +9,7 @@ from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
-from gym_playbyear.experts import CORRECTING_EXPERT, PickPlaceExpert
+from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, PickPlaceExpert
 from gym_playbyear.looks_props import wall_on_the_table
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
@@ -96,7 +95,7 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     - v1: ends attempts that press or grope, wants the cube to stay where it belongs, leaves time for a second search.
     - v0: first version.
     """
-    correcting = partial(PickPlaceExpert, config=replace(CORRECTING_EXPERT, sweep_step=None))
+    correcting = partial(PickPlaceExpert, config=PATIENT_EXPERT)
     traits: dict[str, Any] = {"expert": PickPlaceExpert, "correcting_expert": correcting, "sound": SyntheticEars}
     return _task("OccludedPickPlace-v1", NUMBERS, cube_material, (rails(0.0, 0.38),), **traits)
 

@@ -104,7 +104,7 @@ class Ears:
 
     @property
     def patience_s(self) -> float:
-        """The longest that `read` may take [s]."""
+        """How long `read` waits at most for sound that does not come, after a first block has come [s]."""
         return self.latency_s + sum(card.recording.timeout_s for card in self._cards)
 
     @property

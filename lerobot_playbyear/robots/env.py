@@ -135,12 +135,13 @@ class RobotEnv(gym.Env):
             problem = str(error)
         if not problem:
             due = self._ticks.wait()
-            woke_s = time.perf_counter()
             try:
                 self._last = self._observe(due)
             except RobotError as error:
                 problem = str(error)
-            problem = problem or self._standstill(woke_s)
+            stood_s = self._ticks.standstill_s(rig.ears.patience_s)
+            if not problem and stood_s > self.config.stall_s:
+                problem = f"The program stood still for {stood_s:.1f} s."
         problem = problem or self._frozen.problem(self._pictures) or rig.ears.problem
         if problem:
             return self._end(problem, was_sent)
@@ -273,12 +274,6 @@ class RobotEnv(gym.Env):
         if self.state_names:
             observation["agent_pos"] = state
         return self._sound_pictures.add(observation | {f"audio.{name}": block for name, block in heard.items()})
-
-    def _standstill(self, woke_s: float) -> str:
-        """That the program stood still before its tick, or while it looked and listened; empty if it did not."""
-        observing_s = time.perf_counter() - woke_s - self._rig.ears.patience_s
-        stood_s = max(self._ticks.lateness[-1], observing_s)
-        return f"The program stood still for {stood_s:.1f} s." if stood_s > self.config.stall_s else ""
 
     def _end(self, problem: str, was_sent: bool = True):
         """The attempt ends because something went wrong, before or after its last action was sent."""

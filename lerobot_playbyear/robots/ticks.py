@@ -35,6 +35,7 @@ class Ticks:
         self._began = self._due = self._clock()
         self.n = self.n_late = 0
         self.lateness: list[float] = []
+        self._woke = self._due
         self._paused = 0.0
         return self._due
 
@@ -52,12 +53,17 @@ class Ticks:
         if left > 0:
             self._sleep(left)
         late = max(self._clock() - self._due, 0.0)
+        self._woke = self._due + late
         self.n += 1
         self.n_late += late > _LATE_S
         self.lateness.append(late)
         if late > self._period:
             self._due += late
         return self._due
+
+    def standstill_s(self, patience_s: float) -> float:
+        """How late the last tick came, or by how much more than `patience_s` has passed since it came: the longer [s]."""
+        return max(self.lateness[-1], self._clock() - self._woke - patience_s)
 
     @property
     def rate(self) -> float:
