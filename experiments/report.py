@@ -77,6 +77,7 @@ def _updates(results: list[Result]) -> str:
 
 
 PRESETS_OF_BEFORE = {
+    "an expert whose hops miss and are mended": "missing_hops",
     "no envelope, and an expert that hops more slowly": "no_envelope_slower_expert",
     "envelope times 3": "envelope",
     "steps of 35 ms": "hop_35ms",

@@ -37,6 +37,7 @@ CANDIDATES = {
     "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
     "chunk": {"auxiliary_chunk": 0.5},
     "displacement": {"memory_displacement_gain": 10.0, "low_dimensional_offset": 0.1},
+    "readers": {"memory_displacement_gain": 10.0, "memory_readers": 2},
 }
 EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}
 HEADS = ("onset", "next_sound", "inverse_dynamics", "chunk")
@@ -168,8 +169,27 @@ def test_displacements_are_in_normalised_units_times_their_gain():
     torch.testing.assert_close(displacement, 10 * (state - state[:, -1:]), atol=1e-4, rtol=1e-4)
 
 
-def test_where_nothing_is_felt_there_is_nothing_to_compare():
-    config = make_config(**SMALL, memory_displacement_gain=10.0)
+def test_a_reader_reads_the_displacement_of_the_frame_that_it_chooses():
+    policy = make_policy(memory_displacement_gain=10.0, low_dimensional_gain=4.0, memory_readers=1).eval()
+    head, n_fused, n = policy.model.memory_head, policy.config.embedding_size, policy.config.memory_steps
+    frames = torch.randn(2, n + 1, head.lstm.input_size)
+    frames[..., 0], frames[0, 2, 0], frames[1, 1, 0] = 0.0, 1.0, 1.0  # the frames with a touch
+    lstm_alone = head.recall(frames)  # a new reader reads nothing
+    with torch.no_grad():
+        head.recollection.score.weight.zero_()[0, 0] = 30.0
+        torch.nn.init.eye_(head.recollection.read.weight)
+    read = head.recall(frames) - lstm_alone  # (2, 2, D)
+    felt = 2.5 * frames[..., n_fused:]
+    touched = torch.stack([felt[0, 2], felt[1, 1]])
+    for window in range(2):
+        torch.testing.assert_close(
+            read[:, window, : felt.shape[2]], touched - felt[:, n - 1 + window], atol=1e-3, rtol=1e-4
+        )
+
+
+@pytest.mark.parametrize("n_readers", [0, 2])
+def test_where_nothing_is_felt_there_is_nothing_to_compare(n_readers):
+    config = make_config(**SMALL, memory_displacement_gain=10.0, memory_readers=n_readers)
     for key in config.low_dimensional_keys:
         del config.input_features[key]
     policy = PlaybyearPolicy(config).eval()
@@ -535,6 +555,8 @@ def test_another_microphones_gain_is_one_of_the_bins_below_the_bands(kind):
         ({"auxiliary_chunk": 1.0, "n_supervised_steps": 3}, r"needs runs of at least 4 windows"),
         ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
         ({"memory_displacement_gain": 10.0, "low_dimensional_gain": 0.0}, r"low_dimensional_gain is 0: give 4"),
+        ({"memory_readers": -1}, r"memory_readers must be at least 0 \(none\), got -1"),
+        ({"memory_readers": 2}, r"memory_readers=2 read displacements, .*memory_displacement_gain is 0: give 10"),
         ({"auxiliary_chunk_size": 1}, r"auxiliary_chunk_size must be at least 2"),
     ],
 )

@@ -60,6 +60,8 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
         memory_displacement_gain: The LSTM also reads how far the low-dimensional observations of each remembered frame are from
             the newest ones, in normalised units times this. 0: it does not (the paper).
+        memory_readers: Besides the LSTM's last output the head reads that many weighted means of these displacements, each with
+            weights over the remembered frames that follow from what was seen and heard in them. 0: none (the paper).
         action_range: How far actions reach, in units of the normalised ones. With 1, the paper's, and normalisation to [-1, 1],
             no action lies outside of the demonstrations'; 1.5 reaches a quarter of their range further at both ends.
 
@@ -138,6 +140,7 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     low_dimensional_gain: float = 4.0
     audio_envelope_gain: float = 0.0
     memory_displacement_gain: float = 0.0
+    memory_readers: int = 0
     action_range: float = 1.0
 
     # Training

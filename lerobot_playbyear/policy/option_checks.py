@@ -31,6 +31,13 @@ def check_options(config: "PlaybyearConfig") -> None:
             f"--policy.memory_displacement_gain={config.memory_displacement_gain} compares low-dimensional observations, and "
             "--policy.low_dimensional_gain is 0: give 4, its usual value."
         )
+    if config.memory_readers < 0:
+        raise ValueError(f"--policy.memory_readers must be at least 0 (none), got {config.memory_readers}.")
+    if config.memory_readers and not config.memory_displacement_gain:
+        raise ValueError(
+            f"--policy.memory_readers={config.memory_readers} read displacements, and --policy.memory_displacement_gain is 0: "
+            "give 10, its usual value."
+        )
     if not 0 <= config.ema_decay < 1:
         raise ValueError(f"--policy.ema_decay must be at least 0 (none) and below 1, got {config.ema_decay}.")
     if config.audio_noise_files is not None and config.audio_noise_db is None:

@@ -33,6 +33,7 @@ _NETWORK = (
     "hop_s",
     "audio_envelope_gain",
     "memory_displacement_gain",
+    "memory_readers",
     "auxiliary_onset",
     "auxiliary_onset_s",
     "auxiliary_balance",
