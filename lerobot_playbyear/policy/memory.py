@@ -71,8 +71,8 @@ class MemoryHead(nn.Module):
 class Recollection(nn.Module):
     """Reads, of the frames that it chooses by what was seen and heard in them, how far the arm was from where it is now.
 
-    An LSTM has to carry such a length through all later frames, and it arrives there rounded: a hop of six centimetres ends
-    millimetres beside the cube. Here each of M readers gives every frame of the window a weight (a softmax over frames, of its
+    An LSTM has to carry such a length through all later frames, and hops of six centimetres end millimetres beside the cube.
+    Here each of M readers gives every frame of the window a weight (a softmax over frames, of its
     joint encoding and of how long ago it was), and the mean of the displacements is added to what the LSTM remembers.
 
     Args:
@@ -87,9 +87,8 @@ class Recollection(nn.Module):
         self.score = nn.Linear(n_fused, n_readers)
         self.recency = nn.Parameter(torch.zeros(n_readers, n_steps))
         self.read = nn.Linear(n_readers * n_compared, n_fused, bias=False)
-        nn.init.zeros_(
-            self.read.weight
-        )  # displacements are tens of units, and would drive the actions' tanh to its ends
+        # Displacements are tens of units: other weights drive the actions' tanh to its ends.
+        nn.init.zeros_(self.read.weight)
 
     def forward(self, fused: Tensor, displacement: Tensor) -> Tensor:
         """Joint encodings (B, n, D) and every window's displacements (B, K, H, numbers) -> (B, K, D)."""
