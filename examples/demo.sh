@@ -8,7 +8,7 @@ export MUJOCO_GL=${MUJOCO_GL:-egl}
 DEMO_DIR=${DEMO_DIR:-outputs/demo}
 TASK=${TASK:-OccludedGrasp-v1}
 EPISODES=${EPISODES:-50}
-STEPS=${STEPS:-2500}
+STEPS=${STEPS:-1250}
 EVAL_EPISODES=${EVAL_EPISODES:-20}
 EVAL_SEED=1000  # none of the recorded seeds, which count up from 0
 

@@ -19,13 +19,13 @@ What takes time are updates; collecting makes none, and takes as long as its att
 
 | part | updates | is made once for all methods of a training seed |
 |---|---|---|
-| first policy | 2,500 | yes |
-| corrected policy | new_weights: `--updates` (2,500) a round; online: these, less those of 4 kept attempts | no |
-| `updates` | new_weights: `--updates`, but none if they are 2,500; online: as many as the corrections | if it is as many |
-| `demonstrations` | new_weights: `--updates`; online: 2,500, and as many as the corrections | if it has as many of both |
+| first policy | 1,250 | yes |
+| corrected policy | new_weights: `--updates` (1,250) a round; online: these, less those of 4 kept attempts | no |
+| `updates` | new_weights: `--updates`, but none if they are 1,250; online: as many as the corrections | if it is as many |
+| `demonstrations` | new_weights: `--updates`; online: 1,250, and as many as the corrections | if it has as many of both |
 
-So with one round the first method takes 7,500, and each further one 2,500 to 5,000; online they take 12,500, and 2,500 to
-10,000.
+So with one round the first method takes 3,750, and each further one 1,250 to 2,500; online they take 6,250, and 1,250 to
+5,000.
 
 Resumes where it was interrupted. Studies may run at the same time; those of one training wait for each other. They wait for
 `experiments.ablations`, too, but that does not wait for them: do not start it while a study trains the same policy.

@@ -26,7 +26,7 @@ TRAINING_SEEDS = (1, 2, 3)
 N_DEMONSTRATIONS = 50
 ATTEMPT_STEPS = {"OccludedGrasp-v0": 220, "OccludedPickPlace-v0": 300}  # enough to search a second time
 RUN_LENGTHS = (1, 8, 16)  # windows per run
-STEPS = 2500
+STEPS = 1250
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
     "full": (),

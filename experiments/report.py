@@ -50,7 +50,10 @@ def ablation_table(task: str) -> list[str]:
     rows = []
     found = {condition: load_results(f"ablations/{task}-{condition}-*.json") for condition in CONDITIONS}
     for name, variant in PRESETS_OF_BEFORE.items():
-        found[f"full, preset of before: {name}"] = load_results(f"presets/{task}-full-{variant}-*.json")
+        for condition in ("full", "deaf"):
+            found[f"{condition}, preset of before: {name}"] = load_results(
+                f"presets/{task}-{condition}-{variant}-*.json"
+            )
     for condition, results in found.items():
         if results:
             condition += _updates(results)
@@ -77,6 +80,8 @@ def _updates(results: list[Result]) -> str:
 
 
 PRESETS_OF_BEFORE = {
+    "no readers, no envelope": "no_readers_no_envelope",
+    "no readers, no envelope, and an expert whose hops do not miss": "no_readers_no_envelope_plain_expert",
     "an expert whose hops miss and are mended": "missing_hops",
     "no envelope, and an expert that hops more slowly": "no_envelope_slower_expert",
     "envelope times 3": "envelope",

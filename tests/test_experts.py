@@ -26,15 +26,20 @@ def searches(task: str, seeds: range) -> list[dict[str, float]]:
     return told
 
 
-def test_grasp_s_comes_down_above_the_cube_while_the_touch_is_remembered():
-    told = searches("OccludedGrasp-v1", range(12))
+CUBES = pytest.mark.parametrize("task", ["OccludedGrasp-v1", "OccludedPickPlace-v1"])
+
+
+@CUBES
+def test_it_comes_down_above_the_cube_while_the_touch_is_remembered(task):
+    told = searches(task, range(12))
     assert np.mean([each["beside"] for each in told]) < 0.003
     assert np.mean([each["steps"] <= 18 for each in told]) > 0.8
     assert np.ptp([each["height"] for each in told]) > 0.005
 
 
-def test_grasp_s_draws_back_from_the_cube_by_another_way_in_every_search():
-    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", image_size=8, sound="none", disable_env_checker=True)
+@CUBES
+def test_it_draws_back_from_the_cube_by_another_way_in_every_search(task):
+    env = gym.make(f"gym_playbyear:gym_playbyear/{task}", image_size=8, sound="none", disable_env_checker=True)
     env.reset(seed=1)
     expert = env.unwrapped.scripted_expert()
     ways = []
@@ -47,8 +52,9 @@ def test_grasp_s_draws_back_from_the_cube_by_another_way_in_every_search():
     env.close()
 
 
-def test_grasp_s_hops_miss_the_cube_on_both_sides_and_are_mended():
-    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", image_size=8, sound="none", disable_env_checker=True)
+@CUBES
+def test_its_hops_miss_the_cube_on_both_sides_and_are_mended(task):
+    env = gym.make(f"gym_playbyear:gym_playbyear/{task}", image_size=8, sound="none", disable_env_checker=True)
     missed = []
     for seed in range(8):
         env.reset(seed=seed)
@@ -68,9 +74,9 @@ def test_grasp_s_hops_miss_the_cube_on_both_sides_and_are_mended():
 
 
 @pytest.mark.parametrize(
-    ("task", "kind"), [("OccludedGrasp-v0", GraspExpert), ("OccludedPickPlace-v1", PickPlaceExpert)]
+    ("task", "kind"), [("OccludedGrasp-v0", GraspExpert), ("OccludedPickPlace-v0", PickPlaceExpert)]
 )
-def test_others_show_what_they_always_showed(task, kind):
+def test_those_of_version_0_show_what_they_always_showed(task, kind):
     assert ExpertConfig() == ExpertConfig(
         back_off=0.004, higher=None, hop_step=None, hop_error=None, hop_tolerance=None
     )

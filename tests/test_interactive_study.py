@@ -13,6 +13,7 @@ import pytest
 
 from experiments import interactive, interactive_parts, protocol, training
 from experiments.interactive_parts import alone, demonstrated, first_job, is_written_to, trained
+from experiments.protocol import STEPS
 from experiments.training import Job
 from lerobot_playbyear.training.presets import preset_options
 
@@ -216,12 +217,12 @@ def test_what_is_finished_does_not_run_again(ran):
 
 
 def test_updates_are_those_that_a_policys_weights_got(ran):
-    assert [outcome.updates for outcome in study().run().outcomes] == [2500, 30, 30]  # new weights in each round
+    assert [outcome.updates for outcome in study().run().outcomes] == [STEPS, 30, 30]  # new weights in each round
     online = study(learn="online", kept=14).run()  # 60 // 14 after every kept attempt from the fifth on
-    assert [outcome.updates for outcome in online.outcomes] == [2500, 2500 + 3 * 4, 2500 + 10 * 4]
+    assert [outcome.updates for outcome in online.outcomes] == [STEPS, STEPS + 3 * 4, STEPS + 10 * 4]
 
 
-@pytest.mark.parametrize("options", [{}, {"learn": "online", "kept": 14}, {"updates": 2500}])
+@pytest.mark.parametrize("options", [{}, {"learn": "online", "kept": 14}, {"updates": STEPS}])
 def test_controls_get_as_many_updates_and_as_many_expert_steps(ran, options):
     result = study(**options).run()
     last, updates, further = result.outcomes[-1], *result.controls.values()
@@ -233,13 +234,13 @@ def test_controls_get_as_many_updates_and_as_many_expert_steps(ran, options):
     trainings = ran.of("playbyear-train")
     made = {Path(command["output_dir"]).name: int(command["steps"]) for command in trainings}
     assert made[f"OccludedGrasp-v1-full-{further.n_demonstrations}demos-{last.updates}steps-seed1"] == last.updates
-    going_on = "OccludedGrasp-v1-full-control-of-2500steps-50demos-40steps-seed1"
+    going_on = f"OccludedGrasp-v1-full-control-of-{STEPS}steps-50demos-40steps-seed1"
     alone_on = f"OccludedGrasp-v1-full-50demos-{last.updates}steps-seed1"
-    assert (made[going_on] + 2500 if "learn" in options else made[alone_on]) == last.updates
+    assert (made[going_on] + STEPS if "learn" in options else made[alone_on]) == last.updates
 
 
 def test_where_the_first_policy_has_as_many_updates_it_is_its_control(ran):
-    result = study(updates=2500, controls=("updates",)).run()
+    result = study(updates=STEPS, controls=("updates",)).run()
     assert len(ran.of("playbyear-train")) == 1
     assert result.controls["updates"] == result.outcomes[0]
 
@@ -272,21 +273,21 @@ def test_the_papers_course_begins_with_the_easy_bag(ran, learn):
     assert result.outcomes[-1].kept == 40
     if learn == "online":  # the policy goes from one bag to the next, and takes its updates with it
         assert attempts[0]["output_dir"] in attempts[1]["policy.path"]
-        assert result.outcomes[-1].updates == 2500 + 2 * (40 - 4)
+        assert result.outcomes[-1].updates == STEPS + 2 * (40 - 4)
 
 
 def test_online_without_an_update_ends_with_the_first_policy(ran):
     result = study(learn="online", kept=4, rounds=1).run()
     evaluated = [Path(command["policy.path"]) for command in ran.of("lerobot-eval")]
     assert evaluated[0] == evaluated[1] == study().job.checkpoint
-    assert [outcome.updates for outcome in (*result.outcomes, *result.controls.values())] == [2500] * 4
+    assert [outcome.updates for outcome in (*result.outcomes, *result.controls.values())] == [STEPS] * 4
 
 
 def test_a_policy_that_needs_no_help_stays_as_it_is(ran):
     ran.needs_no_help = True
     result = study(rounds=1).run()
     last, further = result.outcomes[-1], result.controls["demonstrations"]
-    assert (last.updates, last.kept, further.n_demonstrations) == (2500, 0, 50)
+    assert (last.updates, last.kept, further.n_demonstrations) == (STEPS, 0, 50)
     assert len(ran.of("playbyear-train")) == 1
 
 

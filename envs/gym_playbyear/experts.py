@@ -59,10 +59,10 @@ EXACT_EXPERT = ExpertConfig(
     hop_step=(0.015, 0.022),
     hop_error=(-0.012, 0.012),
 )
-"""That of `OccludedGrasp-v1`. It shows that the hand comes down where it is above the cube and not on the way there, and that
-only the touch tells where that is: how far it draws back before it rises differs from search to search, and a hop first misses
-the cube by up to 12 mm, either way, and is mended. Four of five hops end within 18 steps of the touch, while a policy of twenty
-frames remembers where it was."""
+"""That of both cube tasks, version 1. The hand comes down where it is above the cube and not on the way there, and it shows
+that only the touch tells where that is: how far it draws back before it rises differs from search to search, and a hop first
+misses the cube by up to 12 mm, either way, and is mended. Four of five hops end within 18 steps of the touch, while a policy of
+twenty frames remembers where it was."""
 
 CORRECTING_EXPERT = ExpertConfig(
     sweep_step=(0.008, 0.011),

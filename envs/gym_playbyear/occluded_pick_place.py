@@ -9,7 +9,7 @@ from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
-from gym_playbyear.experts import CORRECTING_EXPERT, PATIENT_EXPERT, PickPlaceExpert
+from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, PATIENT_EXACT_EXPERT, PickPlaceExpert
 from gym_playbyear.looks_props import wall_on_the_table
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
@@ -95,9 +95,15 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     - v1: ends attempts that press or grope, wants the cube to stay where it belongs, leaves time for a second search.
     - v0: first version.
     """
-    correcting = partial(PickPlaceExpert, config=PATIENT_EXPERT)
-    traits: dict[str, Any] = {"expert": PickPlaceExpert, "correcting_expert": correcting, "sound": SyntheticEars}
-    return _task("OccludedPickPlace-v1", NUMBERS, cube_material, (rails(0.0, 0.38),), **traits)
+    return _task(
+        "OccludedPickPlace-v1",
+        NUMBERS,
+        cube_material,
+        (rails(0.0, 0.38),),
+        expert=partial(PickPlaceExpert, config=EXACT_EXPERT),
+        correcting_expert=partial(PickPlaceExpert, config=PATIENT_EXACT_EXPERT),
+        sound=SyntheticEars,
+    )
 
 
 def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cube") -> Task:
