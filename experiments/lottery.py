@@ -42,6 +42,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "pcen": ("--policy.audio_features=pcen",),
     "no_onset": ("--policy.auxiliary_onset=0",),
     "past_onsets": ("--policy.auxiliary_onset_s=0.75",),
+    "action_range_1": ("--policy.action_range=1",),
     "no_envelope": ("--policy.audio_envelope_gain=0",),
     "no_readers": ("--policy.memory_readers=0",),
     "no_readers_no_envelope": ("--policy.memory_readers=0", "--policy.audio_envelope_gain=0"),

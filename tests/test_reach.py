@@ -17,6 +17,7 @@ from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training import loop
+from lerobot_playbyear.training.presets import preset_options
 from lerobot_playbyear.training.reach import Reach
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -128,6 +129,32 @@ def test_an_action_outside_the_demonstrations_is_learned_only_within_the_range(a
         optimizer.step()
     action = after(policy.predict_run(batch)[0, -1:].detach())[0]
     torch.testing.assert_close(action, torch.tensor([learned, 0.5]), atol=0.03, rtol=0)
+
+
+def n_updates_until_it_closes(action_range: float) -> int:
+    """After a hand was open in all of many updates, and is to close from then on."""
+    torch.manual_seed(0)
+    config = small_config(action_range=action_range)
+    policy, (before, _) = PlaybyearPolicy(config), processors(config)
+    optimizer = torch.optim.SGD(policy.parameters(), 0.3)  # as far as the slope goes: Adam would make it steep again
+    n_updates = 0
+    for wanted in [-1.0] * 400 + [1.0] * 100:
+        action = torch.tensor([1.0, wanted]).expand(8, 1, 2)
+        batch = before({"observation.state": torch.randn(8, 10, 3), "action": action})
+        n_updates += wanted > 0
+        if n_updates and policy.predict_run(batch)[:, -1, 1].mean() > 0:
+            break
+        optimizer.zero_grad()
+        policy.forward(batch)[0].backward()
+        optimizer.step()
+    return n_updates
+
+
+def test_a_hand_that_was_always_open_learns_to_close_where_the_range_is_wider_than_its_actions():
+    """Towards the ends of `tanh` nothing is learned any more, and -1 is one."""
+    assert 2 * n_updates_until_it_closes(
+        float(preset_options("cpu")["policy.action_range"])
+    ) < n_updates_until_it_closes(1.0)
 
 
 def test_a_range_of_one_is_the_papers_tanh():
