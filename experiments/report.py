@@ -80,6 +80,7 @@ def _updates(results: list[Result]) -> str:
 
 
 PRESETS_OF_BEFORE = {
+    "action range 1": "action_range_1",
     "no readers, no envelope": "no_readers_no_envelope",
     "no readers, no envelope, and an expert whose hops do not miss": "no_readers_no_envelope_plain_expert",
     "an expert whose hops miss and are mended": "missing_hops",
