@@ -80,7 +80,8 @@ def _updates(results: list[Result]) -> str:
 
 
 PRESETS_OF_BEFORE = {
-    "action range 1": "action_range_1",
+    "twice the noise on the arm": "twice_the_noise",
+    "twice the noise on the arm, action range 1": "action_range_1_twice_the_noise",
     "no readers, no envelope": "no_readers_no_envelope",
     "no readers, no envelope, and an expert whose hops do not miss": "no_readers_no_envelope_plain_expert",
     "an expert whose hops miss and are mended": "missing_hops",
