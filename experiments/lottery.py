@@ -28,6 +28,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "twice_the_rate": ("--policy.optimizer_lr=2e-3",),
     "half_the_rate": ("--policy.optimizer_lr=5e-4",),
     "less_noise_on_the_arm": ("--policy.low_dimensional_noise=0.01",),
+    "half_the_noise_on_the_arm": ("--policy.low_dimensional_noise=0.0075",),
     "twice_the_noise_on_the_arm": ("--policy.low_dimensional_noise=0.03",),
     "more_noise_on_the_arm": ("--policy.low_dimensional_noise=0.05",),
     "no_offset": ("--policy.low_dimensional_offset=0",),
