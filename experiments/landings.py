@@ -4,7 +4,7 @@
     python -m experiments.landings --task=OccludedGrasp-v1          # the expert's
 
 A hop begins with the first touch. It ends when the hand has fallen by 12 mm, after it was 3 cm higher than at the touch.
-The episodes are of seeds on which choices are made. Prints a line per episode, and the mean of those that end alike.
+The episodes are of seeds on which choices are made. Prints a line per episode, and the mean of those that end alike and of all.
 """
 
 from collections import defaultdict
@@ -14,19 +14,18 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from lerobot.configs.policies import PreTrainedConfig
-from lerobot.utils.import_utils import register_third_party_plugins
 
+from experiments.listening import actor_of
 from experiments.lottery import CHOICE_SEEDS
-from experiments.protocol import command_line
+from experiments.protocol import NEW_TASKS, TASKS, command_line
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import env_spec
-from lerobot_playbyear.episodes.play import Actor, play
-from lerobot_playbyear.episodes.policy_actor import load_policy_actor
+from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.script import Script
 
 TOUCH_N = 0.2  # a touch, and not the noise of a contact [N]
 RISE_M, FALL_M = 0.03, 0.012
+CUBES = TASKS + NEW_TASKS[:2]
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,8 @@ class Landing:
     """One hop.
 
     Attributes:
-        offset_mm: How far the hand was beyond the cube's middle, along the sweep, when it began to come down.
-        way_mm: How far it was from where it had touched the cube.
+        offset_mm: How far the hand was beyond the cube's middle, along the sweep, when the hop ended.
+        way_mm: How far it was then from where it had touched the cube.
         n_steps: From the touch on.
     """
 
@@ -71,34 +70,31 @@ class HopRecorder(gym.Wrapper):
         if not len(down):
             return None
         end = touch + int(down[0])
-        return Landing(1000 * (y[end] - cube_y[end]), 1000 * (y[end] - y[touch]), end - touch)
-
-
-def actor_of(checkpoint: Path | None, task: PlaybyearEnvConfig) -> Actor:
-    """A trained policy, or the task's expert."""
-    if checkpoint is None:
-        return Script()
-    register_third_party_plugins()
-    policy_cfg = PreTrainedConfig.from_pretrained(checkpoint)
-    policy_cfg.pretrained_path = checkpoint
-    return load_policy_actor(policy_cfg, task)
+        return Landing(float(1000 * (y[end] - cube_y[end])), float(1000 * (y[end] - y[touch])), end - touch)
 
 
 def main() -> None:
-    parser = command_line(__doc__, "task")
+    parser = command_line(__doc__)
+    parser.add_argument("--task", choices=CUBES, default=CUBES[-2])
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--n_episodes", type=int, default=30)
     options = parser.parse_args()
     task = PlaybyearEnvConfig(task=options.task)
     recorder = HopRecorder(env_spec(task).make())
-    actor = actor_of(options.checkpoint, task)
+    actor = actor_of(options.checkpoint, task) if options.checkpoint else Script()
     landings = defaultdict(list)
     for seed in CHOICE_SEEDS[: options.n_episodes]:
         play(recorder, actor, seed)
         landing = recorder.landing()
-        print(seed, recorder.end, landing or "never came down", flush=True)
+        told = (
+            f"{landing.offset_mm:.1f} mm beside, after {landing.way_mm:.1f} mm and {landing.n_steps} steps"
+            if landing
+            else "never came down"
+        )
+        print(seed, recorder.end, told, flush=True)
         if landing:
-            landings[recorder.end].append(landing)
+            for end in (recorder.end, "all"):
+                landings[end].append(landing)
     recorder.close()
     for end, alike in landings.items():
         offsets = np.array([landing.offset_mm for landing in alike])

@@ -34,12 +34,12 @@ ENV = PlaybyearEnvConfig(task=TASK)
 MODES = ("false", "control", "muted")
 
 
-def actor_of(checkpoint: Path) -> PolicyActor:
-    """A trained policy, ready to act in the task."""
+def actor_of(checkpoint: Path, env: PlaybyearEnvConfig = ENV) -> PolicyActor:
+    """A trained policy, ready to act in a task."""
     register_third_party_plugins()
     policy_cfg = PreTrainedConfig.from_pretrained(checkpoint)
     policy_cfg.pretrained_path = checkpoint
-    return load_policy_actor(policy_cfg, ENV)
+    return load_policy_actor(policy_cfg, env)
 
 
 def listen(checkpoint: Path, mode: str, env: gym.Env, seeds: range, donors: list[Donor]) -> list[Trial]:
