@@ -33,6 +33,7 @@ CANDIDATES = {
     "balance": {"auxiliary_balance": 0.1},
     "past_onsets": {"auxiliary_onset": 0.1, "auxiliary_onset_s": 0.2},
     "envelope": {"audio_envelope_gain": 0.3},
+    "way": {"auxiliary_way": 0.1},
     "next_sound": {"auxiliary_next_sound": 0.1},
     "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
     "chunk": {"auxiliary_chunk": 0.5},
@@ -40,7 +41,7 @@ CANDIDATES = {
     "readers": {"memory_displacement_gain": 10.0, "memory_readers": 2},
 }
 EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}
-HEADS = ("onset", "next_sound", "inverse_dynamics", "chunk")
+HEADS = ("onset", "way", "next_sound", "inverse_dynamics", "chunk")
 
 
 def make_policy(**options) -> PlaybyearPolicy:
@@ -289,6 +290,23 @@ def test_what_swells_is_no_onset():
     assert onsets(policy, batch) == [[0, 0, 0, 0, 0]]
     episode[MICROPHONE][14] = episode[MICROPHONE][11]  # what comes after a pause is one
     assert onsets(policy, run_ending_at(episode, 15, policy.config)) == [[0, 0, 0, 0, 1]]
+
+
+def test_the_way_is_from_the_last_onset_that_the_memory_holds():
+    policy = make_policy(auxiliary_way=1.0)  # three frames of memory
+    episode = clicks(policy, (11, 14))
+    episode["observation.state"] = torch.arange(N_FRAMES * 1.0).square().unsqueeze(1) * torch.ones(7)
+    batch, heads = run_ending_at(episode, 15, policy.config), policy.model.auxiliary
+    ways, is_known = heads._ways(batch, heads._levels(batch), 5)
+    assert is_known.tolist() == [[1, 1, 1, 1, 1]]
+    assert ways[0, :, 0].tolist() == [0, 11**2 - 12**2, 11**2 - 13**2, 0, 14**2 - 15**2]  # frames 11 to 15
+    quiet = batch | {MICROPHONE: run_ending_at(clicks(policy, (11,)), 15, policy.config)[MICROPHONE]}
+    ways, is_known = heads._ways(quiet, heads._levels(quiet), 5)
+    assert is_known.tolist() == [[1, 1, 1, 0, 0]]
+    # The head is asked for nothing where nothing is known.
+    outputs = torch.zeros(1, 5, policy.config.embedding_size)
+    (loss,) = heads(quiet, outputs, outputs, batch["action"], torch.tensor([[1.0, 1.0, 0.0, 1.0, 1.0]]))
+    assert loss.weight.tolist() == [[1, 1, 0, 0, 0]]
 
 
 def test_onsets_of_the_past_are_told_newest_first():

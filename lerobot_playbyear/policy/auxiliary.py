@@ -16,10 +16,11 @@ from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.history import newest
 from lerobot_playbyear.policy.spectrogram import POWER_FLOOR, LogSpectrogram, to_float_wave
 
-KINDS = ("onset", "balance", "next_sound", "inverse_dynamics", "chunk")
-_HEARD = ("onset", "balance", "next_sound")  # a deaf policy is trained without
+KINDS = ("onset", "balance", "way", "next_sound", "inverse_dynamics", "chunk")
+_HEARD = ("onset", "balance", "way", "next_sound")  # a deaf policy is trained without
 _HIDDEN = 128
 _ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`, and above the frame before
+_NEAR = 0.1  # [normalised units] errors of a way count squared up to here, and then as they are
 
 
 @dataclass(frozen=True)
@@ -56,9 +57,11 @@ class AuxiliaryHeads(nn.Module):
             # Ears of their own, whatever features the policy hears; their statistics are those of single columns.
             self.ears = nn.ModuleList(_ear(config) for _ in config.audio_keys)
         n_heard = config.n_frequency_bins * len(config.audio_keys)
+        n_felt = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
         sizes = {
             "onset": (size, config.onset_frames),
             "balance": (size, len(config.audio_keys)),
+            "way": (size, n_felt),
             "next_sound": (size + n_actions, n_heard),
             "inverse_dynamics": (2 * size, n_actions),
             "chunk": (size, n_later * n_actions),
@@ -78,7 +81,7 @@ class AuxiliaryHeads(nn.Module):
             weight: (B, K), 0 for windows that are not learned from.
         """
         both = weight[:, :-1] * weight[:, 1:]  # (B, K - 1): of a frame and the next one
-        levels = self._levels(batch) if "onset" in self.heads or "balance" in self.heads else None
+        levels = self._levels(batch) if {"onset", "balance", "way"} & set(self.heads) else None
         for kind in self.heads:
             if kind == "onset":
                 assert levels is not None
@@ -93,6 +96,11 @@ class AuxiliaryHeads(nn.Module):
                 shares = (levels[:, -encodings.shape[1] :] * math.log(10)).softmax(dim=2)  # of the power, (B, K, M)
                 logits = self._predict(kind, encodings).log_softmax(dim=2)
                 error = functional.kl_div(logits, shares, reduction="none").sum(dim=2)
+            elif kind == "way":
+                assert levels is not None
+                ways, is_known = self._ways(batch, levels, encodings.shape[1])
+                predicted, counts = self._predict(kind, outputs), weight * is_known
+                error = functional.smooth_l1_loss(predicted, ways, beta=_NEAR, reduction="none").mean(dim=2)
             elif kind == "next_sound":
                 heard, counts = self._next_columns(batch, both), both  # (B, K - 1, bins)
                 error = _squared(self._predict(kind, outputs[:, :-1], actions[:, :-1]), heard)
@@ -123,6 +131,24 @@ class AuxiliaryHeads(nn.Module):
         louder = levels - levels.sort(dim=1).values[:, (levels.shape[1] - 1) // 2, None]
         loud, sudden = ((rise > _ONSET).any(dim=2) for rise in (louder, levels.diff(dim=1)))
         return (loud[:, 1:] & ~loud[:, :-1] & sudden)[:, -n_windows:].float()
+
+    def _ways(self, batch: dict[str, Tensor], levels: Tensor, n_windows: int) -> tuple[Tensor, Tensor]:
+        """Where the arm was at the last sudden sound that a window remembers, from where it is at the window's end.
+
+        Returns:
+            (B, n_windows, numbers that are felt) without noise, and whether there was such a sound, 0 or 1, (B, n_windows).
+        """
+        config = self.config
+        n_steps = config.memory_steps
+        n_frames = n_windows + n_steps - 1
+        shapes = {key: config.feature_shape(key) for key in config.low_dimensional_keys}
+        felt = [newest(batch, key, n_frames, shape).flatten(2) for key, shape in shapes.items()]
+        places = torch.cat(felt, dim=2)  # (B, n_frames, numbers)
+        frames = torch.arange(n_frames, device=places.device)
+        last = torch.where(self._onsets(levels, n_frames) > 0, frames, -1).cummax(dim=1).values[:, n_steps - 1 :]
+        is_known = last > frames[n_steps - 1 :] - n_steps  # (B, n_windows)
+        at_sound = last.clamp(min=0).unsqueeze(2).expand(-1, -1, places.shape[2])
+        return places.gather(1, at_sound) - places[:, n_steps - 1 :], is_known.to(places.dtype)
 
     def _next_columns(self, batch: dict[str, Tensor], weight: Tensor) -> Tensor:
         """The last spectrogram column of every frame after the first of K, without augmentation, (B, K - 1, bins)."""

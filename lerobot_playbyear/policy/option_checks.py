@@ -74,7 +74,14 @@ def _check_candidates(config: "PlaybyearConfig") -> None:
     if not 0 <= config.fusion_dropout < 1:
         raise ValueError(f"--policy.fusion_dropout must be at least 0 (none) and below 1, got {config.fusion_dropout}.")
     # By kind: how many windows of a run it needs.
-    needs = {"onset": 1, "balance": 1, "next_sound": 2, "inverse_dynamics": 2, "chunk": config.auxiliary_chunk_size}
+    needs = {
+        "onset": 1,
+        "balance": 1,
+        "way": 1,
+        "next_sound": 2,
+        "inverse_dynamics": 2,
+        "chunk": config.auxiliary_chunk_size,
+    }
     for kind, n_windows in needs.items():
         option, weight = f"--policy.auxiliary_{kind}", getattr(config, f"auxiliary_{kind}")
         if not 0 <= weight < math.inf:

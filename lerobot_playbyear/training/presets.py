@@ -37,6 +37,7 @@ _NETWORK = (
     "auxiliary_onset",
     "auxiliary_onset_s",
     "auxiliary_balance",
+    "auxiliary_way",
 )
 """Options of the policy that fix what the network looks like: with `--policy.path` the checkpoint says it."""
 
