@@ -20,8 +20,8 @@ from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 RATE, MICROPHONE, N_FRAMES = 16000, "observation.audio.gripper", 16
-TRAINED = {"d1a39e5a6f87a521": "43ce973ad6ad79b0"}
-"""By the probe of a machine: what the usual options trained before any of this was there."""
+TRAINED = {"d1a39e5a6f87a521": "9d03b8ddf2f5e894"}
+"""By the probe of a machine: what the usual options trained there, since pictures are shrunk before they are recoloured."""
 
 SMALL = {"audio_window_s": 0.9, "n_memory_steps": 3, "n_supervised_steps": 5, "n_frame_stack": 2}
 CANDIDATES = {
@@ -396,11 +396,11 @@ def test_the_balance_is_who_hears_an_onset_louder():
 
 def test_the_balance_is_learned_from_the_ears_and_needs_two_of_them():
     policy = two_ears(auxiliary_balance=1.0)
-    optimizer = torch.optim.Adam(policy.parameters(), lr=3e-3)
+    optimizer = torch.optim.Adam(policy.parameters(), lr=1e-3)
     batches = [clicks_of_two(policy, {frame: side}) for frame in (11, 13, 15) for side in (LEFT, RIGHT)]
     batch = {key: torch.cat([one[key] for one in batches]) for key in batches[0]}
     losses = []
-    for _ in range(90):
+    for _ in range(110):
         loss, figures = policy.forward(batch)
         optimizer.zero_grad()
         loss.backward()
