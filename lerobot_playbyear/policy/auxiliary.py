@@ -21,6 +21,7 @@ _HEARD = ("onset", "balance", "way", "next_sound")  # a deaf policy is trained w
 _HIDDEN = 128
 _ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`, and above the frame before
 _NEAR = 0.1  # [normalised units] errors of a way count squared up to here, and then as they are
+_FAR = 1.0  # [normalised units] what is farther away is told as that far: carrying takes it to several, and nothing hangs on it
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,8 @@ class AuxiliaryHeads(nn.Module):
         """Where the arm was at the last sudden sound that a window remembers, from where it is at the window's end.
 
         Returns:
-            (B, n_windows, numbers that are felt) without noise, and whether there was such a sound, 0 or 1, (B, n_windows).
+            (B, n_windows, numbers that are felt) without noise, `_FAR` at most; and whether there was such a sound, 0 or 1,
+            (B, n_windows).
         """
         config = self.config
         n_steps = config.memory_steps
@@ -148,7 +150,8 @@ class AuxiliaryHeads(nn.Module):
         last = torch.where(self._onsets(levels, n_frames) > 0, frames, -1).cummax(dim=1).values[:, n_steps - 1 :]
         is_known = last > frames[n_steps - 1 :] - n_steps  # (B, n_windows)
         at_sound = last.clamp(min=0).unsqueeze(2).expand(-1, -1, places.shape[2])
-        return places.gather(1, at_sound) - places[:, n_steps - 1 :], is_known.to(places.dtype)
+        ways = places.gather(1, at_sound) - places[:, n_steps - 1 :]
+        return ways.clamp(-_FAR, _FAR), is_known.to(places.dtype)
 
     def _next_columns(self, batch: dict[str, Tensor], weight: Tensor) -> Tensor:
         """The last spectrogram column of every frame after the first of K, without augmentation, (B, K - 1, bins)."""
