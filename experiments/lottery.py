@@ -20,11 +20,11 @@ from lerobot_playbyear.training.checkpoints import average_checkpoints, last_che
 
 STUDY = "lottery"
 PLAIN, EMA, HELD_OUT, LAST_THREE, NEWEST = "plain", "ema", "held_out", "last_three", "held_out_last"
-_LESS_SHIFT = (
-    "--policy.augmentation_crop=1",
-    "--policy.augmentation_degrees=1",
-    "--policy.augmentation_translate=0.01",
-    "--policy.augmentation_scale=0.01",
+_MORE_SHIFT = (
+    "--policy.augmentation_crop=2",
+    "--policy.augmentation_degrees=2",
+    "--policy.augmentation_translate=0.02",
+    "--policy.augmentation_scale=0.02",
 )
 VARIANTS: dict[str, tuple[str, ...]] = {
     "preset": (),
@@ -37,9 +37,9 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "half_the_noise_on_the_arm": ("--policy.low_dimensional_noise=0.0075",),
     "twice_the_noise_on_the_arm": ("--policy.low_dimensional_noise=0.03",),
     "more_noise_on_the_arm": ("--policy.low_dimensional_noise=0.05",),
-    "less_offset": ("--policy.low_dimensional_offset=0.05",),
-    "less_shift": _LESS_SHIFT,
-    "less_shift_and_offset": (*_LESS_SHIFT, "--policy.low_dimensional_offset=0.05"),
+    "more_offset": ("--policy.low_dimensional_offset=0.15",),
+    "more_shift": _MORE_SHIFT,
+    "more_shift_and_offset": (*_MORE_SHIFT, "--policy.low_dimensional_offset=0.15"),
     "no_offset": ("--policy.low_dimensional_offset=0",),
     "no_displacement": ("--policy.memory_displacement_gain=0", "--policy.memory_readers=0"),
     "half_the_runs": ("--batch_size=6",),

@@ -80,8 +80,9 @@ def _updates(results: list[Result]) -> str:
 
 
 PRESETS_OF_BEFORE = {
-    "ways told however far": "far_way",
-    "without `auxiliary_way`": "no_way",
+    "larger shifts and offset": "larger_shifts",
+    "and ways told however far": "far_way",
+    "and without `auxiliary_way`": "no_way",
     "twice the noise on the arm": "twice_the_noise",
     "twice the noise on the arm, action range 1": "action_range_1_twice_the_noise",
     "no readers, no envelope": "no_readers_no_envelope",
