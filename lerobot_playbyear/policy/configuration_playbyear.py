@@ -90,11 +90,11 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame, and in
             each of those of the `auxiliary_onset_s` before it [cross entropy, nats]; balance: at an onset in the newest frame,
             each microphone's share of the power that they hear, which tells where it was [Kullback-Leibler divergence, nats];
-            way: from the memory, how far the low-dimensional observations were at its last onset from what they are now [Huber
-            loss, normalised units]; next_sound: the last spectrogram column of the next frame [squared standard deviations];
-            inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that is executed,
-            so that they are `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves out the first
-            four, and one with a single microphone the second.
+            way: from the memory, how far the low-dimensional observations were at its last onset from what they are now, 1 at
+            most [Huber loss, normalised units]; next_sound: the last spectrogram column of the next frame [squared standard
+            deviations]; inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that
+            is executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves
+            out the first four, and one with a single microphone the second.
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
