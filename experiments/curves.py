@@ -1,6 +1,6 @@
 """How far hearing carries: success over the number of demonstrations, over noise, over unknown materials, and in other rooms.
 
-    python -m experiments.curves demonstrations --jobs=2
+    python -m experiments.curves demonstrations --task=OccludedGrasp-v1 --seeds 1 2 3 4 5 --jobs=2
     python -m experiments.curves noise
     python -m experiments.curves materials
     python -m experiments.curves rooms
@@ -31,21 +31,22 @@ from experiments.protocol import (
 from experiments.training import Job, evaluate, side_by_side
 from gym_playbyear.materials import CUBE_MATERIALS
 
-N_DEMONSTRATIONS_TRIED = (10, 20, 50, 100)
+N_DEMONSTRATIONS_TRIED = (3, 5, 10, 20, 50, 100)
 ROOM_SEED = 7
 KINDS, LEVELS = ("speech_like", "clatter"), ("1", "8")
-NOISE_LEVELS = (1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # factors on the noise's amplitude: 6 dB each
+NOISE_LEVELS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # factors on the noise's amplitude: silence, then 6 dB each
 
 
-def over_demonstrations(task: str, n_jobs: int, threads: int) -> None:
-    """Full and deaf, one training seed each; as many updates whatever the number of demonstrations."""
-    record(task, max(N_DEMONSTRATIONS_TRIED))
+def over_demonstrations(task: str, tried: Sequence[int], seeds: Sequence[int], n_jobs: int, threads: int) -> None:
+    """Full policies of all training seeds, deaf ones of the first three; as many updates whatever the number."""
+    record(task, max(*tried, N_DEMONSTRATIONS))
     jobs = []
-    for n in N_DEMONSTRATIONS_TRIED:
+    for n in tried:
         study = (
             STUDY if n == N_DEMONSTRATIONS else "demonstrations"
         )  # what the ablations have trained is taken from there
-        jobs += [Job(study, task, condition, TRAINING_SEEDS[0], n, threads=threads) for condition in ("full", "deaf")]
+        jobs += [Job(study, task, "full", seed, n, threads=threads) for seed in seeds]
+        jobs += [Job(study, task, "deaf", seed, n, threads=threads) for seed in seeds if seed in TRAINING_SEEDS]
     for result in side_by_side(jobs, n_jobs):
         what = f"{result.task} {result.condition} {result.n_demonstrations} demonstrations"
         print(f"{what}: {result.summary}", flush=True)
@@ -77,15 +78,22 @@ def rooms() -> list[dict[str, str]]:
     noisy = [
         {"room_noise": str(folder / f"{kind}.wav"), "room_noise_level": level} for kind in KINDS for level in LEVELS
     ]
-    return noisy + [{"microphone_response": response} for response in ("phone", "dull", "boomy")]
+    return noisy + [
+        {"microphone_response": response} | louder
+        for response in ("phone", "dull", "boomy")
+        for louder in ({}, {"noise_level": "8"})
+    ]
 
 
 def main() -> None:
     parser = command_line(__doc__, "task", "seeds", "jobs", "threads")
     parser.add_argument("curve", choices=("demonstrations", "noise", "materials", "rooms"))
+    parser.add_argument(
+        "--tried", nargs="+", type=int, default=N_DEMONSTRATIONS_TRIED, help="numbers of demonstrations"
+    )
     options = parser.parse_args()
     if options.curve == "demonstrations":
-        over_demonstrations(options.task, options.jobs, options.threads)
+        over_demonstrations(options.task, options.tried, options.seeds, options.jobs, options.threads)
         return
     conditions = {
         "noise": lambda: [{"noise_level": str(level)} for level in NOISE_LEVELS],

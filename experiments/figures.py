@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 
 from experiments.corrections import load_corrections
 from experiments.protocol import (
+    NEW_TASKS,
     TASKS,
     blind_path,
     command_line,
@@ -53,7 +54,10 @@ def demonstrations(task: str, output: Path) -> None:
         return
     axes = new_axes()
     for condition in ("full", "deaf"):
-        points = {r.n_demonstrations: r.successes for r in results if r.condition == condition}
+        points: dict[float, list[bool]] = {}
+        for result in results:
+            if result.condition == condition:
+                points.setdefault(result.n_demonstrations, []).extend(result.successes)
         band(axes, points, condition, COLOURS[condition])
     blind_line(axes, task)
     axes.set_xscale("log")
@@ -78,7 +82,7 @@ def noise(task: str, output: Path) -> None:
         most = max(map(len, by_level.values()))  # a level that fewer policies were tried at would be another curve
         band(axes, {level: tried for level, tried in by_level.items() if len(tried) == most}, label, colour)
     blind_line(axes, task)
-    axes.set_xscale("log", base=2)
+    axes.set_xscale("symlog", base=2, linthresh=1)  # 0 is silence
     levels = sorted({level for by_level in curves.values() for level in by_level})
     axes.set_xticks(levels, [f"{level:g}" for level in levels])
     finish(axes, "background noise (1: as in training)", output / f"noise-{task}.png")
@@ -132,7 +136,7 @@ def main() -> None:
     output = command_line(__doc__, "output").parse_args().output
     output.mkdir(parents=True, exist_ok=True)
     for draw in (demonstrations, noise, corrections):
-        for task in TASKS:
+        for task in NEW_TASKS + TASKS:
             draw(task, output)
 
 

@@ -1,6 +1,7 @@
 """The results as tables in Markdown: `python -m experiments.report`."""
 
 from collections import defaultdict
+from pathlib import Path
 
 from experiments.corrections import load_corrections
 from experiments.protocol import (
@@ -97,13 +98,15 @@ CURVES = {
     "noise": "noise",
     "noise_white": "noise, trained with white noise up to the recordings' own floor",
     "materials": "materials",
+    "rooms": "noise of kinds and microphones of responses that no training had",
 }
 
 
 def curve_table(study: str, task: str) -> list[str]:
     by_value: dict[str, list[Result]] = defaultdict(list)
     for result in load_results(f"{study}/{task}-*.json"):
-        by_value[", ".join(result.environment.values())].append(result)
+        values = [Path(value).stem if "/" in value else value for value in result.environment.values()]
+        by_value[", ".join(values)].append(result)
     rows = [f"| {value} | {percent(results)} |" for value, results in sorted(by_value.items(), key=_order)]
     head = f"| {study.split('_')[0]} | success (95 % interval) | training seeds |"
     return table(head, rows, f"{task}: {CURVES[study]}")
@@ -112,9 +115,13 @@ def curve_table(study: str, task: str) -> list[str]:
 def demonstration_table(task: str) -> list[str]:
     results, rows = load_demonstrations(task), []
     for n in sorted({result.n_demonstrations for result in results}):
-        rates = {r.condition: f"{r.rate:.0%}" for r in results if r.n_demonstrations == n}
-        rows.append(f"| {n} | {rates.get('full', '')} | {rates.get('deaf', '')} |")
-    return table("| demonstrations | full | deaf |", rows, f"{task}: demonstrations")
+        found = [
+            [r for r in results if (r.n_demonstrations, r.condition) == (n, condition)]
+            for condition in ("full", "deaf")
+        ]
+        rows.append(f"| {n} | {' | '.join(percent(of) if of else ' | ' for of in found)} |")
+    head = "| demonstrations | full | training seeds | deaf | training seeds |"
+    return table(head, rows, f"{task}: demonstrations")
 
 
 def listening_table() -> list[str]:
