@@ -60,6 +60,8 @@ def ablation_table(task: str) -> list[str]:
             condition += _updates(results)
             minutes = ", ".join(f"{result.minutes:.0f}" for result in results)
             failures = "; ".join(result.failures for result in results).strip("; ")
+            if told := "; ".join(filter(None, (result.by_contents for result in results))):
+                condition += f" ({told})"
             rows.append(f"| {condition} | {percent(results)} | {acted_early(results)} | {failures} | {minutes} |")
     if blind_path(task).exists():
         blind = load(blind_path(task))

@@ -36,6 +36,7 @@ class Evaluation(Tally):
     acted_early: list[bool] = field(default_factory=list)
     ends: list[str] = field(default_factory=list)
     n_closings: list[int] = field(default_factory=list)
+    contents: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -195,10 +196,8 @@ def evaluate(
     commands.append(shown(command))
     report = load(output / "eval_info.json")
     successes = [bool(success) for success in report["per_task"][0]["metrics"]["successes"]]
-    early, ends, n_closings = (
-        told_of_attempts(attempts, key, job.evaluation_seeds) for key in ("acted_early", "end", "n_closings")
-    )
-    return Evaluation(successes, early, ends, n_closings)
+    keys = ("acted_early", "end", "n_closings", "contents")
+    return Evaluation(successes, *(told_of_attempts(attempts, key, job.evaluation_seeds) for key in keys))
 
 
 def told_of_attempts(path: Path, key: str, seeds: range) -> list[Any]:
