@@ -165,3 +165,13 @@ def test_results_from_before_are_read_and_new_ones_tell_the_share():
     content = load(next((RESULTS / "ablations").glob("OccludedGrasp-v0-full-*.json")))
     new = Result(**{**content, "successes": [True, False], "acted_early": [False, True]})
     assert (new.early_rate, new.summary) == (0.5, "50% (acted early: 50%)")
+
+
+def test_results_tell_success_with_each_of_the_contents():
+    content = load(next((RESULTS / "ablations").glob("OccludedGrasp-v0-full-*.json"))) | {
+        "successes": [True, False, True]
+    }
+    assert Result(**content).by_contents == ""
+    mixed = Result(**content, contents=["screws", "peanuts", "peanuts"])
+    assert mixed.by_contents == "peanuts 1 of 2, screws 1 of 1" and mixed.by_contents in mixed.summary
+    assert Result(**content, contents=["keys"] * 3).by_contents == ""
