@@ -173,5 +173,6 @@ def test_results_tell_success_with_each_of_the_contents():
     }
     assert Result(**content).by_contents == ""
     mixed = Result(**content, contents=["screws", "peanuts", "peanuts"])
-    assert mixed.by_contents == "peanuts 1 of 2, screws 1 of 1" and mixed.by_contents in mixed.summary
+    assert mixed.by_contents == "peanuts 1 of 2, screws 1 of 1"
+    assert mixed.by_contents in mixed.summary
     assert Result(**content, contents=["keys"] * 3).by_contents == ""
