@@ -1,0 +1,37 @@
+"""Those who hear and do not see: what their script knows, and that it is bound by it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from experiments.sightless import SCRIPTS, Untold, attempts
+
+
+def test_a_script_that_cannot_see_is_told_nothing_of_its_own_episode():
+    env = gym.make("gym_playbyear/OccludedPickPlace-v1", sound="none").unwrapped
+    for script in SCRIPTS.values():
+        told = []
+        for seed in (11, 12):
+            env.begin_episode(seed=seed)
+            told.append(script(env, np.random.default_rng(3)))
+            env.begin_episode(seed=seed)
+            untold = Untold(env, told[-1])
+            assert not np.array_equal(untold.bin_position, env.bin_position)
+            np.testing.assert_array_equal(untold.cube_position, env.cube_position)
+        np.testing.assert_array_equal(told[0]["bin_position"], told[1]["bin_position"])
+    env.close()
+
+
+def test_half_of_the_table_can_be_searched_without_seeing_which_one_and_the_tray_cannot():
+    seeds = range(300, 312)
+    assert attempts("OccludedGrasp-v1", "best", seeds).count("success") >= 11
+    assert attempts("OccludedGrasp-v1", "guess", seeds).count("success") <= 9
+    assert attempts("OccludedPickPlace-v1", "best", seeds).count("success") <= 9
+
+
+def test_an_untold_environment_lacks_what_the_true_one_lacks():
+    env = gym.make("gym_playbyear/OccludedGrasp-v1", sound="none").unwrapped
+    env.begin_episode(seed=1)
+    with pytest.raises(AttributeError):
+        _ = Untold(env, {}).bin_position
+    env.close()
