@@ -6,7 +6,7 @@ It is what policies without pictures (`use_vision=false`) are to be compared wit
 only pictures tell, in which half of the table the cube lies and where the tray stands, it does not know:
 
 - `guess`: it takes them from the picture of another episode, whose number is drawn at random;
-- `best`: it searches the whole table, and lets go above the middle of where the tray may stand.
+- `everywhere`: it searches the whole table, and lets go above the middle of where the tray may stand.
 """
 
 from typing import Any
@@ -45,13 +45,13 @@ def guess(env: Any, rng: np.random.Generator) -> dict[str, Any]:
     return {name: env.shown[name] for name in SHOWN if name in env.shown}
 
 
-def best(env: Any, _: np.random.Generator) -> dict[str, Any]:
+def everywhere(env: Any, _: np.random.Generator) -> dict[str, Any]:
     """All places of the cube, and the middle of those of the tray."""
     middle = np.array([0.0, BIN_Y - BIN_Y_RANGE / 2, env.bin_position[2]]) if "bin_position" in env.shown else None
     return {"hidden_range": env.variant.cube_y} | ({} if middle is None else {"bin_position": middle})
 
 
-SCRIPTS = {"guess": guess, "best": best}
+SCRIPTS = {"guess": guess, "everywhere": everywhere}
 
 
 def attempts(task: str, script: str, seeds: range) -> list[str]:

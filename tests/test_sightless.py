@@ -24,9 +24,9 @@ def test_a_script_that_cannot_see_is_told_nothing_of_its_own_episode():
 
 def test_half_of_the_table_can_be_searched_without_seeing_which_one_and_the_tray_cannot():
     seeds = range(300, 312)
-    assert attempts("OccludedGrasp-v1", "best", seeds).count("success") >= 11
+    assert attempts("OccludedGrasp-v1", "everywhere", seeds).count("success") >= 11
     assert attempts("OccludedGrasp-v1", "guess", seeds).count("success") <= 9
-    assert attempts("OccludedPickPlace-v1", "best", seeds).count("success") <= 9
+    assert attempts("OccludedPickPlace-v1", "everywhere", seeds).count("success") <= 9
 
 
 def test_an_untold_environment_lacks_what_the_true_one_lacks():
