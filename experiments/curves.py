@@ -38,7 +38,7 @@ NOISE_LEVELS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # factors on the noise's a
 
 
 def over_demonstrations(task: str, tried: Sequence[int], seeds: Sequence[int], n_jobs: int, threads: int) -> None:
-    """Full policies of all training seeds, deaf ones of the first three; as many updates whatever the number."""
+    """Full policies of all training seeds, deaf ones of those in `TRAINING_SEEDS`; as many updates whatever the number."""
     record(task, max(*tried, N_DEMONSTRATIONS))
     jobs = []
     for n in tried:

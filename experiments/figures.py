@@ -58,7 +58,8 @@ def demonstrations(task: str, output: Path) -> None:
         for result in results:
             if result.condition == condition:
                 points.setdefault(result.n_demonstrations, []).extend(result.successes)
-        band(axes, points, condition, COLOURS[condition])
+        if points:
+            band(axes, points, condition, COLOURS[condition])
     blind_line(axes, task)
     axes.set_xscale("log")
     ticks = sorted({r.n_demonstrations for r in results})
@@ -85,7 +86,9 @@ def noise(task: str, output: Path) -> None:
     axes.set_xscale("symlog", base=2, linthresh=1)  # 0 is silence
     levels = sorted({level for by_level in curves.values() for level in by_level})
     axes.set_xticks(levels, [f"{level:g}" for level in levels])
-    finish(axes, "background noise (1: as in training)", output / f"noise-{task}.png")
+    axes.minorticks_off()
+    axes.set_xlim(-0.2 if levels[0] == 0 else 0.9, 1.1 * levels[-1])
+    finish(axes, "background noise (0: silence, 1: as in training)", output / f"noise-{task}.png")
 
 
 def corrections(task: str, output: Path) -> None:

@@ -88,7 +88,7 @@ class Tally:
 
     @property
     def by_contents(self) -> str:
-        """Success with each of the contents that there are: `peanuts 47 of 52, screws 42 of 48`; empty where nobody looked."""
+        """Success with each of the contents that there are: `peanuts 47 of 52, screws 42 of 48`; empty if there was one."""
         tried = Counter(self.contents)
         solved = Counter(what for success, what in zip(self.successes, self.contents, strict=False) if success)
         return ", ".join(f"{what} {solved[what]} of {n}" for what, n in sorted(tried.items())) if len(tried) > 1 else ""

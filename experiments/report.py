@@ -59,7 +59,7 @@ def ablation_table(task: str) -> list[str]:
         if results:
             condition += _updates(results)
             minutes = ", ".join(f"{result.minutes:.0f}" for result in results)
-            failures = "; ".join(result.failures for result in results).strip("; ")
+            failures = "; ".join(result.failures for result in results) if any(r.ends for r in results) else ""
             if told := "; ".join(filter(None, (result.by_contents for result in results))):
                 condition += f" ({told})"
             rows.append(f"| {condition} | {percent(results)} | {acted_early(results)} | {failures} | {minutes} |")
@@ -107,11 +107,32 @@ CURVES = {
 def curve_table(study: str, task: str) -> list[str]:
     by_value: dict[str, list[Result]] = defaultdict(list)
     for result in load_results(f"{study}/{task}-*.json"):
-        values = [Path(value).stem if "/" in value else value for value in result.environment.values()]
-        by_value[", ".join(values)].append(result)
+        by_value[_condition(result.environment)].append(result)
     rows = [f"| {value} | {percent(results)} |" for value, results in sorted(by_value.items(), key=_order)]
     head = f"| {study.split('_')[0]} | success (95 % interval) | training seeds |"
     return table(head, rows, f"{task}: {CURVES[study]}")
+
+
+def _condition(environment: dict[str, str]) -> str:
+    """One option of the environment as its value, several with what they are."""
+    values = {name: Path(value).stem if "/" in value else value for name, value in environment.items()}
+    if len(values) == 1:
+        return next(iter(values.values()))
+    return ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in values.items())
+
+
+def sightless_table() -> list[str]:
+    """What scripts solve that do not see, beside the policies without pictures."""
+    rows = []
+    for path in sorted((RESULTS / "sightless").glob("*.json")):
+        report = load(path)
+        solved = {script: ends.count("success") for script, ends in report["ends"].items()}
+        n = len(report["ends"]["guess"])
+        cells = [f"{solved[script] / n:.0%} {interval(solved[script], n)}" for script in ("guess", "everywhere")]
+        policies = load_results(f"ablations/{report['task']}-sightless-*.json")
+        rows.append(f"| {report['task']} | {' | '.join(cells)} | {percent(policies) if policies else ' | '} |")
+    head = "| task | script, guesses | script, searches everywhere | sightless policies | training seeds |"
+    return table(head, rows, "Without pictures")
 
 
 def demonstration_table(task: str) -> list[str]:
@@ -191,7 +212,7 @@ def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
 
 def main() -> None:
     tasks = NEW_TASKS + TASKS
-    lines = [line for task in tasks for line in ablation_table(task)] + listening_table()
+    lines = [line for task in tasks for line in ablation_table(task)] + sightless_table() + listening_table()
     for task in tasks:
         lines += demonstration_table(task)
         for study in CURVES:

@@ -2,8 +2,8 @@
 
     python -m experiments.sightless
 
-It is what policies without pictures (`use_vision=false`) are to be compared with. The expert feels every touch, as always. What
-only pictures tell, in which half of the table the cube lies and where the tray stands, it does not know:
+For comparison with policies without pictures (`use_vision=false`). From a touch on, the expert knows where the cube is, as it
+always does. In which half of the table the cube lies and where the tray stands it does not know:
 
 - `guess`: it takes them from the picture of another episode, whose number is drawn at random;
 - `everywhere`: it searches the whole table, and lets go above the middle of where the tray may stand.
@@ -24,7 +24,7 @@ SHOWN = ("hidden_range", "bin_position")
 _OTHER_EPISODES = range(90000, 91000)
 
 
-class Untold:
+class Mistold:
     """An environment for a script that cannot see: what the camera shows is replaced, the rest is as it is.
 
     Args:
@@ -63,7 +63,7 @@ def attempts(task: str, script: str, seeds: range) -> list[str]:
         task_env.begin_episode(seed=seed)
         told = SCRIPTS[script](task_env, rng)
         task_env.begin_episode(seed=seed)
-        expert = task_env.definition.expert(Untold(task_env, told))
+        expert = task_env.definition.expert(Mistold(task_env, told))
         done = False
         while not done:
             _, terminated, truncated, info = task_env.advance(expert.act())

@@ -196,8 +196,9 @@ def evaluate(
     commands.append(shown(command))
     report = load(output / "eval_info.json")
     successes = [bool(success) for success in report["per_task"][0]["metrics"]["successes"]]
-    keys = ("acted_early", "end", "n_closings", "contents")
-    return Evaluation(successes, *(told_of_attempts(attempts, key, job.evaluation_seeds) for key in keys))
+    keys = {"acted_early": "acted_early", "ends": "end", "n_closings": "n_closings", "contents": "contents"}
+    told = {name: told_of_attempts(attempts, key, job.evaluation_seeds) for name, key in keys.items()}
+    return Evaluation(successes, **told)
 
 
 def told_of_attempts(path: Path, key: str, seeds: range) -> list[Any]:
