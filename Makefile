@@ -24,7 +24,7 @@ install: .venv/.installed  ## Makes .venv with pinned versions (PYTHON=... to ch
 	PYTHON="$(PYTHON)" ./tools/setup.sh
 	@touch $@
 
-demo: install  ## Records, trains, evaluates and films, in 6 to 15 minutes on two cores
+demo: install  ## Records, trains, evaluates and films, in 7 minutes on two fast cores
 	PATH="$(CURDIR)/$(BIN):$$PATH" ./examples/demo.sh
 
 lint: install  ## Style and types

@@ -1,4 +1,4 @@
-"""Those who hear and do not see: what their script knows, and that it is bound by it."""
+"""Scripts that feel contact and do not see: what they are told, and that they are bound by it."""
 
 import gymnasium as gym
 import numpy as np
@@ -15,9 +15,9 @@ def test_a_script_that_cannot_see_is_told_nothing_of_its_own_episode():
             env.begin_episode(seed=seed)
             told.append(script(env, np.random.default_rng(3)))
             env.begin_episode(seed=seed)
-            untold = Mistold(env, told[-1])
-            assert not np.array_equal(untold.bin_position, env.bin_position)
-            np.testing.assert_array_equal(untold.cube_position, env.cube_position)
+            mistold = Mistold(env, told[-1])
+            assert not np.array_equal(mistold.bin_position, env.bin_position)
+            np.testing.assert_array_equal(mistold.cube_position, env.cube_position)
         np.testing.assert_array_equal(told[0]["bin_position"], told[1]["bin_position"])
     env.close()
 
@@ -41,7 +41,7 @@ def test_half_of_the_table_can_be_searched_without_seeing_which_one_and_the_tray
     assert attempts("OccludedPickPlace-v1", "everywhere", seeds).count("success") <= 9
 
 
-def test_an_untold_environment_lacks_what_the_true_one_lacks():
+def test_a_mistold_environment_lacks_what_the_true_one_lacks():
     env = gym.make("gym_playbyear/OccludedGrasp-v1", sound="none").unwrapped
     env.begin_episode(seed=1)
     with pytest.raises(AttributeError):
