@@ -26,6 +26,12 @@ _MORE_SHIFT = (
     "--policy.augmentation_translate=0.02",
     "--policy.augmentation_scale=0.02",
 )
+_NO_SHIFT = (
+    "--policy.augmentation_crop=0",
+    "--policy.augmentation_degrees=0",
+    "--policy.augmentation_translate=0",
+    "--policy.augmentation_scale=0",
+)
 VARIANTS: dict[str, tuple[str, ...]] = {
     "preset": (),
     EMA: ("--policy.ema_decay=0.998",),
@@ -40,6 +46,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "more_offset": ("--policy.low_dimensional_offset=0.15",),
     "more_shift": _MORE_SHIFT,
     "more_shift_and_offset": (*_MORE_SHIFT, "--policy.low_dimensional_offset=0.15"),
+    "no_shift": _NO_SHIFT,
     "no_offset": ("--policy.low_dimensional_offset=0",),
     "no_displacement": ("--policy.memory_displacement_gain=0", "--policy.memory_readers=0"),
     "half_the_runs": ("--batch_size=6",),
@@ -51,6 +58,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "hop_35ms": ("--policy.hop_s=0.035",),
     "log_mel": ("--policy.audio_features=log_mel",),
     "pcen": ("--policy.audio_features=pcen",),
+    "louder_noise": ("--policy.audio_noise_db=24",),
     "no_onset": ("--policy.auxiliary_onset=0",),
     "past_onsets": ("--policy.auxiliary_onset_s=0.75",),
     "action_range_1": ("--policy.action_range=1",),
@@ -68,6 +76,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "next_sound": ("--policy.auxiliary_next_sound=0.01",),
     "inverse_dynamics": ("--policy.auxiliary_inverse_dynamics=0.3",),
     "action_chunk": ("--policy.auxiliary_chunk=0.5",),
+    "chunk_of_8": ("--policy.auxiliary_chunk=0.5", "--policy.auxiliary_chunk_size=8"),
+    "pixels_84": ("--policy.image_size=84",),
 }
 POLICIES: dict[str, tuple[str, ...]] = {EMA: (PLAIN, LAST_THREE), HELD_OUT: (NEWEST,)}
 """By the variant that is trained: the other policies that its checkpoints hold."""

@@ -98,9 +98,12 @@ PRESETS_OF_BEFORE = {
 }
 CURVES = {
     "noise": "noise",
+    "noise-louder_noise": "noise, trained with noise up to 24 dB above the recordings' own floor",
+    "noise-no_noise": "noise, trained without noise in the sound",
     "noise_white": "noise, trained with white noise up to the recordings' own floor",
     "materials": "materials",
     "rooms": "noise of kinds and microphones of responses that no training had",
+    "rooms-louder_noise": "the same, trained with noise up to 24 dB above the recordings' own floor",
 }
 
 
@@ -109,7 +112,7 @@ def curve_table(study: str, task: str) -> list[str]:
     for result in load_results(f"{study}/{task}-*.json"):
         by_value[_condition(result.environment)].append(result)
     rows = [f"| {value} | {percent(results)} |" for value, results in sorted(by_value.items(), key=_order)]
-    head = f"| {study.split('_')[0]} | success (95 % interval) | training seeds |"
+    head = f"| {study.replace('-', '_').split('_')[0]} | success (95 % interval) | training seeds |"
     return table(head, rows, f"{task}: {CURVES[study]}")
 
 
