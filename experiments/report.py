@@ -49,20 +49,20 @@ def acted_early(results: list[Result]) -> str:
 
 def ablation_table(task: str) -> list[str]:
     rows = []
-    found = {condition: load_results(f"ablations/{task}-{condition}-*.json") for condition in CONDITIONS}
+    found = [(condition, load_results(f"ablations/{task}-{condition}-*.json")) for condition in CONDITIONS]
     for name, variant in PRESETS_OF_BEFORE.items():
         for condition in ("full", "deaf"):
-            found[f"{condition}, preset of before: {name}"] = load_results(
-                f"presets/{task}-{condition}-{variant}-*.json"
-            )
-    for condition, results in found.items():
-        if results:
-            condition += _updates(results)
+            results = load_results(f"presets/{task}-{condition}-{variant}-*.json")
+            found.append((f"{condition}, preset of before: {name}", results))
+    for condition, trained in found:
+        for steps in sorted({result.steps for result in trained}):
+            results = [result for result in trained if result.steps == steps]
+            policy = condition + _updates(results)
             minutes = ", ".join(f"{result.minutes:.0f}" for result in results)
             failures = "; ".join(result.failures for result in results) if any(r.ends for r in results) else ""
             if told := "; ".join(filter(None, (result.by_contents for result in results))):
-                condition += f" ({told})"
-            rows.append(f"| {condition} | {percent(results)} | {acted_early(results)} | {failures} | {minutes} |")
+                policy += f" ({told})"
+            rows.append(f"| {policy} | {percent(results)} | {acted_early(results)} | {failures} | {minutes} |")
     if blind_path(task).exists():
         blind = load(blind_path(task))
         first, last = blind["seeds"]
@@ -77,9 +77,9 @@ def ablation_table(task: str) -> list[str]:
 
 
 def _updates(results: list[Result]) -> str:
-    """How many updates were made, where they are not the preset's."""
-    steps = sorted({result.steps for result in results})
-    return "" if steps == [STEPS] or results[0].task in TASKS else f", {' and '.join(map(str, steps))} updates"
+    """How many updates were made, the same in all results, where they are not the preset's."""
+    steps = results[0].steps
+    return "" if steps == STEPS or results[0].task in TASKS else f", {steps} updates"
 
 
 PRESETS_OF_BEFORE = {
