@@ -16,6 +16,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from experiments.ablations import STUDY
+from experiments.lottery import VARIANTS
 from experiments.protocol import (
     N_DEMONSTRATIONS,
     RESULTS,
@@ -37,8 +38,8 @@ ROOM_SEED = 7
 KINDS = ("speech_like", "clatter")
 NOISE_LEVELS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # factors on the noise's amplitude: silence, then 6 dB each
 ROOM_LEVELS = (1.0, 8.0)
-TRAINED = {"louder_noise": ("--policy.audio_noise_db=24",), "no_noise": ("--policy.audio_noise_db=null",)}
-"""Options of policies that differ from the preset `cpu`."""
+TRAINED = ("louder_noise", "no_noise")
+"""Variants of `experiments.lottery` whose trainings it shares."""
 
 
 def over_demonstrations(task: str, tried: Sequence[int], seeds: Sequence[int], n_jobs: int, threads: int) -> None:
@@ -82,7 +83,7 @@ def preset_policy(task: str, seed: int) -> tuple[Job, Result]:
 def trained_otherwise(task: str, seed: int, variant: str) -> tuple[Job, Result]:
     """One that is trained here; its result holds no episodes yet."""
     record(task, N_DEMONSTRATIONS)
-    job = Job("curves", task, "full", seed, options=TRAINED[variant], variant=variant)
+    job = Job("curves", task, "full", seed, options=VARIANTS[variant], variant=variant)
     command, minutes = train(job)
     how = {"minutes": round(minutes, 1), "threads": job.threads, "commands": [command]}
     return job, Result(**job.learned, first_seed=job.evaluation_seeds.start, successes=[], **how)

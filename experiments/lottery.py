@@ -59,6 +59,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "log_mel": ("--policy.audio_features=log_mel",),
     "pcen": ("--policy.audio_features=pcen",),
     "louder_noise": ("--policy.audio_noise_db=24",),
+    "no_noise": ("--policy.audio_noise_db=null",),
     "no_onset": ("--policy.auxiliary_onset=0",),
     "past_onsets": ("--policy.auxiliary_onset_s=0.75",),
     "action_range_1": ("--policy.action_range=1",),
@@ -76,7 +77,6 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "next_sound": ("--policy.auxiliary_next_sound=0.01",),
     "inverse_dynamics": ("--policy.auxiliary_inverse_dynamics=0.3",),
     "action_chunk": ("--policy.auxiliary_chunk=0.5",),
-    "chunk_of_8": ("--policy.auxiliary_chunk=0.5", "--policy.auxiliary_chunk_size=8"),
     "pixels_84": ("--policy.image_size=84",),
 }
 POLICIES: dict[str, tuple[str, ...]] = {EMA: (PLAIN, LAST_THREE), HELD_OUT: (NEWEST,)}
