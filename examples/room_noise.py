@@ -1,4 +1,5 @@
-"""Makes recordings of noise, free of anybody's rights: a hum, something like speech, like music, and a clatter.
+"""Makes recordings of noise, free of anybody's rights: a hum, and something like speech, music, clatter, hammering, typing
+and a tool that starts and stops.
 
     python examples/room_noise.py outputs/noise --seconds=60
     playbyear-train --preset=cpu --policy.audio_noise_files=outputs/noise --dataset.repo_id=...
@@ -88,8 +89,56 @@ def clatter(rng: np.random.Generator, n: int) -> np.ndarray:
     return wave
 
 
+def hammering(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Series of blows, each a burst of noise that a few resonances of what was struck draw out."""
+    wave, place = 1e-3 * rng.standard_normal(n), 0
+    while place < n:
+        centres, every = rng.uniform(100, 4000, 4), rng.uniform(0.2, 0.6) * RATE
+        for _ in range(rng.integers(2, 9)):
+            burst = rng.standard_normal(int(0.15 * RATE)) * np.exp(-np.arange(int(0.15 * RATE)) / (0.004 * RATE))
+            blow = 0.02 * burst
+            for centre in centres:
+                numerator, denominator = signal.iirpeak(centre, rng.uniform(5, 60), fs=RATE)
+                blow = blow + signal.lfilter(numerator, denominator, burst)
+            _add(wave, place, rng.uniform(0.3, 1) * blow / np.abs(blow).max())
+            place += int(every * rng.uniform(0.9, 1.1))
+        place += int(rng.uniform(0, 1.5) * RATE)
+    return wave
+
+
+def typing(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Words on a keyboard: a click when a key goes down and a fainter one when it comes up."""
+    wave, place = 1e-3 * rng.standard_normal(n), 0
+    while place < n:
+        for _ in range(rng.integers(2, 12)):
+            low = rng.uniform(500, 3000)
+            band = signal.butter(2, (low, 2.5 * low), "bandpass", fs=RATE, output="sos")
+            fall = np.exp(-np.arange(int(0.03 * RATE)) / (rng.uniform(0.001, 0.006) * RATE))
+            for after, strength in ((0.0, rng.uniform(0.3, 1)), (rng.uniform(0.05, 0.12), rng.uniform(0.1, 0.4))):
+                click = signal.sosfilt(band, rng.standard_normal(len(fall)) * fall)
+                _add(wave, place + int(after * RATE), strength * click / np.abs(click).max())
+            place += int(rng.uniform(0.08, 0.25) * RATE)
+        place += int(rng.uniform(0.2, 1.5) * RATE)
+    return wave
+
+
+def tool(rng: np.random.Generator, n: int) -> np.ndarray:
+    """A motor that runs up, whines and hisses for a while, and stops at once or slowly."""
+    wave, place = 1e-3 * rng.standard_normal(n), 0
+    while place < n:
+        length = int(rng.uniform(0.2, 2.5) * RATE)
+        pitch = rng.uniform(80, 600) * (1 - np.exp(-np.arange(length) / (rng.uniform(0.02, 0.3) * RATE)))
+        whine = signal.sawtooth(2 * np.pi * np.cumsum(pitch) / RATE) + rng.uniform(0.1, 1) * rng.standard_normal(length)
+        smooth = signal.sosfilt(signal.butter(2, rng.uniform(1000, 8000), fs=RATE, output="sos"), whine)
+        stop = np.clip((length - np.arange(length)) / (rng.uniform(0.005, 0.2) * RATE), 0, 1)
+        _add(wave, place, rng.uniform(0.3, 1) * stop * smooth)
+        place += length + int(rng.uniform(0.1, 1.5) * RATE)
+    return wave
+
+
 KINDS: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {
-    "hum": hum, "speech_like": speech_like, "music_like": music_like, "clatter": clatter
+    "hum": hum, "speech_like": speech_like, "music_like": music_like, "clatter": clatter, "hammering": hammering,
+    "typing": typing, "tool": tool,
 }  # fmt: skip
 
 

@@ -84,6 +84,13 @@ def test_excerpts_come_from_every_recording_at_one_loudness_and_from_all_over(re
     assert len(found[:, 0].unique()) > 10  # phases of the tones
 
 
+def test_recordings_of_another_rate_are_read_in_the_middle_of_training_in_bfloat16(recordings):
+    expected = RecordedNoise(recordings, RATE // 2)
+    with torch.autocast("cpu", torch.bfloat16):
+        found = RecordedNoise(recordings, RATE // 2)
+    assert all(torch.equal(a, b) for a, b in zip(found._recordings, expected._recordings, strict=True))
+
+
 def test_a_recording_that_is_shorter_than_an_excerpt_repeats(tmp_path):
     write_audio(tmp_path / "click.wav", tone(1000, RATE, seconds=0.25)[:, None], RATE)
     found = RecordedNoise(tmp_path, RATE).excerpts(3, RATE)

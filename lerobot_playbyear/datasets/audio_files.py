@@ -142,15 +142,16 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
     if max(sample_rate, new_sample_rate) > _MOST_PHASES * math.gcd(sample_rate, new_sample_rate):
         converted = _resample_odd_rates(channels_first.numpy(), sample_rate, new_sample_rate)
     else:
-        converted = torchaudio.functional.resample(
-            channels_first,
-            sample_rate,
-            new_sample_rate,
-            lowpass_filter_width=_FILTER_WIDTH,
-            rolloff=_ROLLOFF,
-            resampling_method="sinc_interp_kaiser",
-            beta=14.769656459379492,
-        ).numpy()
+        with torch.autocast("cpu", enabled=False):  # training asks within its own number format
+            converted = torchaudio.functional.resample(
+                channels_first,
+                sample_rate,
+                new_sample_rate,
+                lowpass_filter_width=_FILTER_WIDTH,
+                rolloff=_ROLLOFF,
+                resampling_method="sinc_interp_kaiser",
+                beta=14.769656459379492,
+            ).numpy()
     result = converted.T.reshape(-1, *waveform.shape[1:])
     return to_pcm_s16(result) if is_pcm else result.astype(waveform.dtype)
 
