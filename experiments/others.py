@@ -1,4 +1,5 @@
-"""What LeRobot's own policies make of the same demonstrations: ACT and Diffusion, each deaf and with the sound as a picture.
+"""What LeRobot's own policies make of the same demonstrations: ACT and Diffusion, each deaf, with the sound of the last seconds
+as a picture, and with the samples of the frame as a state.
 
     python -m experiments.others --task=OccludedGrasp-v1 --minutes=20
 
@@ -40,10 +41,11 @@ from experiments.protocol import (
 )
 from experiments.training import Job, clocked, evaluate
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.sound_as_state import sound_as_state
 from lerobot_playbyear.datasets.sound_picture import read_pictures
 
 STUDY = "others"
-CONDITIONS = ("picture", "deaf")
+CONDITIONS = ("picture", "state", "deaf")
 SEEDS = (1, 2, 3)
 
 _ACT = (
@@ -61,6 +63,12 @@ SETTINGS = {
     "diffusion_long": f"{_DIFFUSION} n_action_steps=8",
 }
 """Options of each policy, without `--policy.`."""
+
+NORMALIZATION = {
+    "act": '{"VISUAL":"MEAN_STD","STATE":"MEAN_STD","ACTION":"MEAN_STD","ENV":"MEAN_STD"}',
+    "diffusion": '{"VISUAL":"MEAN_STD","STATE":"MIN_MAX","ACTION":"MIN_MAX","ENV":"MEAN_STD"}',
+}
+"""With sound as a state: LeRobot's own, and the sound's, which it would leave as quiet as it is."""
 
 _BATCH_SIZE = 8  # LeRobot's own
 _TRIAL_STEPS, _TRIAL_LOG = 30, 15
@@ -82,8 +90,8 @@ class OtherResult(Result):
     settings: str = ""
 
 
-def prepare(task: str) -> Path:
-    """Records the demonstrations and makes of them the datasets of all conditions. Returns the one with pictures and sound."""
+def prepare(task: str) -> None:
+    """Records the demonstrations and makes of them the datasets of all conditions."""
     record(task, N_DEMONSTRATIONS)
     original = dataset_root(task)
     attached = original.with_name(f"{task}-attached")
@@ -109,19 +117,30 @@ def prepare(task: str) -> Path:
         run(command, f"without-sound-{target.name}", threads=1)
         unfinished.rename(target)
     assert read_pictures(dataset_of(task, "picture")) == read_pictures(attached)
-    return attached
+    if not (target := dataset_of(task, "state")).exists():
+        sound_as_state(LeRobotDataset(f"experiments/{task}", root=original, video_backend="pyav"), target)
 
 
 def dataset_of(task: str, condition: str) -> Path:
     return dataset_root(task).with_name(f"{task}-{condition}")
 
 
+def environment_options(task: str, condition: str) -> list[str]:
+    """What makes the environment give sound as the condition's dataset does."""
+    if condition == "picture":
+        return [f"--env.spectrogram={dataset_of(task, condition)}"]
+    return ["--env.sound_as_state=true"] if condition == "state" else []
+
+
 def training_command(job: Job, settings: str, folder: Path, *options: str) -> list[str]:
+    policy = settings.split()[0].removeprefix("type=")
+    state = [f"--policy.normalization_mapping={NORMALIZATION[policy]}"] if job.condition == "state" else []
     return [
         "lerobot-train",
         *(f"--policy.{option}" for option in settings.split()),
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
+        *state,
         *options_of(dataset_of(job.task, job.condition)),
         "--dataset.video_backend=pyav",
         f"--output_dir={folder}",
@@ -192,14 +211,13 @@ def train_and_evaluate(
     path = RESULTS / STUDY / f"{task}-{condition}-{setting}-{minutes:g}min-seed{seed}{chosen_by}.json"
     if path.exists():
         return OtherResult(**load(path))
-    attached = prepare(task)
+    prepare(task)
     variant = f"{setting}-{minutes:g}min"
     job = Job(STUDY, task, condition, seed, threads=threads, variant=variant, evaluation_seeds=seeds)
     job = replace(job, steps=max(round(60 * minutes / seconds_per_update(job, setting)), 1))
     command, spent = train(job, setting)
     commands = [shown(command)]
-    shown_sound = [f"--env.spectrogram={attached}"] if condition == "picture" else []
-    attempts = evaluate(job, commands, *shown_sound, name=f"{STUDY}{chosen_by}")
+    attempts = evaluate(job, commands, *environment_options(task, condition), name=f"{STUDY}{chosen_by}")
     result = OtherResult(
         **job.learned,
         first_seed=job.evaluation_seeds.start,

@@ -49,12 +49,17 @@ def env_spec(env: "EnvConfig") -> EnvSpec:
     """How Gymnasium makes the environment that a LeRobot configuration describes.
 
     Raises:
-        RolloutError: It asks for pictures of sound, which datasets get from `playbyear-attach-spectrogram`.
+        RolloutError: It asks for pictures of sound, or for sound as a state: datasets get both from the sound that is recorded.
     """
     if getattr(env, "spectrogram", None) is not None:
         raise RolloutError(
             f"--env.spectrogram={env.spectrogram}: these pictures are for policies of LeRobot that act in lerobot-eval, "
             "lerobot-train or playbyear-video. Leave it out here: playbyear-attach-spectrogram makes them of what is recorded."
+        )
+    if getattr(env, "sound_as_state", False):
+        raise RolloutError(
+            "--env.sound_as_state=true: this state is for policies of LeRobot that act in lerobot-eval, lerobot-train or "
+            "playbyear-video. Leave it out here: lerobot_playbyear.datasets.sound_as_state makes it of what is recorded."
         )
     return EnvSpec(f"{env.package_name}:{env.gym_id}", dict(env.gym_kwargs))
 
