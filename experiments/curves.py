@@ -2,13 +2,15 @@
 
     python -m experiments.curves demonstrations --task=OccludedGrasp-v1 --seeds 1 2 3 4 5 --jobs=2
     python -m experiments.curves noise --levels 0 1 8 16
-    python -m experiments.curves noise --trained louder_noise --levels 0 1 8 16
+    python -m experiments.curves noise --task=OccludedGrasp-v1 --trained louder_noise --levels 0 1 8 16
+    python -m experiments.curves rooms --task=OccludedGrasp-v1 --trained recorded_noise --steps=2500 --levels 8
     python -m experiments.curves materials
     python -m experiments.curves rooms --levels 8
 
 Noise, materials and rooms take the full policies that `experiments.ablations` trained, as they are: those of the preset `cpu`,
 which mixes noise into the sound, and never heard another material, a voice, a clatter or another microphone. `--trained` trains
-others here, with louder noise in their sound or none. Results that are there are kept.
+others here: with louder noise in their sound, with recordings besides, of other kinds than those that are tried, or without
+noise. Results that are there are kept.
 """
 
 from collections.abc import Sequence
@@ -16,11 +18,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from experiments.ablations import STUDY
-from experiments.lottery import VARIANTS
+from experiments.lottery import NOISE, VARIANTS
 from experiments.protocol import (
     N_DEMONSTRATIONS,
     RESULTS,
     RUNS,
+    STEPS,
     TRAINING_SEEDS,
     Result,
     command_line,
@@ -36,9 +39,11 @@ from gym_playbyear.materials import CUBE_MATERIALS
 N_DEMONSTRATIONS_TRIED = (3, 5, 10, 20, 50, 100)
 ROOM_SEED = 7
 KINDS = ("speech_like", "clatter")
+TRAINING_KINDS = ("hum", "music_like", "hammering", "typing", "tool")
+TRAINING_SEEDS_OF_NOISE = (101, 102, 103)
 NOISE_LEVELS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # factors on the noise's amplitude: silence, then 6 dB each
 ROOM_LEVELS = (1.0, 8.0)
-TRAINED = ("louder_noise", "no_noise")
+TRAINED = ("louder_noise", "recorded_noise", "no_noise")
 """Variants of `experiments.lottery` whose trainings it shares."""
 
 
@@ -58,7 +63,12 @@ def over_demonstrations(task: str, tried: Sequence[int], seeds: Sequence[int], n
 
 
 def under_conditions(
-    study: str, task: str, seeds: Sequence[int], conditions: Sequence[dict[str, str]], trained: str | None = None
+    study: str,
+    task: str,
+    seeds: Sequence[int],
+    conditions: Sequence[dict[str, str]],
+    trained: str | None = None,
+    steps: int = STEPS,
 ) -> None:
     """Evaluates full policies in environments that differ, by these options, from those they were trained in.
 
@@ -67,9 +77,10 @@ def under_conditions(
         task, seeds: Of the trainings.
         conditions: The environments' options.
         trained: One of `TRAINED`; None for the policies of the ablations.
+        steps: Updates of those that are trained here.
     """
     for seed in seeds:
-        policy = trained_otherwise(task, seed, trained) if trained else preset_policy(task, seed)
+        policy = trained_otherwise(task, seed, trained, steps) if trained else preset_policy(task, seed)
         for condition in conditions:
             print(evaluated_under(study, *policy, condition), flush=True)
 
@@ -80,10 +91,13 @@ def preset_policy(task: str, seed: int) -> tuple[Job, Result]:
     return job, Result(**load(job.result_path))
 
 
-def trained_otherwise(task: str, seed: int, variant: str) -> tuple[Job, Result]:
+def trained_otherwise(task: str, seed: int, variant: str, steps: int) -> tuple[Job, Result]:
     """One that is trained here; its result holds no episodes yet."""
     record(task, N_DEMONSTRATIONS)
-    job = Job("curves", task, "full", seed, options=VARIANTS[variant], variant=variant)
+    if variant == "recorded_noise":
+        for number in TRAINING_SEEDS_OF_NOISE:
+            recordings(NOISE / str(number), number, TRAINING_KINDS)
+    job = Job("curves", task, "full", seed, steps=steps, options=VARIANTS[variant], variant=variant)
     command, minutes = train(job)
     how = {"minutes": round(minutes, 1), "threads": job.threads, "commands": [command]}
     return job, Result(**job.learned, first_seed=job.evaluation_seeds.start, successes=[], **how)
@@ -102,6 +116,14 @@ def evaluated_under(study: str, job: Job, trained: Result, condition: dict[str, 
     return f"{path.stem}: {Result(**load(path)).summary}"
 
 
+def recordings(folder: Path, seed: int, kinds: Sequence[str]) -> None:
+    """Makes recordings of noise, always the same ones, unless they are there."""
+    if all((folder / f"{kind}.wav").exists() for kind in kinds):
+        return
+    command = ["python", "examples/room_noise.py", str(folder), f"--seed={seed}", "--kinds", *kinds]
+    run(command, f"{folder.parent.name}-{folder.name}", threads=1)
+
+
 def rooms(levels: Sequence[float]) -> list[dict[str, str]]:
     """Noise of kinds that no training draws from, and microphones of other frequency responses.
 
@@ -109,7 +131,7 @@ def rooms(levels: Sequence[float]) -> list[dict[str, str]]:
         levels: Of that noise, and of the background that these microphones hear.
     """
     folder = RUNS / "room_noise"
-    run(["python", "examples/room_noise.py", str(folder), f"--seed={ROOM_SEED}"], "room_noise", threads=1)
+    recordings(folder, ROOM_SEED, KINDS)
     noisy = [
         {"room_noise": str(folder / f"{kind}.wav"), "room_noise_level": f"{level:g}"}
         for kind in KINDS
@@ -123,7 +145,7 @@ def rooms(levels: Sequence[float]) -> list[dict[str, str]]:
 
 
 def main() -> None:
-    parser = command_line(__doc__, "task", "seeds", "jobs", "threads")
+    parser = command_line(__doc__, "task", "seeds", "jobs", "threads", "steps")
     parser.add_argument("curve", choices=("demonstrations", "noise", "materials", "rooms"))
     parser.add_argument(
         "--tried", nargs="+", type=int, default=N_DEMONSTRATIONS_TRIED, help="numbers of demonstrations"
@@ -141,7 +163,7 @@ def main() -> None:
         "rooms": lambda: rooms(options.levels or ROOM_LEVELS),
     }
     study = "-".join(filter(None, [options.curve, options.trained]))
-    under_conditions(study, options.task, options.seeds, conditions[options.curve](), options.trained)
+    under_conditions(study, options.task, options.seeds, conditions[options.curve](), options.trained, options.steps)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,8 @@ _NO_SHIFT = (
     "--policy.augmentation_translate=0",
     "--policy.augmentation_scale=0",
 )
+NOISE = RUNS / "training_noise"
+"""Recordings that training mixes in: `experiments.curves` makes them."""
 VARIANTS: dict[str, tuple[str, ...]] = {
     "preset": (),
     EMA: ("--policy.ema_decay=0.998",),
@@ -59,6 +61,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "log_mel": ("--policy.audio_features=log_mel",),
     "pcen": ("--policy.audio_features=pcen",),
     "louder_noise": ("--policy.audio_noise_db=24",),
+    "recorded_noise": ("--policy.audio_noise_db=24", f"--policy.audio_noise_files={NOISE}"),
     "no_noise": ("--policy.audio_noise_db=null",),
     "no_onset": ("--policy.auxiliary_onset=0",),
     "past_onsets": ("--policy.auxiliary_onset_s=0.75",),
