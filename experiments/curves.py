@@ -3,7 +3,7 @@
     python -m experiments.curves demonstrations --task=OccludedGrasp-v1 --seeds 1 2 3 4 5 --jobs=2
     python -m experiments.curves noise --levels 0 1 8 16
     python -m experiments.curves noise --task=OccludedGrasp-v1 --trained louder_noise --levels 0 1 8 16
-    python -m experiments.curves rooms --task=OccludedGrasp-v1 --trained recorded_noise --steps=2500 --levels 8
+    python -m experiments.curves rooms --task=OccludedGrasp-v1 --trained recorded_noise --steps=4000 --levels 8
     python -m experiments.curves materials
     python -m experiments.curves rooms --levels 8
 

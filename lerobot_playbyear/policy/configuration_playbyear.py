@@ -74,9 +74,8 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
         audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]; None
             mixes in none (the paper). Level, colour and a hum are drawn per item, the level uniformly from 20 dB below the
             floor up to this. It decides how loud a room the policy bears: 18 stands 8 times the background's amplitude.
-        audio_noise_files: Folder of WAV or FLAC files; three quarters of the items get an excerpt of one mixed in besides,
-            played at half to twice its speed, its level drawn uniformly from the floor's up to `audio_noise_db`. Only training
-            reads it.
+        audio_noise_files: Folder of WAV or FLAC files; three quarters of the items get an excerpt of one mixed in besides, its
+            level drawn uniformly from the floor's up to `audio_noise_db`. Only training reads it.
         audio_colour_db: Standard deviation of another microphone's gain, a smooth curve over frequency, drawn per item [dB].
         low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
             normalisation, drawn anew for every frame. The paper has none; without it a few dozen demonstrations are learned

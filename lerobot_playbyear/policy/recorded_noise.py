@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from lerobot_playbyear.datasets.audio_files import AudioFileError, audio_pieces, resample
 from lerobot_playbyear.datasets.errors import InputError
@@ -14,7 +13,6 @@ _ENDINGS = (".wav", ".flac")
 _FORMATS = "wav,w64,flac"
 _MOST_SECONDS = 7200
 _SILENCE = 1e-5  # root mean square
-_OCTAVES = 1.0  # up or down, of the speed at which a recording is played
 
 
 class RecordedNoise:
@@ -57,24 +55,19 @@ class RecordedNoise:
         return len(self._recordings)
 
     def excerpts(self, n_items: int, n_samples: int) -> Tensor:
-        """A stretch of a recording for every item, both drawn evenly, and played at another speed; short recordings repeat.
-
-        A policy must not learn to tell the recordings by their pitch: speeds are drawn from half to twice the recorded one,
-        evenly in octaves.
+        """A stretch of a recording for every item, both drawn evenly; short recordings repeat.
 
         Returns:
             (n_items, n_samples) float32; over a whole recording the root mean square is 1.
         """
         found = torch.empty(n_items, n_samples)
-        lengths = (n_samples * 2 ** (_OCTAVES * (2 * torch.rand(n_items) - 1))).ceil().int().tolist()
         for row, index in enumerate(torch.randint(len(self), (n_items,)).tolist()):
-            recording, length = self._recordings[index], lengths[row]
+            recording = self._recordings[index]
             start = int(torch.randint(len(recording), ()))
-            if start + length <= len(recording):
-                stretch = recording[start : start + length]
-            else:
-                stretch = recording[torch.arange(start, start + length) % len(recording)]
-            found[row] = functional.interpolate(stretch.float()[None, None], size=n_samples, mode="linear")
+            repeated = torch.arange(start, start + n_samples) % len(recording)
+            found[row] = (
+                recording[repeated] if start + n_samples > len(recording) else recording[start : start + n_samples]
+            )
         return found
 
 
