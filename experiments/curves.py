@@ -18,7 +18,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from experiments.ablations import STUDY
-from experiments.lottery import NOISE, VARIANTS
+from experiments.lottery import options_of_variant, recordings
 from experiments.protocol import (
     N_DEMONSTRATIONS,
     RESULTS,
@@ -29,7 +29,6 @@ from experiments.protocol import (
     command_line,
     load,
     record,
-    run,
     save,
     shown,
 )
@@ -39,8 +38,6 @@ from gym_playbyear.materials import CUBE_MATERIALS
 N_DEMONSTRATIONS_TRIED = (3, 5, 10, 20, 50, 100)
 ROOM_SEED = 7
 KINDS = ("speech_like", "clatter")
-TRAINING_KINDS = ("hum", "music_like", "hammering", "typing", "tool")
-TRAINING_SEEDS_OF_NOISE = (101, 102, 103)
 NOISE_LEVELS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # factors on the noise's amplitude: silence, then 6 dB each
 ROOM_LEVELS = (1.0, 8.0)
 TRAINED = ("louder_noise", "recorded_noise", "no_noise")
@@ -94,10 +91,7 @@ def preset_policy(task: str, seed: int) -> tuple[Job, Result]:
 def trained_otherwise(task: str, seed: int, variant: str, steps: int) -> tuple[Job, Result]:
     """One that is trained here; its result holds no episodes yet."""
     record(task, N_DEMONSTRATIONS)
-    if variant == "recorded_noise":
-        for number in TRAINING_SEEDS_OF_NOISE:
-            recordings(NOISE / str(number), number, TRAINING_KINDS)
-    job = Job("curves", task, "full", seed, steps=steps, options=VARIANTS[variant], variant=variant)
+    job = Job("curves", task, "full", seed, steps=steps, options=options_of_variant(variant), variant=variant)
     command, minutes = train(job)
     how = {"minutes": round(minutes, 1), "threads": job.threads, "commands": [command]}
     return job, Result(**job.learned, first_seed=job.evaluation_seeds.start, successes=[], **how)
@@ -114,14 +108,6 @@ def evaluated_under(study: str, job: Job, trained: Result, condition: dict[str, 
         told = {option: shown([value]) for option, value in condition.items()}
         save(path, asdict(replace(trained, **asdict(attempts), environment=told, commands=commands)))
     return f"{path.stem}: {Result(**load(path)).summary}"
-
-
-def recordings(folder: Path, seed: int, kinds: Sequence[str]) -> None:
-    """Makes recordings of noise, always the same ones, unless they are there."""
-    if all((folder / f"{kind}.wav").exists() for kind in kinds):
-        return
-    command = ["python", "examples/room_noise.py", str(folder), f"--seed={seed}", "--kinds", *kinds]
-    run(command, f"{folder.parent.name}-{folder.name}", threads=1)
 
 
 def rooms(levels: Sequence[float]) -> list[dict[str, str]]:

@@ -9,12 +9,25 @@ by its last checkpoint instead of the one with the lowest held-out loss. So thes
 episodes are of seeds on which choices are made, not of those that are reported elsewhere. Resumes.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
-from experiments.protocol import N_DEMONSTRATIONS, RESULTS, RUNS, STEPS, Result, command_line, load, record, save, shown
+from experiments.protocol import (
+    N_DEMONSTRATIONS,
+    RESULTS,
+    RUNS,
+    STEPS,
+    Result,
+    command_line,
+    load,
+    record,
+    run,
+    save,
+    shown,
+)
 from experiments.training import Job, evaluate, side_by_side
 from lerobot_playbyear.training.checkpoints import average_checkpoints, last_checkpoints
 
@@ -33,7 +46,9 @@ _NO_SHIFT = (
     "--policy.augmentation_scale=0",
 )
 NOISE = RUNS / "training_noise"
-"""Recordings that training mixes in: `experiments.curves` makes them."""
+"""Recordings that training mixes in, of other kinds than those that `experiments.curves` tries."""
+NOISE_KINDS = ("hum", "music_like", "hammering", "typing", "tool")
+NOISE_SEEDS = (101, 102, 103)
 VARIANTS: dict[str, tuple[str, ...]] = {
     "preset": (),
     EMA: ("--policy.ema_decay=0.998",),
@@ -88,10 +103,28 @@ CHOICE_SEEDS = range(50000, 50100)
 SEEDS = (1, 2, 3, 4, 5)
 
 
+def options_of_variant(variant: str) -> tuple[str, ...]:
+    """Its options of `playbyear-train`; what they name is made first."""
+    if f"--policy.audio_noise_files={NOISE}" in VARIANTS[variant]:
+        for seed in NOISE_SEEDS:
+            recordings(NOISE / str(seed), seed, NOISE_KINDS)
+    return VARIANTS[variant]
+
+
+def recordings(folder: Path, seed: int, kinds: Sequence[str]) -> None:
+    """Makes recordings of noise, always the same ones, unless they are there."""
+    if folder.exists():
+        return
+    unfinished = folder.with_name(f"{folder.name}.unfinished")
+    command = ["python", "examples/room_noise.py", str(unfinished), f"--seed={seed}", "--kinds", *kinds]
+    run(command, f"{folder.parent.name}-{folder.name}", threads=1)
+    unfinished.rename(folder)
+
+
 def job_of(task: str, variant: str, seed: int, steps: int = STEPS) -> Job:
     """One training."""
     chosen = "best" if variant == HELD_OUT else "last"
-    options = VARIANTS[variant]
+    options = options_of_variant(variant)
     names = {"steps": steps, "variant": variant, "chosen": chosen}
     return Job(STUDY, task, "full", seed, evaluation_seeds=CHOICE_SEEDS, options=options, **names)
 

@@ -15,9 +15,9 @@ from lerobot.envs import make_env, make_env_pre_post_processors, preprocess_obse
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.policies import make_policy_config
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.scripts import lerobot_eval, lerobot_train
+from lerobot.scripts import lerobot_train
 from test_peers import needs
-from test_sound_picture import SMALL, call
+from test_sound_picture import SMALL, call, roll_out
 
 from experiments import others
 from experiments.training import Job
@@ -164,22 +164,8 @@ def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path,
     options = others.training_command(job, settings, tmp_path / "train", "--steps=2")
     call(lerobot_train, *options[1:])
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
-    call(
-        lerobot_eval,
-        f"--policy.path={checkpoint}",
-        "--env.type=playbyear",
-        f"--env.task={TASK}",
-        "--env.microphones=[gripper, table]",
-        *others.environment_options(TASK, "state"),
-        "--env.episode_length=3",
-        "--env.visualization_width=64",
-        "--env.visualization_height=64",
-        "--eval.n_episodes=4",
-        "--eval.batch_size=2",
-        "--eval.use_async_envs=false",
-        f"--output_dir={tmp_path / 'eval'}",
-    )
-    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 4
+    sound = others.environment_options(TASK, "state")
+    roll_out(checkpoint, tmp_path / "eval", "--env.microphones=[gripper, table]", *sound)
     preprocessor, _ = make_pre_post_processors(
         PreTrainedConfig.from_pretrained(checkpoint), pretrained_path=str(checkpoint)
     )

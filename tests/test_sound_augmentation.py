@@ -131,6 +131,16 @@ def test_three_quarters_of_the_items_get_recorded_noise_and_none_more_than_was_a
     torch.testing.assert_close(level[with_noise].mean(), torch.tensor(10.0), rtol=0, atol=1.5)
 
 
+def test_recorded_noise_is_never_louder_than_asked_for_where_that_is_below_the_floor(recordings):
+    torch.manual_seed(0)
+    augment, wave = augmentation(audio_noise_db=-6.0, audio_noise_files=str(recordings)), 1e-4 * torch.randn(100, 8000)
+    torch.manual_seed(1)
+    room = mix_in_noise(wave, -6.0, RATE, augment.highest_hz)
+    torch.manual_seed(1)
+    recorded = (augment.noisy(wave) - room) / 1e-4
+    assert 20 * torch.log10(recorded.square().mean(dim=1).sqrt()).max() < -4.5
+
+
 def spoil(folder, how):
     if how == "missing":
         return folder / "nowhere", "there is no such folder"

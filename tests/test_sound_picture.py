@@ -432,6 +432,25 @@ def call(command, *arguments: str) -> None:
         command.main()
 
 
+def roll_out(checkpoint: Path, output: Path, *options: str) -> None:
+    """Four short episodes by `lerobot-eval`, with these options of the environment."""
+    call(
+        lerobot_eval,
+        f"--policy.path={checkpoint}",
+        "--env.type=playbyear",
+        "--env.task=OccludedGrasp-v1",
+        *options,
+        "--env.episode_length=3",
+        "--env.visualization_width=64",
+        "--env.visualization_height=64",
+        "--eval.n_episodes=4",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={output}",
+    )
+    assert json.loads((output / "eval_info.json").read_text())["overall"]["n_episodes"] == 4
+
+
 @pytest.mark.parametrize(
     "name", ["act", pytest.param("diffusion", marks=[needs("diffusers", "diffusion"), pytest.mark.slow])]
 )
@@ -452,21 +471,7 @@ def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path,
         f"--output_dir={tmp_path / 'train'}",
     )
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
-    call(
-        lerobot_eval,
-        f"--policy.path={checkpoint}",
-        "--env.type=playbyear",
-        "--env.task=OccludedGrasp-v1",
-        f"--env.spectrogram={recorded}",
-        "--env.episode_length=3",
-        "--env.visualization_width=64",
-        "--env.visualization_height=64",
-        "--eval.n_episodes=4",
-        "--eval.batch_size=2",
-        "--eval.use_async_envs=false",
-        f"--output_dir={tmp_path / 'eval'}",
-    )
-    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 4
+    roll_out(checkpoint, tmp_path / "eval", f"--env.spectrogram={recorded}")
     policy = get_policy_class(name).from_pretrained(checkpoint).eval()
     item = load(recorded)[45]
     actions = []

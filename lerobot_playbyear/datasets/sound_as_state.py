@@ -22,7 +22,8 @@ _FULL_SCALE = 32768  # int16 PCM; a power of two, so that dividing by it loses n
 def sound_as_state(dataset: LeRobotDataset, target: str | Path) -> Path:
     """Copies a dataset; in the copy sound is a state and nothing else.
 
-    Its statistics are LeRobot's, of every sample's place in the frame: so LeRobot normalises it as any other state.
+    All of the sound is in memory meanwhile. Its statistics are LeRobot's, of every sample's place in the frame: so LeRobot
+    normalises it as any other state.
 
     Args:
         dataset: It has sound, and all of its episodes are opened. It is not changed.

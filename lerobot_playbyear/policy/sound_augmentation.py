@@ -16,7 +16,7 @@ _HUM_HZ = (45.0, 75.0)
 _HUM_HARMONICS = 4
 _HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
 _RECORDED_SHARE = 0.75  # of the items that get recorded noise
-_RECORDED_FAINTEST_DB = 0.0  # of it, relative to an item's noise floor: what is fainter teaches nothing
+_RECORDED_FAINTEST_DB = 0.0  # of it, relative to an item's noise floor, unless the loudest is fainter
 _LEAKAGE = 8  # bins above the highest one that is kept, whose noise still reaches it
 _COLOUR_POINTS = 6  # of a microphone's response, evenly spaced in octaves
 
@@ -53,7 +53,8 @@ class SoundAugmentation(nn.Module):
             self._recorded = RecordedNoise(self.files, self.sample_rate)
         excerpts = self._recorded.excerpts(*wave.shape).to(wave.device)
         draws = torch.rand(2, len(wave), 1, device=wave.device)
-        level = _RECORDED_FAINTEST_DB + (self.max_db - _RECORDED_FAINTEST_DB) * draws[0]  # [dB]
+        faintest = min(_RECORDED_FAINTEST_DB, self.max_db)
+        level = faintest + (self.max_db - faintest) * draws[0]  # [dB]
         gain = 10 ** (level / 20) * (draws[1] < _RECORDED_SHARE)
         return mixed + noise_floor(wave) * gain * excerpts
 
