@@ -1,6 +1,7 @@
 """What training does to sound, so that the policy bears other rooms and other microphones."""
 
 import math
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -38,6 +39,20 @@ class SoundAugmentation(nn.Module):
         away = (place[:, None] - torch.arange(_COLOUR_POINTS)).abs()
         self.register_buffer("response", (1 - away).clamp(min=0), persistent=False)  # (bins, points)
 
+    def train(self, mode: bool = True) -> Self:
+        """A policy that begins to learn reads its recordings, so that a folder that is wrong is told before the data are read.
+
+        Raises:
+            InputError: The folder of recorded noise cannot be used.
+        """
+        if mode:
+            self._read()
+        return super().train(mode)
+
+    def _read(self) -> None:
+        if self.files is not None and self._recorded is None:
+            self._recorded = RecordedNoise(self.files, self.sample_rate)
+
     def noisy(self, wave: Tensor) -> Tensor:
         """(B, samples) in [-1, 1] -> the same shape, with noise.
 
@@ -47,10 +62,9 @@ class SoundAugmentation(nn.Module):
         if self.max_db is None:
             return wave
         mixed = mix_in_noise(wave, self.max_db, self.sample_rate, self.highest_hz)
-        if self.files is None:
-            return mixed
+        self._read()
         if self._recorded is None:
-            self._recorded = RecordedNoise(self.files, self.sample_rate)
+            return mixed
         excerpts = self._recorded.excerpts(*wave.shape).to(wave.device)
         draws = torch.rand(2, len(wave), 1, device=wave.device)
         faintest = min(_RECORDED_FAINTEST_DB, self.max_db)
