@@ -4,9 +4,11 @@ as a picture, and with the samples of the frame as a state.
     python -m experiments.others --task=OccludedGrasp-v1 --minutes=20
 
 All get the same demonstrations, the same number of processor cores and as many updates as fit into the minutes, which a short
-training measures first. Networks are small, for pictures are; every setting is in `SETTINGS`. Datasets hold no column that a
-policy does not look at: LeRobot would read it all the same. Resumes: results that are there are kept, a training that was
-interrupted goes on. Diffusion needs `lerobot[diffusion]`.
+training measures first. Networks are small, for pictures are: 48 pixels, as the preset `cpu` shrinks them. Pictures are
+normalised by the dataset's statistics, ACT begins as `experiments.act_start` says, Diffusion warms up for 50 updates instead
+of 500, and every other setting is in `SETTINGS`. Datasets hold no column that a policy does not look at: LeRobot would read
+it all the same. Resumes: results that are there are kept, a training that was interrupted goes on. Diffusion needs
+`lerobot[diffusion]`.
 """
 
 import re
@@ -22,6 +24,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.utils.constants import OBS_STR
 
+from experiments.act_start import saved_start
 from experiments.protocol import (
     EVALUATION_SEEDS,
     N_DEMONSTRATIONS,
@@ -54,10 +57,11 @@ _ACT = (
 )
 _DIFFUSION = (
     "type=diffusion pretrained_backbone_weights=null use_group_norm=true horizon=16 down_dims=[64,128,256] "
-    "noise_scheduler_type=DDIM num_inference_steps=10"
+    "noise_scheduler_type=DDIM num_inference_steps=10 scheduler_warmup_steps=50"
 )
 SETTINGS = {
     "act": f"{_ACT} n_action_steps=4",
+    "act_fast": f"{_ACT} n_action_steps=4".replace("1e-4", "5e-4"),
     "act_ensemble": f"{_ACT} n_action_steps=1 temporal_ensemble_coeff=0.01",
     "diffusion": f"{_DIFFUSION} n_action_steps=4",
     "diffusion_long": f"{_DIFFUSION} n_action_steps=8",
@@ -70,6 +74,10 @@ NORMALIZATION = {
 }
 """With sound as a state: LeRobot's own, and the sound's, which it would leave as quiet as it is."""
 
+PIXELS = 48
+"""Of every picture, of the sound as of the cameras."""
+
+_IMAGE_SIZE = f"--env.image_size={PIXELS}"
 _BATCH_SIZE = 8  # LeRobot's own
 _TRIAL_STEPS, _TRIAL_LOG = 30, 15
 _TIMES = re.compile(r"updt_s:([\d.]+) data_s:([\d.]+)")
@@ -92,12 +100,12 @@ class OtherResult(Result):
 
 def prepare(task: str) -> None:
     """Records the demonstrations and makes of them the datasets of all conditions."""
-    record(task, N_DEMONSTRATIONS)
-    original = dataset_root(task)
-    attached = original.with_name(f"{task}-attached")
+    original = dataset_root(f"{task}-{PIXELS}px")
+    record(task, N_DEMONSTRATIONS, original, _IMAGE_SIZE)
+    attached = original.with_name(f"{original.name}-attached")
     if not attached.exists():
         command = ["playbyear-attach-spectrogram", *options_of(original), *options_of(attached, "output")]
-        run(command, f"attach-{task}", threads=1)
+        run(command, f"attach-{original.name}", threads=1)
     for condition, source in (("picture", attached), ("deaf", original)):
         target = dataset_of(task, condition)
         if target.exists():
@@ -118,31 +126,33 @@ def prepare(task: str) -> None:
         unfinished.rename(target)
     assert read_pictures(dataset_of(task, "picture")) == read_pictures(attached)
     if not (target := dataset_of(task, "state")).exists():
-        sound_as_state(LeRobotDataset(f"experiments/{task}", root=original, video_backend="pyav"), target)
+        sound_as_state(LeRobotDataset(f"experiments/{original.name}", root=original, video_backend="pyav"), target)
 
 
 def dataset_of(task: str, condition: str) -> Path:
-    return dataset_root(task).with_name(f"{task}-{condition}")
+    return dataset_root(f"{task}-{PIXELS}px-{condition}")
 
 
 def environment_options(task: str, condition: str) -> list[str]:
-    """What makes the environment give sound as the condition's dataset does."""
-    if condition == "picture":
-        return [f"--env.spectrogram={dataset_of(task, condition)}"]
-    return ["--env.sound_as_state=true"] if condition == "state" else []
+    """What makes the environment give pictures and sound as the condition's dataset does."""
+    sound = {"picture": [f"--env.spectrogram={dataset_of(task, condition)}"], "state": ["--env.sound_as_state=true"]}
+    return [_IMAGE_SIZE, *sound.get(condition, [])]
 
 
 def training_command(job: Job, settings: str, folder: Path, *options: str) -> list[str]:
     policy = settings.split()[0].removeprefix("type=")
-    state = [f"--policy.normalization_mapping={NORMALIZATION[policy]}"] if job.condition == "state" else []
+    state = [f"normalization_mapping={NORMALIZATION[policy]}"] if job.condition == "state" else []
+    dataset, how = dataset_of(job.task, job.condition), [*settings.split(), *state]
+    if policy == "act":
+        how = saved_start(how[1:], dataset, folder.with_name(f"{folder.name}.start"), job.training_seed)
     return [
         "lerobot-train",
-        *(f"--policy.{option}" for option in settings.split()),
+        *(f"--policy.{option}" for option in how),
         "--policy.push_to_hub=false",
         "--policy.device=cpu",
-        *state,
-        *options_of(dataset_of(job.task, job.condition)),
+        *options_of(dataset),
         "--dataset.video_backend=pyav",
+        "--dataset.use_imagenet_stats=false",
         f"--output_dir={folder}",
         f"--batch_size={_BATCH_SIZE}",
         "--num_workers=0",

@@ -214,13 +214,14 @@ def options_of(dataset: Path, kind: str = "dataset") -> list[str]:
     return [f"--{kind}.repo_id=experiments/{dataset.name}", f"--{kind}.root={dataset}"]
 
 
-def record(task: str, n_episodes: int, root: Path | None = None) -> None:
+def record(task: str, n_episodes: int, root: Path | None = None, *environment: str) -> None:
     """Records demonstrations, or as many as are missing.
 
     Args:
         task: What the expert does.
         n_episodes: How many there shall be.
         root: The dataset's folder; by default the task's own.
+        environment: Further options of the environment, `--env.image_size=48`.
     """
     root = root or dataset_root(task)
     command = [
@@ -231,5 +232,6 @@ def record(task: str, n_episodes: int, root: Path | None = None) -> None:
         f"--dataset.num_episodes={n_episodes}",
         f"--seed={DEMONSTRATION_SEED}",
         "--resume=true",
+        *environment,
     ]
     run(command, f"record-{root.name}", threads=1)

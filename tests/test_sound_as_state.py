@@ -18,8 +18,9 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts import lerobot_train
 from test_peers import needs
 from test_sound_picture import SMALL, call, roll_out
+from torchvision.ops import FrozenBatchNorm2d
 
-from experiments import others
+from experiments import act_start, others
 from experiments.training import Job
 from lerobot_env_playbyear import PlaybyearEnvConfig, SoundAsStateProcessorStep
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -193,3 +194,28 @@ def test_every_policy_of_the_comparison_keeps_lerobots_normalization_of_all_else
         given = json.loads(others.NORMALIZATION[policy])
         assert given.pop("ENV") == "MEAN_STD"
         assert given == {kind: mode.value for kind, mode in usual.items()}
+
+
+def test_act_without_pretrained_weights_begins_with_norms_that_tell_pictures_apart(recorded, tmp_path):
+    def difference(backbone):
+        """Of pictures, relative to what their encodings have in common."""
+        with torch.no_grad():
+            encoded = backbone(images)["feature_map"]
+        return float(encoded.std(dim=0).mean() / encoded.mean(dim=0).square().mean().sqrt())
+
+    options = ["pretrained_backbone_weights=null", *(o.removeprefix("--policy.") for o in SMALL["act"].split())]
+    (start,) = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
+    again = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
+    assert again == [start] == [f"path={tmp_path / 'start'}"]
+    policy = get_policy_class("act").from_pretrained(tmp_path / "start")
+    assert policy.config.pretrained_backbone_weights is None
+    dataset = load(recorded)
+    key = dataset.meta.camera_keys[0]
+    images = torch.stack([dataset[row][key] for row in range(0, len(dataset), 3)])
+    images = (images - images.mean(dim=(0, 2, 3), keepdim=True)) / images.std(dim=(0, 2, 3), keepdim=True)
+    calibrated = difference(policy.model.backbone)
+    for norm in policy.model.backbone.modules():
+        if isinstance(norm, FrozenBatchNorm2d):
+            norm.running_mean.zero_()
+            norm.running_var.fill_(1)
+    assert calibrated > 3 * difference(policy.model.backbone)
