@@ -1,8 +1,10 @@
 """A beginning for ACT where no weights of ImageNet are at hand.
 
 LeRobot's ACT sees with a ResNet whose batch norms are frozen: their statistics come with pretrained weights, which are
-downloaded. With random weights and statistics of 0 and 1 the pictures of a dataset hardly differ for it. Here the statistics
-are those of the dataset's own pictures under the random weights, as a batch norm that learns has them at first.
+downloaded. With random weights, statistics of 0 and 1 and pictures normalised as ImageNet's, the encodings of Occluded
+Grasp's frames differ from each other by a fifth of their size (root mean square; camera 0.21, picture of the sound 0.17).
+Here the statistics are those of the dataset's own pictures under the random weights, as a batch norm that learns has them
+at first, and pictures are normalised by the dataset: 0.64 and 0.76.
 """
 
 from collections.abc import Sequence
