@@ -4,6 +4,8 @@ from collections import defaultdict
 from pathlib import Path
 
 from experiments.corrections import load_corrections
+from experiments.others import STUDY as OTHERS
+from experiments.others import OtherResult
 from experiments.protocol import (
     ATTEMPT_STEPS,
     CONDITIONS,
@@ -208,6 +210,29 @@ def run_length_table(task: str) -> list[str]:
     return table(head, rows, f"{task}: windows per run, K")
 
 
+def others_table(task: str) -> list[str]:
+    """LeRobot's own policies on the same demonstrations."""
+    found: dict[tuple[str, str, float], list[OtherResult]] = defaultdict(list)
+    for path in sorted((RESULTS / OTHERS).glob(f"{task}-*min-seed?.json")):
+        condition, setting, *_ = path.stem.removeprefix(f"{task}-").split("-")
+        result = OtherResult(**load(path))
+        found[setting, condition, result.budget_minutes].append(result)
+    rows = []
+    for (setting, condition, budget), results in sorted(found.items()):
+        updates, minutes, ms = (
+            ", ".join(f"{getattr(result, name):,.{digits}f}" for result in results)
+            for name, digits in (("steps", 0), ("minutes", 0), ("ms_per_step", 1))
+        )
+        failures = "; ".join(result.failures for result in results)
+        cells = (setting, condition, f"{budget:g}", percent(results), failures, updates, minutes, ms)
+        rows.append(f"| {' | '.join(cells)} |")
+    head = (
+        "| policy | sound | minutes | success (95 % interval) | training seeds | failures | updates | minutes that it took | "
+        "ms per step |"
+    )
+    return table(head, rows, f"{task}: LeRobot's own policies")
+
+
 def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
     try:
         return float(item[0]), ""
@@ -222,7 +247,7 @@ def main() -> None:
         lines += demonstration_table(task)
         for study in CURVES:
             lines += curve_table(study, task)
-        lines += run_length_table(task) + correction_tables(task)
+        lines += others_table(task) + run_length_table(task) + correction_tables(task)
     print("\n".join(lines))
 
 
