@@ -189,7 +189,7 @@ def test_training_reads_the_folder_and_acting_does_not(recordings, tmp_path):
         step_through(again, [make_episode(3, again.config)]), step_through(policy, [make_episode(3, policy.config)])
     )
     with pytest.raises(InputError, match="audio_noise_files"):
-        again.train()
+        again.train().forward(batch_of(again))
 
 
 def test_another_microphones_gain_is_smooth_and_as_strong_as_asked_for():

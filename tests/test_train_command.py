@@ -238,8 +238,13 @@ def test_another_policy_trains_from_memory_too(root, command, tmp_path):
         ({"microphones": ()}, (), "sound.*--policy.use_audio=false"),
         ({}, ("--dataset.image_transforms.enable=true",), "image_transforms.enable does not work in playbyear-train"),
         ({}, ("--sampling.start_weight=0",), "sampling.start_weight must be above 0"),
+        (
+            {},
+            ("--policy.audio_noise_db=18", "--policy.audio_noise_files=nowhere"),
+            "files=nowhere: there is no such folder",
+        ),
     ],
-    ids=["fps", "sample rate", "no microphone", "image transforms", "weight"],
+    ids=["fps", "sample rate", "no microphone", "image transforms", "weight", "noise"],
 )
 def test_bad_input_is_refused_before_any_work(features, options, message, command, tmp_path):
     fps = features.get("fps", FPS)

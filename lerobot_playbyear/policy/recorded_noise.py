@@ -29,7 +29,7 @@ class RecordedNoise:
     def __init__(self, folder: str | Path, sample_rate: int):
         option, folder = f"--policy.audio_noise_files={folder}", Path(folder)
         if not folder.is_dir():
-            raise InputError(f"{option}: there is no such folder; wanted one with WAV or FLAC files.")
+            raise InputError(f"{option}: there is no such folder; wanted one with WAV or FLAC files, or null.")
         files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _ENDINGS and path.is_file())
         if not files:
             raise InputError(

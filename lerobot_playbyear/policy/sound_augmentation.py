@@ -1,7 +1,6 @@
 """What training does to sound, so that the policy bears other rooms and other microphones."""
 
 import math
-from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -39,17 +38,12 @@ class SoundAugmentation(nn.Module):
         away = (place[:, None] - torch.arange(_COLOUR_POINTS)).abs()
         self.register_buffer("response", (1 - away).clamp(min=0), persistent=False)  # (bins, points)
 
-    def train(self, mode: bool = True) -> Self:
-        """A policy that begins to learn reads its recordings, so that a folder that is wrong is told before the data are read.
+    def read_recordings(self) -> None:
+        """Reads the folder of recorded noise, if there is one and that was not done; learning does it at the latest.
 
         Raises:
-            InputError: The folder of recorded noise cannot be used.
+            InputError: The folder cannot be used.
         """
-        if mode:
-            self._read()
-        return super().train(mode)
-
-    def _read(self) -> None:
         if self.files is not None and self._recorded is None:
             self._recorded = RecordedNoise(self.files, self.sample_rate)
 
@@ -62,7 +56,7 @@ class SoundAugmentation(nn.Module):
         if self.max_db is None:
             return wave
         mixed = mix_in_noise(wave, self.max_db, self.sample_rate, self.highest_hz)
-        self._read()
+        self.read_recordings()
         if self._recorded is None:
             return mixed
         excerpts = self._recorded.excerpts(*wave.shape).to(wave.device)

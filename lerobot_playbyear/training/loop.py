@@ -26,6 +26,7 @@ from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
+from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.checkpoints import BestCheckpoint
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
@@ -75,7 +76,11 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         parts = make_training_parts(cfg, meta, accelerator=accelerator)
         if cfg.seed is not None and accelerator.num_processes > 1:
             set_seed(cfg.seed + accelerator.process_index)  # each its own noise
-        config = accelerator.unwrap_model(parts.policy).config
+        policy = accelerator.unwrap_model(parts.policy)
+        for module in policy.modules():
+            if isinstance(module, SoundAugmentation):
+                module.read_recordings()
+        config = policy.config
         windows = PolicyWindows(config, meta, cfg.rename_map)
         is_shared = accelerator.num_processes > 1
         stores = [read_store(each, windows, cfg, is_shared) for each in datasets]
