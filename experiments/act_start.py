@@ -1,12 +1,17 @@
 """A beginning for ACT where no weights of ImageNet are at hand.
 
+    python -m experiments.act_start outputs/seen outputs/start dim_model=128
+    lerobot-train --policy.path=outputs/start --dataset.use_imagenet_stats=false --dataset.root=outputs/seen ...
+
 LeRobot's ACT sees with a ResNet whose batch norms are frozen: their statistics come with pretrained weights, which are
-downloaded. With random weights, statistics of 0 and 1 and pictures normalised as ImageNet's, the encodings of Occluded
-Grasp's frames differ from each other by a fifth of their size (root mean square; camera 0.21, picture of the sound 0.17).
-Here the statistics are those of the dataset's own pictures under the random weights, as a batch norm that learns has them
-at first, and pictures are normalised by the dataset: 0.64 and 0.76.
+downloaded. With random weights, statistics of 0 and 1 and pictures normalised as ImageNet's the encodings of different
+frames are nearly alike. Here the statistics are those of the dataset's own pictures under the random weights, as a batch norm
+that learns has them at first. The command prints by how much the encodings of 200 frames differ, relative to their size.
 """
 
+import argparse
+import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,47 +19,70 @@ from typing import Any
 import draccus
 import torch
 from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import IMAGENET_STATS
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.utils.constants import OBS_IMAGES, OBS_STR
 from torch import Tensor, nn
 from torchvision.ops import FrozenBatchNorm2d
 
+from experiments.protocol import shown
+
 _N_FRAMES = 200
+_NOTE = "start.json"
 
 
-def saved_start(options: Sequence[str], dataset: Path, folder: Path, seed: int) -> list[str]:
+def saved_start(options: Sequence[str], dataset: Path, folder: Path, seed: int) -> str:
     """An ACT that has learned nothing, with its processors; made and saved unless it is there.
 
     Args:
         options: Of the policy, without `--policy.`.
         dataset: Folder of the dataset whose pictures it shall tell apart.
-        folder: Of the checkpoint.
+        folder: Of the checkpoint; one that was made with other arguments is made anew.
         seed: Of the weights and of the pictures that are looked at.
 
     Returns:
-        The option that begins a training with it, without `--policy.`.
+        The command that makes it.
     """
-    if not folder.exists():
-        config = draccus.parse(ACTConfig, args=["--device=cpu", *(f"--{option}" for option in options)])
-        data = LeRobotDataset(f"experiments/{dataset.name}", root=dataset, video_backend="pyav")
-        torch.manual_seed(seed)
-        policy = make_policy(config, ds_meta=data.meta)
-        processors = make_pre_post_processors(config, dataset_stats=data.meta.stats)
-        calibrate(policy.model.backbone, _pictures(data, processors[0]))
-        unfinished = folder.with_name(f"{folder.name}.unfinished")
+    note, made = folder / _NOTE, [*options, dataset.name, seed]
+    if not note.exists() or json.loads(note.read_text()) != made:
+        shutil.rmtree(folder, ignore_errors=True)
+        policy, processors, pictures = _prepared(options, dataset, seed)
+        calibrate(policy.model.backbone, torch.cat(list(pictures.values())))
         for part in (policy, *processors):
-            part.save_pretrained(unfinished)
-        unfinished.rename(folder)
-    return [f"path={folder}"]
+            part.save_pretrained(folder)
+        note.write_text(json.dumps(made))
+    return shown(["python", "-m", "experiments.act_start", str(dataset), str(folder), *options, f"--seed={seed}"])
 
 
-def _pictures(data: LeRobotDataset, preprocessor: Any) -> Tensor:
-    """(n, 3, H, W), of all cameras, as the policy sees them."""
+def difference(backbone: nn.Module, images: Tensor) -> float:
+    """Of the encodings of pictures from their mean, relative to their size; both root mean squares.
+
+    Args:
+        backbone: Gives a dictionary with "feature_map".
+        images: (B, 3, H, W), normalised.
+    """
+    with torch.no_grad():
+        encoded = backbone(images)["feature_map"]
+    return float(encoded.var(dim=0).mean().sqrt() / encoded.square().mean().sqrt())
+
+
+def _prepared(options: Sequence[str], dataset: Path, seed: int) -> tuple[Any, tuple[Any, Any], dict[str, Tensor]]:
+    """A new policy, its processors, and normalised pictures of every camera, (n, 3, H, W)."""
+    config = draccus.parse(ACTConfig, args=["--device=cpu", *(f"--{option}" for option in options)])
+    data = LeRobotDataset(f"experiments/{dataset.name}", root=dataset, video_backend="pyav")
+    torch.manual_seed(seed)
+    policy = make_policy(config, ds_meta=data.meta)
+    processors = make_pre_post_processors(config, dataset_stats=data.meta.stats)
+    return policy, processors, _pictures(data, processors[0])
+
+
+def _pictures(data: LeRobotDataset, preprocessor: Any) -> dict[str, Tensor]:
     frames = [data[index] for index in torch.randperm(len(data))[:_N_FRAMES].tolist()]
     kept = [key for key in frames[0] if key.startswith(f"{OBS_STR}.")]
     batch = preprocessor({key: torch.stack([frame[key] for frame in frames]) for key in kept})
-    return torch.cat([batch[key] for key in kept if key.startswith(OBS_IMAGES)])
+    return {key: batch[key] for key in kept if key.startswith(OBS_IMAGES)}
 
 
 @torch.no_grad()
@@ -75,3 +103,29 @@ def calibrate(network: nn.Module, images: Tensor) -> None:
     network(images)
     for hook in hooks:
         hook.remove()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("folder", type=Path, help="of the checkpoint that is made")
+    parser.add_argument("options", nargs="*", help="of ACT, NAME=VALUE; pretrained_backbone_weights=null is added")
+    parser.add_argument("--seed", type=int, default=0)
+    given = parser.parse_args()
+    options = list(dict.fromkeys(["pretrained_backbone_weights=null", *given.options]))
+    saved_start(options, given.dataset, given.folder, given.seed)
+    policy, _, pictures = _prepared(options, given.dataset, given.seed)
+    backbone = policy.model.backbone
+    mean, deviation = (torch.tensor(IMAGENET_STATS[name]) for name in ("mean", "std"))
+    stats = LeRobotDataset(f"experiments/{given.dataset.name}", root=given.dataset, video_backend="pyav").meta.stats
+    for key, images in pictures.items():
+        own = [torch.as_tensor(stats[key][name]).float() for name in ("mean", "std")]
+        as_imagenet = (images * own[1] + own[0] - mean) / deviation
+        print(f"{key}: ImageNet's normalisation {difference(backbone, as_imagenet):.2f}", end=", ")
+        print(f"the dataset's {difference(backbone, images):.2f}", end=", ", flush=True)
+        calibrated = ACTPolicy.from_pretrained(given.folder).model.backbone
+        print(f"and these norms {difference(calibrated, images):.2f}")
+
+
+if __name__ == "__main__":
+    main()

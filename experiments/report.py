@@ -213,7 +213,7 @@ def run_length_table(task: str) -> list[str]:
 def others_table(task: str) -> list[str]:
     """LeRobot's own policies on the same demonstrations."""
     found: dict[tuple[str, str, float], list[OtherResult]] = defaultdict(list)
-    for path in sorted((RESULTS / OTHERS).glob(f"{task}-*min-seed?.json")):
+    for path in sorted((RESULTS / OTHERS).glob(f"{task}-*min-seed*.json")):
         condition, setting, *_ = path.stem.removeprefix(f"{task}-").split("-")
         result = OtherResult(**load(path))
         found[setting, condition, result.budget_minutes].append(result)

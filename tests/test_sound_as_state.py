@@ -16,6 +16,7 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.policies import make_policy_config
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.scripts import lerobot_train
+from safetensors.torch import load_file
 from test_peers import needs
 from test_sound_picture import SMALL, call, roll_out
 from torchvision.ops import FrozenBatchNorm2d
@@ -164,7 +165,13 @@ def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path,
     job = Job(others.STUDY, TASK, "state", training_seed=1)
     options = others.training_command(job, settings, tmp_path / "train", "--steps=2")
     call(lerobot_train, *options[1:])
+    assert "--dataset.use_imagenet_stats=false" in options
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
+    if name == "act":
+        norms = [load_file(path / "model.safetensors") for path in (tmp_path / "train.start", checkpoint)]
+        before, after = (weights["model.backbone.layer4.1.bn2.running_var"] for weights in norms)
+        assert torch.equal(before, after)
+        assert not torch.equal(after, torch.ones_like(after))
     sound = others.environment_options(TASK, "state")
     roll_out(checkpoint, tmp_path / "eval", "--env.microphones=[gripper, table]", *sound)
     preprocessor, _ = make_pre_post_processors(
@@ -197,25 +204,23 @@ def test_every_policy_of_the_comparison_keeps_lerobots_normalization_of_all_else
 
 
 def test_act_without_pretrained_weights_begins_with_norms_that_tell_pictures_apart(recorded, tmp_path):
-    def difference(backbone):
-        """Of pictures, relative to what their encodings have in common."""
-        with torch.no_grad():
-            encoded = backbone(images)["feature_map"]
-        return float(encoded.std(dim=0).mean() / encoded.mean(dim=0).square().mean().sqrt())
-
-    options = ["pretrained_backbone_weights=null", *(o.removeprefix("--policy.") for o in SMALL["act"].split())]
-    (start,) = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
-    again = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
-    assert again == [start] == [f"path={tmp_path / 'start'}"]
+    options = ["pretrained_backbone_weights=null", *SMALL["act"].split()]
+    command = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
+    assert command.startswith("python -m experiments.act_start")
+    assert "dim_model=32" in command
+    written = (tmp_path / "start/model.safetensors").stat().st_mtime_ns
+    act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
+    assert (tmp_path / "start/model.safetensors").stat().st_mtime_ns == written
     policy = get_policy_class("act").from_pretrained(tmp_path / "start")
-    assert policy.config.pretrained_backbone_weights is None
     dataset = load(recorded)
     key = dataset.meta.camera_keys[0]
     images = torch.stack([dataset[row][key] for row in range(0, len(dataset), 3)])
     images = (images - images.mean(dim=(0, 2, 3), keepdim=True)) / images.std(dim=(0, 2, 3), keepdim=True)
-    calibrated = difference(policy.model.backbone)
+    calibrated = act_start.difference(policy.model.backbone, images)
     for norm in policy.model.backbone.modules():
         if isinstance(norm, FrozenBatchNorm2d):
             norm.running_mean.zero_()
             norm.running_var.fill_(1)
-    assert calibrated > 3 * difference(policy.model.backbone)
+    assert calibrated > 1.5 * act_start.difference(policy.model.backbone, images)
+    act_start.saved_start(options, recorded, tmp_path / "start", seed=1)
+    assert (tmp_path / "start/model.safetensors").stat().st_mtime_ns != written
