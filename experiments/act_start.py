@@ -118,13 +118,13 @@ def main() -> None:
     backbone = policy.model.backbone
     mean, deviation = (torch.tensor(IMAGENET_STATS[name]) for name in ("mean", "std"))
     stats = LeRobotDataset(f"experiments/{given.dataset.name}", root=given.dataset, video_backend="pyav").meta.stats
+    calibrated = ACTPolicy.from_pretrained(given.folder).model.backbone
     for key, images in pictures.items():
         own = [torch.as_tensor(stats[key][name]).float() for name in ("mean", "std")]
         as_imagenet = (images * own[1] + own[0] - mean) / deviation
-        print(f"{key}: ImageNet's normalisation {difference(backbone, as_imagenet):.2f}", end=", ")
-        print(f"the dataset's {difference(backbone, images):.2f}", end=", ", flush=True)
-        calibrated = ACTPolicy.from_pretrained(given.folder).model.backbone
-        print(f"and these norms {difference(calibrated, images):.2f}")
+        print(f"{key}: {difference(backbone, as_imagenet):.2f} with ImageNet's normalisation", end=", ")
+        print(f"{difference(backbone, images):.2f} with the dataset's", end=", ")
+        print(f"{difference(calibrated, images):.2f} with these norms")
 
 
 if __name__ == "__main__":
