@@ -5,7 +5,7 @@
 
 LeRobot's ACT sees with a ResNet whose batch norms are frozen: their statistics come with pretrained weights, which are
 downloaded. With random weights, statistics of 0 and 1 and pictures normalised as ImageNet's the encodings of different
-frames are nearly alike. Here the statistics are those of the dataset's own pictures under the random weights, as a batch norm
+frames are much alike. Here the statistics are those of the dataset's own pictures under the random weights, as a batch norm
 that learns has them at first. The command prints by how much the encodings of 200 frames differ, relative to their size.
 """
 
