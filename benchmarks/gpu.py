@@ -6,8 +6,8 @@
 Records demonstrations, trains with `playbyear-train --preset=gpu`, evaluates, and corrects for some rounds. Then it
 makes updates in this process: operations are counted by torch's FlopCounterMode and divided by the time of an update;
 beside it stands the largest product of matrices that the card reaches in the same number format. Parts of an update
-are timed one by one, with the card waited for in between, so that they add up to more than an update takes. Five
-updates run with `torch.cuda.set_sync_debug_mode("error")`: a line that waits for the card fails there.
+are timed one by one, with the card waited for in between, so that they add up to more than an update takes. In five
+updates `torch.cuda.set_sync_debug_mode("warn")` tells the lines that wait for the card.
 """
 
 import json
@@ -17,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,7 +26,9 @@ from common import Row, machine, parser_for, report
 from lerobot.configs import parser as lerobot_parser
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.import_utils import register_third_party_plugins
+from reference import Reference, random_windows
 from torch.utils.flop_counter import FlopCounterMode
+from training import update_of
 
 from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
@@ -44,6 +47,7 @@ _ENV = (
 )
 _UPDATES, _CHECKED = 10, 5
 _MATRIX = {"cuda": 8192, "cpu": 512}
+_PUBLISHED_WINDOWS = {"cuda": 64, "cpu": 1}  # of an update
 
 
 def program(name: str, *options: str) -> float:
@@ -92,8 +96,33 @@ def best_product(device: torch.device, dtype: torch.dtype) -> float:
     return 2 * n**3 / seconds_each(lambda: torch.matmul(a, b), device) / 1e12
 
 
-def updates(options: list[str]) -> list[Row]:
-    """What an update costs, how much of it the card computes, and which part takes how long."""
+def waiting_lines(update: Callable[[], None], device: torch.device) -> set[str]:
+    """Where the host waits for the card in some updates; each is printed. Empty on a machine without one."""
+    if device.type != "cuda":
+        return set()
+    torch.cuda.set_sync_debug_mode("warn")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(_CHECKED):
+            update()
+    torch.cuda.set_sync_debug_mode("default")
+    lines = {f"{w.filename}:{w.lineno}" for w in caught if "synchroniz" in str(w.message)}
+    print(*sorted(lines), sep="\n")
+    return lines
+
+
+def published(device: torch.device) -> float:
+    """The published scheme's windows per second, its augmentation not counted: one by one it would cost the most."""
+    model = Reference(augments=False).to(device).train()
+    images, sound, state, action = (part.to(device) for part in random_windows(_PUBLISHED_WINDOWS[device.type]))
+    update = update_of(model, lambda: (model(images, sound, state) - action).square().mean())
+    for _ in range(3):
+        update()
+    return len(images) / seconds_each(update, device)
+
+
+def updates(options: list[str], plain: bool = False) -> list[Row]:
+    """What an update costs, how much of it the card computes, and which part takes how long; plain: the first alone."""
     cfg, dataset, parts = parts_of(options)
     device = parts.accelerator.device
     windows = PolicyWindows(parts.policy.config, dataset.meta)
@@ -110,12 +139,9 @@ def updates(options: list[str]) -> list[Row]:
 
     for _ in range(3):  # also compiles
         update()
-    if device.type == "cuda":
-        torch.cuda.set_sync_debug_mode("error")
-        for _ in range(_CHECKED):
-            update()
-        torch.cuda.set_sync_debug_mode("default")
     took = seconds_each(update, device)
+    if plain:
+        return [Row("an update, not compiled", 1e3 * took, "ms")]
     ready = parts.preprocessor(batch())
 
     def forward() -> torch.Tensor:
@@ -134,8 +160,15 @@ def updates(options: list[str]) -> list[Row]:
         "optimizer": seconds_each(parts.optimizer.step, device),
     }
     n_windows = cfg.batch_size * windows.n_windows
+    waits = waiting_lines(update, device)
     return [
-        Row("training, windows of the preset", n_windows / took, "windows/s"),
+        Row(
+            "training, windows of the preset",
+            n_windows / took,
+            "windows/s",
+            beside="the published scheme without its augmentation, float32",
+            theirs=published(device),
+        ),
         Row(
             "operations of an update over its time",
             counter.get_total_flops() / took / 1e12,
@@ -144,6 +177,7 @@ def updates(options: list[str]) -> list[Row]:
             limit=best_product(device, dtype),
         ),
         Row("an update", 1e3 * took, "ms"),
+        Row("lines of an update that wait for the card", len(waits), "", wanted="none", holds=not waits),
         *(Row(f"... of it alone: {name}", 1e3 * seconds, "ms") for name, seconds in pieces.items()),
     ]
 
@@ -152,6 +186,7 @@ def main() -> None:
     parser = parser_for(__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--demos", type=int, default=50, help="episodes recorded")
+    parser.add_argument("--data", type=Path, help="demonstrations that are there, instead of recording them")
     parser.add_argument("--seed", type=int, default=1, help="of the training")
     parser.add_argument("--evaluations", type=int, default=100, help="episodes")
     parser.add_argument("--rounds", type=int, default=5, help="of corrections")
@@ -163,8 +198,9 @@ def main() -> None:
     started = machine()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        data = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={folder / 'data'}"]
-        program("playbyear-record", *_ENV, *data, f"--dataset.num_episodes={args.demos}", "--seed=0")
+        data = [f"--dataset.repo_id={REPO_ID}", f"--dataset.root={args.data or folder / 'data'}"]
+        if args.data is None:
+            program("playbyear-record", *_ENV, *data, f"--dataset.num_episodes={args.demos}", "--seed=0")
         device, own = f"--policy.device={args.device}", shlex.split(args.options)
         options = ["--preset=gpu", device, *data, *own]
         run = [f"--seed={args.seed}", "--env_eval_freq=0", f"--output_dir={folder / 'run'}"]
@@ -201,6 +237,7 @@ def main() -> None:
             ),
             Row(f"success on {args.evaluations} episodes", success, "%"),
             *updates(options),
+            *updates([*options, "--compile=false"], plain=True),
             Row("a round of HG-DAgger", sorted(spent)[len(spent) // 2], "s"),
         ]
     card = torch.cuda.get_device_name() if args.device == "cuda" else "none"

@@ -32,8 +32,9 @@ class Reference(nn.Module):
     image_mean: Tensor
     image_std: Tensor
 
-    def __init__(self, n_state: int = 7, n_actions: int = 4) -> None:
+    def __init__(self, n_state: int = 7, n_actions: int = 4, augments: bool = True) -> None:
         super().__init__()
+        self.augments = augments
         self.vision = resnet18()
         self.vision.conv1 = nn.Conv2d(3 * FRAME_STACK, 64, 7, stride=2, padding=3, bias=False)
         self.vision.fc = nn.Identity()
@@ -63,7 +64,7 @@ class Reference(nn.Module):
         n = len(images)
         stacks = torch.stack([images[:, t : t + FRAME_STACK] for t in range(MEMORY_STEPS)], dim=1)
         stacks = stacks.flatten(0, 1)  # (B * 10, 3, 3, H, W)
-        if self.training:
+        if self.training and self.augments:
             stacks = torch.stack([augment(stack) for stack in stacks])
         stacks = functional.interpolate(stacks.flatten(1, 2), (IMAGE_SIZE, IMAGE_SIZE), mode="bilinear")
         seen = self.vision((stacks - self.image_mean) / self.image_std)  # (B * 10, 512)

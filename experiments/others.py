@@ -17,7 +17,7 @@ import re
 import shutil
 import time
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -92,11 +92,13 @@ class OtherResult(Result):
         ms_per_step: Of `select_action` in a rollout, on average: most steps take an action from a chunk [ms].
         budget_minutes: That its updates were planned to take; `minutes` is what they took.
         settings: Of the policy.
+        twin_closings: How often the hand closed in each episode of the twin world (`others_twin`); empty: not tried.
     """
 
     ms_per_step: float = 0.0
     budget_minutes: float = 0.0
     settings: str = ""
+    twin_closings: list[int] = field(default_factory=list)
 
 
 def prepare(task: str) -> None:
