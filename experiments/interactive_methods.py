@@ -13,10 +13,11 @@ METHODS: dict[str, tuple[str, ...]] = {
     "early": ("--takeover_delay_s=-0.5",),
     "late": ("--takeover_delay_s=0.5",),
     "all_frames": ("--learn_from=all",),
+    "skip": ("--skip_s=1",),
     "person": ("--expert.person=true",),
     "person_robot_gated": ("--method.type=robot_gated", "--expert.person=true"),
 }
-WEIGHING = ("sirius", "iwr", "all_frames")
+WEIGHING = ("sirius", "iwr", "all_frames", "skip")
 """Those that say what is learned from; the others say who acts, and what is kept."""
 COURSES = {"own": {}, "paper": {"KeyBag-Easy-v1": 12}}
 """Attempts that are kept in other tasks before the task itself; the paper's order for the bag."""

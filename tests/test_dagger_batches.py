@@ -8,7 +8,7 @@ import torch
 from dataset_factory import make_dataset
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_playbyear.dagger.batches import BalancedBatches, intervention_run_weights
+from lerobot_playbyear.dagger.batches import BalancedBatches, frames_learned_from, intervention_run_weights
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.windows import PolicyWindows
@@ -63,6 +63,26 @@ def test_half_of_every_batchs_windows_end_on_an_intervention_frame(n_windows):
         assert len(from_attempts) == len(ends) / 2
         assert marks[from_attempts].all()
         assert len(ends) > 6 * n_windows  # most of the windows that are computed are learned from
+
+
+@pytest.mark.parametrize("n_windows", [1, 4, 8])
+@pytest.mark.parametrize("n_skipped", [0, 2, 5])
+def test_the_beginning_of_every_correction_can_be_left_out(n_windows, n_skipped):
+    interventions = store([35, 14, 10], ATTEMPTS, first=N_DEMONSTRATIONS)
+    batches = BalancedBatches(windows(n_windows), store([40]), interventions, 12, n_skipped=n_skipped)
+    wanted, length, episode = [], 0, np.repeat([0, 1, 2], [35, 14, 10])
+    for frame, mark in enumerate(ATTEMPTS):
+        goes_on = mark == "x" and frame > 0 and episode[frame] == episode[frame - 1]
+        length = (length if goes_on else 0) + (mark == "x")
+        if length > n_skipped:
+            wanted.append(frame)
+    seen = np.concatenate([supervised(batches.batch(number)).numpy() for number in range(150)])
+    assert sorted({int(frame) - N_DEMONSTRATIONS for frame in seen if frame >= N_DEMONSTRATIONS}) == wanted
+
+
+def test_where_nothing_would_remain_all_is_learned_from():
+    learned = frames_learned_from(store([9], "..xxx..xx"), 3)
+    assert "".join("x" if frame else "." for frame in learned) == "..xxx..xx"
 
 
 def test_both_halves_weigh_the_same_in_the_loss():

@@ -213,6 +213,9 @@ def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monk
         (("--method.type=weighted", "--learn_from=all"), "--method.type=weighted says by itself what is learned from"),
         (("--method.type=dagger", "--takeover_delay_s=1"), "--method.type=dagger the expert does not decide when"),
         (("--method.type=robot_gated", "--method.intervention_share=1.5"), "intervention_share=1.5: give a share"),
+        (("--skip_s=-1",), "--skip_s=-1.0: give 0 or more seconds"),
+        (("--skip_s=1", "--learn_from=all"), "--skip_s=1.0 is for corrections alone"),
+        (("--skip_s=1", "--method.type=weighted"), "leave out --learn_from=all and --method.type=weighted"),
         (("--new_weights=true",), "--new_weights=true: a policy that knows nothing cannot be corrected"),
         (
             ("--expert.type=scripted", "--expert.person=true", "--expert.tremor=-1"),

@@ -32,6 +32,7 @@ class BalancedBatches:
             while there are none.
         batch_size: Runs per batch, even: half of them from each store.
         seed: Of the random numbers.
+        n_skipped: Frames at the beginning of every correction that are not learned from.
 
     Raises:
         InputError: No frame of `interventions` is an intervention.
@@ -44,8 +45,10 @@ class BalancedBatches:
         interventions: EpisodeStore | None,
         batch_size: int,
         seed: int = 0,
+        n_skipped: int = 0,
     ) -> None:
         self._windows, self._seed, self._n_half = windows, seed, batch_size // 2
+        self._n_skipped = n_skipped
         self._demonstrations = demonstrations
         self._deltas = {INTERVENTION: windows.action_deltas}
         self._from_demonstrations = RunSampler(run_weights(demonstrations, windows.n_windows), seed)
@@ -59,7 +62,8 @@ class BalancedBatches:
         Raises:
             InputError: No frame is an intervention.
         """
-        weights = intervention_run_weights(interventions, self._windows.n_windows)
+        self._is_learned = frames_learned_from(interventions, self._n_skipped).cpu()
+        weights = intervention_run_weights(interventions, self._windows.n_windows, self._is_learned)
         if not weights.any():
             raise InputError(
                 f"None of the {len(interventions)} frames of the intervention dataset has '{INTERVENTION}' set: there is "
@@ -95,16 +99,17 @@ class BalancedBatches:
         return ({k: v[: self._n_half] for k, v in batch.items()}, {k: v[self._n_half :] for k, v in batch.items()})
 
     def _by_expert(self, store: EpisodeStore, last: Tensor) -> Tensor:
-        """Which of the K actions of each item the expert chose, inside its episode, (B/2, K) bool."""
-        flags = store.windows(last, self._deltas)
-        return flags[INTERVENTION].flatten(1) & ~flags[f"{INTERVENTION}_is_pad"]
+        """Which of the K actions of each item are learned from: the expert's, inside its episode, (B/2, K) bool."""
+        is_pad = store.windows(last, self._deltas)[f"{INTERVENTION}_is_pad"]
+        frames = last.cpu().unsqueeze(1) + torch.tensor(self._deltas[INTERVENTION])
+        return self._is_learned[frames.clamp(0, len(self._is_learned) - 1)].to(is_pad.device) & ~is_pad
 
     def _generator(self, number: int) -> torch.Generator:
         seed = np.random.SeedSequence([self._seed + 2, number]).generate_state(1, np.uint64)[0]
         return torch.Generator().manual_seed(int(seed))
 
 
-def intervention_run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
+def intervention_run_weights(store: EpisodeStore, n_windows: int = 1, is_learned: Tensor | None = None) -> Tensor:
     """How often to draw the run that ends at each frame, so that every intervention frame is learned from alike.
 
     Where the expert was in control for K frames or longer, runs lie inside; shorter stretches have one run that holds
@@ -113,11 +118,12 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
     Args:
         store: Attempts with the column `intervention`.
         n_windows: K, the windows per run.
+        is_learned: (N,) bool, the frames that are learned from; None: all interventions.
 
     Returns:
         (N,) float64, 0 for frames at which no run ends.
     """
-    by_expert = frames_by_expert(store).cpu().numpy()
+    by_expert = (frames_by_expert(store) if is_learned is None else is_learned).cpu().numpy()
     weights = np.zeros(len(store))
     for start, end in zip(store.starts, store.ends, strict=True):
         changes = np.flatnonzero(np.diff(np.concatenate([[False], by_expert[start:end], [False]])))
@@ -130,6 +136,18 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
             for end_of_run in (first + n_windows - 1, after - 1):  # the same one if the stretch is a single run
                 weights[end_of_run] += (n_windows - 1) / 2  # see `run_weights`
     return torch.from_numpy(weights)
+
+
+def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
+    """The frames that an expert chose, without the first ones of every correction, (N,) bool. All, if none were left."""
+    by_expert = frames_by_expert(store)
+    later = by_expert.cpu().numpy().copy()
+    for start, end in zip(store.starts, store.ends, strict=True):
+        changes = np.flatnonzero(np.diff(np.concatenate([[False], later[start:end]]).astype(int)) == 1) + start
+        for first in changes:
+            after = first + int(np.argmin(np.append(later[first:end], False)))  # where the expert hands back
+            later[first : min(first + n_skipped, after)] = False
+    return torch.from_numpy(later).to(by_expert.device) if later.any() else by_expert
 
 
 def frames_by_expert(store: EpisodeStore) -> Tensor:

@@ -66,6 +66,8 @@ class DaggerConfig:
         method: How attempts are made and what is learned of them, `--method.type=hg_dagger` or another registered one.
         takeover_delay_s: How much later than it would the expert takes over [s]. Below 0 it is earlier, the first time in an
             attempt, which is played twice for that: only in simulation and with a script.
+        skip_s: Of every correction, how long its beginning is not learned from [s]: while the policy remembers what it did
+            itself, it takes the expert's way back for the way on.
         learn_from: "expert": of attempts only what the expert chose; "all": all frames of those that are kept.
         new_weights: With `episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation stays.
         episodes: Attempts that the intervention dataset shall hold in the end. 0: none are collected and no environment is
@@ -102,6 +104,7 @@ class DaggerConfig:
     expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
     method: MethodConfig = field(default_factory=HgDaggerConfig)
     takeover_delay_s: float = 0.0
+    skip_s: float = 0.0
     learn_from: str = "expert"
     new_weights: bool = False
     episodes: int = 25
@@ -175,6 +178,13 @@ class DaggerConfig:
         if self.learn_from == "all" and self.method.chooses_frames:
             raise InputError(
                 f"--learn_from=all: --method.type={self.method.type} says by itself what is learned from; leave it out."
+            )
+        if not 0 <= self.skip_s < math.inf:
+            raise InputError(f"--skip_s={self.skip_s}: give 0 or more seconds.")
+        if self.skip_s and (self.learn_from == "all" or self.method.chooses_frames):
+            raise InputError(
+                f"--skip_s={self.skip_s} is for corrections alone: leave it out, or leave out --learn_from=all and "
+                f"--method.type={self.method.type}."
             )
         if not math.isfinite(self.takeover_delay_s):
             raise InputError(f"--takeover_delay_s={self.takeover_delay_s}: give a number of seconds.")

@@ -183,7 +183,8 @@ def _make_batches(
     cfg: DaggerConfig, method: Method, windows: PolicyWindows, demonstrations: EpisodeStore, corrections: Corrections
 ) -> BalancedBatches:
     if not method.weighs_frames:
-        return BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed)
+        n_skipped = round(cfg.skip_s * demonstrations.fps)
+        return BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed, n_skipped)
     learned = partial(method.learned, len(demonstrations))
     return WeightedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed, learned)
 

@@ -14,6 +14,7 @@ _SAME_RUN = (
     "expert",
     "method",
     "takeover_delay_s",
+    "skip_s",
     "learn_from",
     "new_weights",
     "seed",

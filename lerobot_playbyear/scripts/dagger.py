@@ -23,6 +23,7 @@ Method
                                weighted (IWR, Sirius), robot_gated (the robot asks: ThriftyDAgger)
   --method.intervention_share=...   with robot_gated: of the steps in which it asks
   --takeover_delay_s=0.0       the expert takes over later, or below 0 sooner
+  --skip_s=0.0                 of every correction so much of its beginning is not learned from
   --learn_from=expert          all: of kept attempts every frame is learned from
 
 Attempts
