@@ -185,7 +185,7 @@ def updates(options: list[str], plain: bool = False) -> list[Row]:
 def main() -> None:
     parser = parser_for(__doc__)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--demos", type=int, default=50, help="episodes recorded")
+    parser.add_argument("--demos", type=int, default=50, help="episodes recorded, without --data")
     parser.add_argument("--data", type=Path, help="demonstrations that are there, instead of recording them")
     parser.add_argument("--seed", type=int, default=1, help="of the training")
     parser.add_argument("--evaluations", type=int, default=100, help="episodes")

@@ -5,6 +5,7 @@ control rarely begins or ends where an item does, so actions are masked one by o
 actions of demonstrations are supervised as there are actions that the expert chose, and all weigh the same.
 """
 
+import logging
 from typing import Any
 
 import numpy as np
@@ -63,6 +64,8 @@ class BalancedBatches:
             InputError: No frame is an intervention.
         """
         self._is_learned = frames_learned_from(interventions, self._n_skipped).cpu()
+        if self._n_skipped and torch.equal(self._is_learned, frames_by_expert(interventions).cpu()):
+            logging.warning("No correction is longer than --skip_s so far: for now all of them is learned from.")
         weights = intervention_run_weights(interventions, self._windows.n_windows, self._is_learned)
         if not weights.any():
             raise InputError(

@@ -66,8 +66,9 @@ class DaggerConfig:
         method: How attempts are made and what is learned of them, `--method.type=hg_dagger` or another registered one.
         takeover_delay_s: How much later than it would the expert takes over [s]. Below 0 it is earlier, the first time in an
             attempt, which is played twice for that: only in simulation and with a script.
-        skip_s: Of every correction, how long its beginning is not learned from [s]: while the policy remembers what it did
-            itself, it takes the expert's way back for the way on.
+        skip_s: Of every correction, how long its beginning is not learned from [s]: while the policy's memory still holds its
+            own last movements, it mistakes the expert's retreat for the next step of the task. Shorter corrections are not
+            learned from at all, unless all are shorter.
         learn_from: "expert": of attempts only what the expert chose; "all": all frames of those that are kept.
         new_weights: With `episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation stays.
         episodes: Attempts that the intervention dataset shall hold in the end. 0: none are collected and no environment is

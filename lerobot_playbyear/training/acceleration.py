@@ -1,4 +1,4 @@
-"""What is meant to make updates on a GPU faster and changes nothing that is learned; its speed was not measured yet."""
+"""What is meant to make updates on a GPU faster and changes nothing that is learned (docs/scale.md)."""
 
 from collections.abc import Mapping
 from typing import Any
