@@ -57,7 +57,7 @@ def main() -> None:
         closed, in_twin = (sum(n > 0 for n in counts) for counts in (result.n_closings, result.twin_closings))
         n = len(result.successes)
         print(
-            f"{path.stem}: closes its hand in {closed} of {n} episodes, and in {in_twin} of them without a touch",
+            f"{path.stem}: closes its hand in {closed} of {n} episodes with a touch, in {in_twin} without",
             flush=True,
         )
 

@@ -130,6 +130,11 @@ def test_other_frames_are_learned_from(tmp_path, options):
     assert all(line["loss_interventions"] > 0 < line["loss_demonstrations"] for line in rounds)
 
 
+def test_a_run_skips_the_beginning_of_corrections(tmp_path, capfd):
+    dagger(tmp_path, *RUN, "--skip_s=60")
+    assert "No correction is longer than --skip_s so far" in capfd.readouterr().err
+
+
 def test_figures_of_the_field_stand_in_every_line(tmp_path, capfd):
     dagger(tmp_path, *RUN, "--eval_every=1", "--eval.n_episodes=1", "--eval.batch_size=1")
     kept = next(line for line in metrics(tmp_path, "attempt") if line["outcome"] == "kept")

@@ -51,7 +51,6 @@ class BalancedBatches:
         self._windows, self._seed, self._n_half = windows, seed, batch_size // 2
         self._n_skipped = n_skipped
         self._demonstrations = demonstrations
-        self._deltas = {INTERVENTION: windows.action_deltas}
         self._from_demonstrations = RunSampler(run_weights(demonstrations, windows.n_windows), seed)
         self._interventions: EpisodeStore | None = None
         if interventions is not None:
@@ -88,8 +87,10 @@ class BalancedBatches:
             self._demonstrations, draw(self._from_demonstrations, number, self._n_half)
         )
         if len(self._windows.action_deltas) > 1:
-            by_expert = self._by_expert(self._interventions, last)  # (B/2, K)
-            is_learned = ~demonstrations[_IS_PAD]
+            is_learned = ~demonstrations[_IS_PAD]  # (B/2, K)
+            by_expert = (
+                of_actions(self._is_learned, last, self._windows).to(is_learned.device) & ~interventions[_IS_PAD]
+            )
             n, generator = int(min(is_learned.sum(), by_expert.sum())), self._generator(number)
             demonstrations[_IS_PAD] = ~keep(is_learned, n, generator)
             interventions[_IS_PAD] = ~keep(by_expert, n, generator)
@@ -100,12 +101,6 @@ class BalancedBatches:
         """A batch of demonstrations and one of interventions, to tell their losses apart."""
         batch = self.batch(number)
         return ({k: v[: self._n_half] for k, v in batch.items()}, {k: v[self._n_half :] for k, v in batch.items()})
-
-    def _by_expert(self, store: EpisodeStore, last: Tensor) -> Tensor:
-        """Which of the K actions of each item are learned from: the expert's, inside its episode, (B/2, K) bool."""
-        is_pad = store.windows(last, self._deltas)[f"{INTERVENTION}_is_pad"]
-        frames = last.cpu().unsqueeze(1) + torch.tensor(self._deltas[INTERVENTION])
-        return self._is_learned[frames.clamp(0, len(self._is_learned) - 1)].to(is_pad.device) & ~is_pad
 
     def _generator(self, number: int) -> torch.Generator:
         seed = np.random.SeedSequence([self._seed + 2, number]).generate_state(1, np.uint64)[0]
@@ -129,8 +124,7 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1, is_learned
     by_expert = (frames_by_expert(store) if is_learned is None else is_learned).cpu().numpy()
     weights = np.zeros(len(store))
     for start, end in zip(store.starts, store.ends, strict=True):
-        changes = np.flatnonzero(np.diff(np.concatenate([[False], by_expert[start:end], [False]])))
-        for first, after in (changes + start).reshape(-1, 2):
+        for first, after in _stretches(by_expert[start:end]) + start:
             length = after - first
             if length < n_windows:
                 weights[min(max(after, start + n_windows), end) - 1] += n_windows
@@ -146,16 +140,25 @@ def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
     by_expert = frames_by_expert(store)
     later = by_expert.cpu().numpy().copy()
     for start, end in zip(store.starts, store.ends, strict=True):
-        changes = np.flatnonzero(np.diff(np.concatenate([[False], later[start:end]]).astype(int)) == 1) + start
-        for first in changes:
-            after = first + int(np.argmin(np.append(later[first:end], False)))  # where the expert hands back
+        for first, after in _stretches(later[start:end]) + start:
             later[first : min(first + n_skipped, after)] = False
     return torch.from_numpy(later).to(by_expert.device) if later.any() else by_expert
+
+
+def _stretches(flags: np.ndarray) -> np.ndarray:
+    """Where flags (T,) are true without a gap, (n, 2): the first frame of each stretch, and the one after its last."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 
 
 def frames_by_expert(store: EpisodeStore) -> Tensor:
     """Which frames of attempts have an action that the expert chose, (N,) bool."""
     return store.column(INTERVENTION).reshape(len(store), -1)[:, 0].bool()
+
+
+def of_actions(values: Tensor, last: Tensor, windows: PolicyWindows) -> Tensor:
+    """What is said of frames, (N,), for the K actions of the items at the frames `last`, (B, K)."""
+    frames = last.unsqueeze(1) + torch.tensor(windows.action_deltas)
+    return values[frames.clamp(0, len(values) - 1)]
 
 
 def draw(sampler: RunSampler, number: int, n: int) -> Tensor:

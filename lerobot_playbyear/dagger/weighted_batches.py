@@ -12,7 +12,7 @@ import torch
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_playbyear.dagger.batches import BalancedBatches, concatenated, draw, keep
+from lerobot_playbyear.dagger.batches import BalancedBatches, concatenated, draw, keep, of_actions
 from lerobot_playbyear.dagger.methods.base import Learned
 from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
 from lerobot_playbyear.datasets.errors import InputError
@@ -69,9 +69,7 @@ class WeightedBatches(BalancedBatches):
         )
         if len(self._windows.action_deltas) > 1:
             generator = self._generator(number)
-            frames = last.unsqueeze(1) + torch.tensor(self._windows.action_deltas)  # (B, K)
-            chance = self._remains[frames.clamp(0, len(self._remains) - 1)]
-            chance = chance * (~attempts[_IS_PAD]).cpu()
+            chance = of_actions(self._remains, last, self._windows) * (~attempts[_IS_PAD]).cpu()  # (B, K)
             remains = torch.rand(chance.shape, generator=generator, dtype=torch.float64) < chance
             remains |= (chance == chance.max()) & ~remains.any()  # something is learned in every batch
             is_learned = ~demonstrations[_IS_PAD]
