@@ -272,7 +272,7 @@ def main() -> None:
     parser = command_line(__doc__, "task", "seeds", "threads")
     parser.set_defaults(task=NEW_TASKS[0], seeds=[1])
     parser.add_argument("--n_demonstrations", type=int, default=N_DEMONSTRATIONS)
-    parser.add_argument("--method", choices=METHODS, default="hg_dagger")
+    parser.add_argument("--method", choices=METHODS, default="skip")
     parser.add_argument("--learn", choices=("new_weights", "online"), default="new_weights")
     parser.add_argument("--course", choices=COURSES, default="own", help="what is attempted first")
     parser.add_argument("--kept", type=int, default=100, help="attempts that are kept in all")

@@ -4,7 +4,8 @@ from argparse import Namespace
 from collections.abc import Sequence
 
 METHODS: dict[str, tuple[str, ...]] = {
-    "hg_dagger": (),
+    "skip": (),
+    "hg_dagger": ("--skip_s=0",),
     "dagger": ("--method.type=dagger",),
     "no_handback": ("--method.type=no_handback",),
     "sirius": ("--method.type=weighted",),
@@ -13,11 +14,11 @@ METHODS: dict[str, tuple[str, ...]] = {
     "early": ("--takeover_delay_s=-0.5",),
     "late": ("--takeover_delay_s=0.5",),
     "all_frames": ("--learn_from=all",),
-    "skip": ("--skip_s=1",),
     "person": ("--expert.person=true",),
     "person_robot_gated": ("--method.type=robot_gated", "--expert.person=true"),
 }
-WEIGHING = ("sirius", "iwr", "all_frames", "skip")
+"""`skip` is `playbyear-dagger` as it is by default, `hg_dagger` learns from whole corrections, as it was published."""
+WEIGHING = ("hg_dagger", "sirius", "iwr", "all_frames")
 """Those that say what is learned from; the others say who acts, and what is kept."""
 COURSES = {"own": {}, "paper": {"KeyBag-Easy-v1": 12}}
 """Attempts that are kept in other tasks before the task itself; the paper's order for the bag."""

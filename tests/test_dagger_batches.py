@@ -7,8 +7,10 @@ import pytest
 import torch
 from dataset_factory import make_dataset
 from lerobot.datasets import LeRobotDataset
+from lerobot.policies.act.configuration_act import ACTConfig
 
 from lerobot_playbyear.dagger.batches import BalancedBatches, frames_learned_from, intervention_run_weights
+from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.windows import PolicyWindows
@@ -72,12 +74,29 @@ def test_the_beginning_of_every_correction_can_be_left_out(n_windows, n_skipped)
     batches = BalancedBatches(windows(n_windows), store([40]), interventions, 12, n_skipped=n_skipped)
     wanted, length, episode = [], 0, np.repeat([0, 1, 2], [35, 14, 10])
     for frame, mark in enumerate(ATTEMPTS):
-        goes_on = mark == "x" and frame > 0 and episode[frame] == episode[frame - 1]
-        length = (length if goes_on else 0) + (mark == "x")
+        begins_episode = frame == 0 or episode[frame] != episode[frame - 1]
+        if mark == "x" and begins_episode:
+            length = n_skipped  # nothing came before it: all of it counts
+        length = length + 1 if mark == "x" else 0
         if length > n_skipped:
             wanted.append(frame)
     seen = np.concatenate([supervised(batches.batch(number)).numpy() for number in range(150)])
     assert sorted({int(frame) - N_DEMONSTRATIONS for frame in seen if frame >= N_DEMONSTRATIONS}) == wanted
+
+
+def test_by_default_corrections_are_learned_from_once_the_memory_holds_nothing_else():
+    cfg = DaggerConfig(
+        DatasetSource("demos"),
+        DatasetSource("corrections"),
+        policy=PlaybyearConfig(n_memory_steps=3, device="cpu", push_to_hub=False),
+    )
+    assert cfg.n_skipped(20) == 3  # n_memory_steps
+    cfg.policy.use_memory = False
+    assert cfg.n_skipped(20) == 0
+    cfg.policy = ACTConfig(device="cpu", push_to_hub=False)
+    assert cfg.n_skipped(20) == 0
+    cfg.skip_s = 0.42
+    assert cfg.n_skipped(20) == 9
 
 
 def test_where_nothing_would_remain_all_is_learned_from():

@@ -131,7 +131,9 @@ def test_other_frames_are_learned_from(tmp_path, options):
 
 
 def test_a_run_skips_the_beginning_of_corrections(tmp_path, capfd):
-    dagger(tmp_path, *RUN, "--skip_s=60")
+    dagger(tmp_path / "default", *RUN)  # corrections of 3 frames, a memory of 2
+    assert "No correction is longer" not in capfd.readouterr().err
+    dagger(tmp_path / "long", *RUN, "--skip_s=60")
     assert "No correction is longer than --skip_s so far" in capfd.readouterr().err
 
 
@@ -219,8 +221,7 @@ def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monk
         (("--method.type=dagger", "--takeover_delay_s=1"), "--method.type=dagger the expert does not decide when"),
         (("--method.type=robot_gated", "--method.intervention_share=1.5"), "intervention_share=1.5: give a share"),
         (("--skip_s=-1",), "--skip_s=-1.0: give 0 or more seconds"),
-        (("--skip_s=1", "--learn_from=all"), "--skip_s=1.0 is for corrections alone"),
-        (("--skip_s=1", "--method.type=weighted"), "leave out --learn_from=all and --method.type=weighted"),
+        (("--skip_s=1", "--learn_from=all"), "--skip_s=1.0 and --learn_from=all"),
         (("--new_weights=true",), "--new_weights=true: a policy that knows nothing cannot be corrected"),
         (
             ("--expert.type=scripted", "--expert.person=true", "--expert.tremor=-1"),

@@ -10,6 +10,7 @@ import torch
 from test_dagger_batches import N_DEMONSTRATIONS, store, supervised, windows
 
 from lerobot_playbyear.dagger import curves
+from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
 from lerobot_playbyear.dagger.figures import Totals, attempt_figures, round_figures, steps_until
 from lerobot_playbyear.dagger.methods.base import Learned, Method
 from lerobot_playbyear.dagger.methods.weighted import Weighted, WeightedConfig, kinds_of_frames, shares
@@ -55,7 +56,7 @@ def test_all_frames_of_attempts_are_learned_from_alike():
 
 
 def test_a_kind_of_frames_has_its_share_however_many_there_are():
-    method = Weighted(SimpleNamespace(learn_from="expert"), WeightedConfig(before_s=0.5))
+    method = Weighted(SimpleNamespace(learn_from="expert", n_skipped=lambda fps: 0), WeightedConfig(before_s=0.5))
     seen, demonstrated = learned_shares(lambda attempts: method.learned(100, attempts), 4)
     kinds = kinds_of_frames(store([40, 32], ATTEMPTS), 10)
     assert demonstrated == pytest.approx(0.5, abs=0.01)
@@ -68,6 +69,20 @@ def test_a_kind_of_frames_has_its_share_however_many_there_are():
 def test_what_came_before_an_intervention_ends_at_the_attempts_start_and_at_the_expert():
     kinds = kinds_of_frames(store([8, 10], "..xx..x." + "x..xx....."), 3)
     assert "".join("xb."[kind] for kind in kinds) == "bbxxbbx." + "xbbxx....."
+
+
+def test_the_beginning_of_an_intervention_is_a_kind_that_is_not_learned_from():
+    kinds = kinds_of_frames(store([8, 10], "xxx.xxxx" + "x..xx....."), 3, n_skipped=2)
+    assert "".join("xb.-"[kind] for kind in kinds) == "xxxb--xx" + "xbb--....."
+    cfg = DaggerConfig(
+        DatasetSource("demos"), DatasetSource("corrections"), method=WeightedConfig(before_s=0.5), skip_s=0.2
+    )
+    learned = Weighted(cfg, cfg.method).learned(100, store([40, 32], ATTEMPTS))
+    assert "".join("x" if weight else "." for weight in learned.weights) == ("." * 26 + "x" * 6 + "." * 8) + (
+        "xx" + "." * 30
+    )
+    cfg.skip_s = None
+    assert cfg.n_skipped(20) == 0
 
 
 def test_the_papers_shares():

@@ -33,7 +33,7 @@ class BalancedBatches:
             while there are none.
         batch_size: Runs per batch, even: half of them from each store.
         seed: Of the random numbers.
-        n_skipped: Frames at the beginning of every correction that are not learned from.
+        n_skipped: Frames at the beginning of every correction that are not learned from, see `frames_learned_from`.
 
     Raises:
         InputError: No frame of `interventions` is an intervention.
@@ -136,12 +136,16 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1, is_learned
 
 
 def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
-    """The frames that an expert chose, without the first ones of every correction, (N,) bool. All, if none were left."""
+    """The frames that an expert chose, without the first ones of every correction, (N,) bool. All, if none were left.
+
+    Where an episode begins with the expert, the policy has done nothing that it could remember: none is left out.
+    """
     by_expert = frames_by_expert(store)
     later = by_expert.cpu().numpy().copy()
     for start, end in zip(store.starts, store.ends, strict=True):
         for first, after in _stretches(later[start:end]) + start:
-            later[first : min(first + n_skipped, after)] = False
+            if first > start:
+                later[first : min(first + n_skipped, after)] = False
     return torch.from_numpy(later).to(by_expert.device) if later.any() else by_expert
 
 

@@ -68,7 +68,8 @@ class DaggerConfig:
             attempt, which is played twice for that: only in simulation and with a script.
         skip_s: Of every correction, how long its beginning is not learned from [s]: while the policy's memory still holds its
             own last movements, it mistakes the expert's retreat for the next step of the task. Shorter corrections are not
-            learned from at all, unless all are shorter.
+            learned from at all, unless all are shorter; one that an episode begins with is learned from whole. None: as long
+            as the policy remembers, or 0 with methods that choose frames by themselves.
         learn_from: "expert": of attempts only what the expert chose; "all": all frames of those that are kept.
         new_weights: With `episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation stays.
         episodes: Attempts that the intervention dataset shall hold in the end. 0: none are collected and no environment is
@@ -105,7 +106,7 @@ class DaggerConfig:
     expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
     method: MethodConfig = field(default_factory=HgDaggerConfig)
     takeover_delay_s: float = 0.0
-    skip_s: float = 0.0
+    skip_s: float | None = None
     learn_from: str = "expert"
     new_weights: bool = False
     episodes: int = 25
@@ -180,12 +181,11 @@ class DaggerConfig:
             raise InputError(
                 f"--learn_from=all: --method.type={self.method.type} says by itself what is learned from; leave it out."
             )
-        if not 0 <= self.skip_s < math.inf:
+        if not 0 <= (self.skip_s or 0) < math.inf:
             raise InputError(f"--skip_s={self.skip_s}: give 0 or more seconds.")
-        if self.skip_s and (self.learn_from == "all" or self.method.chooses_frames):
+        if self.skip_s and self.learn_from == "all":
             raise InputError(
-                f"--skip_s={self.skip_s} is for corrections alone: leave it out, or leave out --learn_from=all and "
-                f"--method.type={self.method.type}."
+                f"--skip_s={self.skip_s} and --learn_from=all contradict each other: leave out one of them."
             )
         if not math.isfinite(self.takeover_delay_s):
             raise InputError(f"--takeover_delay_s={self.takeover_delay_s}: give a number of seconds.")
@@ -199,6 +199,15 @@ class DaggerConfig:
                 "--new_weights=true: a policy that knows nothing cannot be corrected. Collect attempts first, and then learn "
                 "from all of them with --episodes=0 --updates=N --new_weights=true and another --output_dir."
             )
+
+    def n_skipped(self, fps: float) -> int:
+        """Frames at the beginning of every correction that are not learned from."""
+        if self.skip_s is None and self.method.chooses_frames:
+            return 0
+        if self.skip_s is None:
+            n_remembered = int(getattr(self.policy, "memory_steps", 1))
+            return n_remembered if n_remembered > 1 else 0
+        return math.ceil(self.skip_s * fps)
 
     def rate(self, step: int, number: int, n_updates: int) -> float:
         """The learning rate of an update.

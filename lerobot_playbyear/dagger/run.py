@@ -1,7 +1,6 @@
 """A run of HG-DAgger from its options: what it needs is made and checked, then `Loop` runs."""
 
 import logging
-import math
 import shlex
 from contextlib import ExitStack
 from functools import partial
@@ -184,7 +183,7 @@ def _make_batches(
     cfg: DaggerConfig, method: Method, windows: PolicyWindows, demonstrations: EpisodeStore, corrections: Corrections
 ) -> BalancedBatches:
     if not method.weighs_frames:
-        n_skipped = math.ceil(cfg.skip_s * demonstrations.fps)
+        n_skipped = cfg.n_skipped(demonstrations.fps)
         return BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed, n_skipped)
     learned = partial(method.learned, len(demonstrations))
     return WeightedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed, learned)

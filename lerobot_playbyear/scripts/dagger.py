@@ -23,7 +23,8 @@ Method
                                weighted (IWR, Sirius), robot_gated (the robot asks: ThriftyDAgger)
   --method.intervention_share=...   with robot_gated: of the steps in which it asks
   --takeover_delay_s=0.0       the expert takes over later, or below 0 sooner
-  --skip_s=0.0                 of every correction so much of its beginning is not learned from
+  --skip_s=null                of every correction so much of its beginning is not learned from;
+                               else as long as the policy remembers. 0: all of it is
   --learn_from=expert          all: of kept attempts every frame is learned from
 
 Attempts

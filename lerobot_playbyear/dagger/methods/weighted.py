@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
-from lerobot_playbyear.dagger.batches import frames_by_expert
+from lerobot_playbyear.dagger.batches import frames_by_expert, frames_learned_from
 from lerobot_playbyear.dagger.methods.base import Learned, Method, MethodConfig
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
@@ -70,7 +70,8 @@ class Weighted(Method):
         return True
 
     def learned(self, n_demonstrated: int, attempts: EpisodeStore) -> Learned:
-        kinds = kinds_of_frames(attempts, round(self._config.before_s * attempts.fps))  # (N,)
+        n_skipped = self.cfg.n_skipped(attempts.fps)
+        kinds = kinds_of_frames(attempts, round(self._config.before_s * attempts.fps), n_skipped)  # (N,)
         counts = {name: float((kinds == number).sum()) for number, name in enumerate(_SHARES[:3])}
         counts["demonstrations"] = float(n_demonstrated)
         wanted = shares(counts, self._config)
@@ -102,12 +103,13 @@ def shares(counts: dict[str, float], config: WeightedConfig) -> dict[str, float]
     return {name: value / sum(wanted.values()) for name, value in wanted.items()}
 
 
-def kinds_of_frames(store: EpisodeStore, n_before: int) -> np.ndarray:
-    """What each frame of attempts is, (N,): 0 an intervention, 1 just before one, 2 the policy's own.
+def kinds_of_frames(store: EpisodeStore, n_before: int, n_skipped: int = 0) -> np.ndarray:
+    """What each frame of attempts is, (N,): 0 an intervention, 1 just before one, 2 the policy's own, 3 the beginning of one.
 
     Args:
         store: The attempts.
         n_before: Frames of the policy before an intervention that count as just before it.
+        n_skipped: Frames of an intervention that count as its beginning, see `frames_learned_from`.
     """
     by_expert = frames_by_expert(store).cpu().numpy()
     kinds = np.where(by_expert, 0, 2)
@@ -116,4 +118,5 @@ def kinds_of_frames(store: EpisodeStore, n_before: int) -> np.ndarray:
         for first in begins:
             before = slice(max(first - n_before, start), first)
             kinds[before] = np.where(by_expert[before], 0, 1)
-    return kinds
+    is_learned = frames_learned_from(store, n_skipped).cpu().numpy()
+    return np.where(by_expert & ~is_learned, 3, kinds)
