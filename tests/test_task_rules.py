@@ -113,7 +113,7 @@ def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
         while expert.phase != "hop":
             env.advance(expert.act())
         wait(env, CLOSE, 15)  # above the cube: nothing is between the fingers
-        corrector = env.definition.correcting_expert(env)
+        corrector = env.intervention_gate().expert
         corrector.begin_at("retreat")
         done = False
         while not done:

@@ -6,7 +6,7 @@ every episode, so that neither the time since contact nor the time since the sta
 is when the sound comes.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -59,10 +59,10 @@ EXACT_EXPERT = ExpertConfig(
     hop_step=(0.015, 0.022),
     hop_error=(-0.012, 0.012),
 )
-"""That of both cube tasks, version 1. The hand comes down where it is above the cube and not on the way there, and it shows
-that only the touch tells where that is: how far it draws back before it rises differs from search to search, and a hop first
-misses the cube by up to 12 mm, either way, and is mended. Four of five hops end within 18 steps of the touch, while a policy of
-twenty frames remembers where it was."""
+"""That of both cube tasks, version 1, where it demonstrates and where it corrects. The hand comes down where it is above the
+cube and not on the way there, and it shows that only the touch tells where that is: how far it draws back before it rises
+differs from search to search, and a hop first misses the cube by up to 12 mm, either way, and is mended. Four of five hops end
+within 18 steps of the touch, while a policy of twenty frames remembers where it was."""
 
 CORRECTING_EXPERT = ExpertConfig(
     sweep_step=(0.008, 0.011),
@@ -72,13 +72,7 @@ CORRECTING_EXPERT = ExpertConfig(
     rise_step=(0.013, 0.018),
     hover=(0, 1),
 )
-"""An expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
-
-PATIENT_EXPERT = replace(CORRECTING_EXPERT, sweep_step=None)
-"""Where there is time, it corrects without haste: it sweeps as one that demonstrates."""
-
-PATIENT_EXACT_EXPERT = replace(PATIENT_EXPERT, hop_tolerance=EXACT_EXPERT.hop_tolerance, back_off=EXACT_EXPERT.back_off)
-"""Besides, it comes down where it is above the cube, as `EXACT_EXPERT` does."""
+"""In version 0 an expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
 
 
 class GraspExpert:

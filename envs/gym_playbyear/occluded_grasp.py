@@ -9,7 +9,7 @@ from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp, SteadyBlindGrasp
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
-from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, PATIENT_EXACT_EXPERT, GraspExpert, SteadyGraspExpert
+from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, GraspExpert, SteadyGraspExpert
 from gym_playbyear.looks_props import panel_on_posts, wall_on_the_table
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
@@ -100,7 +100,6 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
         (rails(-0.38, 0.38),),
         expert=partial(SteadyGraspExpert, config=EXACT_EXPERT),
         sound=SyntheticEars,
-        correcting_expert=partial(SteadyGraspExpert, config=PATIENT_EXACT_EXPERT),
         blind={name: partial(SteadyBlindGrasp, strategy=name) for name in BLIND_STRATEGIES},
     )
 

@@ -9,7 +9,7 @@ from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
-from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, PATIENT_EXACT_EXPERT, PickPlaceExpert
+from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, PickPlaceExpert
 from gym_playbyear.looks_props import wall_on_the_table
 from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
@@ -101,7 +101,6 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
         cube_material,
         (rails(0.0, 0.38),),
         expert=partial(PickPlaceExpert, config=EXACT_EXPERT),
-        correcting_expert=partial(PickPlaceExpert, config=PATIENT_EXACT_EXPERT),
         sound=SyntheticEars,
     )
 
