@@ -105,6 +105,7 @@ def correct(job: Job) -> Corrected:
         f"--batch_size={BATCH_SIZE}",
         f"--seed={job.training_seed}",
         "--eval_every=0",
+        "--skip_s=0",
         f"--save_every={EVERY}",
         f"--output_dir={folder}",
         "--resume=true",

@@ -10,7 +10,7 @@ from test_dagger_resume import PowerCut, assert_ended_alike, cut_power
 
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.dagger.attempt import Scene
-from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource
+from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource, with_saved_options
 from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Staying
 from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
 from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
@@ -131,10 +131,16 @@ def test_other_frames_are_learned_from(tmp_path, options):
 
 
 def test_a_run_skips_the_beginning_of_corrections(tmp_path, capfd):
-    dagger(tmp_path / "default", *RUN)  # corrections of 3 frames, a memory of 2
-    assert "No correction is longer" not in capfd.readouterr().err
+    losses = {}
+    for options in ((), ("--skip_s=0.1",), ("--skip_s=0",)):  # corrections of 3 frames, a memory of 2
+        folder = tmp_path / str(len(losses))
+        dagger(folder, *RUN, *options)
+        losses[options] = [line["loss_interventions"] for line in metrics(folder, "round")]
+        assert "No correction is longer" not in capfd.readouterr().err
+    by_default, memory, nothing = losses.values()
+    assert by_default == memory != nothing
     dagger(tmp_path / "long", *RUN, "--skip_s=60")
-    assert "No correction is longer than --skip_s so far" in capfd.readouterr().err
+    assert "No correction is longer than the 1200 frames" in capfd.readouterr().err
 
 
 def test_figures_of_the_field_stand_in_every_line(tmp_path, capfd):
@@ -222,6 +228,7 @@ def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monk
         (("--method.type=robot_gated", "--method.intervention_share=1.5"), "intervention_share=1.5: give a share"),
         (("--skip_s=-1",), "--skip_s=-1.0: give 0 or more seconds"),
         (("--skip_s=1", "--learn_from=all"), "--skip_s=1.0 and --learn_from=all"),
+        (("--skip_s=1", "--method.type=dagger"), "--skip_s=1.0: with --method.type=dagger the expert labels"),
         (("--new_weights=true",), "--new_weights=true: a policy that knows nothing cannot be corrected"),
         (
             ("--expert.type=scripted", "--expert.person=true", "--expert.tremor=-1"),
@@ -252,12 +259,14 @@ def test_a_run_goes_on_with_its_own_method_alone(tmp_path):
 def test_a_run_of_a_version_without_methods_was_hg_dagger(tmp_path):
     source = DatasetSource("a/b")
     saved = DaggerConfig(source, source).options()
-    for name in ("method", "takeover_delay_s", "learn_from", "new_weights"):
+    for name in ("method", "takeover_delay_s", "learn_from", "new_weights", "skip_s"):
         del saved[name]
     saved["expert"] = {"type": "scripted"}
     (tmp_path / CONFIG_NAME).write_text(json.dumps(saved))
-    assert differences(tmp_path, DaggerConfig(source, source)) == []
-    (changed,) = differences(tmp_path, DaggerConfig(source, source, method=WeightedConfig()))
+    assert with_saved_options(["--resume=true", f"--output_dir={tmp_path}"])[1] == "--skip_s=0"
+    assert differences(tmp_path, DaggerConfig(source, source, skip_s=0.0)) == []
+    assert differences(tmp_path, DaggerConfig(source, source)) == ["--skip_s was 0.0 and is None"]
+    (changed,) = differences(tmp_path, DaggerConfig(source, source, skip_s=0.0, method=WeightedConfig()))
     assert changed.startswith("--method was {'type': 'hg_dagger'} and is {'type': 'weighted', 'paper': 'sirius'")
 
 

@@ -16,6 +16,7 @@ from lerobot_playbyear.dagger.methods.base import Learned, Method
 from lerobot_playbyear.dagger.methods.weighted import Weighted, WeightedConfig, kinds_of_frames, shares
 from lerobot_playbyear.dagger.weighted_batches import WeightedBatches
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 ATTEMPTS = "......................xxxxxxxxxx........" + "xx......xxxx...................."
 COUNTS = {"intervention": 100.0, "before": 30.0, "policy": 370.0, "demonstrations": 500.0}
@@ -77,6 +78,7 @@ def test_the_beginning_of_an_intervention_is_a_kind_that_is_not_learned_from():
     cfg = DaggerConfig(
         DatasetSource("demos"), DatasetSource("corrections"), method=WeightedConfig(before_s=0.5), skip_s=0.2
     )
+    cfg.policy = PlaybyearConfig(n_memory_steps=3, device="cpu", push_to_hub=False)
     learned = Weighted(cfg, cfg.method).learned(100, store([40, 32], ATTEMPTS))
     assert "".join("x" if weight else "." for weight in learned.weights) == ("." * 26 + "x" * 6 + "." * 8) + (
         "xx" + "." * 30

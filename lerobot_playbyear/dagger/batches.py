@@ -63,8 +63,6 @@ class BalancedBatches:
             InputError: No frame is an intervention.
         """
         self._is_learned = frames_learned_from(interventions, self._n_skipped).cpu()
-        if self._n_skipped and torch.equal(self._is_learned, frames_by_expert(interventions).cpu()):
-            logging.warning("No correction is longer than --skip_s so far: for now all of them is learned from.")
         weights = intervention_run_weights(interventions, self._windows.n_windows, self._is_learned)
         if not weights.any():
             raise InputError(
@@ -146,7 +144,14 @@ def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
         for first, after in _stretches(later[start:end]) + start:
             if first > start:
                 later[first : min(first + n_skipped, after)] = False
-    return torch.from_numpy(later).to(by_expert.device) if later.any() else by_expert
+    if later.any():
+        return torch.from_numpy(later).to(by_expert.device)
+    if by_expert.any():
+        logging.warning(
+            f"No correction is longer than the {n_skipped} frames that are left out at the beginning of each (--skip_s) so "
+            "far: for now all of them is learned from."
+        )
+    return by_expert
 
 
 def _stretches(flags: np.ndarray) -> np.ndarray:

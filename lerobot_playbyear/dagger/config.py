@@ -1,5 +1,6 @@
 """What `playbyear-dagger` can be told."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -183,6 +184,11 @@ class DaggerConfig:
             )
         if not 0 <= (self.skip_s or 0) < math.inf:
             raise InputError(f"--skip_s={self.skip_s}: give 0 or more seconds.")
+        if self.skip_s and self.method.type == "dagger":
+            raise InputError(
+                f"--skip_s={self.skip_s}: with --method.type=dagger the expert labels every frame, and no correction has a "
+                "beginning; leave it out."
+            )
         if self.skip_s and self.learn_from == "all":
             raise InputError(
                 f"--skip_s={self.skip_s} and --learn_from=all contradict each other: leave out one of them."
@@ -207,7 +213,7 @@ class DaggerConfig:
         if self.skip_s is None:
             n_remembered = int(getattr(self.policy, "memory_steps", 1))
             return n_remembered if n_remembered > 1 else 0
-        return math.ceil(self.skip_s * fps)
+        return math.ceil(round(self.skip_s * fps, 6))
 
     def rate(self, step: int, number: int, n_updates: int) -> float:
         """The learning rate of an update.
@@ -269,5 +275,7 @@ def with_saved_options(args: Sequence[str]) -> list[str]:
     is_resumed = (parser.parse_arg("resume", args) or "").lower() in ("true", "1", "yes")
     folder = Path(parser.parse_arg("output_dir", args) or DaggerConfig.output_dir)
     if is_resumed and parser.parse_arg("config_path", args) is None and (folder / CONFIG_NAME).is_file():
-        return [f"--config_path={folder / CONFIG_NAME}", *args]
+        older = [] if "skip_s" in json.loads((folder / CONFIG_NAME).read_text()) else ["--skip_s=0"]
+        given = [] if parser.parse_arg("skip_s", args) else older  # an older version skipped nothing
+        return [f"--config_path={folder / CONFIG_NAME}", *given, *args]
     return args

@@ -29,6 +29,7 @@ def differences(folder: Path, cfg: DaggerConfig) -> list[str]:
     saved = json.loads((folder / CONFIG_NAME).read_text())
     plain = DaggerConfig(cfg.demos, cfg.interventions)
     options, defaults = (json.loads(json.dumps(each.options())) for each in (cfg, plain))
+    saved.setdefault("skip_s", 0.0)
     for name in _SAME_RUN:
         saved.setdefault(name, defaults[name])  # an older version did not know it
         _fill_in(saved.get(name), options.get(name), getattr(cfg, name))

@@ -61,7 +61,7 @@ class MethodConfig(draccus.ChoiceRegistry, abc.ABC):
 
     Attributes:
         expert_decides: The expert says when it takes over, so that `--takeover_delay_s` has a meaning.
-        chooses_frames: The method says what is learned from, so that `--learn_from` has none.
+        chooses_frames: The method says what is learned from, so that `--learn_from` has none, and `--skip_s` is 0 by default.
         is_watched: A person who corrects has to watch all of every attempt.
     """
 
