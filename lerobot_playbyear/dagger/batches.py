@@ -122,7 +122,7 @@ def intervention_run_weights(store: EpisodeStore, n_windows: int = 1, is_learned
     by_expert = (frames_by_expert(store) if is_learned is None else is_learned).cpu().numpy()
     weights = np.zeros(len(store))
     for start, end in zip(store.starts, store.ends, strict=True):
-        for first, after in _stretches(by_expert[start:end]) + start:
+        for first, after in stretches(by_expert[start:end]) + start:
             length = after - first
             if length < n_windows:
                 weights[min(max(after, start + n_windows), end) - 1] += n_windows
@@ -141,7 +141,7 @@ def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
     by_expert = frames_by_expert(store)
     later = by_expert.cpu().numpy().copy()
     for start, end in zip(store.starts, store.ends, strict=True):
-        for first, after in _stretches(later[start:end]) + start:
+        for first, after in stretches(later[start:end]) + start:
             if first > start:
                 later[first : min(first + n_skipped, after)] = False
     if later.any():
@@ -154,7 +154,7 @@ def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
     return by_expert
 
 
-def _stretches(flags: np.ndarray) -> np.ndarray:
+def stretches(flags: np.ndarray) -> np.ndarray:
     """Where flags (T,) are true without a gap, (n, 2): the first frame of each stretch, and the one after its last."""
     return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 

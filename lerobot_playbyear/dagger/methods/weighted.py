@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 import torch
 
-from lerobot_playbyear.dagger.batches import frames_by_expert, frames_learned_from
+from lerobot_playbyear.dagger.batches import frames_by_expert, frames_learned_from, stretches
 from lerobot_playbyear.dagger.methods.base import Learned, Method, MethodConfig
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
@@ -114,8 +114,7 @@ def kinds_of_frames(store: EpisodeStore, n_before: int, n_skipped: int = 0) -> n
     by_expert = frames_by_expert(store).cpu().numpy()
     kinds = np.where(by_expert, 0, 2)
     for start, end in zip(store.starts, store.ends, strict=True):
-        begins = np.flatnonzero(np.diff(np.concatenate([[False], by_expert[start:end]]).astype(int)) == 1) + start
-        for first in begins:
+        for first, _ in stretches(by_expert[start:end]) + start:
             before = slice(max(first - n_before, start), first)
             kinds[before] = np.where(by_expert[before], 0, 1)
     is_learned = frames_learned_from(store, n_skipped).cpu().numpy()
