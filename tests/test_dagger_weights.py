@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from lerobot.policies.act.configuration_act import ACTConfig
 from test_dagger_batches import N_DEMONSTRATIONS, store, supervised, windows
 
 from lerobot_playbyear.dagger import curves
@@ -14,12 +15,19 @@ from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
 from lerobot_playbyear.dagger.figures import Totals, attempt_figures, round_figures, steps_until
 from lerobot_playbyear.dagger.methods.base import Learned, Method
 from lerobot_playbyear.dagger.methods.weighted import Weighted, WeightedConfig, kinds_of_frames, shares
-from lerobot_playbyear.dagger.weighted_batches import WeightedBatches
+from lerobot_playbyear.dagger.weighted_batches import WeightedBatches, how_often_drawn, learned_per_run
+from lerobot_playbyear.datasets import run_weights
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.training.windows import PolicyWindows
 
 ATTEMPTS = "......................xxxxxxxxxx........" + "xx......xxxx...................."
 COUNTS = {"intervention": 100.0, "before": 30.0, "policy": 370.0, "demonstrations": 500.0}
+
+
+def chunks(n_actions):
+    config = ACTConfig(chunk_size=n_actions, n_action_steps=n_actions, device="cpu", push_to_hub=False)
+    return PolicyWindows(config, SimpleNamespace(fps=20, features={"action": {}, "observation.state": {}}))
 
 
 def learned_shares(learned, n_windows, n_batches=400):
@@ -46,6 +54,39 @@ def test_frames_are_learned_from_as_their_weights_say(n_windows):
     assert not seen[wanted == 0].any()
     np.testing.assert_allclose(seen, wanted, atol=0.012)
     assert demonstrated == pytest.approx(0.25, abs=0.01)
+
+
+def test_runs_lie_where_frames_weigh_alike_so_that_few_actions_are_computed_in_vain():
+    attempts, kinds = store([40, 32], ATTEMPTS), kinds_of_frames(store([40, 32], ATTEMPTS), 4)
+    few = torch.from_numpy((kinds == 0) * 1.0)  # stretches of 10, 2 and 4 frames
+    learned = learned_per_run(attempts, few, how_often_drawn(attempts, few, 8), 8)
+    assert learned == pytest.approx(16 / 4)  # two runs for ten frames, one each for two and four
+    assert learned > 1.5 * learned_per_run(attempts, few, run_weights(attempts, 8, few), 8)
+    for weights in (torch.ones(len(ATTEMPTS)).double(), torch.from_numpy(np.where(kinds == 0, 3.0, 1.0))):
+        drawn = how_often_drawn(attempts, weights, 8)
+        by_means = learned_per_run(attempts, weights, run_weights(attempts, 8, weights), 8)
+        assert by_means < learned_per_run(attempts, weights, drawn, 8) <= 8
+    smooth = torch.linspace(1, 2, len(ATTEMPTS), dtype=torch.float64)
+    assert learned_per_run(attempts, smooth, how_often_drawn(attempts, smooth, 8), 8) > 2
+
+
+def test_of_a_chunk_those_actions_remain_that_weigh_as_much_as_its_observation():
+    attempts = store([40, 32], ATTEMPTS, first=N_DEMONSTRATIONS)
+    kinds = kinds_of_frames(attempts, 4)
+    weights = torch.from_numpy(np.select([kinds == 0, kinds == 2], [1.0, 0.25], 0.0))
+    batches = WeightedBatches(chunks(8), store([60, 40]), attempts, 12, 0, lambda attempts: Learned(weights, 0.25))
+    n_learned, starts = 0, np.zeros(len(ATTEMPTS))
+    for number in range(300):
+        batch = batches.batch(number)
+        n = int((batch["action"][:, 0, 0] < N_DEMONSTRATIONS).sum())
+        first = batch["action"][n:, 0, 0].int().numpy() - N_DEMONSTRATIONS
+        np.add.at(starts, first, 1)
+        learned = (~batch["action_is_pad"][n:]).numpy()
+        frames = np.minimum(first[:, None] + np.arange(8), len(ATTEMPTS) - 1)
+        assert not learned[weights.numpy()[frames] == 0].any()
+        n_learned += learned.sum()
+    np.testing.assert_allclose(starts / starts.sum(), (weights / weights.sum()).numpy(), atol=0.02)
+    assert n_learned / 300 / 9 > 3
 
 
 def test_all_frames_of_attempts_are_learned_from_alike():
