@@ -136,7 +136,11 @@ def test_a_run_skips_the_beginning_of_corrections(tmp_path, capfd):
         folder = tmp_path / str(len(losses))
         dagger(folder, *RUN, *options)
         losses[options] = [line["loss_interventions"] for line in metrics(folder, "round")]
-        assert "No correction is longer" not in capfd.readouterr().err
+        said = capfd.readouterr()
+        assert "No correction is longer" not in said.err
+        n = 6 if options == ("--skip_s=0",) else 2  # of two attempts
+        assert f"Corrections: {n} of 6 frames that the expert chose are learned from" in said.out
+        assert ("the first 0.1 s of every correction are left out" in said.out) is (n == 2)
     by_default, memory, nothing = losses.values()
     assert by_default == memory != nothing
     dagger(tmp_path / "long", *RUN, "--skip_s=60")

@@ -71,6 +71,13 @@ class BalancedBatches:
             )
         self._interventions, self._from_interventions = interventions, RunSampler(weights, self._seed + 1)
 
+    def n_expert_frames(self) -> tuple[int, int]:
+        """How many of the frames that the expert chose are learned from, and how many there are."""
+        if self._interventions is None:
+            return 0, 0
+        by_expert = frames_by_expert(self._interventions).cpu()
+        return int((by_expert & self._is_learned).sum()), int(by_expert.sum())
+
     def batch(self, number: int) -> dict[str, Any]:
         """The batch of that number, counted from 0: the first half are demonstrations.
 

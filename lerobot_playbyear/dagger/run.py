@@ -70,7 +70,7 @@ def run_dagger(cfg: DaggerConfig) -> Path:
                 return folder.path
             loop = _make_loop(cfg, folder, state, stack)
         loop.run()
-    _print_results(cfg, folder, state)
+    _print_results(cfg, folder, state, loop)
     if cfg.policy is not None and cfg.policy.push_to_hub and state.checkpoint is not None:
         assert cfg.policy.repo_id is not None
         checkpoint = folder.checkpoints / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
@@ -208,7 +208,7 @@ def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, correcti
         )
 
 
-def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> None:
+def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: Loop) -> None:
     print(f"\nFigures:     {folder.path / METRICS_NAME}")
     if cfg.is_online:
         print(
@@ -220,6 +220,10 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> Non
             f"Expert:      {totals.expert_steps} steps in {totals.takeovers} takeovers, {totals.switches} context switches, "
             f"autonomy {totals.autonomy:.0%}, {totals.person_seconds / 60:.1f} minutes of a person's time"
         )
+    n_learned, n_corrected = loop.batches.n_expert_frames()
+    skipped_s = cfg.n_skipped(loop.demonstrations.fps) / loop.demonstrations.fps
+    left_out = f"; the first {skipped_s:g} s of every correction are left out (--skip_s)" if skipped_s else ""
+    print(f"Corrections: {n_learned} of {n_corrected} frames that the expert chose are learned from{left_out}")
     if state.success is not None:
         print(f"Success:     {state.success:.1f} % of {cfg.eval.n_episodes} episodes")
     if state.checkpoint is None:

@@ -57,6 +57,7 @@ class WeightedBatches(BalancedBatches):
         n_windows, share, weights = self._windows.n_windows, learned.demonstrations, learned.weights.double()
         drawn = how_often_drawn(interventions, weights, n_windows)
         self._interventions, self._from_interventions = interventions, RunSampler(drawn, self._seed + 1)
+        self._is_learned = weights > 0
         self._weights, self._remains, self._share = weights, chances(interventions, weights, drawn, n_windows), share
         masked = n_windows / learned_per_run(
             interventions, weights, drawn, n_windows
