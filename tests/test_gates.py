@@ -154,6 +154,30 @@ def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(ta
     env.close()
 
 
+def carried(drift, n_steps=60, **options):
+    """Pick and Place, version 1: a policy that carries the cube, moves by `drift` on the way, and the gate that watches."""
+    env, gate = at_phase("OccludedPickPlace-v1", "carry", config=GateConfig(still_steps=100), **options)
+    play(env, gate, np.array([*drift, 1.0]), n_steps)
+    return env, gate
+
+
+@pytest.mark.parametrize("drift", [(0, -0.3, 0), (0, -0.3, -0.025)])
+def test_a_cube_that_would_be_put_down_beside_the_tray_is_carried_back_and_then_to_the_tray(drift):
+    env, gate = carried(drift)
+    tray = env.unwrapped.bin_position
+    assert (gate.reason, gate.expert.phase) == ("misplaces", "bring_back")
+    ways, done, info = [], False, {}
+    while not done:
+        ways.append(env.unwrapped.cube_position[1] - tray[1])
+        _, terminated, truncated, info = env.unwrapped.advance(gate.act())
+        done = terminated or truncated
+        assert gate.wants_control(STAY) or done
+    assert info["is_success"]
+    assert 0.13 < max(ways) < 0.28  # so far back
+    assert min(ways[int(np.argmax(ways)) :]) > -0.02  # and not past the tray again
+    env.close()
+
+
 def play(env, gate, action, n_steps: int) -> int:
     """The policy does the same at every step until the expert takes over; returns how often it did."""
     for step in range(n_steps):

@@ -21,7 +21,8 @@ class ExpertConfig:
     gain: share of the remaining distance covered per step; max_step: longest displacement per step; noise: uniform, either
     way, added to every displacement; hop_tolerance: how exactly the hand is above the cube, along the sweep, before it comes
     down, None: as at every other goal; hop_step: the longest displacement of a hop, None: `max_step`; hop_error: by how much a
-    hop misses the cube, along the sweep, before it is mended, None: not at all; back_off: how far it draws back from a touch.
+    hop misses the cube, along the sweep, before it is mended, None: not at all; back_off: how far it draws back from a touch;
+    bring_back: how far before the tray a correction carries the cube back to show its place anew, None: not at all.
     The pairs are ranges of uniform draws, `pause_probability` is per step of the sweep.
     """
 
@@ -47,6 +48,7 @@ class ExpertConfig:
     hop_error: tuple[float, float] | None = None
     descent_step: float = 0.014
     back_off: float | tuple[float, float] = 0.004
+    bring_back: tuple[float, float] | None = None
 
 
 EXACT_EXPERT = ExpertConfig(
@@ -58,6 +60,7 @@ EXACT_EXPERT = ExpertConfig(
     hop_tolerance=0.002,
     hop_step=(0.015, 0.022),
     hop_error=(-0.012, 0.012),
+    bring_back=(0.15, 0.25),
 )
 """That of both cube tasks, version 1, where it demonstrates and where it corrects. The hand comes down where it is above the
 cube and not on the way there, and it shows that only the touch tells where that is: how far it draws back before it rises
@@ -108,6 +111,7 @@ class GraspExpert:
         self.back_off = rng.uniform(*config.back_off) if isinstance(config.back_off, tuple) else config.back_off
         self.hop_step = None if config.hop_step is None else rng.uniform(*config.hop_step)
         self.hop_error = 0.0 if config.hop_error is None else rng.uniform(*config.hop_error)
+        self._back: float | None = None
         self.phase = "approach"
 
     def begin_at(self, phase: str) -> None:
@@ -119,7 +123,7 @@ class GraspExpert:
 
     def act(self) -> np.ndarray:
         """The action (4,) in [-1, 1] for the environment's present state."""
-        if self.phase in ("lift", "hold", "carry") and self._dropped():
+        if self.phase in ("lift", "hold", "bring_back", "carry") and self._dropped():
             self._begin()
             displacement, close = np.zeros(3), False
         else:
@@ -277,6 +281,17 @@ class PickPlaceExpert(GraspExpert):
         if self.env.eef_position[2] > TABLE_TOP + self.carry_height - 0.01:
             self.phase = "carry"
         return np.array([0, 0, self.rise_step]), True
+
+    def _bring_back(self):
+        """Back on the way to the tray, to carry the cube there once more."""
+        if self._back is None:
+            assert self.config.bring_back is not None
+            came_from = np.sign(np.mean(self.env.hidden_range) - self.env.bin_position[1])
+            self._back = came_from * self.rng.uniform(*self.config.bring_back)
+        goal = self.env.bin_position + np.array([0, self._back, self.carry_height])
+        if self._near(goal, 0.02):
+            self.phase = "carry"
+        return self._towards(goal), True
 
     def _carry(self):
         goal = self.env.bin_position + np.array([0, 0, self.carry_height])

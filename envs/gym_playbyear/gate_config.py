@@ -22,6 +22,8 @@ class GateConfig:
             near to the cube's middle across the line, and at most the margin, and one step, above where it lands.
         empty_opening: Fingers that were closed, and are this near to each other, hold nothing.
         release_reach: Fingers may open when the held cube is this near to the tray's middle.
+        carry_past, carry_sink: A held cube that was carried is this far past the tray's middle, or so far below the height at
+            which the expert carries and not over the tray: it is about to be put down beside it.
         drop_distance: A cube that was held and is this far from the hand was dropped.
         stray_x, stray_y: How far a hand that searches on the table may be beside the line of the sweep, and before its start.
         hop_past: How far a hand that rose after the touch may go past the cube.
@@ -48,6 +50,8 @@ class GateConfig:
     land_margin: float = 0.012
     empty_opening: float = 0.03
     release_reach: float = 0.02
+    carry_past: float = 0.03
+    carry_sink: float = 0.015
     drop_distance: float = 0.04
     stray_x: float = 0.03
     stray_y: float = 0.12

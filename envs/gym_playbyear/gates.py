@@ -6,7 +6,9 @@ mistake is final: in our tasks a cube shoved over 3 cm ends the attempt, and fin
 
 A policy can learn from a correction if what it senses tells it what to do. Therefore the gates wait until a mistake can be
 noticed: fingers closed on nothing, the hand stays on top of the cube. And the expert does not go where only it knows the cube
-to be: it rises and searches anew, as in a demonstration.
+to be: it rises and searches anew, as in a demonstration. A cube that would be put down beside the tray it carries back a piece
+of the way, and then to the tray: where a way ends is learned from the way, not from mending its end (recovery before
+correction, Hu et al., "RaC", 2025).
 """
 
 from collections import deque
@@ -24,7 +26,7 @@ _STAGES = {
     **dict.fromkeys(("retreat", "approach", "lower", "sweep"), SEARCH),
     **dict.fromkeys(("dwell", "rise", "hover", "hop", "descend", "grasp"), GRASP),
     **dict.fromkeys(("lift", "hold"), LIFT),
-    **dict.fromkeys(("carry", "release"), CARRY),
+    **dict.fromkeys(("bring_back", "carry", "release"), CARRY),
 }
 
 
@@ -36,7 +38,7 @@ class InterventionGate(StagedGate):
     def __init__(self, env, expert: GraspExpert, config: GateConfig | None = None):
         super().__init__(env, expert, config or GateConfig())
         self._on_top_for = 0  # steps
-        self._was_held = False
+        self._was_held = self._was_carried = False
         self._first_cube = env.cube_position
         self._positions: deque[np.ndarray] = deque(maxlen=self.config.still_steps + 1)
 
@@ -55,6 +57,7 @@ class InterventionGate(StagedGate):
             self._touched_at = self._n_steps
         self._on_top_for = self._on_top_for + 1 if self._is_on_top() else 0
         self._was_held |= self._holds() and self._cube_height() > 0.01
+        self._was_carried |= self._holds() and self._height() > self._carry_height() - 0.01
         self._positions.append(self.env.eef_position)
 
     def _height(self) -> float:
@@ -92,6 +95,10 @@ class InterventionGate(StagedGate):
         tray = getattr(self.env, "bin_position", None)
         return tray is not None and bool(np.abs(self.env.cube_position - tray)[:2].max() < self.config.release_reach)
 
+    def _carry_height(self) -> float:
+        """At which the expert carries [m above the table]; infinite where nothing is carried."""
+        return getattr(self.expert, "carry_height", np.inf)
+
     def _before_cube(self) -> bool:
         """Whether a sweep from here can still touch the cube."""
         return self._offset()[1] > self.expert.reach - 0.003
@@ -107,6 +114,7 @@ class InterventionGate(StagedGate):
             "lands": not holds and self._lands(action),
             "landed": self._on_top_for > self.config.landed_steps,
             "empty": not holds and self.env.finger_positions.sum() < self.config.empty_opening,
+            "misplaces": holds and self._misplaces(),
             "opens": holds and action[3] <= 0 and self.env.gripper_obeys,
             "dropped": not holds and self._was_held and np.linalg.norm(self._offset()) > self.config.drop_distance,
             "missed": not holds and not self._was_held and self._missed(),
@@ -127,6 +135,18 @@ class InterventionGate(StagedGate):
         along, up = np.linalg.norm(action[:2]) * ACTION_SCALE, action[2] * ACTION_SCALE
         lifts = self._cube_height() > 0.01 or up > self.config.push_step
         return bool(along > 1.5 * self.config.push_step and not lifts and self._is_shoved())
+
+    def _misplaces(self) -> bool:
+        """Has carried the cube past the tray, or lowers it beside the tray."""
+        if not self._was_carried or self.expert.config.bring_back is None:
+            return False
+        lowers = self._height() < self._carry_height() - self.config.carry_sink
+        return self._way_left() < -self.config.carry_past or (lowers and not self._is_over_tray())
+
+    def _way_left(self) -> float:
+        """How far the cube still has to be carried, on the side from which it came [m]."""
+        way, left = (place[1] - self.env.bin_position[1] for place in (self._first_cube, self.env.cube_position))
+        return float(np.sign(way) * left)
 
     def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
@@ -204,17 +224,23 @@ class InterventionGate(StagedGate):
     def _take_over(self) -> None:
         """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
         self._positions.clear()
-        self._was_held = self._holds()
+        self._was_held, self._was_carried = self._holds(), False
         phase = self._fitting_phase()
+        bring_back = self.expert.config.bring_back
+        puts_down = self.reason in ("opens", "misplaces") and hasattr(self.env, "bin_position")
+        if puts_down and bring_back is not None and self._way_left() < bring_back[0]:
+            phase = "bring_back"
         self.expert.begin_at(phase)
         is_searching = self._touched_at is None and self.reason != "late"
         self._hands_back_at = GRASP if is_searching else max(LIFT, _STAGES[phase] + 1)
-        if self.reason == "opens":
+        if self.reason in ("opens", "misplaces"):
             self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
 
     def _follow(self) -> None:
         phase, now = self._fitting_phase(), _STAGES[self.expert.phase]
         found = phase in ("dwell", "grasp") and now == SEARCH and self.expert.phase != "sweep"
+        if self.expert.phase == "bring_back":  # of an expert that only labels: nothing is shown anew
+            self.expert.phase = phase if _STAGES[phase] == CARRY else "carry"
         if found or _STAGES[phase] > max(now, GRASP):
             self.expert.begin_at(phase)
         elif _STAGES[phase] == now == SEARCH:
@@ -222,7 +248,7 @@ class InterventionGate(StagedGate):
 
     def _fitting_phase(self) -> str:
         if self._holds():
-            high = self._height() > getattr(self.expert, "carry_height", np.inf) - 0.01
+            high = self._height() > self._carry_height() - 0.01
             return "release" if self._is_over_tray() else "carry" if high else "lift"
         if self._is_between() and self._is_open() and self._hears():
             return "grasp"
