@@ -148,6 +148,11 @@ class InterventionGate(StagedGate):
         way, left = (place[1] - self.env.bin_position[1] for place in (self._first_cube, self.env.cube_position))
         return float(np.sign(way) * left)
 
+    def _has_to_bring_back(self) -> bool:
+        """Whether too little of the way to the tray is left to show where it ends."""
+        bring_back = self.expert.config.bring_back
+        return bring_back is not None and hasattr(self.env, "bin_position") and self._way_left() < bring_back[0]
+
     def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
         return bool(moved > self.config.shove_share * self.env.variant.max_shove)
@@ -224,16 +229,13 @@ class InterventionGate(StagedGate):
     def _take_over(self) -> None:
         """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
         self._positions.clear()
+        puts_down = self._holds() and (self.reason in ("opens", "misplaces") or self._misplaces())
+        phase = "bring_back" if puts_down and self._has_to_bring_back() else self._fitting_phase()
         self._was_held, self._was_carried = self._holds(), False
-        phase = self._fitting_phase()
-        bring_back = self.expert.config.bring_back
-        puts_down = self.reason in ("opens", "misplaces") and hasattr(self.env, "bin_position")
-        if puts_down and bring_back is not None and self._way_left() < bring_back[0]:
-            phase = "bring_back"
         self.expert.begin_at(phase)
         is_searching = self._touched_at is None and self.reason != "late"
         self._hands_back_at = GRASP if is_searching else max(LIFT, _STAGES[phase] + 1)
-        if self.reason in ("opens", "misplaces"):
+        if puts_down:
             self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
 
     def _follow(self) -> None:
