@@ -1,0 +1,136 @@
+"""What went wrong first: the cube was not found, the hop missed it, or it was put down beside the tray.
+
+    python -m experiments.failures --task=OccludedPickPlace-v1 --checkpoint=outputs/train/checkpoints/last/pretrained_model
+    python -m experiments.failures --task=OccludedPickPlace-v1        # the expert's
+
+Told from what the simulator knows: `pressed` alone says that the hand came down on the cube, not that it had dropped it beside
+the tray before. Beside it stands for what the scripted expert would have taken over first, had it watched. The episodes are of
+seeds on which choices are made. Prints a line per episode and a table.
+"""
+
+from collections import Counter, defaultdict
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from experiments.landings import CUBES, HopRecorder
+from experiments.listening import actor_of
+from experiments.lottery import CHOICE_SEEDS
+from experiments.protocol import command_line
+from gym_playbyear.occluded_pick_place import PLACE_TOLERANCE
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
+
+LIFTED_M = 0.01
+BESIDE_MM = 6.0
+"""A hop that ends further beside the cube's middle has missed: closed fingers have 5 mm on either side of it."""
+
+
+class FailureRecorder(HopRecorder):
+    """Notes also what became of the cube in every step of an episode of a cube task."""
+
+    def reset(self, **options: Any) -> Any:
+        self._cubes: list[tuple[float, float, float]] = []
+        self._held: list[bool] = []
+        result = super().reset(**options)
+        self._first_z = float(self.env.unwrapped.cube_position[2])  # type: ignore[attr-defined]
+        return result
+
+    def step(self, action: Any) -> Any:
+        result, world = super().step(action), self.env.unwrapped
+        self._cubes.append(tuple(world.cube_position))  # type: ignore[attr-defined]
+        self._held.append(world.contact_forces["gripper-cube"] > 0)  # type: ignore[attr-defined]
+        return result
+
+    def let_go(self) -> float | None:
+        """How far the cube was from the tray's middle when it was first let go, negative before the tray [mm]; None: never."""
+        cubes, held = np.array(self._cubes), np.array(self._held)
+        lifted = held & (cubes[:, 2] > self._first_z + LIFTED_M)
+        after = np.flatnonzero(~held & (np.cumsum(lifted) > 0))
+        tray = getattr(self.env.unwrapped, "bin_position", None)
+        if not len(after) or tray is None:
+            return None
+        beyond = tray[1] - cubes[after[0], 1]  # cubes are carried towards smaller y
+        across = abs(cubes[after[0], 0] - tray[0])
+        return float(1000 * (beyond if abs(beyond) >= across else across))
+
+    def first_mistake(self) -> str:
+        """In a few words, the same for mistakes of one kind; empty where the episode succeeded."""
+        landing, let_go = self.landing(), self.let_go()
+        lifted = any(
+            held and z > self._first_z + LIFTED_M for held, (_, _, z) in zip(self._held, self._cubes, strict=True)
+        )
+        if self.end == "success":
+            return ""
+        if let_go is not None:
+            is_beside = abs(let_go) > 1000 * PLACE_TOLERANCE
+            return "put down beside the tray" if is_beside else "let go over the tray, and no success"
+        if lifted:
+            return "held, and no success"
+        if not any(self._held):
+            return "never touched"
+        if landing is not None and abs(landing.offset_mm) > BESIDE_MM:
+            return "came down beside the cube"
+        return "touched, and not lifted"
+
+
+class Onlooker(ScriptedExpert):
+    """Notes for what it would first have taken over, and never does."""
+
+    def reset(self, env: gym.Env) -> None:
+        super().reset(env)
+        self.reason = "nothing"
+
+    def wants_control(self, observation: Any, policy_action: np.ndarray) -> bool:
+        if self.reason == "nothing" and super().wants_control(observation, policy_action):
+            self.reason = str(self._gate.reason)
+        return False
+
+
+def table_of(seen: dict[str, Counter[str]], n: int) -> str:
+    """In Markdown, the most frequent mistake first.
+
+    Args:
+        seen: Of each first mistake, for what the expert would have taken over.
+        n: Episodes in all.
+    """
+    rows = ["| first mistake | episodes | taken over first for |", "|---|---|---|"]
+    for mistake, reasons in sorted(seen.items(), key=lambda item: -item[1].total()):
+        told = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+        rows.append(f"| {mistake or 'none: success'} | {reasons.total()} of {n} | {told} |")
+    return "\n".join(rows)
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--task", choices=CUBES, default=CUBES[-1])
+    parser.add_argument("--checkpoint", type=Path)
+    parser.add_argument("--n_episodes", type=int, default=50)
+    options = parser.parse_args()
+    task = PlaybyearEnvConfig(task=options.task)
+    recorder, onlooker = FailureRecorder(env_spec(task).make()), Onlooker()
+    actor = actor_of(options.checkpoint, task) if options.checkpoint else Script()
+    seen: dict[str, Counter[str]] = defaultdict(Counter)
+    let_go = []
+    for seed in CHOICE_SEEDS[: options.n_episodes]:
+        play(recorder, actor, seed, expert=onlooker)
+        mistake, place = recorder.first_mistake(), recorder.let_go()
+        seen[mistake][onlooker.reason] += 1
+        where = "" if place is None else f", let go {place:.0f} mm from the tray's middle"
+        print(f"{seed} {recorder.end or 'time'}: {mistake or 'no mistake'}{where}", flush=True)
+        let_go += [] if place is None else [place]
+    recorder.close()
+    print(f"\n{table_of(seen, min(options.n_episodes, len(CHOICE_SEEDS)))}")
+    if let_go:
+        print(
+            f"\nLet go {np.mean(let_go):.0f} ± {np.std(let_go):.0f} mm from the tray's middle, {len(let_go)} episodes."
+        )
+
+
+if __name__ == "__main__":
+    main()
