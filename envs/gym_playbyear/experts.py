@@ -22,7 +22,8 @@ class ExpertConfig:
     way, added to every displacement; hop_tolerance: how exactly the hand is above the cube, along the sweep, before it comes
     down, None: as at every other goal; hop_step: the longest displacement of a hop, None: `max_step`; hop_error: by how much a
     hop misses the cube, along the sweep, before it is mended, None: not at all; back_off: how far it draws back from a touch;
-    bring_back: how far before the tray a correction carries the cube back to show its place anew, None: not at all.
+    bring_back_step: the longest displacement per step with which a correction carries the cube back to where it was lifted,
+    to show the way to the tray anew, None: it does not.
     The pairs are ranges of uniform draws, `pause_probability` is per step of the sweep.
     """
 
@@ -48,7 +49,7 @@ class ExpertConfig:
     hop_error: tuple[float, float] | None = None
     descent_step: float = 0.014
     back_off: float | tuple[float, float] = 0.004
-    bring_back: tuple[float, float] | None = None
+    bring_back_step: float | None = None
 
 
 EXACT_EXPERT = ExpertConfig(
@@ -60,7 +61,7 @@ EXACT_EXPERT = ExpertConfig(
     hop_tolerance=0.002,
     hop_step=(0.015, 0.022),
     hop_error=(-0.012, 0.012),
-    bring_back=(0.15, 0.25),
+    bring_back_step=0.04,
 )
 """That of both cube tasks, version 1, where it demonstrates and where it corrects. The hand comes down where it is above the
 cube and not on the way there, and it shows that only the touch tells where that is: how far it draws back before it rises
@@ -111,7 +112,6 @@ class GraspExpert:
         self.back_off = rng.uniform(*config.back_off) if isinstance(config.back_off, tuple) else config.back_off
         self.hop_step = None if config.hop_step is None else rng.uniform(*config.hop_step)
         self.hop_error = 0.0 if config.hop_error is None else rng.uniform(*config.hop_error)
-        self._back: float | None = None
         self.phase = "approach"
 
     def begin_at(self, phase: str) -> None:
@@ -282,16 +282,15 @@ class PickPlaceExpert(GraspExpert):
             self.phase = "carry"
         return np.array([0, 0, self.rise_step]), True
 
+    def bring_back(self, y: float) -> None:
+        """The cube that it holds, to that place on the line of the sweep [m, world frame], and from there to the tray."""
+        self.phase, self._lifted_y = "bring_back", y
+
     def _bring_back(self):
-        """Back on the way to the tray, to carry the cube there once more."""
-        if self._back is None:
-            assert self.config.bring_back is not None
-            came_from = np.sign(np.mean(self.env.hidden_range) - self.env.bin_position[1])
-            self._back = came_from * self.rng.uniform(*self.config.bring_back)
-        goal = self.env.bin_position + np.array([0, self._back, self.carry_height])
+        goal = self._on_line(self._lifted_y, self.carry_height)
         if self._near(goal, 0.02):
             self.phase = "carry"
-        return self._towards(goal), True
+        return self._towards(goal, self.config.bring_back_step), True
 
     def _carry(self):
         goal = self.env.bin_position + np.array([0, 0, self.carry_height])

@@ -6,8 +6,8 @@ mistake is final: in our tasks a cube shoved over 3 cm ends the attempt, and fin
 
 A policy can learn from a correction if what it senses tells it what to do. Therefore the gates wait until a mistake can be
 noticed: fingers closed on nothing, the hand stays on top of the cube. And the expert does not go where only it knows the cube
-to be: it rises and searches anew, as in a demonstration. A cube that would be put down beside the tray it carries back a piece
-of the way, and then to the tray: where a way ends is learned from the way, not from mending its end (recovery before
+to be: it rises and searches anew, as in a demonstration. A cube that would be put down beside the tray it carries back to
+where it was lifted, and then to the tray: where a way ends is learned from the way, not from mending its end (recovery before
 correction, Hu et al., "RaC", 2025).
 """
 
@@ -138,7 +138,7 @@ class InterventionGate(StagedGate):
 
     def _misplaces(self) -> bool:
         """Has carried the cube past the tray, or lowers it beside the tray."""
-        if not self._was_carried or self.expert.config.bring_back is None:
+        if not self._was_carried or self.expert.config.bring_back_step is None:
             return False
         lowers = self._height() < self._carry_height() - self.config.carry_sink
         return self._way_left() < -self.config.carry_past or (lowers and not self._is_over_tray())
@@ -148,10 +148,12 @@ class InterventionGate(StagedGate):
         way, left = (place[1] - self.env.bin_position[1] for place in (self._first_cube, self.env.cube_position))
         return float(np.sign(way) * left)
 
-    def _has_to_bring_back(self) -> bool:
-        """Whether too little of the way to the tray is left to show where it ends."""
-        bring_back = self.expert.config.bring_back
-        return bring_back is not None and hasattr(self.env, "bin_position") and self._way_left() < bring_back[0]
+    def _puts_down(self) -> bool:
+        """Whether the policy, after most of the way, puts the cube down where it does not belong."""
+        if self.expert.config.bring_back_step is None or not hasattr(self.env, "bin_position") or not self._holds():
+            return False
+        was_carried = np.linalg.norm((self.env.cube_position - self._first_cube)[:2]) > self.config.carried
+        return bool(was_carried and (self.reason in ("opens", "misplaces") or self._misplaces()))
 
     def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
@@ -229,13 +231,14 @@ class InterventionGate(StagedGate):
     def _take_over(self) -> None:
         """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
         self._positions.clear()
-        puts_down = self._holds() and (self.reason in ("opens", "misplaces") or self._misplaces())
-        phase = "bring_back" if puts_down and self._has_to_bring_back() else self._fitting_phase()
+        puts_down, phase = self._puts_down(), self._fitting_phase()
         self._was_held, self._was_carried = self._holds(), False
         self.expert.begin_at(phase)
+        if puts_down:
+            self.expert.bring_back(float(self._first_cube[1]))
         is_searching = self._touched_at is None and self.reason != "late"
         self._hands_back_at = GRASP if is_searching else max(LIFT, _STAGES[phase] + 1)
-        if puts_down:
+        if self.reason in ("opens", "misplaces") or puts_down:
             self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
 
     def _follow(self) -> None:
