@@ -28,7 +28,9 @@ from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
 
 LIFTED_M = 0.01
 BESIDE_MM = 6.0
-"""A hop that ends further beside the cube's middle has missed: closed fingers have 5 mm on either side of it."""
+"""A hop that ends further beside the cube's middle has missed: open fingers leave 7 mm on either side of the cube."""
+N_APART = 3
+"""Steps without contact after which a held cube was let go, and not only held loosely."""
 
 
 class FailureRecorder(HopRecorder):
@@ -51,7 +53,8 @@ class FailureRecorder(HopRecorder):
         """How far the cube was from the tray's middle when it was first let go, negative before the tray [mm]; None: never."""
         cubes, held = np.array(self._cubes), np.array(self._held)
         lifted = held & (cubes[:, 2] > self._first_z + LIFTED_M)
-        after = np.flatnonzero(~held & (np.cumsum(lifted) > 0))
+        apart = np.convolve(~held, np.ones(N_APART), "valid") == N_APART  # (T - 2,) from this step on
+        after = np.flatnonzero(apart & (np.cumsum(lifted) > 0)[: len(apart)])
         tray = getattr(self.env.unwrapped, "bin_position", None)
         if not len(after) or tray is None:
             return None
@@ -61,7 +64,7 @@ class FailureRecorder(HopRecorder):
 
     def first_mistake(self) -> str:
         """In a few words, the same for mistakes of one kind; empty where the episode succeeded."""
-        landing, let_go = self.landing(), self.let_go()
+        let_go = self.let_go()
         lifted = any(
             held and z > self._first_z + LIFTED_M for held, (_, _, z) in zip(self._held, self._cubes, strict=True)
         )
@@ -74,6 +77,7 @@ class FailureRecorder(HopRecorder):
             return "held, and no success"
         if not any(self._held):
             return "never touched"
+        landing = self.landing()
         if landing is not None and abs(landing.offset_mm) > BESIDE_MM:
             return "came down beside the cube"
         return "touched, and not lifted"

@@ -173,8 +173,20 @@ def test_a_cube_that_would_be_put_down_beside_the_tray_is_carried_back_and_then_
         done = terminated or truncated
         assert gate.wants_control(STAY) or done
     assert info["is_success"]
-    assert max(ways) == pytest.approx(gate._first_cube[1] - tray[1], abs=0.03)  # back to where it was lifted
+    assert max(ways) == pytest.approx(gate._lifted_at[1] - tray[1], abs=0.03)  # back to where it was lifted
     assert min(ways[int(np.argmax(ways)) :]) > -0.02  # and not past the tray again
+    env.close()
+
+
+def test_a_label_where_the_cube_would_be_put_down_leads_to_the_tray():
+    env, gate = at_phase("OccludedPickPlace-v1", "carry", config=GateConfig(still_steps=100))
+    forward, lets_go = np.array([0, -0.3, 0, 1.0]), np.array([0, -0.3, 0, -1.0])
+    for _ in range(40):
+        gate.wants_control(lets_go if env.unwrapped.gripper_obeys else forward)
+        left = env.unwrapped.cube_position[1] - env.unwrapped.bin_position[1]
+        label = gate.label()
+        assert label[1] * left < 0.2 * abs(left)  # never back, even in the first step of a mistake
+        env.unwrapped.advance(forward)
     env.close()
 
 

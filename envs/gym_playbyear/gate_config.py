@@ -24,7 +24,7 @@ class GateConfig:
         release_reach: Fingers may open when the held cube is this near to the tray's middle.
         carry_past, carry_sink: A held cube that was carried is this far past the tray's middle, or so far below the height at
             which the expert carries and not over the tray: it is about to be put down beside it.
-        carried: A cube that was carried this far is carried back, to show the way anew.
+        far: From where it was lifted; a cube that is this far is carried back, to show the way to the tray anew.
         drop_distance: A cube that was held and is this far from the hand was dropped.
         stray_x, stray_y: How far a hand that searches on the table may be beside the line of the sweep, and before its start.
         hop_past: How far a hand that rose after the touch may go past the cube.
@@ -53,7 +53,7 @@ class GateConfig:
     release_reach: float = 0.02
     carry_past: float = 0.03
     carry_sink: float = 0.015
-    carried: float = 0.1
+    far: float = 0.1
     drop_distance: float = 0.04
     stray_x: float = 0.03
     stray_y: float = 0.12

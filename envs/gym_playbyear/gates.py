@@ -38,8 +38,8 @@ class InterventionGate(StagedGate):
     def __init__(self, env, expert: GraspExpert, config: GateConfig | None = None):
         super().__init__(env, expert, config or GateConfig())
         self._on_top_for = 0  # steps
-        self._was_held = self._was_carried = False
-        self._first_cube = env.cube_position
+        self._was_held = self._was_up = False
+        self._first_cube = self._lifted_at = env.cube_position
         self._positions: deque[np.ndarray] = deque(maxlen=self.config.still_steps + 1)
 
     def act(self) -> np.ndarray:
@@ -50,14 +50,21 @@ class InterventionGate(StagedGate):
             self.expert.phase = "approach"  # a new search begins as the first did: in silence
         return super().act()
 
+    def label(self) -> np.ndarray:
+        """See `StagedGate`. An expert that does not lead the hand shows nothing anew: it brings no cube back."""
+        if self.expert.phase == "bring_back":
+            self.expert.begin_at(self._fitting_phase())
+        return super().label()
+
     # What there is to see
 
     def _look(self) -> None:
         if self.env.contact_forces["gripper-cube"] > self.expert.config.contact_force:
             self._touched_at = self._n_steps
         self._on_top_for = self._on_top_for + 1 if self._is_on_top() else 0
-        self._was_held |= self._holds() and self._cube_height() > 0.01
-        self._was_carried |= self._holds() and self._height() > self._carry_height() - 0.01
+        if self._holds() and self._cube_height() > 0.01 and not self._was_held:
+            self._was_held, self._lifted_at = True, self.env.cube_position
+        self._was_up |= self._holds() and self._height() > self._carry_height() - 0.01
         self._positions.append(self.env.eef_position)
 
     def _height(self) -> float:
@@ -138,22 +145,26 @@ class InterventionGate(StagedGate):
 
     def _misplaces(self) -> bool:
         """Has carried the cube past the tray, or lowers it beside the tray."""
-        if not self._was_carried or self.expert.config.bring_back_step is None:
+        if not self._was_up or self.expert.config.bring_back_step is None or not self._is_far():
             return False
+        way, left = (place[1] - self.env.bin_position[1] for place in (self._lifted_at, self.env.cube_position))
+        past = np.sign(way) * left < -self.config.carry_past
         lowers = self._height() < self._carry_height() - self.config.carry_sink
-        return self._way_left() < -self.config.carry_past or (lowers and not self._is_over_tray())
+        return bool(past or (lowers and not self._is_over_tray()))
 
-    def _way_left(self) -> float:
-        """How far the cube still has to be carried, on the side from which it came [m]."""
-        way, left = (place[1] - self.env.bin_position[1] for place in (self._first_cube, self.env.cube_position))
-        return float(np.sign(way) * left)
+    def _is_far(self) -> bool:
+        """Whether the cube is a good way from where it was lifted."""
+        return bool(np.linalg.norm((self.env.cube_position - self._lifted_at)[:2]) > self.config.far)
 
-    def _puts_down(self) -> bool:
-        """Whether the policy, after most of the way, puts the cube down where it does not belong."""
-        if self.expert.config.bring_back_step is None or not hasattr(self.env, "bin_position") or not self._holds():
+    def _brings_back(self) -> bool:
+        """Whether the way to the tray is to be shown anew: the policy has gone most of it, and there is time."""
+        step, tray = self.expert.config.bring_back_step, getattr(self.env, "bin_position", None)
+        if step is None or tray is None or not (self._holds() and self._is_far()):
             return False
-        was_carried = np.linalg.norm((self.env.cube_position - self._first_cube)[:2]) > self.config.carried
-        return bool(was_carried and (self.reason in ("opens", "misplaces") or self._misplaces()))
+        back, way = (abs(place[1] - self._lifted_at[1]) for place in (self.env.cube_position, tray))
+        needed = back / step + way / self.config.travel_step + self.config.place_steps + self.config.slack_steps
+        has_time = self.env._max_episode_steps - self._n_steps > needed
+        return bool(has_time and (self.reason in ("opens", "misplaces") or self._misplaces()))
 
     def _is_shoved(self) -> bool:
         moved = np.linalg.norm((self.env.cube_position - self._first_cube)[:2])
@@ -231,21 +242,19 @@ class InterventionGate(StagedGate):
     def _take_over(self) -> None:
         """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
         self._positions.clear()
-        puts_down, phase = self._puts_down(), self._fitting_phase()
-        self._was_held, self._was_carried = self._holds(), False
+        brings_back, phase = self._brings_back(), self._fitting_phase()
+        self._was_held, self._was_up = self._holds(), False
         self.expert.begin_at(phase)
-        if puts_down:
-            self.expert.bring_back(float(self._first_cube[1]))
+        if brings_back:
+            self.expert.bring_back(float(self._lifted_at[1]))
         is_searching = self._touched_at is None and self.reason != "late"
         self._hands_back_at = GRASP if is_searching else max(LIFT, _STAGES[phase] + 1)
-        if self.reason in ("opens", "misplaces") or puts_down:
+        if self.reason in ("opens", "misplaces") or brings_back:
             self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
 
     def _follow(self) -> None:
         phase, now = self._fitting_phase(), _STAGES[self.expert.phase]
         found = phase in ("dwell", "grasp") and now == SEARCH and self.expert.phase != "sweep"
-        if self.expert.phase == "bring_back":  # of an expert that only labels: nothing is shown anew
-            self.expert.phase = phase if _STAGES[phase] == CARRY else "carry"
         if found or _STAGES[phase] > max(now, GRASP):
             self.expert.begin_at(phase)
         elif _STAGES[phase] == now == SEARCH:

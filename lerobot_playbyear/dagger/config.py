@@ -208,7 +208,7 @@ class DaggerConfig:
 
     def n_skipped(self, fps: float) -> int:
         """Frames at the beginning of every correction that are not learned from."""
-        if self.skip_s is None and self.method.chooses_frames:
+        if self.learn_from == "all" or (self.skip_s is None and self.method.chooses_frames):
             return 0
         if self.skip_s is None:
             n_remembered = int(getattr(self.policy, "memory_steps", 1))

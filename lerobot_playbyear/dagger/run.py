@@ -222,7 +222,9 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
         )
     n_learned, n_corrected = loop.batches.n_expert_frames()
     skipped_s = cfg.n_skipped(loop.demonstrations.fps) / loop.demonstrations.fps
-    left_out = f"; the first {skipped_s:g} s of every correction are left out (--skip_s)" if skipped_s else ""
+    left_out = (
+        f"; the first {skipped_s:g} s of every correction are left out (--skip_s)" if n_learned < n_corrected else ""
+    )
     print(f"Corrections: {n_learned} of {n_corrected} frames that the expert chose are learned from{left_out}")
     if state.success is not None:
         print(f"Success:     {state.success:.1f} % of {cfg.eval.n_episodes} episodes")

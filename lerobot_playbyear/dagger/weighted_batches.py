@@ -1,8 +1,9 @@
 """Batches in which frames of attempts are learned from as often as a method wants, and not only what the expert chose.
 
-Runs are drawn so that they lie, wherever they fit, among frames of one weight. Some hold others, too, so of every run's actions
-some are masked by chance: each remains with a probability that makes up for how often its frame is drawn. A chunk is drawn by
-the weight of the frame whose observation it answers; of its actions those remain that weigh as much, of others a share.
+Runs are drawn so that they lie, where that wastes least, among frames of one weight. Some hold others, too, so of every run's
+actions some are masked by chance: each remains with a probability that makes up for how often its frame is drawn. A chunk is
+drawn by the weight of the frame whose observation it answers, and of its actions those that weigh less remain by chance: there
+it is the observations that are learned from as often as the method wants.
 """
 
 from collections.abc import Callable
@@ -85,6 +86,18 @@ class WeightedBatches(BalancedBatches):
             attempts[_IS_PAD] = ~keep(remains.to(is_learned.device), max(n_attempts, 1), generator)
         common = [key for key in demonstrations if key in attempts]
         return {key: concatenated(demonstrations[key], attempts[key]) for key in common}
+
+    @property
+    def _n_actions(self) -> int:
+        return max(len(self._windows.action_deltas), 1)
+
+    def _learned_per_item(self, drawn: Tensor) -> float:
+        """How many actions of an item of the attempts are learned from, on average."""
+        assert self._interventions is not None
+        if self._windows.n_windows > 1 or self._n_actions == 1:
+            return learned_per_run(self._interventions, self._weights, drawn, self._windows.n_windows)
+        frames = drawn.nonzero().squeeze(1)
+        return float((self._chances_of(frames).sum(1) * drawn[frames]).sum() / drawn.sum())
 
     def _chances_of(self, last: Tensor) -> Tensor:
         """With which probability each action of the items at the frames `last` remains, (B, K)."""
