@@ -9,21 +9,14 @@ seeds on which choices are made. Prints a line per episode and a table.
 """
 
 from collections import Counter, defaultdict
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from experiments.landings import CUBES, HopRecorder
-from experiments.listening import actor_of
-from experiments.lottery import CHOICE_SEEDS
-from experiments.protocol import command_line
+from experiments.landings import CUBES, HopRecorder, asked_for
 from gym_playbyear.occluded_pick_place import PLACE_TOLERANCE
-from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.episodes.script import Script
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
 
 LIFTED_M = 0.01
@@ -111,17 +104,11 @@ def table_of(seen: dict[str, Counter[str]], n: int) -> str:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--task", choices=CUBES, default=CUBES[-1])
-    parser.add_argument("--checkpoint", type=Path)
-    parser.add_argument("--n_episodes", type=int, default=50)
-    options = parser.parse_args()
-    task = PlaybyearEnvConfig(task=options.task)
-    recorder, onlooker = FailureRecorder(env_spec(task).make()), Onlooker()
-    actor = actor_of(options.checkpoint, task) if options.checkpoint else Script()
+    env, actor, seeds = asked_for(__doc__, CUBES[-1], n_episodes=50)
+    recorder, onlooker = FailureRecorder(env), Onlooker()
     seen: dict[str, Counter[str]] = defaultdict(Counter)
     let_go = []
-    for seed in CHOICE_SEEDS[: options.n_episodes]:
+    for seed in seeds:
         play(recorder, actor, seed, expert=onlooker)
         mistake, place = recorder.first_mistake(), recorder.let_go()
         seen[mistake][onlooker.reason] += 1
@@ -129,7 +116,7 @@ def main() -> None:
         print(f"{seed} {recorder.end or 'time'}: {mistake or 'no mistake'}{where}", flush=True)
         let_go += [] if place is None else [place]
     recorder.close()
-    print(f"\n{table_of(seen, min(options.n_episodes, len(CHOICE_SEEDS)))}")
+    print(f"\n{table_of(seen, len(seeds))}")
     if let_go:
         print(
             f"\nLet go {np.mean(let_go):.0f} ± {np.std(let_go):.0f} mm from the tray's middle, {len(let_go)} episodes."

@@ -20,7 +20,7 @@ from experiments.lottery import CHOICE_SEEDS
 from experiments.protocol import NEW_TASKS, TASKS, command_line
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import env_spec
-from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.script import Script
 
 TOUCH_N = 0.2  # a touch, and not the noise of a contact [N]
@@ -73,17 +73,27 @@ class HopRecorder(gym.Wrapper):
         return Landing(float(1000 * (y[end] - cube_y[end])), float(1000 * (y[end] - y[touch])), end - touch)
 
 
-def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--task", choices=CUBES, default=CUBES[-2])
+def asked_for(doc: str | None, task: str, n_episodes: int) -> tuple[gym.Env, Actor, range]:
+    """What the command line asks for: the environment, who acts in it, and the seeds of the episodes.
+
+    Args:
+        doc: Of the module, which is its help.
+        task, n_episodes: Where none is given.
+    """
+    parser = command_line(doc)
+    parser.add_argument("--task", choices=CUBES, default=task)
     parser.add_argument("--checkpoint", type=Path)
-    parser.add_argument("--n_episodes", type=int, default=30)
+    parser.add_argument("--n_episodes", type=int, default=n_episodes)
     options = parser.parse_args()
-    task = PlaybyearEnvConfig(task=options.task)
-    recorder = HopRecorder(env_spec(task).make())
-    actor = actor_of(options.checkpoint, task) if options.checkpoint else Script()
-    landings = defaultdict(list)
-    for seed in CHOICE_SEEDS[: options.n_episodes]:
+    config = PlaybyearEnvConfig(task=options.task)
+    actor = actor_of(options.checkpoint, config) if options.checkpoint else Script()
+    return env_spec(config).make(), actor, CHOICE_SEEDS[: options.n_episodes]
+
+
+def main() -> None:
+    env, actor, seeds = asked_for(__doc__, CUBES[-2], n_episodes=30)
+    recorder, landings = HopRecorder(env), defaultdict(list)
+    for seed in seeds:
         play(recorder, actor, seed)
         landing = recorder.landing()
         told = (

@@ -123,8 +123,9 @@ def test_without_a_hand_back_an_attempt_ends_with_its_correction(tmp_path):
     ],
     ids=["sirius", "iwr", "all, early"],
 )
-def test_other_frames_are_learned_from(tmp_path, options):
+def test_other_frames_are_learned_from(tmp_path, options, capfd):
     dagger(tmp_path, *RUN, *options)
+    assert "left out (--skip_s)" not in capfd.readouterr().out
     rounds = metrics(tmp_path, "round")
     assert [line["step"] for line in rounds] == [2, 4]
     assert all(line["loss_interventions"] > 0 < line["loss_demonstrations"] for line in rounds)
