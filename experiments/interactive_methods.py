@@ -8,6 +8,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "hg_dagger": ("--skip_s=0",),
     "dagger": ("--method.type=dagger",),
     "no_handback": ("--method.type=no_handback",),
+    "redo": ("--method.type=redo",),
     "sirius": ("--method.type=weighted",),
     "iwr": ("--method.type=weighted", "--method.paper=iwr"),
     "robot_gated": ("--method.type=robot_gated",),
@@ -18,7 +19,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "person_robot_gated": ("--method.type=robot_gated", "--expert.person=true"),
 }
 """`skip` is `playbyear-dagger` as it is by default, `hg_dagger` learns from whole corrections, as it was published."""
-WEIGHING = ("hg_dagger", "sirius", "iwr", "all_frames")
+WEIGHING = ("hg_dagger", "redo", "sirius", "iwr", "all_frames")
 """Those that say what is learned from; the others say who acts, and what is kept."""
 COURSES = {"own": {}, "paper": {"KeyBag-Easy-v1": 12}}
 """Attempts that are kept in other tasks before the task itself; the paper's order for the bag."""

@@ -4,18 +4,19 @@ import json
 
 import numpy as np
 import pytest
-from dagger_factory import QUICK, column, command, corrections, dagger, metrics
+from dagger_factory import QUICK, Quick, column, command, corrections, dagger, metrics
 from test_dagger import Scripted, scene
 from test_dagger_resume import PowerCut, assert_ended_alike, cut_power
 
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource, with_saved_options
-from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Staying
+from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Redoing, Staying
 from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
 from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
 from lerobot_playbyear.dagger.same_run import differences
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.play import Seconds, play
 from lerobot_playbyear.training.parts import TrainingParts
 
@@ -91,6 +92,21 @@ def test_labels_are_the_experts_and_the_policy_acts():
     assert not np.allclose(np.stack(labelling.labels), episode.actions)
 
 
+def test_an_expert_that_redoes_ends_a_try_and_acts_from_the_first_step_in_a_demonstration():
+    expert = Telling(steps=(4, 5))
+    redoing = Redoing(expert)
+    _, tried = flags(redoing)
+    assert (len(tried), tried.verdict, redoing.was_needed, expert.told) == (5, Verdict.DISCARD, True, [])
+    redoing.demonstrates = True
+    steps, shown = flags(redoing)
+    assert steps == list(range(len(shown)))
+    assert len(shown) > 5
+    assert (shown.verdict, redoing.was_needed, expert.told) == (None, True, [(-1, True)])
+    redoing.demonstrates, expert.steps = False, ()
+    steps, tried = flags(redoing)
+    assert (steps, tried.verdict, redoing.was_needed) == ([], None, False)
+
+
 # Runs
 
 
@@ -112,6 +128,37 @@ def test_without_a_hand_back_an_attempt_ends_with_its_correction(tmp_path):
     marks = column(corrections(tmp_path), "intervention").reshape(2, 8)
     assert marks.tolist() == [[False, False, *[True] * 6]] * 2
     assert [line["takeover_steps"] for line in metrics(tmp_path, "attempt") if line["outcome"] == "kept"] == [[6], [6]]
+
+
+def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, monkeypatch, capfd):
+    run = (*RUN, "--method.type=redo")
+    dagger(tmp_path / "calm", *run)
+    assert "context switches, autonomy 27%" in capfd.readouterr().out  # 3 steps of a try, 8 of a demonstration
+    data, attempts = corrections(tmp_path / "calm"), metrics(tmp_path / "calm", "attempt")
+    assert column(data, "intervention").all()
+    np.testing.assert_allclose(column(data, "action"), np.tile([0.2, 0.1, -0.2, -1.0], (data.num_frames, 1)))
+    assert [line["outcome"] for line in attempts] == ["kept", "kept"]
+    cost = {"n_expert_steps": 8, "n_tried_steps": 3, "n_takeovers": 1, "n_switches": 1, "person_seconds": 0.55}
+    assert all({key: line[key] for key in cost} == cost for line in attempts)
+    with monkeypatch.context() as patch:
+        cut_power(patch, folder_module.RunFolder, "commit", 3)
+        with pytest.raises(PowerCut):
+            dagger(tmp_path / "killed", *run)
+    command("--resume=true", f"--output_dir={tmp_path / 'killed/out'}")
+    assert_ended_alike(tmp_path / "killed", tmp_path / "calm")
+
+
+def test_what_a_policy_solves_alone_is_not_shown_and_what_it_fails_at_unseen_is(tmp_path, monkeypatch):
+    monkeypatch.setattr(Quick, "wants_control", lambda self, *_: setattr(self, "n", self.n + 1) is not None)
+    dagger(tmp_path, *QUICK, "--method.type=redo", "--episodes=1", "--max_attempts=1", "--episode_seed=10000")
+    (attempt,) = metrics(tmp_path, "attempt")  # seeds that 3 does not divide end as successes
+    assert (attempt["outcome"], attempt["n_expert_steps"], attempt["autonomy"]) == ("unneeded", 0, 1.0)
+    assert "n_tried_steps" not in attempt
+    options = ("--episodes=1", "--max_attempts=1", "--episode_seed=9999", f"--output_dir={tmp_path / 'b/out'}")
+    with pytest.raises(PlaybyearError, match="1 of 1 attempts in a row failed"):
+        dagger(tmp_path, *QUICK, "--method.type=redo", *options)
+    (attempt,) = metrics(tmp_path / "b", "attempt")
+    assert (attempt["outcome"], attempt["n_expert_steps"], attempt["n_tried_steps"]) == ("failed", 8, 8)
 
 
 @pytest.mark.parametrize(
@@ -230,10 +277,16 @@ def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monk
         (("--learn_from=everything",), "--learn_from='everything': give expert or all"),
         (("--method.type=weighted", "--learn_from=all"), "--method.type=weighted says by itself what is learned from"),
         (("--method.type=dagger", "--takeover_delay_s=1"), "--method.type=dagger the expert does not decide when"),
+        (("--method.type=redo", "--skip_s=1"), "--method.type=redo the expert chooses every frame"),
+        (("--method.type=redo", "--takeover_delay_s=1"), "--method.type=redo the expert does not decide when"),
+        (("--method.type=redo", "--learn_from=all"), "--method.type=redo says by itself what is learned from"),
         (("--method.type=robot_gated", "--method.intervention_share=1.5"), "intervention_share=1.5: give a share"),
         (("--skip_s=-1",), "--skip_s=-1.0: give 0 or more seconds"),
         (("--skip_s=1", "--learn_from=all"), "--skip_s=1.0 and --learn_from=all"),
-        (("--skip_s=1", "--method.type=dagger"), "--skip_s=1.0: with --method.type=dagger the expert labels"),
+        (
+            ("--skip_s=1", "--method.type=dagger"),
+            "--skip_s=1.0: with --method.type=dagger the expert chooses every frame",
+        ),
         (("--new_weights=true",), "--new_weights=true: a policy that knows nothing cannot be corrected"),
         (
             ("--expert.type=scripted", "--expert.person=true", "--expert.tremor=-1"),

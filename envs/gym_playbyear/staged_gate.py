@@ -59,7 +59,8 @@ class StagedGate:
         return self.expert.act()
 
     def take_over(self, until_told: bool = True) -> None:
-        """The expert acts from this step on, because somebody else says so. Call it after `wants_control` and before `act`.
+        """The expert acts from this step on, because somebody else says so. Call it after `wants_control` and before `act`,
+        or before the first step.
 
         Args:
             until_told: Until `hand_back`; otherwise until the stage in which it begins is done.

@@ -184,10 +184,10 @@ class DaggerConfig:
             )
         if not 0 <= (self.skip_s or 0) < math.inf:
             raise InputError(f"--skip_s={self.skip_s}: give 0 or more seconds.")
-        if self.skip_s and self.method.type == "dagger":
+        if self.skip_s and self.method.type in ("dagger", "redo"):
             raise InputError(
-                f"--skip_s={self.skip_s}: with --method.type=dagger the expert labels every frame, and no correction has a "
-                "beginning; leave it out."
+                f"--skip_s={self.skip_s}: with --method.type={self.method.type} the expert chooses every frame, and no "
+                "correction has a beginning; leave it out."
             )
         if self.skip_s and self.learn_from == "all":
             raise InputError(
@@ -198,7 +198,7 @@ class DaggerConfig:
         if self.takeover_delay_s and not self.method.expert_decides:
             raise InputError(
                 f"--takeover_delay_s={self.takeover_delay_s}: with --method.type={self.method.type} the expert does not decide "
-                "when it takes over; leave it out."
+                "when it takes over, or not of what is learned from; leave it out."
             )
         if self.new_weights and self.is_online:
             raise InputError(

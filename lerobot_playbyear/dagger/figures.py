@@ -68,7 +68,7 @@ class Totals:
         n_frames = int(line["n_frames"])
         by_share = round(float(line["intervention_share"]) * n_frames)
         self.attempts += 1
-        self.steps += n_frames
+        self.steps += n_frames + int(line.get("n_tried_steps", 0))
         self.expert_steps += int(line.get("n_expert_steps", by_share))
         self.controlled_steps += sum(line["takeover_steps"]) if "takeover_steps" in line else by_share
         self.takeovers += int(line.get("n_takeovers", 0))

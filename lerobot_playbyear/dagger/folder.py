@@ -199,6 +199,15 @@ class RunFolder:
         with _errors_of_writing(self.path):
             _replace(path, "".join(kept))
 
+    def note(self, name: str, text: str) -> None:
+        """Keeps a few words of a method's in a file of this name."""
+        with _errors_of_writing(self.path):
+            _replace(self.path / name, text)
+
+    def noted(self, name: str) -> str:
+        """The words of that file."""
+        return (self.path / name).read_text()
+
 
 def _replace(path: Path, content: str) -> None:
     """Write a file so that at every moment the old or the new one is there."""

@@ -154,7 +154,7 @@ class Loop:
             self.state.next_seed += 1
         self.method.prepare()
         seed = self.state.next_seed
-        return self.method.recorded(self.scene.attempt(seed, self._random_seed(_ATTEMPT, seed), spent))
+        return self.method.recorded(self.method.attempt(self.scene, seed, self._random_seed(_ATTEMPT, seed), spent))
 
     def _note(self, episode: Episode, outcome: str, spent: Seconds) -> None:
         """Counts an attempt."""

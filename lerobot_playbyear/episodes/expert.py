@@ -62,7 +62,8 @@ class Expert(abc.ABC):
         """The expert's action (action dim,) for this step."""
 
     def take_over(self, until_told: bool = True) -> None:  # noqa: B027 (an expert that looks at the present state needs none)
-        """Somebody else says that the expert is in control from this step on. Called after `wants_control`, before `act`.
+        """Somebody else says that the expert is in control from this step on. Called after `wants_control`, before `act`, or
+        after `reset`.
 
         Args:
             until_told: Until `hand_back`, or the end; otherwise until its `wants_control` says no.

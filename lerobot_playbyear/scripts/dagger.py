@@ -19,8 +19,9 @@ What goes in
   --expert.person=...          with scripted: true for a script that reacts late, trembles and errs
 
 Method
-  --method.type=...            hg_dagger (default), dagger (labels), no_handback,
-                               weighted (IWR, Sirius), robot_gated (the robot asks: ThriftyDAgger)
+  --method.type=...            hg_dagger (default), dagger (labels), no_handback, redo (shows
+                               all that the policy failed at), weighted (IWR, Sirius),
+                               robot_gated (the robot asks: ThriftyDAgger)
   --method.intervention_share=...   with robot_gated: of the steps in which it asks
   --takeover_delay_s=0.0       the expert takes over later, or below 0 sooner
   --skip_s=null                of every correction so much of its beginning is not learned from;

@@ -16,8 +16,10 @@ from torch import Tensor
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.episodes.episode import Episode, Verdict
 from lerobot_playbyear.episodes.expert import Expert
+from lerobot_playbyear.episodes.play import Seconds
 
 if TYPE_CHECKING:
+    from lerobot_playbyear.dagger.attempt import Scene
     from lerobot_playbyear.dagger.config import DaggerConfig
     from lerobot_playbyear.dagger.corrections import Corrections
     from lerobot_playbyear.dagger.folder import RunFolder, RunState
@@ -117,6 +119,10 @@ class Method:
     def prepare(self) -> None:
         """An attempt follows. What is made here must depend on the state of the run alone, so that it resumes exactly."""
 
+    def attempt(self, scene: "Scene", seed: int, random_seed: int, seconds: Seconds) -> Episode:
+        """Makes an attempt; the arguments are those of `Scene.attempt`."""
+        return scene.attempt(seed, random_seed, seconds)
+
     def recorded(self, episode: Episode) -> Episode:
         """An attempt as it is recorded, with `interventions` where the recorded action is the expert's."""
         return episode
@@ -136,7 +142,7 @@ class Method:
         """No attempt follows."""
 
     def figures(self) -> Mapping[str, float]:
-        """Further figures of the last attempt."""
+        """Further figures of the last attempt, and those that are otherwise than `attempt_figures` takes them to be."""
         return {}
 
     def recovered_figures(self, cost: Mapping[str, Any]) -> Mapping[str, float]:

@@ -63,6 +63,37 @@ class Staying(Beside):
         return self._stays
 
 
+class Redoing(Beside):
+    """In a try the policy acts, and the expert's wish to take over ends it; in a demonstration the expert acts all the time.
+
+    Attributes:
+        demonstrates: Set it before the attempt.
+        was_needed: Whether the expert ended the last try.
+    """
+
+    def __init__(self, expert: Expert) -> None:
+        super().__init__(expert)
+        self.demonstrates = self.was_needed = False
+
+    def reset(self, env: gym.Env) -> None:
+        super().reset(env)
+        if self.demonstrates:
+            self.expert.take_over()
+        else:
+            self.was_needed = False
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        wants = super().wants_control(observation, policy_action)
+        if not self.demonstrates:
+            self.was_needed |= wants
+        return wants or self.demonstrates
+
+    def verdict(self) -> Verdict | None:
+        verdict = super().verdict()
+        is_over = self.was_needed and not self.demonstrates
+        return verdict or (Verdict.DISCARD if is_over else None)
+
+
 class Labelling(Beside):
     """Lets the policy act, and notes what the expert would do in its place.
 
