@@ -31,15 +31,13 @@ Resumes where it was interrupted. Studies may run at the same time; those of one
 `experiments.ablations`, too, but that does not wait for them: do not start it while a study trains the same policy.
 """
 
-import json
 import math
-from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from experiments.interactive_methods import COURSES, METHODS, WEIGHING, check
-from experiments.interactive_parts import alone, demonstrated, finished, first_job, trained
+from experiments.interactive_parts import alone, demonstrated, finished, first_job, metrics_of, newest, trained
 from experiments.protocol import (
     N_DEMONSTRATIONS,
     NEW_TASKS,
@@ -129,7 +127,7 @@ class Study:
         how = [options.method, options.learn, *([] if options.course == "own" else [options.course])]
         self.how = "-".join([*how, f"{options.kept}kept", f"{options.rounds}rounds", f"{options.updates}updates"])
         self.name = f"{job.name}-{self.how}"
-        self.path = RESULTS / STUDY / f"{self.name}.json"
+        self.path = RESULTS / STUDY / f"{self.name}{'-grow' if options.grow else ''}.json"
         self.corrections = RUNS / "datasets" / f"{STUDY}-{self.name}"
         self.commands: list[str] = []
         self.folders: list[Path] = []
@@ -145,8 +143,9 @@ class Study:
                 policy, updates = self._learn_online(kept)
             else:
                 self._collect(policy, number, kept)
-                if any(line.get("outcome") == "kept" for line in _metrics(self.folders)):
-                    policy, updates = self._learn_anew(number), options.updates
+                if any(line.get("outcome") == "kept" for line in metrics_of(self.folders)):
+                    updates = options.updates * (number if options.grow else 1)
+                    policy = self._learn_anew(number, updates)
             outcomes.append(self._outcome_of_round(number, policy, updates))
             print(f"{self.name}: {outcomes[-1]}", flush=True)
         controls = {name: self._control(name, outcomes[-1]) for name in options.controls}
@@ -189,12 +188,18 @@ class Study:
         for task, n in course.items():
             self._attempts(policy, f"collect{number}-{task}", task, n, 0)
 
-    def _learn_anew(self, number: int) -> Path:
+    def _learn_anew(self, number: int, updates: int) -> Path:
         """A policy that learns everything; the first one gives its options and its normalisation. Returns its checkpoint."""
-        learned = (f"--updates={self.options.updates}", "--updates_per_episode=500", "--episodes=0")
+        learned = (f"--updates={updates}", "--updates_per_episode=500", "--episodes=0")
         weights = METHODS[self.options.method] if self.options.method in WEIGHING else ()
-        folder = self._dagger(self.job.checkpoint, f"learn{number}", *learned, "--new_weights=true", *weights)
-        return _newest(folder)
+        name = f"learn{number}{self._grown(updates)}"
+        folder = self._dagger(self.job.checkpoint, name, *learned, "--new_weights=true", *weights)
+        return newest(folder)
+
+    def _grown(self, updates: int) -> str:
+        """What tells a round that has more than `--updates` from the same round with those."""
+        grown = self.options.learn == "new_weights" and updates > self.options.updates
+        return f"-{updates}updates" if grown else ""
 
     def _learn_online(self, kept: int) -> tuple[Path, int]:
         """HG-DAgger as it is meant: updates after every kept attempt; a further round goes on with the same runs.
@@ -208,7 +213,7 @@ class Study:
             folder = self._attempts(policy, f"online-{task}", task, n, per_episode)
             state = load(folder / "dagger_state.json")
             if state["checkpoint"] is not None:
-                policy, updates = _newest(folder), updates + state["step"]
+                policy, updates = newest(folder), updates + state["step"]
         return policy, updates
 
     def _control(self, name: str, last: Outcome) -> Outcome:
@@ -236,11 +241,12 @@ class Study:
         return replace(outcome, expert_steps=expert_steps)  # depends on what it is a control of
 
     def _outcome_of_round(self, number: int, policy: Path, updates: int) -> Outcome:
-        lines = list(_metrics(self.folders))
+        lines = list(metrics_of(self.folders))
         totals, figures = Totals.of(lines), ("expert_steps", "takeovers", "switches", "person_seconds", "autonomy")
         spent = {figure: getattr(totals, figure) for figure in figures}
         kept = sum(line.get("outcome") == "kept" for line in lines)
-        return self._evaluated(self.job, f"-{self.how}-round{number}", policy, updates, kept=kept, **spent)
+        name = f"-{self.how}-round{number}{self._grown(updates)}"
+        return self._evaluated(self.job, name, policy, updates, kept=kept, **spent)
 
     def _evaluated(self, job: Job, name: str, policy: Path, updates: int, **spent: Any) -> Outcome:
         """Evaluates a policy, unless that was done; what it had taken by then is kept with it."""
@@ -258,16 +264,6 @@ class Study:
         return Outcome(**saved)
 
 
-def _newest(folder: Path) -> Path:
-    return folder / "checkpoints" / "last" / "pretrained_model"
-
-
-def _metrics(folders: Iterable[Path]) -> Iterable[dict[str, Any]]:
-    """The lines of some runs' attempts."""
-    for folder in folders:
-        yield from (json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
-
-
 def main() -> None:
     parser = command_line(__doc__, "task", "seeds", "threads")
     parser.set_defaults(task=NEW_TASKS[0], seeds=[1])
@@ -278,6 +274,7 @@ def main() -> None:
     parser.add_argument("--kept", type=int, default=100, help="attempts that are kept in all")
     parser.add_argument("--rounds", type=int, default=1, help="in which they are collected and learned from")
     parser.add_argument("--updates", type=int, default=STEPS, help="of each round")
+    parser.add_argument("--grow", action="store_true", help="round k has k times --updates, as it learns from more")
     parser.add_argument("--controls", nargs="*", choices=CONTROLS, default=CONTROLS)
     options, training = parser.parse_known_args()
     try:

@@ -49,5 +49,7 @@ def check(options: Namespace, training: Sequence[str]) -> None:
             f"--kept={options.kept} with --rounds={options.rounds} and --course={options.course}: {first} attempts in the "
             f"first round are too few; give more than {max(others.values())} a round."
         )
+    if options.learn == "online" and options.grow:
+        raise ValueError("--grow is for --learn=new_weights: online a policy learns more with every attempt anyway.")
     if options.learn == "online" and options.updates * options.rounds < options.kept:
         raise ValueError(f"--updates={options.updates}: give at least one for every attempt that is kept.")

@@ -10,7 +10,7 @@ import json
 import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +125,17 @@ def is_written_to(folder: Path) -> bool:
             if any(wanted in (path, *path.parents) for path in paths):
                 return True
     return False
+
+
+def newest(folder: Path) -> Path:
+    """The last checkpoint of a run."""
+    return folder / "checkpoints" / "last" / "pretrained_model"
+
+
+def metrics_of(folders: Iterable[Path]) -> Iterable[dict[str, Any]]:
+    """The lines of some runs' attempts."""
+    for folder in folders:
+        yield from (json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
 
 
 def _root(task: str, n: int) -> Path:

@@ -24,6 +24,7 @@ DEFAULTS = {
     "kept": 4,
     "rounds": 2,
     "updates": 30,
+    "grow": False,
     "controls": interactive.CONTROLS,
 }
 DEMONSTRATION_STEPS, EXPERT_STEPS = 10, 7  # of a demonstration, and in an attempt that is kept
@@ -192,6 +193,18 @@ def test_rounds_collect_with_the_newest_policy_and_learn_anew(ran):
     assert "learn1" in collected[1]["policy.path"]
     assert [outcome.expert_steps for outcome in result.outcomes] == [0, 2 * EXPERT_STEPS, 4 * EXPERT_STEPS]
     assert [outcome.kept for outcome in result.outcomes] == [0, 2, 4]
+
+
+def test_rounds_that_grow_share_what_was_collected(ran):
+    plain = study().run()
+    n_collected, n_learned = 2, 2
+    grown = study(grow=True, controls=("updates",)).run()
+    dagger = ran.of("playbyear-dagger")
+    assert len(dagger) == n_collected + n_learned + 1  # the second round alone has more updates
+    assert dagger[-1]["updates"] == "60"
+    assert [outcome.updates for outcome in grown.outcomes[1:]] == [30, 60]
+    assert grown.outcomes[:2] == plain.outcomes[:2]
+    assert grown.controls["updates"].updates == 60
 
 
 @pytest.mark.parametrize("when", ["before", "halfway", "after"])
@@ -394,6 +407,7 @@ def test_the_command_line_passes_options_of_the_policy_on(ran, monkeypatch):
         (["--task=KeyBag-Hard-v1", "--course=paper", "--kept=20", "--rounds=2"], "give more than 12 a round"),
         (["--kept=1", "--rounds=2"], "give more than 0 a round"),
         (["--learn=online", "--updates=50"], "at least one for every attempt"),
+        (["--learn=online", "--grow"], "--grow is for --learn=new_weights"),
     ],
 )
 def test_what_does_not_go_together_is_refused_before_any_work(ran, monkeypatch, capsys, arguments, message):
