@@ -24,6 +24,7 @@ What takes time are updates; collecting makes none, and takes as long as its att
 | `updates` | new_weights: `--updates`, but none if they are 1,250; online: as many as the corrections | if it is as many |
 | `demonstrations` | new_weights: `--updates`; online: 1,250, and as many as the corrections | if it has as many of both |
 
+With `--rounds=2 --grow` the second round has twice `--updates`; all that comes before is shared with the study without it.
 So with one round the first method takes 3,750, and each further one 1,250 to 2,500; online they take 6,250, and 1,250 to
 5,000.
 

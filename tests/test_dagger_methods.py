@@ -11,6 +11,7 @@ from test_dagger_resume import PowerCut, assert_ended_alike, cut_power
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource, with_saved_options
+from lerobot_playbyear.dagger.methods import redo
 from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Redoing, Staying
 from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
 from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
@@ -18,6 +19,7 @@ from lerobot_playbyear.dagger.same_run import differences
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.play import Seconds, play
+from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
 from lerobot_playbyear.training.parts import TrainingParts
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -105,6 +107,32 @@ def test_an_expert_that_redoes_ends_a_try_and_acts_from_the_first_step_in_a_demo
     redoing.demonstrates, expert.steps = False, ()
     steps, tried = flags(redoing)
     assert (steps, tried.verdict, redoing.was_needed) == ([], None, False)
+    expert.steps, expert.verdicts = (4,), {4: Verdict.DISCARD}  # a person throws the attempt away while taking over
+    assert flags(redoing)[1].verdict is Verdict.DISCARD
+    assert not redoing.was_needed
+
+
+@pytest.mark.parametrize("is_person", [False, True])
+def test_the_tasks_script_acts_from_the_first_step_if_it_is_told_to(is_person):
+    env, actor, _ = scene()
+    redoing = Redoing(ScriptedExpertConfig(person=is_person).make(env))
+    redoing.demonstrates = True
+    episode = play(env, actor, seed=5, expert=redoing)
+    env.close()
+    assert episode.interventions.all()
+    assert episode.success or is_person  # its hand trembles
+
+
+def test_redo_learns_of_attempts_of_another_method_only_what_the_expert_chose(tmp_path, monkeypatch):
+    dagger(tmp_path, *RUN)
+    given = []
+    monkeypatch.setattr(
+        redo.Redo, "learned", lambda *args, real=redo.Redo.learned: given.append(real(*args)) or given[-1]
+    )
+    options = ("--method.type=redo", "--episodes=0", "--updates=1", f"--interventions.root={tmp_path / 'corrections'}")
+    dagger(tmp_path / "other", *options, env=())
+    assert given[-1].weights.tolist() == column(corrections(tmp_path), "intervention").ravel().tolist()
+    assert given[-1].weights.sum() == 6
 
 
 # Runs
@@ -278,7 +306,7 @@ def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monk
         (("--method.type=weighted", "--learn_from=all"), "--method.type=weighted says by itself what is learned from"),
         (("--method.type=dagger", "--takeover_delay_s=1"), "--method.type=dagger the expert does not decide when"),
         (("--method.type=redo", "--skip_s=1"), "--method.type=redo the expert chooses every frame"),
-        (("--method.type=redo", "--takeover_delay_s=1"), "--method.type=redo the expert does not decide when"),
+        (("--method.type=redo", "--takeover_delay_s=1"), "--method.type=redo a takeover only ends the policy's try"),
         (("--method.type=redo", "--learn_from=all"), "--method.type=redo says by itself what is learned from"),
         (("--method.type=robot_gated", "--method.intervention_share=1.5"), "intervention_share=1.5: give a share"),
         (("--skip_s=-1",), "--skip_s=-1.0: give 0 or more seconds"),

@@ -408,6 +408,7 @@ def test_the_command_line_passes_options_of_the_policy_on(ran, monkeypatch):
         (["--kept=1", "--rounds=2"], "give more than 0 a round"),
         (["--learn=online", "--updates=50"], "at least one for every attempt"),
         (["--learn=online", "--grow"], "--grow is for --learn=new_weights"),
+        (["--rounds=3", "--grow"], "give --rounds=2, not 3"),
     ],
 )
 def test_what_does_not_go_together_is_refused_before_any_work(ran, monkeypatch, capsys, arguments, message):

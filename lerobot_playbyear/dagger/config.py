@@ -193,12 +193,22 @@ class DaggerConfig:
             raise InputError(
                 f"--skip_s={self.skip_s} and --learn_from=all contradict each other: leave out one of them."
             )
+        if self.method.needs_simulation and getattr(self.env, "is_real_time", False):
+            raise InputError(
+                f"--method.type={self.method.type} sets up the scene of every failure a second time, which only a simulation "
+                "does alike. On a robot leave it out, or record further demonstrations with playbyear-record."
+            )
         if not math.isfinite(self.takeover_delay_s):
             raise InputError(f"--takeover_delay_s={self.takeover_delay_s}: give a number of seconds.")
+        if self.takeover_delay_s and self.method.type == "redo":
+            raise InputError(
+                f"--takeover_delay_s={self.takeover_delay_s}: with --method.type=redo a takeover only ends the policy's try; "
+                "leave it out."
+            )
         if self.takeover_delay_s and not self.method.expert_decides:
             raise InputError(
                 f"--takeover_delay_s={self.takeover_delay_s}: with --method.type={self.method.type} the expert does not decide "
-                "when it takes over, or not of what is learned from; leave it out."
+                "when it takes over; leave it out."
             )
         if self.new_weights and self.is_online:
             raise InputError(

@@ -68,7 +68,7 @@ class Redoing(Beside):
 
     Attributes:
         demonstrates: Set it before the attempt.
-        was_needed: Whether the expert ended the last try.
+        was_needed: Whether the expert ended the last try by taking over.
     """
 
     def __init__(self, expert: Expert) -> None:
@@ -90,6 +90,8 @@ class Redoing(Beside):
 
     def verdict(self) -> Verdict | None:
         verdict = super().verdict()
+        if verdict is Verdict.DISCARD and not self.demonstrates:
+            self.was_needed = False  # void, whoever was about to act
         is_over = self.was_needed and not self.demonstrates
         return verdict or (Verdict.DISCARD if is_over else None)
 

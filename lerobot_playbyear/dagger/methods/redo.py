@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
-
+from lerobot_playbyear.dagger.batches import frames_by_expert
 from lerobot_playbyear.dagger.methods.base import Learned, Method, MethodConfig, Tools
 from lerobot_playbyear.dagger.methods.beside import Redoing
 from lerobot_playbyear.datasets import EpisodeStore
@@ -28,6 +27,7 @@ class RedoConfig(MethodConfig):
 
     expert_decides: ClassVar[bool] = False
     chooses_frames: ClassVar[bool] = True
+    needs_simulation: ClassVar[bool] = True
 
     def make(self, cfg: "DaggerConfig") -> Method:
         return Redo(cfg)
@@ -37,8 +37,7 @@ class Redo(Method):
     """Demonstrations of the scenes that the policy fails in; they weigh as much as those that are there, frame by frame.
 
     The policy tries first, until the expert would take over or the attempt ends. After a failure the environment is reset with
-    the same seed: a simulation sets up the same scene, on a robot a person puts the things back. An attempt that is kept holds
-    the demonstration alone.
+    the same seed, which sets up the same scene. An attempt that is kept holds the demonstration alone.
     """
 
     def beside(self, expert: Expert) -> Expert:
@@ -80,4 +79,5 @@ class Redo(Method):
         return True
 
     def learned(self, n_demonstrated: int, attempts: EpisodeStore) -> Learned:
-        return Learned(torch.ones(len(attempts)), n_demonstrated / (n_demonstrated + len(attempts)))
+        weights = frames_by_expert(attempts).cpu().double()  # of attempts of another method, only what the expert chose
+        return Learned(weights, n_demonstrated / (n_demonstrated + float(weights.sum())))
