@@ -1,6 +1,7 @@
 """The methods behind `--method.type`: who acts, what is recorded, what is kept, and that each resumes exactly."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -326,6 +327,13 @@ def test_options_that_do_not_go_together(tmp_path, options, message):
     with pytest.raises(PlaybyearError, match=message):
         dagger(tmp_path, *RUN, *options)
     assert not (tmp_path / "out").exists()
+
+
+def test_no_robot_is_asked_to_set_up_a_scene_twice():
+    source, robot = DatasetSource("a/b"), SimpleNamespace(is_real_time=True)
+    with pytest.raises(PlaybyearError, match="--method.type=redo sets up the scene of every failure a second time"):
+        DaggerConfig(source, source, env=robot, method=redo.RedoConfig(), eval_every=0).check()
+    DaggerConfig(source, source, env=robot, eval_every=0).check()
 
 
 def test_a_run_goes_on_with_its_own_method_alone(tmp_path):
