@@ -331,7 +331,7 @@ def test_options_that_do_not_go_together(tmp_path, options, message):
 
 def test_no_robot_is_asked_to_set_up_a_scene_twice():
     source, robot = DatasetSource("a/b"), SimpleNamespace(is_real_time=True)
-    with pytest.raises(PlaybyearError, match="--method.type=redo sets up the scene of every failure a second time"):
+    with pytest.raises(PlaybyearError, match="redo sets up the scene of every failure a second time"):
         DaggerConfig(source, source, env=robot, method=redo.RedoConfig(), eval_every=0).check()
     DaggerConfig(source, source, env=robot, eval_every=0).check()
 
