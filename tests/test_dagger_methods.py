@@ -56,6 +56,15 @@ def test_an_expert_that_stays_acts_from_its_first_takeover_to_the_end():
     assert expert.told == [(4, True)]
 
 
+@pytest.mark.parametrize("decides", [False, True])
+def test_a_person_who_stays_is_not_asked_to_act_in_the_step_that_they_ended(decides):
+    expert = Telling(steps=(4, 5), verdicts={7: Verdict.FAILURE})  # as where a leader no longer answers
+    expert.decides = decides
+    steps, episode = flags(Staying(expert))
+    assert (len(episode), episode.verdict) == (8, Verdict.FAILURE)
+    assert steps == ([4, 5, 6] if decides else [4, 5, 6, 7])  # a script has an action for it
+
+
 def test_a_late_expert_begins_later_from_where_the_hand_is_then():
     expert = Telling(steps=(3, 10, 11, 12, 13, 14))
     steps, _ = flags(Late(expert, 2))
@@ -113,7 +122,7 @@ def test_an_expert_that_redoes_ends_a_try_and_acts_from_the_first_step_in_a_demo
     assert not redoing.was_needed
 
 
-@pytest.mark.parametrize("is_person", [False, True])
+@pytest.mark.parametrize("is_person", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_tasks_script_acts_from_the_first_step_if_it_is_told_to(is_person):
     env, actor, _ = scene()
     redoing = Redoing(ScriptedExpertConfig(person=is_person).make(env))
@@ -124,6 +133,7 @@ def test_the_tasks_script_acts_from_the_first_step_if_it_is_told_to(is_person):
     assert episode.success or is_person  # its hand trembles
 
 
+@pytest.mark.slow
 def test_redo_learns_of_attempts_of_another_method_only_what_the_expert_chose(tmp_path, monkeypatch):
     dagger(tmp_path, *RUN)
     given = []
