@@ -60,7 +60,9 @@ class Staying(Beside):
         if wants and not self._stays:
             self._stays = True
             self.expert.take_over()
-        has_left = self.decides and not wants and super().verdict() is not None  # ended by a person, who has no action for it
+        has_left = (
+            self.decides and not wants and super().verdict() is not None
+        )  # ended by a person, who has no action for it
         return self._stays and not has_left
 
 
