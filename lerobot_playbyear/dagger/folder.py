@@ -21,6 +21,7 @@ from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
+from lerobot_playbyear.training.checkpoints import BEST_LINK
 
 STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""
@@ -44,6 +45,8 @@ class RunState:
         next_seed: Of the next attempt.
         evaluated_round: The round after which the last evaluation took place; -1 for none.
         success: What it gave [%].
+        best: The best evaluation on the present seeds: its `success` [%], its `seeds` (first, number), and the `checkpoint`
+            that it was of, None for the policy that the run began with. Empty before.
         checkpoint: Folder of the newest weights; None before the first update.
         milestones: Checkpoints that are kept for good.
         method: What the method keeps, such as what it knew when the round began.
@@ -63,6 +66,7 @@ class RunState:
     next_seed: int = 0
     evaluated_round: int = -1
     success: float | None = None
+    best: dict[str, Any] = field(default_factory=dict)
     checkpoint: str | None = None
     milestones: list[str] = field(default_factory=list)
     method: dict[str, Any] = field(default_factory=dict)
@@ -159,18 +163,19 @@ class RunFolder:
             flush(self.checkpoints)
 
     def clean(self, state: RunState) -> None:
-        """Remove checkpoints that are neither the newest nor milestones, and let `last` name the newest."""
+        """Remove checkpoints that are neither the newest nor the best nor milestones; `last` and `best` name those."""
         if not self.checkpoints.is_dir():
             return
-        wanted = {*state.milestones, state.checkpoint}
+        wanted = {*state.milestones, state.checkpoint, state.best.get("checkpoint")}
         for path in self.checkpoints.iterdir():
             if path.is_dir() and not path.is_symlink() and path.name not in wanted:
                 shutil.rmtree(path, ignore_errors=True)
-        if state.checkpoint is not None:
-            link = self.checkpoints / (LAST_CHECKPOINT_LINK + _PARTIAL)
-            link.unlink(missing_ok=True)
-            link.symlink_to(state.checkpoint)
-            os.replace(link, self.checkpoints / LAST_CHECKPOINT_LINK)
+        for name, checkpoint in ((LAST_CHECKPOINT_LINK, state.checkpoint), (BEST_LINK, state.best.get("checkpoint"))):
+            if checkpoint is not None:
+                link = self.checkpoints / (name + _PARTIAL)
+                link.unlink(missing_ok=True)
+                link.symlink_to(checkpoint)
+                os.replace(link, self.checkpoints / name)
 
     # Figures
 

@@ -247,8 +247,12 @@ class Loop:
         with contextlib.redirect_stderr(io.StringIO()):  # LeRobot's own progress bars; ours goes on
             info = self.parts.evaluate(self.training, cfg.eval_videos)
         state.evaluated_round, state.success = state.round, float(info["overall"]["pc_success"])
+        seeds = [cfg.eval_seeds.start, len(cfg.eval_seeds)]
+        if state.best.get("seeds") != seeds or state.success >= state.best["success"]:  # of equal ones the last
+            state.best = {"success": state.success, "checkpoint": state.checkpoint, "seeds": seeds}
         self.report.write_evaluation(info, evaluation_s=round(time.perf_counter() - start, 3))
         self.folder.commit(state)
+        self.folder.clean(state)
 
     def _random_seed(self, purpose: int, number: int) -> int:
         return int(np.random.SeedSequence([self.cfg.seed, purpose, number]).generate_state(1)[0])

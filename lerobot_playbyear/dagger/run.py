@@ -35,6 +35,7 @@ from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.training.checkpoints import BEST_LINK
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.loop import read_store
 from lerobot_playbyear.training.parts import make_training_parts
@@ -228,6 +229,10 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
     print(f"Corrections: {n_learned} of {n_corrected} frames that the expert chose are learned from{left_out}")
     if state.success is not None:
         print(f"Success:     {state.success:.1f} % of {cfg.eval.n_episodes} episodes")
+    if state.success is not None and state.best and state.best["success"] > state.success:
+        best = folder.checkpoints / BEST_LINK / PRETRAINED_MODEL_DIR if state.best["checkpoint"] else state.policy_path
+        print(f"Best:        {state.best['success']:.1f} % of them: {best}")
+        print("             The best of several evaluations looks better than it is: evaluate it on other seeds, too.")
     if state.checkpoint is None:
         print("No update was made: --warmup_episodes is larger than what was collected.")
         return
