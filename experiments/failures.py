@@ -3,21 +3,25 @@
     python -m experiments.failures --task=OccludedPickPlace-v1 --checkpoint=outputs/train/checkpoints/last/pretrained_model
     python -m experiments.failures --task=OccludedPickPlace-v1        # the expert's
 
+`--films=FOLDER` also films the first episode of each kind, with sound.
+
 Told from what the simulator knows: `pressed` alone says that the hand came down on the cube, not that it had dropped it beside
 the tray before. Beside it stands for what the scripted expert would have taken over first, had it watched. The episodes are of
 seeds on which choices are made. Prints a line per episode and a table.
 """
 
 from collections import Counter, defaultdict
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from experiments.landings import CUBES, HopRecorder, asked_for
+from experiments.landings import CUBES, HopRecorder, asked_for, parser_of
 from gym_playbyear.occluded_pick_place import PLACE_TOLERANCE
-from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
+from lerobot_playbyear.film.episode_film import write_episode_film
 
 LIFTED_M = 0.01
 BESIDE_MM = 6.0
@@ -103,18 +107,33 @@ def table_of(seen: dict[str, Counter[str]], n: int) -> str:
     return "\n".join(rows)
 
 
+def film(env: gym.Env, actor: Actor, seed: int, path: Path) -> None:
+    """Films an episode that was played before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    episode = play(env, actor, seed, watch=env.render)
+    write_episode_film(episode, path, round(env.metadata["render_fps"]))
+    print(f"{path}: seed {seed}", flush=True)
+
+
 def main() -> None:
-    env, actor, seeds = asked_for(__doc__, CUBES[-1], n_episodes=50)
+    parser = parser_of(__doc__, CUBES[-1], n_episodes=50)
+    parser.add_argument("--films", type=Path, help="folder for a film of each kind of mistake, and of a success")
+    options = parser.parse_args()
+    env, actor, seeds = asked_for(options)
     recorder, onlooker = FailureRecorder(env), Onlooker()
     seen: dict[str, Counter[str]] = defaultdict(Counter)
-    let_go = []
+    let_go, first = [], {}
     for seed in seeds:
         play(recorder, actor, seed, expert=onlooker)
         mistake, place = recorder.first_mistake(), recorder.let_go()
         seen[mistake][onlooker.reason] += 1
+        first.setdefault(mistake, seed)
         where = "" if place is None else f", let go {place:.0f} mm from the tray's middle"
         print(f"{seed} {recorder.end or 'time'}: {mistake or 'no mistake'}{where}", flush=True)
         let_go += [] if place is None else [place]
+    if options.films is not None:
+        for mistake, seed in first.items():
+            film(recorder, actor, seed, options.films / f"{mistake.replace(',', '').replace(' ', '_') or 'success'}.mp4")
     recorder.close()
     print(f"\n{table_of(seen, len(seeds))}")
     if let_go:

@@ -7,6 +7,7 @@ A hop begins with the first touch. It ends when the hand has fallen by 12 mm, af
 The episodes are of seeds on which choices are made. Prints a line per episode, and the mean of those that end alike and of all.
 """
 
+from argparse import ArgumentParser, Namespace
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,8 +74,8 @@ class HopRecorder(gym.Wrapper):
         return Landing(float(1000 * (y[end] - cube_y[end])), float(1000 * (y[end] - y[touch])), end - touch)
 
 
-def asked_for(doc: str | None, task: str, n_episodes: int) -> tuple[gym.Env, Actor, range]:
-    """What the command line asks for: the environment, who acts in it, and the seeds of the episodes.
+def parser_of(doc: str | None, task: str, n_episodes: int) -> ArgumentParser:
+    """Knows what `asked_for` needs.
 
     Args:
         doc: Of the module, which is its help.
@@ -84,14 +85,18 @@ def asked_for(doc: str | None, task: str, n_episodes: int) -> tuple[gym.Env, Act
     parser.add_argument("--task", choices=CUBES, default=task)
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--n_episodes", type=int, default=n_episodes)
-    options = parser.parse_args()
+    return parser
+
+
+def asked_for(options: Namespace) -> tuple[gym.Env, Actor, range]:
+    """What a command line asks for: the environment, who acts in it, and the seeds of the episodes."""
     config = PlaybyearEnvConfig(task=options.task)
     actor = actor_of(options.checkpoint, config) if options.checkpoint else Script()
     return env_spec(config).make(), actor, CHOICE_SEEDS[: options.n_episodes]
 
 
 def main() -> None:
-    env, actor, seeds = asked_for(__doc__, CUBES[-2], n_episodes=30)
+    env, actor, seeds = asked_for(parser_of(__doc__, CUBES[-2], n_episodes=30).parse_args())
     recorder, landings = HopRecorder(env), defaultdict(list)
     for seed in seeds:
         play(recorder, actor, seed)
