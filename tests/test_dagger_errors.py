@@ -93,9 +93,17 @@ def test_without_an_environment_or_a_policy(tmp_path):
 def test_an_environment_without_a_gate(tmp_path, monkeypatch):
     from gym_playbyear.task_env import TaskEnv
 
+    wanted = r"needs an environment with `intervention_gate\(\)`.*own_expert.py"
     monkeypatch.setattr(TaskEnv, "intervention_gate", None)
-    with pytest.raises(PlaybyearError, match=r"needs an environment with `intervention_gate\(\)`.*own_expert.py"):
-        dagger(tmp_path)
+    with pytest.raises(
+        PlaybyearError, match=r"OccludedGrasp.*--method.type=no_handback needs one. Give --method.type=redo"
+    ):
+        dagger(tmp_path, "--method.type=no_handback")
+    with pytest.raises(PlaybyearError, match=f"--expert.person=true {wanted}"):
+        dagger(tmp_path, "--method.type=redo", "--expert.person=true")
+    monkeypatch.setattr(TaskEnv, "scripted_expert", None)
+    with pytest.raises(PlaybyearError, match=wanted):
+        dagger(tmp_path, "--method.type=redo")
 
 
 # Output folders

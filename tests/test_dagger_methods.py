@@ -9,6 +9,7 @@ from dagger_factory import QUICK, Quick, column, command, corrections, dagger, m
 from test_dagger import Scripted, scene
 from test_dagger_resume import PowerCut, assert_ended_alike, cut_power
 
+from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource, with_saved_options
@@ -18,6 +19,7 @@ from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
 from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
 from lerobot_playbyear.dagger.same_run import differences
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.play import Seconds, play
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
@@ -131,6 +133,19 @@ def test_the_tasks_script_acts_from_the_first_step_if_it_is_told_to(is_person):
     env.close()
     assert episode.interventions.all()
     assert episode.success or is_person  # its hand trembles
+
+
+def test_where_no_gate_is_the_script_shows_what_the_policy_failed_in():
+    env = env_spec(PlaybyearEnvConfig(task="TellApart-v1")).make()
+    expert = ScriptedExpertConfig().make(env)
+    redoing = Redoing(expert)
+    still = SimpleNamespace(reset=lambda env: None, act=lambda observation: np.zeros(4, np.float32))
+    tried = play(env, still, seed=5, expert=redoing)
+    assert (tried.success, tried.interventions.any(), redoing.was_needed) == (False, False, False)
+    redoing.demonstrates = True
+    shown = play(env, still, seed=5, expert=redoing)
+    env.close()
+    assert (shown.success, shown.interventions.all(), expert.judges) == (True, True, False)
 
 
 @pytest.mark.slow

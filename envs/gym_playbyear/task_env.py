@@ -140,11 +140,17 @@ class TaskEnv(PrivilegedState, gym.Env):
         """An expert for the current episode, with privileged knowledge: `act()` gives an action (4,). Make it after `reset`."""
         return self.definition.expert(self)
 
-    def intervention_gate(self) -> Any:
-        """The expert beside a policy in this episode: `wants_control(policy_action)` and `act()`. Make it after `reset`."""
-        if self.definition.gate is None:
+    @property
+    def intervention_gate(self) -> Callable[[], Any]:
+        """Gives the expert beside a policy in this episode: `wants_control(policy_action)` and `act()`. Call it after `reset`.
+
+        Raises:
+            AttributeError: The task has none; `hasattr` tells.
+        """
+        gate = self.definition.gate
+        if gate is None:
             raise AttributeError(f"{self.task} has no intervention gate.")
-        return self.definition.gate(self, (self.definition.correcting_expert or self.definition.expert)(self))
+        return lambda: gate(self, (self.definition.correcting_expert or self.definition.expert)(self))
 
     def blind_baselines(self) -> dict[str, Any]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""

@@ -10,8 +10,10 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.episodes.expert import Expert, ExpertError
 from lerobot_playbyear.episodes.frames import INTERVENTION
 from lerobot_playbyear.training.parts import TrainingParts, check_dataset_suits
 from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
@@ -141,3 +143,18 @@ def _signature(feature: Mapping[str, Any] | None) -> str:
     kind = "picture" if feature["dtype"] in ("image", "video") else feature["dtype"]
     rate = (feature.get("info") or {}).get("sample_rate")
     return f"{kind} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
+
+
+def check_expert(cfg: DaggerConfig, expert: Expert) -> None:
+    """Refuse an expert that cannot do what the method asks of it.
+
+    Raises:
+        ExpertError: It never takes over by itself.
+    """
+    if cfg.method.needs_judge and not expert.judges:
+        task = getattr(cfg.env, "task", None)
+        raise ExpertError(
+            f"--env.task={task} has a script that demonstrates, and none that says when a policy has to be corrected "
+            f"(`intervention_gate()`): --method.type={cfg.method.type} needs one. Give --method.type=redo, which demonstrates "
+            "the scenes that the policy fails in, or an expert of your own with --expert.type (examples/own_expert.py)."
+        )

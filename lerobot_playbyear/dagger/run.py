@@ -13,7 +13,13 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.batches import BalancedBatches, frames_by_expert
-from lerobot_playbyear.dagger.checks import check_action_range, check_actions_can_be_masked, check_alike, check_dataset
+from lerobot_playbyear.dagger.checks import (
+    check_action_range,
+    check_actions_can_be_masked,
+    check_alike,
+    check_dataset,
+    check_expert,
+)
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.figures import Totals
@@ -133,6 +139,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         stack.callback(env.close)
         expert = cfg.expert.make(env)
         stack.callback(expert.close)
+        check_expert(cfg, expert)
         on_time = shifted(expert, cfg.takeover_delay_s, env_facts(env).fps, env)
         expert = method.beside(on_time)
     corrections = Corrections(cfg.interventions)

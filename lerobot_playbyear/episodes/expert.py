@@ -32,11 +32,13 @@ class Expert(abc.ABC):
 
     Attributes:
         decides: It takes over when it likes, also where the robot asks, as a person does: then it is only called.
+        judges: It says by itself when it takes over. Otherwise it only shows whole scenes, `--method.type=redo`.
         can_label: It can say what to do while somebody else acts.
         clock_fps: Steps per second of the person who corrects; None where nobody's time is spent.
     """
 
     decides: ClassVar[bool] = False
+    judges: ClassVar[bool] = True
     can_label: ClassVar[bool] = True
     clock_fps: float | None = None
 

@@ -9,12 +9,16 @@ import numpy as np
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Observation
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
+from lerobot_playbyear.episodes.script import Script
+
+_SCRIPTS = ("intervention_gate", "scripted_expert")
 
 
 @ExpertConfig.register_subclass("scripted")
 @dataclass
 class ScriptedExpertConfig(ExpertConfig):
-    """The script that comes with the environment, `env.unwrapped.intervention_gate()`.
+    """The script that comes with the environment, `env.unwrapped.intervention_gate()`; where there is none its
+    `scripted_expert()`, which can only show whole scenes.
 
     Attributes:
         person: Whether it corrects as a person does: late, with an unsteady hand, and now and then without need.
@@ -36,12 +40,15 @@ class ScriptedExpertConfig(ExpertConfig):
     seed: int = 0
 
     def make(self, env: gym.Env) -> Expert:
-        if not callable(getattr(env.unwrapped, "intervention_gate", None)):
+        scripts = [name for name in _SCRIPTS if callable(getattr(env.unwrapped, name, None))]
+        if not scripts or (self.person and _SCRIPTS[0] not in scripts):
             raise ExpertError(
-                f"--expert.type=scripted needs an environment with `intervention_gate()`, and "
-                f"{type(env.unwrapped).__name__} has none. Give another --expert.type, or write an expert "
-                "(examples/own_expert.py)."
+                f"--expert.type=scripted{' --expert.person=true' if self.person else ''} needs an environment with "
+                f"`intervention_gate()`, and {type(env.unwrapped).__name__} has none. Give another --expert.type, or write an "
+                "expert (examples/own_expert.py)."
             )
+        if _SCRIPTS[0] not in scripts:
+            return ScriptedDemonstrator()
         if not self.person:
             return ScriptedExpert()
         for name in ("reaction_s", "tremor", "tremor_s", "wrong_per_minute", "wrong_s", "seed"):
@@ -74,6 +81,33 @@ class ScriptedExpert(Expert):
     def label(self) -> np.ndarray:
         ask = self._gate.label if hasattr(self._gate, "label") else self._gate.act
         return np.asarray(ask(), np.float32)
+
+
+class ScriptedDemonstrator(Expert):
+    """Shows the scenes that it is told to, from their first step on; in the middle its script would not know what to do."""
+
+    judges = False
+    can_label = False
+
+    def __init__(self) -> None:
+        self._script = Script()
+
+    def reset(self, env: gym.Env) -> None:
+        self._script.reset(env)
+        self._acts = False
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        self._observation = observation
+        return self._acts
+
+    def act(self) -> np.ndarray:
+        return np.asarray(self._script.act(self._observation), np.float32)
+
+    def take_over(self, until_told: bool = True) -> None:
+        self._acts = True
+
+    def hand_back(self) -> None:
+        self._acts = False
 
 
 class ScriptedPerson(ScriptedExpert):
