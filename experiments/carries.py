@@ -18,6 +18,7 @@ from lerobot_playbyear.episodes.episode import Observation
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
 
+TRAYS = tuple(task for task in CUBES if "PickPlace" in task)
 EDGES_MM = (-10, 10, 30, 60, 100, 200, 300, 800)
 UP_M = 0.05
 """A cube that is held so much higher than it was is being carried."""
@@ -83,7 +84,7 @@ def _mean(rows: np.ndarray, low: float, high: float, column: int) -> str:
 
 
 def main() -> None:
-    env, actor, seeds = asked_for(parser_of(__doc__, CUBES[-1], n_episodes=12).parse_args())
+    env, actor, seeds = asked_for(parser_of(__doc__, TRAYS[-1], n_episodes=12, tasks=TRAYS).parse_args())
     tables = []
     for acts in (False, True):
         companion = Companion(acts)

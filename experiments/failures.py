@@ -11,14 +11,17 @@ seeds on which choices are made. Prints a line per episode and a table.
 """
 
 from collections import Counter, defaultdict
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from lerobot.utils.random_utils import set_seed
 
 from experiments.landings import CUBES, HopRecorder, asked_for, parser_of
 from gym_playbyear.occluded_pick_place import PLACE_TOLERANCE
+from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
 from lerobot_playbyear.film.episode_film import write_episode_film
@@ -107,10 +110,18 @@ def table_of(seen: dict[str, Counter[str]], n: int) -> str:
     return "\n".join(rows)
 
 
+def played(
+    env: gym.Env, actor: Actor, seed: int, onlooker: Onlooker, watch: Callable[[], Any] | None = None
+) -> Episode:
+    """An episode, the same one whenever it is played."""
+    set_seed(seed)
+    return play(env, actor, seed, expert=onlooker, watch=watch)
+
+
 def film(env: gym.Env, actor: Actor, seed: int, path: Path) -> None:
-    """Films an episode that was played before."""
+    """Films an episode that was played before, with the same expert looking on: it draws from the episode's numbers."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    episode = play(env, actor, seed, watch=env.render)
+    episode = played(env, actor, seed, Onlooker(), env.render)
     write_episode_film(episode, path, round(env.metadata["render_fps"]))
     print(f"{path}: seed {seed}", flush=True)
 
@@ -124,7 +135,7 @@ def main() -> None:
     seen: dict[str, Counter[str]] = defaultdict(Counter)
     let_go, first = [], {}
     for seed in seeds:
-        play(recorder, actor, seed, expert=onlooker)
+        played(recorder, actor, seed, onlooker)
         mistake, place = recorder.first_mistake(), recorder.let_go()
         seen[mistake][onlooker.reason] += 1
         first.setdefault(mistake, seed)

@@ -74,15 +74,16 @@ class HopRecorder(gym.Wrapper):
         return Landing(float(1000 * (y[end] - cube_y[end])), float(1000 * (y[end] - y[touch])), end - touch)
 
 
-def parser_of(doc: str | None, task: str, n_episodes: int) -> ArgumentParser:
+def parser_of(doc: str | None, task: str, n_episodes: int, tasks: tuple[str, ...] = CUBES) -> ArgumentParser:
     """Knows what `asked_for` needs.
 
     Args:
         doc: Of the module, which is its help.
         task, n_episodes: Where none is given.
+        tasks: Those that can be asked for.
     """
     parser = command_line(doc)
-    parser.add_argument("--task", choices=CUBES, default=task)
+    parser.add_argument("--task", choices=tasks, default=task)
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--n_episodes", type=int, default=n_episodes)
     return parser

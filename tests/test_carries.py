@@ -40,8 +40,9 @@ def test_the_expert_carries_and_the_policys_wish_stands_beside():
 def test_a_policy_carries_as_it_wants():
     rows, episode = carried(acts=False)
     assert not episode.interventions.any()
-    np.testing.assert_allclose(rows[(rows[:, 0] > 60) & (np.arange(len(rows)) > 5), 1], 10, atol=1e-4)
-    np.testing.assert_array_equal(rows[:, 1], rows[:, 2])
+    on_the_way = (rows[:, 0] > 60) & (np.arange(len(rows)) > 5)
+    assert on_the_way.sum() > 20
+    np.testing.assert_allclose(rows[on_the_way, 1], 10, atol=1e-4)
 
 
 def test_the_table_tells_where_nobody_was():

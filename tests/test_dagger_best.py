@@ -1,13 +1,17 @@
-"""`checkpoints/best` of playbyear-dagger: the weights of the best evaluation, kept for good."""
+"""`checkpoints/best` of playbyear-dagger: the weights of the best evaluation, which are kept until a better one comes."""
+
+import shutil
 
 import pytest
 from dagger_factory import QUICK, command, dagger, state
+from test_dagger_resume import PowerCut
 
+from lerobot_playbyear.dagger.folder import RunFolder
 from lerobot_playbyear.training.parts import TrainingParts
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-RUN = (*QUICK, "--warmup_episodes=1", "--eval_every=2", "--eval.n_episodes=1", "--eval.batch_size=1")
+RUN = (*QUICK, "--warmup_episodes=1", "--eval_every=2", "--eval.n_episodes=1")
 
 
 @pytest.fixture
@@ -22,31 +26,47 @@ def gives(monkeypatch):
     return rates
 
 
-def test_the_best_evaluation_keeps_its_weights(tmp_path, gives, capfd):
+def test_the_best_evaluation_keeps_its_weights(tmp_path, gives, monkeypatch, capfd):
     checkpoints = tmp_path / "out/checkpoints"
 
-    def linked():
+    def go_on(*options):
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", *options)
         assert gives == []
-        return {name: (checkpoints / name).resolve().name for name in ("best", "last")}
+        return (checkpoints / "best").resolve(), (checkpoints / "last").resolve()
+
+    def cut_after_the_best(folder, state, clean=RunFolder.clean):
+        if state.best.get("success") == 60:
+            raise PowerCut
+        clean(folder, state)
 
     gives += [10, 30, 60]
-    dagger(tmp_path, *RUN, "--episodes=3")  # evaluated after 0, 2 and 3 attempts
-    third = state(tmp_path)["checkpoint"]
-    assert linked() == {"best": third, "last": third}
-    assert "Best:" not in capfd.readouterr().out
-
+    with monkeypatch.context() as patch:
+        patch.setattr(RunFolder, "clean", cut_after_the_best)
+        with pytest.raises(PowerCut):
+            dagger(tmp_path, *RUN, "--episodes=3")  # evaluated after 0, 2 and 3 attempts
+    third = checkpoints / state(tmp_path)["checkpoint"]
     gives += [20, 50]
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=5")
-    assert linked() == {"best": third, "last": state(tmp_path)["checkpoint"]}
-    assert (checkpoints / "best/pretrained_model/model.safetensors").is_file()  # though it is no milestone
+    best, last = go_on("--episodes=5")
+    assert (best, last.name) == (third.resolve(), state(tmp_path)["checkpoint"])
+    assert (best / "pretrained_model/model.safetensors").is_file()  # though it is no milestone
+    assert best != last
     assert f"Best:        60.0 % of them: {checkpoints / 'best/pretrained_model'}" in capfd.readouterr().out
 
-    gives += [60]  # of equal ones the last, and of other seeds every one
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=6")
-    assert linked()["best"] == linked()["last"] == state(tmp_path)["checkpoint"]
+    gives += [60]  # of equal ones the last
+    best, last = go_on("--episodes=6")
+    assert best == last
+    assert not third.exists()
+    assert "Best:" not in capfd.readouterr().out
+    gives += [50]
+    best, last = go_on("--episodes=7", "--eval.batch_size=1")  # the same episodes
+    assert best != last
+    shutil.rmtree(best)  # to make room
     gives += [40]
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=7", "--eval.n_episodes=2")
-    assert linked()["best"] == linked()["last"] == state(tmp_path)["checkpoint"]
+    best, last = go_on("--episodes=8")
+    assert best == last
+    gives += [10]
+    best, last = go_on("--episodes=9", "--eval.n_episodes=2")  # others
+    assert best == last
 
 
 def test_the_policy_that_a_run_began_with_may_be_the_best(tmp_path, gives, capfd):

@@ -146,6 +146,8 @@ def test_where_no_gate_is_the_script_shows_what_the_policy_failed_in():
     shown = play(env, still, seed=5, expert=redoing)
     env.close()
     assert (shown.success, shown.interventions.all(), expert.judges) == (True, True, False)
+    with pytest.raises(AttributeError, match=r"TellApart-v1 has no intervention gate"):
+        env.unwrapped.intervention_gate()
 
 
 @pytest.mark.slow

@@ -49,6 +49,8 @@ class PrivilegedState:
         prop = name.removesuffix("_position")
         if definition is not None and prop != name and prop in {prop.name for prop in definition.props}:
             return self.position(prop)
+        if definition is not None and name == "intervention_gate":
+            raise AttributeError(f"{self.__dict__['task']} has no intervention gate.")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def camera_numbers(self) -> dict[str, Any]:

@@ -147,10 +147,13 @@ class TaskEnv(PrivilegedState, gym.Env):
         Raises:
             AttributeError: The task has none; `hasattr` tells.
         """
-        gate = self.definition.gate
-        if gate is None:
-            raise AttributeError(f"{self.task} has no intervention gate.")
-        return lambda: gate(self, (self.definition.correcting_expert or self.definition.expert)(self))
+        if self.definition.gate is None:
+            raise AttributeError
+        return self._make_gate
+
+    def _make_gate(self) -> Any:
+        assert self.definition.gate is not None
+        return self.definition.gate(self, (self.definition.correcting_expert or self.definition.expert)(self))
 
     def blind_baselines(self) -> dict[str, Any]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""

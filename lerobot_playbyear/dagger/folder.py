@@ -46,7 +46,7 @@ class RunState:
         evaluated_round: The round after which the last evaluation took place; -1 for none.
         success: What it gave [%].
         best: The best evaluation on the present seeds: its `success` [%], its `seeds` (first, number), and the `checkpoint`
-            that it was of, None for the policy that the run began with. Empty before.
+            that it was of, None for the policy that the run began with. Empty before, and where that checkpoint was removed.
         checkpoint: Folder of the newest weights; None before the first update.
         milestones: Checkpoints that are kept for good.
         method: What the method keeps, such as what it knew when the round began.
@@ -115,6 +115,9 @@ class RunFolder:
         with _errors_of_writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             _replace(self.path / CONFIG_NAME, json.dumps(cfg.options(), indent=1))
+        best = state.best.get("checkpoint")
+        if best is not None and not (self.checkpoints / best).is_dir():  # somebody made room
+            state.best = {}
         self.commit(state)
         self.clean(state)
         self._forget_metrics(state)
@@ -166,16 +169,19 @@ class RunFolder:
         """Remove checkpoints that are neither the newest nor the best nor milestones; `last` and `best` name those."""
         if not self.checkpoints.is_dir():
             return
-        wanted = {*state.milestones, state.checkpoint, state.best.get("checkpoint")}
+        named = {LAST_CHECKPOINT_LINK: state.checkpoint, BEST_LINK: state.best.get("checkpoint")}
+        for name, checkpoint in named.items():
+            if checkpoint is None:
+                (self.checkpoints / name).unlink(missing_ok=True)
+                continue
+            link = self.checkpoints / (name + _PARTIAL)
+            link.unlink(missing_ok=True)
+            link.symlink_to(checkpoint)
+            os.replace(link, self.checkpoints / name)
+        wanted = {*state.milestones, *named.values()}
         for path in self.checkpoints.iterdir():
             if path.is_dir() and not path.is_symlink() and path.name not in wanted:
                 shutil.rmtree(path, ignore_errors=True)
-        for name, checkpoint in ((LAST_CHECKPOINT_LINK, state.checkpoint), (BEST_LINK, state.best.get("checkpoint"))):
-            if checkpoint is not None:
-                link = self.checkpoints / (name + _PARTIAL)
-                link.unlink(missing_ok=True)
-                link.symlink_to(checkpoint)
-                os.replace(link, self.checkpoints / name)
 
     # Figures
 

@@ -33,7 +33,7 @@ from lerobot_playbyear.training.report import is_due
 
 __all__ = ["Loop", "outcome_of"]
 
-_ATTEMPT, _UPDATES = 0, 1  # what random numbers are for
+_ATTEMPT, _UPDATES, _EVALUATION = 0, 1, 2  # what random numbers are for
 _LOSS_BATCHES = 10**9  # numbers from here on are of batches that are only looked at
 
 
@@ -244,11 +244,13 @@ class Loop:
             return
         self.report.doing("evaluating")
         start = time.perf_counter()
+        set_seed(self._random_seed(_EVALUATION, state.round))  # of policies that act by chance
         with contextlib.redirect_stderr(io.StringIO()):  # LeRobot's own progress bars; ours goes on
             info = self.parts.evaluate(self.training, cfg.eval_videos)
         state.evaluated_round, state.success = state.round, float(info["overall"]["pc_success"])
-        seeds = [cfg.eval_seeds.start, len(cfg.eval_seeds)]
-        if state.best.get("seeds") != seeds or state.success >= state.best["success"]:  # of equal ones the last
+        seeds, is_trained = [cfg.seed, cfg.eval.n_episodes], state.checkpoint is not None or not cfg.new_weights
+        is_best = state.best.get("seeds") != seeds or state.success >= state.best["success"]  # of equal ones the last
+        if is_trained and is_best:
             state.best = {"success": state.success, "checkpoint": state.checkpoint, "seeds": seeds}
         self.report.write_evaluation(info, evaluation_s=round(time.perf_counter() - start, 3))
         self.folder.commit(state)

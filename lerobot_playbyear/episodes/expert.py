@@ -82,7 +82,7 @@ class Expert(abc.ABC):
         """Whether the robot asks for help in this step. Called before `wants_control` of an expert that `decides`."""
 
     def verdict(self) -> Verdict | None:
-        """Whether the attempt ends now; None goes on. Asked after every step."""
+        """Whether the attempt ends now; None goes on. Asked after every step, or more often."""
         return None
 
     def close(self) -> None:  # noqa: B027 (most experts have nothing to close)
