@@ -72,6 +72,7 @@ class Outcome:
         expert_steps: Steps in which the expert acted, in these and in those that were not kept; of the control
             `demonstrations`, in the further ones.
         takeovers, switches, person_seconds, autonomy: As in `metrics.jsonl`, of all attempts so far.
+        by_contents: Success with each of the contents; empty where a task has none.
         ends: How each episode of the evaluation ended, in the order of the seeds.
     """
 
@@ -86,6 +87,7 @@ class Outcome:
     switches: int = 0
     person_seconds: float = 0.0
     autonomy: float = 1.0
+    by_contents: str = ""
     ends: list[str] = field(default_factory=list, repr=False)
 
 
@@ -258,7 +260,8 @@ class Study:
                 told = evaluate(job, commands, name=f"{STUDY}{name}", checkpoint=policy)
                 first = None if told.first_search_rate is None else 100 * told.first_search_rate
                 figures = (100 * told.rate, first, told.failures)
-                outcome = Outcome(updates, job.n_demonstrations, *figures, ends=told.ends, **spent)
+                more = {"by_contents": told.by_contents, "ends": told.ends}
+                outcome = Outcome(updates, job.n_demonstrations, *figures, **more, **spent)
                 save(path, {**asdict(outcome), "commands": commands})
         saved = load(path)
         self.commands += saved.pop("commands")

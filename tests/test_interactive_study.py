@@ -82,6 +82,8 @@ class Commands:
         seeds = range(int(options["seed"]), int(options["seed"]) + int(options["eval.n_episodes"]))
         ends, n_closings = ("success", "time", "success", "pressed"), (1, 1, 2, 0)
         lines = [{"seed": seed, "end": ends[seed % 4], "n_closings": n_closings[seed % 4]} for seed in seeds]
+        contents = ("peanuts", "screws", "screws", "screws")
+        lines = [line | {"contents": contents[seed % 4]} for seed, line in zip(seeds, lines, strict=True)]
         attempts = Path(options["env.attempts_file"])
         attempts.parent.mkdir(parents=True, exist_ok=True)
         attempts.write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -264,6 +266,7 @@ def test_every_policy_tells_of_its_first_search_and_of_how_its_attempts_ended(ra
     assert len(policies) == 5
     for outcome in policies:
         assert (outcome.success, outcome.first_search, outcome.failures) == (50, 25, "25 time, 25 pressed")
+        assert outcome.by_contents == "peanuts 25 of 25, screws 25 of 75"
         assert outcome.ends == ["success", "time", "success", "pressed"] * 25
 
 
