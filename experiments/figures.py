@@ -1,5 +1,6 @@
 """The results as pictures: `python -m experiments.figures --output=docs/media`."""
 
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,9 @@ from experiments.protocol import (
 COLOURS = {"full": "#1f6f8b", "deaf": "#c8553d", "blind": "#777777"}
 NOISES = {
     "noise": ("a room's noise in training, up to 18 dB above the floor", COLOURS["full"]),
-    "noise_white": ("white noise in training, up to the floor (one seed)", "#d08c2e"),
+    "noise-louder_noise": ("up to 24 dB", "#2e8b57"),
+    "noise-recorded_noise": ("up to 24 dB, and recordings; 4,000 updates", "#7b5ea7"),
+    "noise_white": ("white noise in training, up to the floor", "#d08c2e"),
 }
 KINDS = ("#1f6f8b", "#d08c2e", "#7b5ea7", "#c8553d")  # of corrected policies: as they come
 
@@ -69,26 +72,30 @@ def demonstrations(task: str, output: Path) -> None:
 
 
 def noise(task: str, output: Path) -> None:
-    """Success of the full policies over the background's level, with the training noise of two recipes."""
-    curves: dict[str, dict[float, list[bool]]] = {}
+    """Success of the full policies over the background's level, with each recipe's noise in training."""
+    curves: dict[str, dict[float, dict[int, list[bool]]]] = {}
     for study in NOISES:
         for result in load_results(f"{study}/{task}-*.json"):
             level = float(result.environment["noise_level"])
-            curves.setdefault(study, {}).setdefault(level, []).extend(result.successes)
+            curves.setdefault(study, {}).setdefault(level, {})[result.training_seed] = result.successes
     if not curves:
         return
     axes = new_axes()
     for study, by_level in curves.items():
         label, colour = NOISES[study]
-        most = max(map(len, by_level.values()))  # a level that fewer policies were tried at would be another curve
-        band(axes, {level: tried for level, tried in by_level.items() if len(tried) == most}, label, colour)
+        seeds = set.intersection(
+            *map(set, by_level.values())
+        )  # what only some levels were tried with would bend the line
+        points = {level: [*chain.from_iterable(tried[seed] for seed in seeds)] for level, tried in by_level.items()}
+        band(axes, points, f"{label} ({len(seeds)} training seed{'s' if len(seeds) > 1 else ''})", colour)
     blind_line(axes, task)
     axes.set_xscale("symlog", base=2, linthresh=1)  # 0 is silence
     levels = sorted({level for by_level in curves.values() for level in by_level})
     axes.set_xticks(levels, [f"{level:g}" for level in levels])
     axes.minorticks_off()
     axes.set_xlim(-0.2 if levels[0] == 0 else 0.9, 1.1 * levels[-1])
-    finish(axes, "background noise (0: silence, 1: as in training)", output / f"noise-{task}.png")
+    above = {"loc": "lower left", "bbox_to_anchor": (0, 1), "fontsize": "small"}
+    finish(axes, "background noise (0: silence, 1: as in training)", output / f"noise-{task}.png", **above)
 
 
 def corrections(task: str, output: Path) -> None:
