@@ -24,7 +24,7 @@ What takes time are updates; collecting makes none, and takes as long as its att
 | `updates` | new_weights: `--updates`, but none if they are 1,250; online: as many as the corrections | if it is as many |
 | `demonstrations` | new_weights: `--updates`; online: 1,250, and as many as the corrections | if it has as many of both |
 
-With `--rounds=2 --grow` the second round has twice `--updates`; all that comes before is shared with the study without it.
+With `--grow` the last round has twice `--updates`; all that comes before is shared with the study without it.
 So with one round the first method takes 3,750, and each further one 1,250 to 2,500; online they take 6,250, and 1,250 to
 5,000.
 
@@ -147,7 +147,7 @@ class Study:
             else:
                 self._collect(policy, number, kept)
                 if any(line.get("outcome") == "kept" for line in metrics_of(self.folders)):
-                    updates = options.updates * (number if options.grow else 1)
+                    updates = options.updates * (2 if options.grow and number == options.rounds else 1)
                     policy = self._learn_anew(number, updates)
             outcomes.append(self._outcome_of_round(number, policy, updates))
             print(f"{self.name}: {outcomes[-1]}", flush=True)
@@ -278,7 +278,9 @@ def main() -> None:
     parser.add_argument("--kept", type=int, default=100, help="attempts that are kept in all")
     parser.add_argument("--rounds", type=int, default=1, help="in which they are collected and learned from")
     parser.add_argument("--updates", type=int, default=STEPS, help="of each round")
-    parser.add_argument("--grow", action="store_true", help="round k has k times --updates, as it learns from more")
+    parser.add_argument(
+        "--grow", action="store_true", help="the last round has twice --updates, as it learns from more"
+    )
     parser.add_argument("--controls", nargs="*", choices=CONTROLS, default=CONTROLS)
     options, training = parser.parse_known_args()
     try:

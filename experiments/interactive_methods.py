@@ -51,9 +51,5 @@ def check(options: Namespace, training: Sequence[str]) -> None:
         )
     if options.learn == "online" and options.grow:
         raise ValueError("--grow is for --learn=new_weights: online a policy learns more with every attempt anyway.")
-    if options.grow and options.rounds != 2:
-        raise ValueError(
-            f"--grow shares what was collected with the study without it: give --rounds=2, not {options.rounds}."
-        )
     if options.learn == "online" and options.updates * options.rounds < options.kept:
         raise ValueError(f"--updates={options.updates}: give at least one for every attempt that is kept.")
