@@ -147,8 +147,8 @@ def test_a_run_collects_learns_saves_and_evaluates(finished):
             "checkpoint_saving_s",
         )
         assert line["total_s"] == pytest.approx(sum(line[part] for part in parts), rel=0.2)
-    assert {path.name for path in (finished / "out/checkpoints").iterdir()} == {"000002", "000004", "last"}
-    assert (finished / "out/checkpoints/last").resolve().name == "000004"
+    assert {path.name for path in (finished / "out/checkpoints").iterdir()} == {"000002", "000004", "last", "best"}
+    assert {(finished / "out/checkpoints" / name).resolve().name for name in ("last", "best")} == {"000004"}
 
 
 def test_the_dataset_is_a_plain_one_of_successes_with_corrections(finished):

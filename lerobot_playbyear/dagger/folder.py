@@ -172,12 +172,15 @@ class RunFolder:
         named = {LAST_CHECKPOINT_LINK: state.checkpoint, BEST_LINK: state.best.get("checkpoint")}
         for name, checkpoint in named.items():
             if checkpoint is None:
-                (self.checkpoints / name).unlink(missing_ok=True)
+                if (self.checkpoints / name).is_symlink():
+                    (self.checkpoints / name).unlink()
                 continue
-            link = self.checkpoints / (name + _PARTIAL)
+            link, place = self.checkpoints / (name + _PARTIAL), self.checkpoints / name
             link.unlink(missing_ok=True)
             link.symlink_to(checkpoint)
-            os.replace(link, self.checkpoints / name)
+            if place.is_dir() and not place.is_symlink():  # the folder was copied, and what links named with it
+                shutil.rmtree(place)
+            os.replace(link, place)
         wanted = {*state.milestones, *named.values()}
         for path in self.checkpoints.iterdir():
             if path.is_dir() and not path.is_symlink() and path.name not in wanted:
