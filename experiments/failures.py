@@ -144,9 +144,8 @@ def main() -> None:
         let_go += [] if place is None else [place]
     if options.films is not None:
         for mistake, seed in first.items():
-            film(
-                recorder, actor, seed, options.films / f"{mistake.replace(',', '').replace(' ', '_') or 'success'}.mp4"
-            )
+            name = mistake.replace(",", "").replace(" ", "_") or "success"
+            film(recorder, actor, seed, options.films / f"{name}.mp4")
     recorder.close()
     print(f"\n{table_of(seen, len(seeds))}")
     if let_go:
