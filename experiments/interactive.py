@@ -32,6 +32,7 @@ Resumes where it was interrupted. Studies may run at the same time; those of one
 `experiments.ablations`, too, but that does not wait for them: do not start it while a study trains the same policy.
 """
 
+import json
 import math
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -52,6 +53,7 @@ from experiments.protocol import (
     save,
 )
 from experiments.training import Job, evaluate
+from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger.figures import Totals
 
 STUDY = "interactive"
@@ -178,7 +180,9 @@ class Study:
 
     def _attempts(self, policy: Path, name: str, task: str, kept: int, updates_per_episode: int) -> Path:
         """Attempts at a task until the dataset holds so many. Returns the run's folder."""
-        environment = ("--env.type=playbyear", f"--env.task={task}", *METHODS[self.options.method])
+        environment = ["--env.type=playbyear", f"--env.task={task}", *METHODS[self.options.method]]
+        if task != self.job.task:  # the policy hears by the microphones that it knows
+            environment.append(f"--env.microphones={json.dumps(PlaybyearEnvConfig(task=self.job.task).microphones)}")
         how = (f"--episodes={kept}", f"--updates_per_episode={updates_per_episode}", "--max_attempts=200")
         folder = self._dagger(policy, name, *environment, *how)
         if folder not in self.folders:

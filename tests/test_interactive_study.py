@@ -15,6 +15,7 @@ from experiments import interactive, interactive_parts, protocol, training
 from experiments.interactive_parts import alone, demonstrated, first_job, is_written_to, trained
 from experiments.protocol import STEPS
 from experiments.training import Job
+from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.training.presets import preset_options
 
 DEFAULTS = {
@@ -106,6 +107,10 @@ class Commands:
             assert n > 0, "the intervention dataset is empty"
             state |= {"step": int(options["updates"]) // (2 if halfway else 1)}
         else:
+            heard = PlaybyearEnvConfig(
+                task=options["env.task"], microphones=json.loads(options.get("env.microphones", "null"))
+            )
+            assert heard.microphones == PlaybyearEnvConfig(task=folder.name.split("-full-")[0]).microphones
             unnoted = n - state["first"] - state["kept"]
             assert unnoted in (0, 1), "something else changed the dataset"
             assert state["kept"] or n < episodes, "the dataset holds enough already"
