@@ -74,3 +74,15 @@ def test_the_policy_that_a_run_began_with_may_be_the_best(tmp_path, gives, capfd
     dagger(tmp_path, *RUN, "--episodes=3")
     assert not (tmp_path / "out/checkpoints/best").is_symlink()
     assert f"Best:        30.0 % of them: {state(tmp_path)['policy_path']}" in capfd.readouterr().out
+
+
+def test_a_run_that_has_ended_is_evaluated_again_on_more_episodes_and_on_as_many_only_once(tmp_path, gives, capfd):
+    gives += [30, 20]
+    dagger(tmp_path, *RUN, "--episodes=2")
+    gives += [40]
+    for _ in range(2):
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=2")
+        assert gives == []
+        assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=1", "--eval_every=0")
+    assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out

@@ -44,6 +44,7 @@ class RunState:
             it; ended by the expert as void.
         next_seed: Of the next attempt.
         evaluated_round: The round after which the last evaluation took place; -1 for none.
+        evaluated_episodes: How many it had; None before, and where an older version evaluated.
         success: What it gave [%].
         best: The best evaluation on the present seeds: its `success` [%], its `seeds` (first, number), and the `checkpoint`
             that it was of, None for the policy that the run began with. Empty before, and where that checkpoint was removed.
@@ -65,6 +66,7 @@ class RunState:
     discarded: int = 0
     next_seed: int = 0
     evaluated_round: int = -1
+    evaluated_episodes: int | None = None
     success: float | None = None
     best: dict[str, Any] = field(default_factory=dict)
     checkpoint: str | None = None

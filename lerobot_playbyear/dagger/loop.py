@@ -240,14 +240,16 @@ class Loop:
     def _evaluate_if_due(self, is_last: bool = False) -> None:
         cfg, state = self.cfg, self.state
         wanted = cfg.eval_every > 0 and (is_last or is_due(state.round, cfg.eval_every))
-        if cfg.env is None or not wanted or state.evaluated_round == state.round:
+        is_other = is_last and state.evaluated_episodes not in (None, cfg.eval.n_episodes)
+        if cfg.env is None or not wanted or (state.evaluated_round == state.round and not is_other):
             return
         self.report.doing("evaluating")
         start = time.perf_counter()
         set_seed(self._random_seed(_EVALUATION, state.round))  # of policies that act by chance
         with contextlib.redirect_stderr(io.StringIO()):  # LeRobot's own progress bars; ours goes on
             info = self.parts.evaluate(self.training, cfg.eval_videos)
-        state.evaluated_round, state.success = state.round, float(info["overall"]["pc_success"])
+        state.evaluated_round, state.evaluated_episodes = state.round, cfg.eval.n_episodes
+        state.success = float(info["overall"]["pc_success"])
         seeds, is_trained = [cfg.seed, cfg.eval.n_episodes], state.checkpoint is not None or not cfg.new_weights
         is_best = state.best.get("seeds") != seeds or state.success >= state.best["success"]  # of equal ones the last
         if is_trained and is_best:
