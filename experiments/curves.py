@@ -2,14 +2,14 @@
 
     python -m experiments.curves demonstrations --task=OccludedGrasp-v1 --seeds 1 2 3 4 5 --jobs=2
     python -m experiments.curves noise --levels 0 1 8 16
-    python -m experiments.curves noise --task=OccludedGrasp-v1 --trained louder_noise --levels 0 1 8 16
+    python -m experiments.curves noise --task=OccludedGrasp-v1 --trained quieter_noise --levels 0 1 8 16
     python -m experiments.curves rooms --task=OccludedGrasp-v1 --trained recorded_noise --steps=4000 --levels 8
     python -m experiments.curves materials
     python -m experiments.curves rooms --levels 8
 
 Noise, materials and rooms take the full policies that `experiments.ablations` trained, as they are: those of the preset `cpu`,
 which mixes noise into the sound, and never heard another material, a voice, a clatter or another microphone. `--trained` trains
-others here: with louder noise in their sound, with recordings besides, of other kinds than those that are tried, or without
+others here: with quieter noise in their sound, with recordings besides, of other kinds than those that are tried, or without
 noise. Results that are there are kept.
 """
 
@@ -40,7 +40,7 @@ ROOM_SEED = 7
 KINDS = ("speech_like", "clatter")
 NOISE_LEVELS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # factors on the noise's amplitude: silence, then 6 dB each
 ROOM_LEVELS = (1.0, 8.0)
-TRAINED = ("louder_noise", "recorded_noise", "no_noise")
+TRAINED = ("quieter_noise", "recorded_noise", "no_noise")
 """Variants of `experiments.lottery` whose trainings it shares."""
 
 

@@ -24,9 +24,9 @@ from experiments.protocol import (
 
 COLOURS = {"full": "#1f6f8b", "deaf": "#c8553d", "blind": "#777777"}
 NOISES = {
-    "noise": ("a room's noise in training, up to 18 dB above the floor", COLOURS["full"]),
-    "noise-louder_noise": ("up to 24 dB", "#2e8b57"),
-    "noise-recorded_noise": ("up to 24 dB, and recordings; 4,000 updates", "#7b5ea7"),
+    "noise": ("the preset: a room's noise in training", COLOURS["full"]),
+    "noise-quieter_noise": ("up to 18 dB above the floor, not 24", "#2e8b57"),
+    "noise-recorded_noise": ("the preset's, and recordings; 4,000 updates", "#7b5ea7"),
     "noise_white": ("white noise in training, up to the floor", "#d08c2e"),
 }
 KINDS = ("#1f6f8b", "#d08c2e", "#7b5ea7", "#c8553d")  # of corrected policies: as they come

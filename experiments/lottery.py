@@ -75,7 +75,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "hop_35ms": ("--policy.hop_s=0.035",),
     "log_mel": ("--policy.audio_features=log_mel",),
     "pcen": ("--policy.audio_features=pcen",),
-    "louder_noise": ("--policy.audio_noise_db=24",),
+    "quieter_noise": ("--policy.audio_noise_db=18",),
     "recorded_noise": ("--policy.audio_noise_db=24", f"--policy.audio_noise_files={NOISE}"),
     "no_noise": ("--policy.audio_noise_db=null",),
     "no_onset": ("--policy.auxiliary_onset=0",),

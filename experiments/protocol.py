@@ -158,10 +158,16 @@ def load_results(pattern: str) -> list[Result]:
 
 
 def load_demonstrations(task: str) -> list[Result]:
-    """The results over the number of demonstrations, with those that the ablations have for the same training seed."""
-    few = load_results(f"demonstrations/{task}-*.json")
-    seeds = {result.training_seed for result in few}
-    return few + [r for r in load_results(f"ablations/{task}-*demos-*.json") if r.training_seed in seeds]
+    """The results over the number of demonstrations, with those that other studies have for the same training seed.
+
+    Most full policies were trained with the quieter noise that the preset had then, so these come first.
+    """
+    few = ("demonstrations-quieter_noise", "demonstrations")
+    studies = (few[0], "quieter_noise", few[1], "ablations")
+    results = {study: load_results(f"{study}/{task}-*demos-*.json") for study in studies}
+    seeds = {result.training_seed for study in few for result in results[study]}
+    found = {(r.condition, r.n_demonstrations, r.training_seed): r for s in reversed(studies) for r in results[s]}
+    return [result for result in found.values() if result.training_seed in seeds]
 
 
 def blind_path(task: str) -> Path:

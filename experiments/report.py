@@ -100,14 +100,13 @@ PRESETS_OF_BEFORE = {
 }
 CURVES = {
     "noise": "noise",
-    "noise-louder_noise": "noise, trained with noise up to 24 dB above the recordings' own floor",
-    "noise-recorded_noise": "noise, trained with that and recordings, 4,000 updates",
+    "noise-quieter_noise": "noise, trained with noise up to 18 dB above the recordings' own floor",
+    "noise-recorded_noise": "noise, trained with recordings besides, 4,000 updates",
     "noise-no_noise": "noise, trained without noise in the sound",
     "noise_white": "noise, trained with white noise up to the recordings' own floor",
     "materials": "materials",
     "rooms": "noise of kinds and microphones of responses that no training had",
-    "rooms-louder_noise": "the same, trained with noise up to 24 dB above the recordings' own floor",
-    "rooms-recorded_noise": "the same, trained with that and recordings of other kinds, 4,000 updates",
+    "rooms-recorded_noise": "the same, trained with recordings of other kinds besides, 4,000 updates",
 }
 
 

@@ -174,7 +174,7 @@ def test_more_than_fits_into_memory_is_refused_before_it_is_read(recordings, mon
 
 def test_recorded_noise_without_a_level_is_refused():
     with pytest.raises(
-        ValueError, match=r"audio_noise_files=here says nothing of how loud.*--policy.audio_noise_db=18"
+        ValueError, match=r"audio_noise_files=here says nothing of how loud.*--policy.audio_noise_db=24"
     ):
         make_config(audio_noise_files="here")
 

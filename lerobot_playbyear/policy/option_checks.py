@@ -43,7 +43,7 @@ def check_options(config: "PlaybyearConfig") -> None:
     if config.audio_noise_files is not None and config.audio_noise_db is None:
         raise ValueError(
             f"--policy.audio_noise_files={config.audio_noise_files} says nothing of how loud the noise may be: add "
-            "--policy.audio_noise_db=18 (dB above the recordings' own noise floor)."
+            "--policy.audio_noise_db=24 (dB above the recordings' own noise floor)."
         )
     if config.audio_colour_db < 0:
         raise ValueError(f"--policy.audio_colour_db must be at least 0 dB, got {config.audio_colour_db}.")
