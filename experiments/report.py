@@ -150,7 +150,9 @@ def demonstration_table(task: str) -> list[str]:
         ]
         rows.append(f"| {n} | {' | '.join(percent(of) if of else ' | ' for of in found)} |")
     head = "| demonstrations | full | training seeds | deaf | training seeds |"
-    return table(head, rows, f"{task}: demonstrations")
+    quieter = any((RESULTS / "demonstrations-quieter_noise").glob(f"{task}-*.json"))
+    noise = ", full policies with up to 18 dB of noise in training" if quieter else ""
+    return table(head, rows, f"{task}: demonstrations{noise}")
 
 
 def listening_table() -> list[str]:
