@@ -162,11 +162,13 @@ def load_demonstrations(task: str) -> list[Result]:
 
     Most full policies were trained with the quieter noise that the preset had then, so these come first.
     """
-    few = ("demonstrations-quieter_noise", "demonstrations")
-    studies = (few[0], "quieter_noise", few[1], "ablations")
-    results = {study: load_results(f"{study}/{task}-*demos-*.json") for study in studies}
-    seeds = {result.training_seed for study in few for result in results[study]}
-    found = {(r.condition, r.n_demonstrations, r.training_seed): r for s in reversed(studies) for r in results[s]}
+    places = ("ablations/{}", "demonstrations/{}", "presets/{}-full-quieter_noise", "demonstrations-quieter_noise/{}")
+    found, seeds = {}, set()
+    for place in places:  # of the same training the last one counts
+        for result in load_results(f"{place.format(task)}-*demos-*.json"):
+            found[result.condition, result.n_demonstrations, result.training_seed] = result
+            if place.startswith("demonstrations"):
+                seeds.add(result.training_seed)
     return [result for result in found.values() if result.training_seed in seeds]
 
 

@@ -85,6 +85,7 @@ def _updates(results: list[Result]) -> str:
 
 
 PRESETS_OF_BEFORE = {
+    "up to 18 dB of noise in training": "quieter_noise",
     "larger shifts and offset": "larger_shifts",
     "and ways told however far": "far_way",
     "and without `auxiliary_way`": "no_way",

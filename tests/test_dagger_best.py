@@ -86,3 +86,16 @@ def test_a_run_that_has_ended_is_evaluated_again_on_more_episodes_and_on_as_many
         assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
     command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=1", "--eval_every=0")
     assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
+
+
+def test_the_best_of_other_episodes_is_kept_when_a_run_that_has_ended_is_evaluated_again(tmp_path, gives):
+    gives += [10, 60]
+    dagger(tmp_path, *RUN, "--episodes=1")  # evaluated at its end, which is no milestone
+    best = tmp_path / "out/checkpoints" / state(tmp_path)["checkpoint"]
+    gives += [20]
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=2")
+    gives += [5]
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=2")
+    assert state(tmp_path)["best"]["success"] == 5
+    assert best.name != state(tmp_path)["checkpoint"]
+    assert (best / "pretrained_model/model.safetensors").is_file()

@@ -253,6 +253,9 @@ class Loop:
         seeds, is_trained = [cfg.seed, cfg.eval.n_episodes], state.checkpoint is not None or not cfg.new_weights
         is_best = state.best.get("seeds") != seeds or state.success >= state.best["success"]  # of equal ones the last
         if is_trained and is_best:
+            before = state.best.get("checkpoint")
+            if before is not None and state.best["seeds"] != seeds:  # it was not beaten: it solved other episodes
+                state.milestones.append(before)
             state.best = {"success": state.success, "checkpoint": state.checkpoint, "seeds": seeds}
         self.report.write_evaluation(info, evaluation_s=round(time.perf_counter() - start, 3))
         self.folder.commit(state)
