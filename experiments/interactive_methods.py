@@ -12,6 +12,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "sirius": ("--method.type=weighted",),
     "iwr": ("--method.type=weighted", "--method.paper=iwr"),
     "robot_gated": ("--method.type=robot_gated",),
+    "robot_gated_no_handback": ("--method.type=robot_gated", "--method.hands_back=false"),
     "early": ("--takeover_delay_s=-0.5",),
     "late": ("--takeover_delay_s=0.5",),
     "all_frames": ("--learn_from=all",),

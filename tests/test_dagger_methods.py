@@ -308,6 +308,16 @@ def test_a_robot_asks_once_its_first_attempts_are_made(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_robot_that_does_not_go_on_by_itself_leaves_the_rest_to_the_expert(tmp_path):
+    dagger(tmp_path, *QUICK, *GATED, "--method.hands_back=false", "--episodes=2", "--max_attempts=30")
+    asked = [line for line in metrics(tmp_path, "attempt") if line["n_calls"]]
+    assert all((line["n_calls"], line["n_switches"]) == (1, 1) for line in asked)
+    marks = column(corrections(tmp_path), "intervention").reshape(2, -1)
+    assert all((np.diff(marks.astype(int), axis=1) >= 0).ravel())
+    assert marks[:, -1].all()
+
+
+@pytest.mark.slow
 def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monkeypatch):
     dagger(tmp_path, *RUN)
     seen, update = [], TrainingParts.update

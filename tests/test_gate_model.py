@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_playbyear.dagger.methods.gate_model import Asking, GateModel, Played, Thresholds, thresholds_for
+from lerobot_playbyear.dagger.methods.gate_model import FOR_GOOD, Asking, GateModel, Played, Thresholds, thresholds_for
 from lerobot_playbyear.dagger.methods.remembering import check_memory
 from lerobot_playbyear.datasets.errors import InputError
 
@@ -73,17 +73,22 @@ def test_the_robot_asks_until_it_is_calm_and_for_a_least_time():
     assert asks == ".xxx.xxx.."  # it does not begin to ask because it is uneasy
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3])
-def test_thresholds_follow_from_the_wanted_share(share):
+def test_a_robot_that_does_not_go_on_by_itself_asks_to_the_end():
+    asking = Asking(LIMITS, FOR_GOOD)
+    assert [asking.asks(*step) for step in [(0.1, 0.1), (1.5, 0.1), *[(0.1, 0.1)] * 50]] == [False, *[True] * 51]
+
+
+@pytest.mark.parametrize(("share", "n_least"), [(0.1, 5), (0.3, 5), (0.3, FOR_GOOD)])
+def test_thresholds_follow_from_the_wanted_share(share, n_least):
     rng = np.random.default_rng(0)
     traces = [
         (np.convolve(rng.exponential(1, 120), np.ones(6) / 6)[:100], np.convolve(rng.random(120), np.ones(6) / 6)[:100])
         for _ in range(20)
     ]
-    limits = thresholds_for(traces, share, n_least=5)
+    limits = thresholds_for(traces, share, n_least)
     fresh, asked = Asking, 0
     for each in traces:
-        asking = fresh(limits, 5)
+        asking = fresh(limits, n_least)
         asked += sum(asking.asks(*step) for step in zip(*each, strict=True))
     assert asked / 2000 == pytest.approx(share, abs=0.06)
 

@@ -7,6 +7,7 @@ own draw of the data; where they disagree nobody has shown what to do. They are 
 memory changes with the policy.
 """
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,6 +18,8 @@ from torch import Tensor, nn
 
 _HIDDEN = 128
 _BATCH = 256
+FOR_GOOD = sys.maxsize
+"""For so many steps asks a robot at least that does not go on by itself."""
 
 
 @dataclass
@@ -173,7 +176,7 @@ def thresholds_for(
     novelty, risk = (np.concatenate(parts) for parts in zip(*traces, strict=True))
     calm = float(np.quantile(novelty, calm_share)), float(np.quantile(risk, calm_share))
     best, nearest = Thresholds(float(novelty.max()), float(risk.max()), *calm), share
-    for quantile in np.linspace(calm_share, 1.0, 101)[:-1]:
+    for quantile in 1 - (1 - calm_share) * np.linspace(1, 0, 101)[:-1] ** 2:  # finer where few steps are asked in
         limits = Thresholds(float(np.quantile(novelty, quantile)), float(np.quantile(risk, quantile)), *calm)
         n_asked = 0
         for each in traces:

@@ -25,13 +25,14 @@ if TYPE_CHECKING:
 @MethodConfig.register_subclass("robot_gated")
 @dataclass
 class RobotGatedConfig(MethodConfig):
-    """The robot asks. A script then acts until the robot is calm again; a person is called, and takes over as they like.
+    """The robot asks. A script then acts until it is calm again, or to the end; a person is called, and acts as they like.
 
     Attributes:
         intervention_share: Of the steps in which it shall ask; the thresholds follow from it, anew in every round.
         rollouts: First attempts, in which the policy is alone: from them it learns what failing looks like.
         calm_share: It asks until novelty and risk both lie among this share of the smallest; larger means earlier hand-backs.
         least_s: For how long it asks at least [s].
+        hands_back: Whether it goes on by itself once it is calm; otherwise it asks once, to the attempt's end, as in RaC.
         n_heads: Whose disagreement is novelty; ThriftyDAgger: 5 policies.
         gate_updates: Of each head and of each success value, in every round.
         discount: Of a success, per step; ThriftyDAgger: 0.9999.
@@ -45,6 +46,7 @@ class RobotGatedConfig(MethodConfig):
     rollouts: int = 10
     calm_share: float = 0.5
     least_s: float = 0.5
+    hands_back: bool = True
     n_heads: int = 5
     gate_updates: int = 400
     discount: float = 0.9999
@@ -85,11 +87,12 @@ class RobotGated(Method):
     def begin(self, tools: Tools) -> None:
         if self._expert is None or tools.facts is None:
             return  # nobody acts
+        from lerobot_playbyear.dagger.methods.gate_model import FOR_GOOD
         from lerobot_playbyear.dagger.methods.remembering import check_memory
 
         check_memory(tools)
         self._tools = tools
-        self._n_least = round(self._config.least_s * tools.facts.fps)
+        self._n_least = round(self._config.least_s * tools.facts.fps) if self._config.hands_back else FOR_GOOD
 
     @property
     def _remembering(self) -> "Remembering":
