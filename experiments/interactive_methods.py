@@ -3,6 +3,8 @@
 from argparse import Namespace
 from collections.abc import Sequence
 
+_ASKING = ("--method.type=robot_gated", "--method.intervention_share=0.45")
+"""The share of steps is about what the simulator's gates take of a policy of five demonstrations."""
 METHODS: dict[str, tuple[str, ...]] = {
     "skip": (),
     "hg_dagger": ("--skip_s=0",),
@@ -11,13 +13,13 @@ METHODS: dict[str, tuple[str, ...]] = {
     "redo": ("--method.type=redo",),
     "sirius": ("--method.type=weighted",),
     "iwr": ("--method.type=weighted", "--method.paper=iwr"),
-    "robot_gated": ("--method.type=robot_gated",),
-    "robot_gated_no_handback": ("--method.type=robot_gated", "--method.hands_back=false"),
+    "robot_gated": _ASKING,
+    "robot_gated_no_handback": (*_ASKING, "--method.hands_back=false"),
     "early": ("--takeover_delay_s=-0.5",),
     "late": ("--takeover_delay_s=0.5",),
     "all_frames": ("--learn_from=all",),
     "person": ("--expert.person=true",),
-    "person_robot_gated": ("--method.type=robot_gated", "--expert.person=true"),
+    "person_robot_gated": (*_ASKING, "--expert.person=true"),
 }
 """`skip` is `playbyear-dagger` as it is by default, `hg_dagger` learns from whole corrections, as it was published."""
 WEIGHING = ("hg_dagger", "redo", "sirius", "iwr", "all_frames")
