@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_playbyear.dagger.methods.gate_model import FOR_GOOD, Asking, GateModel, Played, Thresholds, thresholds_for
+from lerobot_playbyear.dagger.methods.gate_model import (
+    FOR_GOOD,
+    Asking,
+    GateModel,
+    Played,
+    Thresholds,
+    Trace,
+    thresholds_for,
+)
 from lerobot_playbyear.dagger.methods.remembering import check_memory
 from lerobot_playbyear.datasets.errors import InputError
 
@@ -78,19 +86,39 @@ def test_a_robot_that_does_not_go_on_by_itself_asks_to_the_end():
     assert [asking.asks(*step) for step in [(0.1, 0.1), (1.5, 0.1), *[(0.1, 0.1)] * 50]] == [False, *[True] * 51]
 
 
+def wandering(rng):
+    """An attempt of 100 steps by the policy alone, whose novelty and risk go up and down."""
+    novelty, risk = rng.exponential(1, 120), rng.random(120)
+    smooth = [np.convolve(values, np.ones(6) / 6)[:100] for values in (novelty, risk)]
+    return Trace(*smooth, np.ones(100, bool))
+
+
 @pytest.mark.parametrize(("share", "n_least"), [(0.1, 5), (0.3, 5), (0.3, FOR_GOOD)])
 def test_thresholds_follow_from_the_wanted_share(share, n_least):
     rng = np.random.default_rng(0)
-    traces = [
-        (np.convolve(rng.exponential(1, 120), np.ones(6) / 6)[:100], np.convolve(rng.random(120), np.ones(6) / 6)[:100])
-        for _ in range(20)
-    ]
+    traces = [wandering(rng) for _ in range(20)]
     limits = thresholds_for(traces, share, n_least)
     fresh, asked = Asking, 0
     for each in traces:
         asking = fresh(limits, n_least)
-        asked += sum(asking.asks(*step) for step in zip(*each, strict=True))
+        asked += sum(asking.asks(*step) for step in zip(each.novelty, each.risk, strict=True))
     assert asked / 2000 == pytest.approx(share, abs=0.06)
+
+
+@pytest.mark.parametrize("n_least", [5, FOR_GOOD])
+def test_where_the_expert_brought_the_robot_does_not_count_for_the_share(n_least):
+    """After a call of the second half of an attempt all is new: a robot that asks there only would never ask by itself."""
+    rng = np.random.default_rng(0)
+    traces = [wandering(rng) for _ in range(20)]
+    for each in traces[::2]:
+        each.is_own[51:] = False
+        each.novelty[51:] += 10
+    limits = thresholds_for(traces, 0.3, n_least)
+    asked = []
+    for each in (wandering(rng) for _ in range(200)):
+        asking = Asking(limits, n_least)
+        asked += [asking.asks(*step) for step in zip(each.novelty, each.risk, strict=True)]
+    assert np.mean(asked) == pytest.approx(0.3, abs=0.1)
 
 
 def test_a_policy_without_a_memory_is_refused():

@@ -85,10 +85,11 @@ class GateModel:
         values = self._values if seed not in self._half else [self._values[self._half[seed]]]
         return 1 - torch.stack([value(seen).sigmoid().squeeze(-1) for value in values]).mean(dim=0)
 
-    def trace(self, played: Played) -> tuple[np.ndarray, np.ndarray]:
-        """Novelty (T,) and risk (T,) of an attempt in which the policy would act."""
+    def trace(self, played: Played) -> "Trace":
+        """Of an attempt, as if the policy would act."""
         risk = self.risk(played.memories, played.policy_actions, played.seed)
-        return self.novelty(played.memories).numpy(), risk.numpy()
+        was_expert_before = np.concatenate([[False], played.by_expert[:-1]])
+        return Trace(self.novelty(played.memories).numpy(), risk.numpy(), ~was_expert_before)
 
     def _scaled(self, memories: Tensor) -> Tensor:
         return (memories.float() - self._mean) / self._std
@@ -136,6 +137,20 @@ class Thresholds:
     calm_risk: float
 
 
+@dataclass(frozen=True)
+class Trace:
+    """What a robot thought of an attempt of T steps.
+
+    Attributes:
+        novelty, risk: (T,)
+        is_own: (T,) bool. The policy brought the robot to where it was, and not the expert.
+    """
+
+    novelty: np.ndarray
+    risk: np.ndarray
+    is_own: np.ndarray
+
+
 class Asking:
     """Whether the robot asks for help, step by step.
 
@@ -148,6 +163,11 @@ class Asking:
         self._thresholds, self._n_least = thresholds, n_least
         self._asked_for = 0
 
+    @property
+    def is_asking(self) -> bool:
+        """Whether it asked in the last step."""
+        return self._asked_for > 0
+
     def asks(self, novelty: float, risk: float) -> bool:
         """Whether it asks now."""
         limits = self._thresholds
@@ -159,32 +179,36 @@ class Asking:
         return asks
 
 
-def thresholds_for(
-    traces: list[tuple[np.ndarray, np.ndarray]], share: float, n_least: int, calm_share: float = 0.5
-) -> Thresholds:
+def thresholds_for(traces: list[Trace], share: float, n_least: int, calm_share: float = 0.5) -> Thresholds:
     """The thresholds with which a robot would have asked in a wanted share of the steps.
 
     It asks above the same quantile of novelty and of risk, and until both are calm. Of all such quantiles that one is taken
-    which comes nearest.
+    which comes nearest. Where the expert had brought the robot, nobody knows how a robot would stand that had not asked before:
+    such steps are left out, unless it would still be asking then.
 
     Args:
-        traces: Novelty (T,) and risk (T,) of every attempt.
+        traces: Of every attempt.
         share: Of the steps in which the expert shall act.
         n_least: Steps for which it asks at least.
         calm_share: Share of the steps whose novelty, or risk, is calm; a half is ThriftyDAgger's, of risk.
     """
-    novelty, risk = (np.concatenate(parts) for parts in zip(*traces, strict=True))
+    novelty = np.concatenate([each.novelty[each.is_own] for each in traces])
+    risk = np.concatenate([each.risk[each.is_own] for each in traces])
     calm = float(np.quantile(novelty, calm_share)), float(np.quantile(risk, calm_share))
     best, nearest = Thresholds(float(novelty.max()), float(risk.max()), *calm), share
     for quantile in 1 - (1 - calm_share) * np.linspace(1, 0, 101)[:-1] ** 2:  # finer where few steps are asked in
         limits = Thresholds(float(np.quantile(novelty, quantile)), float(np.quantile(risk, quantile)), *calm)
-        n_asked = 0
-        for each in traces:
-            asking = Asking(limits, n_least)
-            n_asked += sum(asking.asks(float(new), float(risky)) for new, risky in zip(*each, strict=True))
-        if abs(n_asked / len(novelty) - share) < nearest:
-            best, nearest = limits, abs(n_asked / len(novelty) - share)
+        asked = np.concatenate([_asked(each, limits, n_least) for each in traces])
+        if abs(asked.mean() - share) < nearest:
+            best, nearest = limits, float(abs(asked.mean() - share))
     return best
+
+
+def _asked(trace: Trace, limits: Thresholds, n_least: int) -> np.ndarray:
+    """Whether a robot would have asked, in the steps of which that can be told."""
+    asking = Asking(limits, n_least)
+    steps = zip(trace.novelty, trace.risk, trace.is_own, strict=True)
+    return np.array([asking.asks(float(new), float(risky)) for new, risky, own in steps if own or asking.is_asking])
 
 
 def _last_takeover(by_expert: np.ndarray) -> int:
