@@ -1,11 +1,13 @@
 """A person whom the robot calls: the window is lit, it rings once, and they take over when they like."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_teleoperation import Clock, Nobody, Screenless, holding, letting_go, make_env
 
 from lerobot_playbyear.dagger.methods.beside import Labelling, Staying
-from lerobot_playbyear.dagger.methods.robot_gated import Asked
+from lerobot_playbyear.dagger.methods.robot_gated import Asked, RobotGatedConfig
 from lerobot_playbyear.episodes.expert import ExpertError
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.teleoperation.actions import ActionMapping, Gripper
@@ -75,6 +77,12 @@ def test_without_a_hand_back_one_press_is_for_the_whole_attempt():
     steps, shown, _ = attempt({7: holding("space"), 9: letting_go("space")}, Staying)
     assert steps == list(range(7, 20))
     assert shown[8:] == [Control.PERSON] * len(shown[8:])
+
+
+def test_a_person_who_is_called_cannot_be_kept():
+    method = RobotGatedConfig(hands_back=False).make(SimpleNamespace())
+    with pytest.raises(ExpertError, match=r"--method\.hands_back=false.*--expert\.type=scripted"):
+        attempt({}, method.beside)
 
 
 def test_nobody_labels_what_somebody_else_does():

@@ -271,6 +271,7 @@ GATED = (
     "--method.rollouts=2",
     "--method.gate_updates=5",
     "--method.intervention_share=0.4",
+    "--method.hands_back=true",
 )
 
 
@@ -309,9 +310,11 @@ def test_a_robot_asks_once_its_first_attempts_are_made(tmp_path):
 
 @pytest.mark.slow
 def test_a_robot_that_does_not_go_on_by_itself_leaves_the_rest_to_the_expert(tmp_path):
-    dagger(tmp_path, *QUICK, *GATED, "--method.hands_back=false", "--episodes=2", "--max_attempts=30")
+    by_default = [option for option in GATED if "hands_back" not in option]
+    dagger(tmp_path, *QUICK, *by_default, "--episodes=2", "--max_attempts=30")
     asked = [line for line in metrics(tmp_path, "attempt") if line["n_calls"]]
-    assert all((line["n_calls"], line["n_switches"]) == (1, 1) for line in asked)
+    assert asked
+    assert all(line["n_calls"] == 1 >= line["n_switches"] for line in asked)  # none where it asks at once
     marks = column(corrections(tmp_path), "intervention").reshape(2, -1)
     assert all((np.diff(marks.astype(int), axis=1) >= 0).ravel())
     assert marks[:, -1].all()

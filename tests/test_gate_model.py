@@ -86,6 +86,12 @@ def test_a_robot_that_does_not_go_on_by_itself_asks_to_the_end():
     assert [asking.asks(*step) for step in [(0.1, 0.1), (1.5, 0.1), *[(0.1, 0.1)] * 50]] == [False, *[True] * 51]
 
 
+def test_the_step_in_which_the_expert_takes_over_was_reached_by_the_policy(model):
+    attempt = walk(1.0, True, True, n=6)
+    attempt.by_expert[2:4] = True
+    assert model.trace(attempt).is_own.tolist() == [True, True, True, False, False, True]
+
+
 def wandering(rng):
     """An attempt of 100 steps by the policy alone, whose novelty and risk go up and down."""
     novelty, risk = rng.exponential(1, 120), rng.random(120)

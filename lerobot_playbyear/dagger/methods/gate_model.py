@@ -19,7 +19,7 @@ from torch import Tensor, nn
 _HIDDEN = 128
 _BATCH = 256
 FOR_GOOD = sys.maxsize
-"""For so many steps asks a robot at least that does not go on by itself."""
+"""`n_least` of a robot that never goes on by itself: once it asks, it asks to the attempt's end."""
 
 
 @dataclass
@@ -86,7 +86,7 @@ class GateModel:
         return 1 - torch.stack([value(seen).sigmoid().squeeze(-1) for value in values]).mean(dim=0)
 
     def trace(self, played: Played) -> "Trace":
-        """Of an attempt, as if the policy would act."""
+        """What the robot thinks of every step; risk is that of the policy's action, also where the expert acted."""
         risk = self.risk(played.memories, played.policy_actions, played.seed)
         was_expert_before = np.concatenate([[False], played.by_expert[:-1]])
         return Trace(self.novelty(played.memories).numpy(), risk.numpy(), ~was_expert_before)
@@ -143,7 +143,7 @@ class Trace:
 
     Attributes:
         novelty, risk: (T,)
-        is_own: (T,) bool. The policy brought the robot to where it was, and not the expert.
+        is_own: (T,) bool. The policy, and not the expert, acted in the step before; true of the first step.
     """
 
     novelty: np.ndarray
@@ -180,11 +180,12 @@ class Asking:
 
 
 def thresholds_for(traces: list[Trace], share: float, n_least: int, calm_share: float = 0.5) -> Thresholds:
-    """The thresholds with which a robot would have asked in a wanted share of the steps.
+    """The thresholds with which a robot would have asked in a wanted share of the steps of which that can be told.
 
-    It asks above the same quantile of novelty and of risk, and until both are calm. Of all such quantiles that one is taken
-    which comes nearest. Where the expert had brought the robot, nobody knows how a robot would stand that had not asked before:
-    such steps are left out, unless it would still be asking then.
+    It asks above the same quantile of novelty and of risk, and until both are calm. Of all such quantiles, from that of the
+    calm on, that one is taken which comes nearest. Where the expert had brought the robot, nobody knows how a robot would
+    stand that had not asked before: such steps are left out, unless it would still be asking then. So each quantile has its
+    own steps, and the share is met only about.
 
     Args:
         traces: Of every attempt.

@@ -14,7 +14,7 @@ from lerobot_playbyear.dagger.methods.base import Method, MethodConfig, Tools
 from lerobot_playbyear.dagger.methods.beside import Beside
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Episode, Observation
-from lerobot_playbyear.episodes.expert import Expert
+from lerobot_playbyear.episodes.expert import Expert, ExpertError
 
 if TYPE_CHECKING:
     from lerobot_playbyear.dagger.config import DaggerConfig
@@ -25,14 +25,15 @@ if TYPE_CHECKING:
 @MethodConfig.register_subclass("robot_gated")
 @dataclass
 class RobotGatedConfig(MethodConfig):
-    """The robot asks. A script then acts until it is calm again, or to the end; a person is called, and acts as they like.
+    """The robot asks. A script then acts until the robot is calm again, or to the end; a person is called, and may take over.
 
     Attributes:
         intervention_share: Of the steps in which it shall ask; the thresholds follow from it, anew in every round.
         rollouts: First attempts, in which the policy is alone: from them it learns what failing looks like.
         calm_share: It asks until novelty and risk both lie among this share of the smallest; larger means earlier hand-backs.
         least_s: For how long it asks at least [s].
-        hands_back: Whether it goes on by itself once it is calm; otherwise it asks once, to the attempt's end, as in RaC.
+        hands_back: Whether the expert hands back once the robot is calm; otherwise it acts to the end, as in RaC. None: only
+            an expert that decides for itself, as a person, hands back.
         n_heads: Whose disagreement is novelty; ThriftyDAgger: 5 policies.
         gate_updates: Of each head and of each success value, in every round.
         discount: Of a success, per step; ThriftyDAgger: 0.9999.
@@ -46,7 +47,7 @@ class RobotGatedConfig(MethodConfig):
     rollouts: int = 10
     calm_share: float = 0.5
     least_s: float = 0.5
-    hands_back: bool = True
+    hands_back: bool | None = None
     n_heads: int = 5
     gate_updates: int = 400
     discount: float = 0.9999
@@ -81,6 +82,11 @@ class RobotGated(Method):
         self._remembered: Remembering | None = None
 
     def beside(self, expert: Expert) -> Expert:
+        if expert.decides and self._config.hands_back is False:
+            raise ExpertError(
+                "--method.hands_back=false is for experts that the robot can call and keep, and this one hands back as it "
+                "likes: leave the option out, and act to the end once you have taken over, or give --expert.type=scripted."
+            )
         self._expert = Asked(expert, self)
         return self._expert
 
@@ -92,7 +98,8 @@ class RobotGated(Method):
 
         check_memory(tools)
         self._tools = tools
-        self._n_least = round(self._config.least_s * tools.facts.fps) if self._config.hands_back else FOR_GOOD
+        hands_back = self._expert.decides if self._config.hands_back is None else self._config.hands_back
+        self._n_least = round(self._config.least_s * tools.facts.fps) if hands_back else FOR_GOOD
 
     @property
     def _remembering(self) -> "Remembering":
