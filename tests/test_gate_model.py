@@ -113,12 +113,13 @@ def test_thresholds_follow_from_the_wanted_share(share, n_least):
 
 @pytest.mark.parametrize("n_least", [5, FOR_GOOD])
 def test_where_the_expert_brought_the_robot_does_not_count_for_the_share(n_least):
-    """After a call of the second half of an attempt all is new: a robot that asks there only would never ask by itself."""
+    """After a call in the middle of an attempt all is new and risky: a robot that asks there only never asks by itself."""
     rng = np.random.default_rng(0)
     traces = [wandering(rng) for _ in range(20)]
     for each in traces[::2]:
         each.is_own[51:] = False
         each.novelty[51:] += 10
+        each.risk[51:] += 1
     limits = thresholds_for(traces, 0.3, n_least)
     asked = []
     for each in (wandering(rng) for _ in range(200)):
