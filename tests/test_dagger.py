@@ -207,11 +207,13 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
     cfg.episodes, cfg.warmup_episodes, cfg.updates_per_episode = 7, 3, 10
     rounds = [[cfg.rate(10 * done + number, number, 10) for number in range(10)] for done in range(6)]
     first, second, last = rounds[0], rounds[1], rounds[4]
-    assert cfg.total_updates == 50
+    assert cfg.total_updates() == 50
     assert first[:3] == [0.25, pytest.approx(0.5 * second[1] / second[0]), pytest.approx(0.75 * second[2] / second[0])]
     assert all(rates[1:] == sorted(rates[1:], reverse=True) and rates[-1] < 0.05 for rates in rounds[1:])
     assert [rates[0] for rates in rounds] == pytest.approx([0.25, 0.82, 0.64, 0.46, 0.28, 0.1])
     assert rounds[5][0] < last[0]
+    appended = [cfg.rate(10 * done, 0, 10, n_before=5) for done in range(3)]  # two rounds
+    assert appended == pytest.approx([0.25, 0.55, 0.1])
     cfg.anneal = False
     assert cfg.rate(17, 7, 10) == 1
 
@@ -310,6 +312,14 @@ def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
     assert "needed no help in 3 attempts in a row" in "".join(capfd.readouterr())
     assert seeds(tmp_path) == [10]
     assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
+
+
+def test_attempts_of_which_none_can_be_kept_are_told_as_what_they_were(tmp_path, capfd):
+    choices = ("--expert.type=test_verdicts", "--expert.successes=10+11", "--expert.acts=12")
+    dagger(tmp_path, *choices, "--episode_seed=10", "--episodes=5", "--max_attempts=3")
+    printed = "".join(capfd.readouterr())
+    assert "None of 3 attempts in a row could be kept: 2 needed no help, 1 failed, and 0 were thrown away." in printed
+    assert "No update was made: no attempt was kept.\nGo on:" in printed
 
 
 def test_an_expert_that_rescues_nothing_is_an_error(tmp_path):

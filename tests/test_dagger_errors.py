@@ -13,7 +13,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, attempt
-from lerobot_playbyear.dagger.config import DatasetSource
+from lerobot_playbyear.dagger.config import DaggerEvalConfig, DatasetSource, with_saved_options
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes import frames, saving
 from lerobot_playbyear.scripts import dagger as dagger_script
@@ -73,11 +73,31 @@ def test_options_that_do_not_go_together(options, message, tmp_path):
         ({"learning_rate": 0.0}, "--learning_rate=0.0 must be above 0"),
         ({"updates": 5}, "--updates is for --episodes=0"),
         ({"episodes": 0}, "give --updates"),
+        ({"eval": DaggerEvalConfig(n_episodes=0)}, "--eval.n_episodes=0: give at least 1, or --eval_every=0"),
     ],
 )
 def test_numbers_out_of_their_range(options, message):
     with pytest.raises(PlaybyearError, match=message):
         DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), env=PlaybyearEnvConfig(), **options).check()
+
+
+def test_a_run_without_evaluations_needs_no_episodes_of_one():
+    source = DatasetSource("a/b")
+    cfg = DaggerConfig(source, source, env=PlaybyearEnvConfig(), eval_every=0, eval=DaggerEvalConfig(n_episodes=0))
+    cfg.check()
+    assert len(cfg.eval_seeds) == 0
+
+
+@pytest.mark.parametrize("said", ["true", "True", "yes", "on"])
+def test_however_a_resume_is_said_the_saved_options_stay(finished, said):
+    args = [f"--resume={said}", f"--output_dir={finished / 'out'}"]
+    assert with_saved_options(args)[0] == f"--config_path={finished / 'out/dagger_config.json'}"
+
+
+def test_recorded_noise_that_is_gone_is_told_before_any_attempt(tmp_path):
+    with pytest.raises(PlaybyearError, match="nowhere"):
+        dagger(tmp_path, *QUICK, f"--policy.audio_noise_files={tmp_path / 'nowhere'}", "--policy.audio_noise_db=20")
+    assert not (tmp_path / "out").exists()
 
 
 def test_without_an_environment_or_a_policy(tmp_path):
@@ -128,7 +148,8 @@ def test_the_folder_of_a_run_is_not_touched_without_resume(finished):
         (("--demos.repo_id=other/demos",), r"--demos was .*tests/demos.* and is .*other/demos"),
         (("--expert.n_steps=9",), "--expert was .*'n_steps': 8.* and is .*'n_steps': 9"),
         (("--episode_seed=5",), "--episode_seed was 10000 and is 5"),
-        (("--policy.path=elsewhere",), "--policy.path was .*policy and is elsewhere"),
+        (("--policy.path=elsewhere",), "--policy.path was .*pretrained_model and is elsewhere"),
+        (("--episodes=0", "--updates=5"), "--episodes was 1 and is 0"),
     ],
 )
 def test_resuming_another_run_names_the_difference(finished, options, difference):

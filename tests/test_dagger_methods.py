@@ -14,7 +14,7 @@ from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource, with_saved_options
 from lerobot_playbyear.dagger.methods import redo
-from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Redoing, Staying
+from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Redoing, Staying, shifted
 from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
 from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
 from lerobot_playbyear.dagger.same_run import differences
@@ -309,6 +309,14 @@ def test_a_robot_asks_once_its_first_attempts_are_made(tmp_path):
 
 
 @pytest.mark.slow
+def test_attempts_in_which_nobody_could_be_asked_do_not_end_a_run(tmp_path):
+    dagger(tmp_path, *QUICK, *GATED, "--method.rollouts=4", "--episodes=1", "--max_attempts=4", "--episode_seed=12000")
+    attempts = metrics(tmp_path, "attempt")
+    assert len(attempts) > 4
+    assert attempts[-1]["outcome"] == "kept"
+
+
+@pytest.mark.slow
 def test_a_robot_that_does_not_go_on_by_itself_leaves_the_rest_to_the_expert(tmp_path):
     by_default = [option for option in GATED if "hands_back" not in option]
     dagger(tmp_path, *QUICK, *by_default, "--episodes=2", "--max_attempts=30")
@@ -351,6 +359,11 @@ def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monk
         (("--method.type=redo", "--learn_from=all"), "--method.type=redo says by itself what is learned from"),
         (("--method.type=robot_gated", "--method.intervention_share=1.5"), "intervention_share=1.5: give a share"),
         (("--skip_s=-1",), "--skip_s=-1.0: give 0 or more seconds"),
+        (("--takeover_delay_s=0.02",), "--takeover_delay_s=0.02: that is less than half a step at 20 steps per second"),
+        (
+            ("--takeover_delay_s=-0.5", "--expert.type=scripted", "--expert.person=true"),
+            "--takeover_delay_s below 0 plays every attempt twice",
+        ),
         (("--skip_s=1", "--learn_from=all"), "--skip_s=1.0 and --learn_from=all"),
         (
             ("--skip_s=1", "--method.type=dagger"),
@@ -367,6 +380,15 @@ def test_options_that_do_not_go_together(tmp_path, options, message):
     with pytest.raises(PlaybyearError, match=message):
         dagger(tmp_path, *RUN, *options)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_person_is_not_held_back():
+    env, person = SimpleNamespace(unwrapped=None), SimpleNamespace(decides=True, can_label=False, clock_fps=20)
+    with pytest.raises(
+        PlaybyearError, match=r"--takeover_delay_s=0.5: a person who takes over has the control at once"
+    ):
+        shifted(person, 0.5, 20, env)
+    assert isinstance(shifted(SimpleNamespace(decides=True, can_label=True, clock_fps=20), 0.5, 20, env), Late)
 
 
 def test_no_robot_is_asked_to_set_up_a_scene_twice():

@@ -1,6 +1,7 @@
 """A run of HG-DAgger that is killed at any moment goes on and ends as one that was not; nothing is lost or doubled."""
 
 import contextlib
+import json
 import multiprocessing
 import os
 import resource
@@ -21,6 +22,7 @@ from dagger_factory import (
     seeds,
     state,
 )
+from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
@@ -100,6 +102,51 @@ def test_wherever_it_stops_it_ends_alike(undisturbed, tmp_path, monkeypatch, own
             dagger(tmp_path, *RUN)
     command("--resume=true", f"--output_dir={tmp_path / 'out'}")
     assert_ended_alike(tmp_path, undisturbed)
+
+
+def test_one_attempt_that_was_saved_and_not_counted_is_all_that_was_wanted(tmp_path, monkeypatch):
+    run = (*QUICK, "--episodes=1")
+    dagger(tmp_path / "calm", *run)
+    with monkeypatch.context() as patch:
+        cut_power(patch, folder_module.RunFolder, "commit", len(metrics(tmp_path / "calm", "attempt")))
+        with pytest.raises(PowerCut):
+            dagger(tmp_path / "cut", *run)
+    assert state(tmp_path / "cut")["kept"] == 0 < len(seeds(tmp_path / "cut"))
+    command("--resume=true", f"--output_dir={tmp_path / 'cut/out'}")
+    assert_ended_alike(tmp_path / "cut", tmp_path / "calm")
+
+
+def test_what_a_run_could_not_write_at_its_beginning_does_not_block_it(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/dagger_config.json.partial").write_text("{")
+    dagger(tmp_path, *QUICK, "--episodes=1")
+    assert state(tmp_path)["kept"] == 1
+
+
+def test_a_policys_options_stay_until_there_is_a_checkpoint(tmp_path, monkeypatch):
+    """Those of a file and of a resume; and the policy that a link named when the run began."""
+    policy, link, options = (base_folder() / "policy").resolve(), tmp_path / "link", tmp_path / "run.yaml"
+    link.symlink_to(policy)
+    options.write_text(f"policy:\n  path: {link}\n  low_dimensional_noise: 0.25\n  optimizer_lr: 0.002\n")
+    args = [each for each in arguments(tmp_path, *RUN) if not each.startswith("--policy.path")]
+    with monkeypatch.context() as patch:
+        for name in ("_config_path_args", "_config_yaml_overrides"):  # that LeRobot keeps for the process
+            patch.setattr(parser, name, {})
+        cut_power(patch, folder_module.RunFolder, "commit", 1)
+        with pytest.raises(PowerCut):
+            command(f"--config_path={options}", *args)
+    link.unlink()
+    link.symlink_to(tmp_path)
+    again = ("--resume=true", f"--output_dir={tmp_path / 'out'}")
+    with monkeypatch.context() as patch:
+        cut_power(patch, folder_module.RunFolder, "commit", 1)
+        with pytest.raises(PowerCut):
+            command(*again, f"--policy.path={policy}", "--policy.optimizer_weight_decay=0.125")
+    command(*again)
+    config = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
+    names = ("low_dimensional_noise", "optimizer_lr", "optimizer_weight_decay")
+    assert [config[name] for name in names] == [0.25, 0.002, 0.125]
+    assert len(state(tmp_path)["policy_overrides"]) == 3
 
 
 def test_more_episodes_go_on_with_a_finished_run(undisturbed, tmp_path):

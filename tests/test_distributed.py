@@ -179,7 +179,8 @@ def demonstrations_as_corrections(base: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_corrections_in_two_processes_teach_what_they_teach_in_one(tmp_path):
+@pytest.mark.parametrize("new_weights", ["false", "true"])
+def test_corrections_in_two_processes_teach_what_they_teach_in_one(tmp_path, new_weights):
     """The batch is shared out, so that both have the same number of runs."""
     from dagger_factory import base_folder
 
@@ -192,6 +193,7 @@ def test_corrections_in_two_processes_teach_what_they_teach_in_one(tmp_path):
             "--episodes=0",
             "--updates=20",
             "--batch_size=4",
+            f"--new_weights={new_weights}",
         )
         rest = ("--updates_per_episode=5", "--eval_every=0", f"--output_dir={folder}")
         launch(n_processes, "playbyear-dagger", *demonstrations_as_corrections(base), *options, *rest)

@@ -16,11 +16,13 @@ import lerobot.datasets.dataset_writer
 import numpy as np
 import pytest
 from lerobot.configs.video import RGBEncoderConfig
+from lerobot.datasets import image_writer
 from recording_factory import FEATURES, FILM, FPS, REPO_ID, RICH_FEATURES, differences, episode_frames, load
 
 from lerobot_playbyear.datasets import journal
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
 from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.staging import Staging
 from lerobot_playbyear.episodes.saving import save_or_ask
 
 ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
@@ -323,6 +325,46 @@ def test_without_a_terminal_nobody_is_asked(tmp_path, monkeypatch):
             with pytest.raises(DatasetWriteError, match="call save_episode again"):
                 save_or_ask(target)
         monkeypatch.undo()
+
+
+@pytest.mark.parametrize("is_given_up", [False, True])
+@pytest.mark.parametrize("what", ["pictures", "a frame"])
+def test_an_episode_in_memory_is_written_anew_where_its_pictures_did_not_reach_the_disk(
+    tmp_path, monkeypatch, what, is_given_up
+):
+    root, questions = tmp_path / "dataset", []
+    real, real_write = Staging.add_frame, image_writer.write_image
+
+    def no_room_for_the_third(staging, frame):
+        if staging.length == 2 and not questions:
+            _no_room()
+        real(staging, frame)
+
+    def no_pictures(*args, **kwargs):  # LeRobot's threads log it, and go on
+        if questions:
+            real_write(*args, **kwargs)
+
+    def answer(question):
+        questions.append(question)
+        return "q" if is_given_up else ""
+
+    ours, theirs = os.openpty()
+    with writer(root, FEATURES) as target, os.fdopen(theirs) as terminal:
+        write_episode(target, 0)
+        monkeypatch.setattr(sys, "stdin", terminal)
+        monkeypatch.setattr("builtins.input", answer)
+        if what == "pictures":
+            monkeypatch.setattr(image_writer, "write_image", no_pictures)
+        else:
+            monkeypatch.setattr(Staging, "add_frame", no_room_for_the_third)
+        with pytest.raises(DatasetWriteError) if is_given_up else contextlib.nullcontext():
+            assert save_or_ask(target, episode_frames(1, FEATURES)) == 1
+        assert len(questions) == 1
+        assert "still in memory" in questions[0]
+        if is_given_up:
+            assert save_or_ask(target, episode_frames(1, FEATURES)) == 1
+    os.close(ours)
+    assert_recorded(root, 2, FEATURES)
 
 
 def _no_room(*_: Any, **__: Any) -> None:

@@ -91,7 +91,8 @@ class DaggerConfig:
         eval_every: Rounds between two evaluations; there is one before the first round and one after the last. 0: none.
         eval: Size of an evaluation, as in lerobot-eval.
         eval_videos: Episodes of each evaluation that are filmed.
-        save_every: Rounds between two checkpoints that are kept for good. 0: the last and those that were evaluated.
+        save_every: Rounds between two checkpoints that are kept for good. Those of every `eval_every`-th round are, if there
+            is an evaluation; the last and the best always are there.
         output_dir: Folder of checkpoints, figures and options.
         resume: Go on with the run in `output_dir`, or begin it if there is none; options that are not given again stay.
         job_name: For wandb.
@@ -145,7 +146,7 @@ class DaggerConfig:
     @property
     def eval_seeds(self) -> range:
         """Of all evaluation episodes, those included that only fill the last batch of environments."""
-        n_batches = -(-self.eval.n_episodes // self.eval.batch_size)
+        n_batches = -(-self.eval.n_episodes // max(self.eval.batch_size, 1))  # LeRobot makes it 0 where there are none
         return range(self.seed, self.seed + n_batches * self.eval.batch_size)
 
     def check(self) -> None:
@@ -155,6 +156,10 @@ class DaggerConfig:
         for name, value in vars(self).items():
             if isinstance(value, int) and value < _LEAST.get(name, 0):
                 raise InputError(f"--{name}={value}: give at least {_LEAST.get(name, 0)}.")
+        if self.eval.n_episodes < (self.eval_every > 0):
+            raise InputError(
+                f"--eval.n_episodes={self.eval.n_episodes}: give at least 1, or --eval_every=0 for no evaluation."
+            )
         if self.batch_size < 2 or self.batch_size % 2:
             raise InputError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
         if self.is_online and self.updates:
@@ -225,20 +230,21 @@ class DaggerConfig:
             return n_remembered if n_remembered > 1 else 0
         return math.ceil(round(self.skip_s * fps, 6))
 
-    def rate(self, step: int, number: int, n_updates: int) -> float:
+    def rate(self, step: int, number: int, n_updates: int, n_before: int = 0) -> float:
         """The learning rate of an update.
 
         Args:
             step: Updates of the run before it.
             number: Updates of the round before it.
             n_updates: Updates of the round.
+            n_before: Attempts that the dataset held before the run.
         """
         rate = self.largest_rate * min(1.0, (step + 1) / max(self.warmup_updates, 1))
         if not self.anneal:
             return rate
         if not self.is_online:  # rounds are there to be saved; nobody acts in between
-            number, n_updates = step, self.total_updates
-        done = min(1.0, (step - number) / self.total_updates)
+            number, n_updates = step, self.updates
+        done = min(1.0, (step - number) / self.total_updates(n_before))
         return rate * (1 - 0.9 * done) * 0.5 * (1 + math.cos(math.pi * number / n_updates))
 
     @property
@@ -249,10 +255,10 @@ class DaggerConfig:
         assert self.policy is not None
         return float(self.policy.get_optimizer_preset().lr)
 
-    @property
-    def total_updates(self) -> int:
-        """Updates of a run that keeps all attempts it is asked for."""
-        return self.updates or max(self.episodes - self.warmup_episodes + 1, 1) * self.updates_per_episode
+    def total_updates(self, n_before: int = 0) -> int:
+        """Updates of a run that keeps all attempts it is asked for, from a dataset that held `n_before`."""
+        n_rounds = max(self.episodes - max(n_before, self.warmup_episodes - 1), 1)
+        return self.updates or n_rounds * self.updates_per_episode
 
     def training(self) -> PlaybyearTrainConfig:
         """The same as options of playbyear-train, for what HG-DAgger shares with it."""
@@ -262,7 +268,7 @@ class DaggerConfig:
         optimizer.lr = self.largest_rate
         return PlaybyearTrainConfig(
             dataset=DatasetConfig(self.demos.repo_id, root=self.demos.root, video_backend=self.demos.video_backend),
-            steps=self.total_updates,
+            steps=self.total_updates(),
             num_workers=0,
             env_eval_freq=0,
             optimizer=optimizer,
@@ -282,7 +288,7 @@ def with_saved_options(args: Sequence[str]) -> list[str]:
         args: Command-line arguments; without `--resume` they are returned as they are.
     """
     args = list(args)
-    is_resumed = (parser.parse_arg("resume", args) or "").lower() in ("true", "1", "yes")
+    is_resumed = (parser.parse_arg("resume", args) or "").lower() in ("true", "yes", "on")
     folder = Path(parser.parse_arg("output_dir", args) or DaggerConfig.output_dir)
     if is_resumed and parser.parse_arg("config_path", args) is None and (folder / CONFIG_NAME).is_file():
         older = [] if "skip_s" in json.loads((folder / CONFIG_NAME).read_text()) else ["--skip_s=0"]

@@ -99,7 +99,8 @@ class RunFolder:
             InputError: The folder holds a run and `resume` is off, or it holds something else.
         """
         is_run = (self.path / CONFIG_NAME).is_file()
-        if not self.path.exists() or not any(self.path.iterdir()):
+        begun = CONFIG_NAME + _PARTIAL  # of a run that could not write even its options
+        if not self.path.exists() or {path.name for path in self.path.iterdir()} <= {begun}:
             return None
         if not is_run:
             raise InputError(

@@ -7,6 +7,7 @@ import torch
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_playbyear.dagger.config import DaggerConfig
+from lerobot_playbyear.dagger.new_weights import forget_all
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.parts import make_training_parts
 
@@ -29,6 +30,8 @@ def help_to_learn(cfg: DaggerConfig, training: PlaybyearTrainConfig) -> None:
     parts = make_training_parts(
         training, LeRobotDatasetMetadata(cfg.demos.repo_id, cfg.demos.root), keep_normalization=True
     )
+    if cfg.new_weights and not training.resume:
+        forget_all(parts, cfg.seed)  # as the first process does: they are told of gradients, not of weights
     orders = Orders(parts.accelerator)
     while order := orders.take():
         if order["seed"] is not None:

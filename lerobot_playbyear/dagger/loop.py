@@ -118,34 +118,41 @@ class Loop:
         self.folder.commit(state)
 
     def _collect(self, seconds: Seconds) -> bool:
-        """Attempts until one is kept. Returns False when there is none among `max_attempts`."""
+        """Attempts until one is kept. Returns False when there is none among `max_attempts` in which the expert might act."""
         outcomes: list[str] = []
         while len(outcomes) < self.cfg.max_attempts:
             self.report.doing("acting")
-            spent = Seconds()
+            spent, is_alone = Seconds(), self.method.is_alone
             episode = self._attempt(spent)
-            outcomes.append(self.method.outcome(episode))
-            if outcomes[-1] == "kept":
+            outcome = self.method.outcome(episode)
+            if not is_alone or outcome == "discarded":
+                outcomes.append(outcome)
+            if outcome == "kept":
                 with spent.of("episode_saving"):
                     self.corrections.append(episode)
                     assert self.corrections.store is not None
                     self.batches.set_interventions(self.corrections.store)
-            self.method.note(episode, outcomes[-1])
-            self._note(episode, outcomes[-1], spent)
+            self.method.note(episode, outcome)
+            self._note(episode, outcome, spent)
             seconds.add(spent)
-            if outcomes[-1] == "kept":
+            if outcome == "kept":
                 self.report.bar.update(1)
                 by_expert = torch.from_numpy(episode.actions[episode.interventions])
                 self.reach.warn(by_expert, f"the corrections of attempt {self.state.attempts}")
                 return True
-        if outcomes.count("failed") > len(outcomes) / 2:
+        n, n_failed, n_unneeded = len(outcomes), outcomes.count("failed"), outcomes.count("unneeded")
+        if n_failed > n / 2:
             raise InputError(
-                f"{outcomes.count('failed')} of {len(outcomes)} attempts in a row failed in spite of the expert: it cannot "
-                "rescue this policy. Begin with a better one, or look at the environment's options."
+                f"{n_failed} of {n} attempts in a row failed in spite of the expert: it cannot rescue this policy. Begin with "
+                "a better one, or look at the environment's options."
             )
-        logging.info(
-            f"The policy needed no help in {len(outcomes)} attempts in a row: there is nothing left to correct."
-        )
+        if n_unneeded == n:
+            logging.info(f"The policy needed no help in {n} attempts in a row: there is nothing left to correct.")
+        else:
+            logging.info(
+                f"None of {n} attempts in a row could be kept: {n_unneeded} needed no help, {n_failed} failed, and "
+                f"{outcomes.count('discarded')} were thrown away."
+            )
         return False
 
     def _attempt(self, spent: Seconds) -> Episode:
@@ -201,7 +208,7 @@ class Loop:
         tracker = Figures(self.cfg.batch_size, self.demonstrations, parts.step)
         for number in range(n_updates):
             self.report.doing(f"learning {number + 1}/{n_updates}")
-            rate = self.cfg.rate(parts.step, number, n_updates)
+            rate = self.cfg.rate(parts.step, number, n_updates, self.state.first_episodes or 0)
             with seconds.of("batch"):
                 batch = self.batches.batch(parts.step)
                 begins = seed if number == 0 else None
@@ -229,7 +236,8 @@ class Loop:
             with seconds.of("checkpoint_saving"):
                 self.folder.save_checkpoint(name, lambda path: self.parts.write_checkpoint(path, self.training))
             state.checkpoint, state.step = name, self.parts.step
-            if is_due(state.round, cfg.eval_every) or is_due(state.round, cfg.save_every):
+            is_evaluated = cfg.env is not None and is_due(state.round, cfg.eval_every)
+            if is_evaluated or is_due(state.round, cfg.save_every):
                 state.milestones.append(name)
         total = time.perf_counter() - start
         spent = {} if self.scene is None else round_figures(self.folder.metrics(), state.round)

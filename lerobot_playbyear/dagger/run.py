@@ -1,6 +1,7 @@
 """A run of HG-DAgger from its options: what it needs is made and checked, then `Loop` runs."""
 
 import logging
+import os
 import shlex
 from contextlib import ExitStack
 from functools import partial
@@ -41,6 +42,7 @@ from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.checkpoints import BEST_LINK
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.loop import read_store
@@ -90,7 +92,8 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     given = parser.get_path_arg("policy")
     if given is None and cfg.policy is not None and cfg.policy.pretrained_path:
         given = str(cfg.policy.pretrained_path)
-    overrides = list(parser.get_cli_overrides("policy") or [])
+    given = given and _followed(given)
+    overrides = [*parser.get_yaml_overrides("policy"), *(parser.get_cli_overrides("policy") or [])]  # the last one wins
     if state is None:
         if given is None:
             raise InputError(
@@ -101,7 +104,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
         state = RunState(policy_path=given, policy_overrides=overrides, first_episodes=None)
     else:
         changed = differences(folder.path, cfg)
-        if given is not None and given != state.policy_path:
+        if given is not None and given != _followed(state.policy_path):
             changed.append(f"--policy.path was {state.policy_path} and is {given}")
         if changed:
             raise InputError(
@@ -110,8 +113,8 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
             )
     checkpoint = folder.checkpoint(state)
     source = state.policy_path if checkpoint is None else str(checkpoint / PRETRAINED_MODEL_DIR)
-    if checkpoint is None and not overrides:
-        overrides = state.policy_overrides
+    if checkpoint is None and overrides != state.policy_overrides:
+        overrides = state.policy_overrides = [*state.policy_overrides, *overrides]
     cfg.policy = PreTrainedConfig.from_pretrained(source, cli_overrides=overrides)
     cfg.policy.pretrained_path = source  # type: ignore[assignment]
     if overrides:
@@ -123,6 +126,14 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     if cfg.policy.push_to_hub:
         warn_without_login()
     return state
+
+
+def _followed(policy: str) -> str:
+    """A policy's folder itself where a link names it, such as `checkpoints/last`, which names another one tomorrow."""
+    if not os.path.isdir(policy):  # a name on the Hub
+        return policy
+    folder = os.path.realpath(policy)
+    return folder if os.path.isabs(policy) else os.path.relpath(folder)
 
 
 def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack) -> Loop:
@@ -164,6 +175,9 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         forget_all(parts, cfg.seed)
     orders = Orders(parts.accelerator)
     stack.callback(orders.end)
+    for module in parts.accelerator.unwrap_model(parts.policy).modules():
+        if isinstance(module, SoundAugmentation):
+            module.read_recordings()
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = read_store(demos, windows, training)
     check_actions_can_be_masked(parts, windows, demonstrations)
@@ -209,9 +223,10 @@ def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, correcti
             f"The intervention dataset '{cfg.interventions.repo_id}' is empty: collect attempts with --episodes, or give one "
             "that holds some."
         )
-    if cfg.is_online and state.kept == 0 and corrections.n_episodes >= cfg.episodes:
+    n_before = state.first_episodes or 0  # one more may be there, of a run that was killed before it counted
+    if cfg.is_online and state.kept == 0 and n_before >= cfg.episodes:
         raise InputError(
-            f"The intervention dataset holds {corrections.n_episodes} attempts already, and --episodes={cfg.episodes} asks for "
+            f"The intervention dataset holds {n_before} attempts already, and --episodes={cfg.episodes} asks for "
             "no more: give a larger number, or --episodes=0 --updates=N to learn from what is there."
         )
 
@@ -235,14 +250,23 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
     )
     print(f"Corrections: {n_learned} of {n_corrected} frames that the expert chose are learned from{left_out}")
     if state.success is not None:
-        print(f"Success:     {state.success:.1f} % of {state.evaluated_episodes or cfg.eval.n_episodes} episodes")
+        print(
+            f"Success:     {state.success:.1f} % of {state.evaluated_episodes or cfg.eval.n_episodes} episodes"
+            + (
+                f", after {state.evaluated_round} of {state.round} rounds"
+                if state.evaluated_round != state.round
+                else ""
+            )
+        )
     is_better = state.success is not None and state.best and state.best["success"] > state.success
     if is_better and state.best["seeds"] == [cfg.seed, cfg.eval.n_episodes]:
         best = folder.checkpoints / BEST_LINK / PRETRAINED_MODEL_DIR if state.best["checkpoint"] else state.policy_path
         print(f"Best:        {state.best['success']:.1f} % of them: {best}")
         print("             The best of several evaluations looks better than it is: evaluate it on other seeds, too.")
+    more = "episodes" if cfg.is_online else "updates"
+    go_on = f"Go on:       playbyear-dagger --resume=true --output_dir={folder.path} --{more}=..."
     if state.checkpoint is None:
-        print("No update was made: --warmup_episodes is larger than what was collected.")
+        print(f"No update was made: {_why_none(cfg, state)}.\n{go_on}")
         return
     policy = folder.checkpoints / "last" / PRETRAINED_MODEL_DIR
     env = " --env.type=..."
@@ -251,4 +275,14 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
         env += " ... (the robot's options)" if getattr(cfg.env, "is_real_time", False) else ""
     print(f"Policy:      {policy}")
     print(f"Evaluate:    lerobot-eval --policy.path={policy}{env}")
-    print(f"Go on:       playbyear-dagger --resume=true --output_dir={folder.path} --episodes=...")
+    print(go_on)
+
+
+def _why_none(cfg: DaggerConfig, state: RunState) -> str:
+    if state.kept == 0:
+        return "no attempt was kept"
+    if cfg.updates_per_episode == 0:
+        return (
+            "--updates_per_episode=0. To learn from all attempts give --episodes=0 --updates=N and another --output_dir"
+        )
+    return f"--warmup_episodes={cfg.warmup_episodes} is more than the dataset holds"

@@ -33,11 +33,16 @@ def differences(folder: Path, cfg: DaggerConfig) -> list[str]:
     for name in _SAME_RUN:
         saved.setdefault(name, defaults[name])  # an older version did not know it
         _fill_in(saved.get(name), options.get(name), getattr(cfg, name))
-    return [
+    changed = [
         f"--{name} was {_brief(saved.get(name))} and is {_brief(options.get(name))}"
         for name in _SAME_RUN
         if saved.get(name) != options.get(name)
     ]
+    if (
+        saved.get("episodes", cfg.episodes) > 0
+    ) != cfg.is_online:  # one collects, and the other learns from what is there
+        changed.append(f"--episodes was {saved['episodes']} and is {cfg.episodes}")
+    return changed
 
 
 def _fill_in(saved: Any, options: Any, config: Any) -> None:

@@ -1,6 +1,8 @@
 """Saving an episode that a person may have made by hand: a full disk is a reason to ask, not to lose it."""
 
+import contextlib
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -20,19 +22,19 @@ def save_episode(episode: Episode, writer: DurableWriter) -> list[dict[str, Any]
         DatasetWriteError: As `save_or_ask`; the dataset is as it was before.
     """
     frames = episode_frames(episode, writer.features) if episode.observations else []  # else the writer has them
-    for frame in frames:
-        writer.add_frame(frame)
-    index = save_or_ask(writer)
+    index = save_or_ask(writer, frames)
     if episode.facts is not None:
         note_recording(writer.root, index, episode.facts)
     return frames
 
 
-def save_or_ask(writer: DurableWriter) -> int:
+def save_or_ask(writer: DurableWriter, frames: Sequence[dict[str, Any]] = ()) -> int:
     """Saves the episode in progress; where that fails and somebody sits at the terminal, as often as they want it.
 
     Args:
-        writer: With an episode in progress.
+        writer: With an episode in progress, or none where there are `frames`.
+        frames: All frames of the episode. Where pictures did not reach the disk, they are written anew; without `frames` the
+            episode is lost then.
 
     Returns:
         The episode's index.
@@ -40,16 +42,39 @@ def save_or_ask(writer: DurableWriter) -> int:
     Raises:
         DatasetWriteError: It could not be written, and nobody is there to make room, or they gave it up.
     """
+    to_write, is_again = bool(frames), False
     while True:
         try:
+            if to_write and is_again:
+                _forget(writer)
+            for frame in frames if to_write else ():
+                writer.add_frame(frame)
             return writer.save_episode()
         except DatasetWriteError as error:
-            if not error.can_be_repeated or sys.stdin is None or not sys.stdin.isatty():
+            to_write, is_again = bool(frames) and not error.can_be_repeated, True
+            if not ((error.can_be_repeated or to_write) and _wants_again(error, to_write)):
+                with contextlib.suppress(DatasetWriteError):
+                    if to_write:  # or what got through is the beginning of the next episode
+                        _forget(writer)
                 raise
-            print(f"\n{error}", file=sys.stderr)
-            try:
-                answer = input("Press Enter to save it again once there is room, or type q to give it up: ")
-            except EOFError:
-                raise error from None
-            if answer.strip().lower() == "q":
-                raise
+
+
+def _wants_again(error: DatasetWriteError, is_in_memory: bool) -> bool:
+    """Asks at the terminal whether to try again; where there is none nobody wants it."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        return False
+    print(f"\n{error}", file=sys.stderr)
+    kept = "All of it is still in memory. " if is_in_memory else ""
+    try:
+        answer = input(f"{kept}Press Enter to save it again once there is room, or type q to give it up: ")
+    except EOFError:
+        return False
+    return answer.strip().lower() != "q"
+
+
+def _forget(writer: DurableWriter) -> None:
+    """Drops what got through of an episode in progress."""
+    try:
+        writer.discard_episode()
+    except OSError as error:
+        raise DatasetWriteError(f"Cannot write to {writer.root}: {error}.") from error

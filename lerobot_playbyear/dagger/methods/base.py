@@ -120,6 +120,11 @@ class Method:
             InputError: The method cannot work with these parts.
         """
 
+    @property
+    def is_alone(self) -> bool:
+        """Whether nobody helps in the next attempt, whatever happens: such a one counts for no `--max_attempts`."""
+        return False
+
     def prepare(self) -> None:
         """An attempt follows. What is made here must depend on the state of the run alone, so that it resumes exactly."""
 

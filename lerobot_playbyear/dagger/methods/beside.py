@@ -172,7 +172,7 @@ class Early(Beside):
     """
 
     def __init__(self, expert: Expert, n_steps: int, env: gym.Env) -> None:
-        if getattr(env.unwrapped, "is_real_time", False) or not expert.can_label:
+        if getattr(env.unwrapped, "is_real_time", False) or expert.decides or not expert.can_label:
             raise InputError(
                 "--takeover_delay_s below 0 plays every attempt twice, to know when the expert would take over: only a "
                 "simulation and a script do the same again. Give 0 or more."
@@ -204,8 +204,22 @@ class Early(Beside):
 
 
 def shifted(expert: Expert, delay_s: float, fps: float, env: gym.Env) -> Expert:
-    """An expert that takes over so many seconds later, or, where they are below 0, earlier."""
+    """An expert that takes over so many seconds later, or, where they are below 0, earlier.
+
+    Raises:
+        InputError: A person is the expert, or the time is shorter than a step.
+    """
     n_steps = round(delay_s * fps)
-    if n_steps == 0:
+    if delay_s == 0:
         return expert
+    if n_steps == 0:
+        raise InputError(
+            f"--takeover_delay_s={delay_s}: that is less than half a step at {fps:g} steps per second. Give at least "
+            f"{1 / fps:g}, or leave it out."
+        )
+    if n_steps > 0 and expert.decides and not expert.can_label:
+        raise InputError(
+            f"--takeover_delay_s={delay_s}: a person who takes over has the control at once. Leave it out; a script's person "
+            "(--expert.person=true) has --expert.reaction_s."
+        )
     return Late(expert, n_steps) if n_steps > 0 else Early(expert, -n_steps, env)

@@ -117,7 +117,7 @@ class RobotGated(Method):
 
         Thresholds are set anew before every attempt, with what was met in those of this round too.
         """
-        if self._is_alone():
+        if self.is_alone:
             return
         from lerobot_playbyear.dagger.methods.gate_model import thresholds_for
 
@@ -149,12 +149,13 @@ class RobotGated(Method):
         self._traces = {each.seed: self._model.trace(each) for each in attempts[-config.memory :]}
         self._fitted_round = state.round
 
-    def _is_alone(self) -> bool:
+    @property
+    def is_alone(self) -> bool:
         return self._tools.state.attempts - self._tools.state.discarded < self._config.rollouts
 
     def asking(self) -> "Asking | None":
         """A fresh gate for an attempt; None while the policy is alone."""
-        if self._is_alone():
+        if self.is_alone:
             return None
         from lerobot_playbyear.dagger.methods.gate_model import Asking
 
