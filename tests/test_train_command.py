@@ -159,6 +159,7 @@ def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(
 
     tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (tuned["image_size"], tuned["vision_width"]) == (32, 8)
+    assert (tuned["n_memory_steps"], tuned["action_range"]) == (3, 1.0)
     assert tuned["n_supervised_steps"] == int(preset_options("cpu")["policy.n_supervised_steps"])
 
 
@@ -298,7 +299,11 @@ def test_a_preset_leaves_checkpoints_and_the_hub_alone():
     resumed = apply_preset(["--preset=cpu", "--resume=true"])
     shared = apply_preset(["--preset=cpu", "--policy.repo_id=me/policy"])
 
-    assert not any(arg.startswith(("--policy.type", "--policy.vision_width")) for arg in tuned)
+    wider = apply_preset(["--preset=cpu", "--policy.path=somewhere", "--policy.action_range=1.5"])
+
+    kept = ("--policy.type", "--policy.vision_width", "--policy.n_memory_steps", "--policy.action_range")
+    assert not any(arg.startswith(kept) for arg in tuned)
+    assert [arg for arg in wider if arg.startswith(kept)] == ["--policy.action_range=1.5"]
     assert f"--batch_size={preset_options('cpu')['batch_size']}" in tuned
     assert resumed == ["--preset=cpu", "--resume=true"]
     assert "--policy.push_to_hub=false" not in shared
