@@ -2,15 +2,17 @@
 
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
 from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies import make_pre_post_processors
+from lerobot.policies import ACTConfig, make_pre_post_processors
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 from torch.utils.data import default_collate
@@ -24,6 +26,7 @@ from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.loop import frame_weights
 from lerobot_playbyear.training.presets import PRESETS, RECIPES, apply_preset, preset_options
+from lerobot_playbyear.training.validation import first_of_each_task, validation_runs
 from lerobot_playbyear.training.windows import PolicyWindows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -222,13 +225,73 @@ def test_the_policy_is_rolled_out_while_it_trains(trained, command, tmp_path):
 
 
 def test_another_policy_trains_from_memory_too(root, command, tmp_path):
-    act = ("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=32")
-    small = ("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.chunk_size=5", "--policy.n_action_steps=5")
-    scratch = ("--policy.pretrained_backbone_weights=null", "--steps=1", "--batch_size=2")
-
-    command(train, *act, *small, *scratch, *data(root), f"--output_dir={tmp_path / 'out'}")
+    command(train, *SMALL_ACT, *data(root), f"--output_dir={tmp_path / 'out'}")
 
     assert step_of(tmp_path / "out/checkpoints/000001") == 1
+
+
+SMALL_ACT = (
+    "--policy.type=act",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+    "--policy.dim_model=32",
+    "--policy.n_heads=2",
+    "--policy.dim_feedforward=32",
+    "--policy.chunk_size=5",
+    "--policy.n_action_steps=5",
+    "--policy.pretrained_backbone_weights=null",
+    "--steps=1",
+    "--batch_size=2",
+)
+
+
+def test_the_last_frames_that_a_policy_drops_are_not_drawn(root, command, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(ACTConfig, "drop_n_last_frames", 12, raising=False)  # as that of diffusion
+    monkeypatch.setattr(loop, "RunSampler", lambda weights, _: drawn.append(weights) or 1 / 0)
+
+    with pytest.raises(ZeroDivisionError):
+        command(train, *SMALL_ACT, *data(root), f"--output_dir={tmp_path / 'out'}")
+    assert drawn[0].nonzero().squeeze(1).tolist() == [*range(12, 17), 38, 39]  # of 12, 17, 9 and 14 frames
+
+    monkeypatch.setattr(ACTConfig, "drop_n_last_frames", 17)
+    with pytest.raises(PlaybyearError, match=r"drop_n_last_frames=17 leaves no frame of .* longest episode has 17"):
+        command(train, *SMALL_ACT, *data(root), f"--output_dir={tmp_path / 'out'}")
+    assert len(drawn) == 1
+
+
+def test_held_out_frames_are_as_many_as_asked_for(root, command, tmp_path, monkeypatch):
+    measured = []
+
+    def measure(parts, windows, store, batch_size, chosen):
+        measured.append((len(store), windows.n_windows, validation_runs(store, windows.n_windows, chosen).tolist()))
+        return 0.0
+
+    monkeypatch.setattr(loop, "validation_loss", measure)
+    options = ("--dataset.eval_split=0.5", "--eval_steps=1", "--steps=1", "--policy.n_supervised_steps=4")
+    for n_samples in (11, 0):
+        command(
+            train,
+            *TINY,
+            *data(root),
+            *options,
+            f"--max_eval_samples={n_samples}",
+            f"--output_dir={tmp_path / str(n_samples)}",
+        )
+
+    assert measured == [
+        (23, 4, [8, 4, 0, 10]),  # episodes of 9 and 14 frames
+        (23, 4, [8, 4, 0, 22, 18, 14, 10]),
+    ]
+
+
+def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
+    table = pa.table({"task_index": [3] * 5 + [1] * 2 + [3] * 4})
+    dataset = SimpleNamespace(hf_dataset=SimpleNamespace(data=table))
+
+    assert first_of_each_task(dataset, 9).nonzero().squeeze(1).tolist() == [0, 1, 2, 3, 5, 6]
+    assert first_of_each_task(dataset, 1).nonzero().squeeze(1).tolist() == [0, 5]
+    assert first_of_each_task(dataset, 0) is None
 
 
 @pytest.mark.parametrize(
