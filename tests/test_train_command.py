@@ -1,6 +1,8 @@
 """playbyear-train learns what lerobot-train learns, and either continues the other's checkpoints."""
 
+import errno
 import json
+import os
 import sys
 from types import SimpleNamespace
 
@@ -330,6 +332,25 @@ def test_a_truncated_dataset_and_an_existing_output_are_refused(command, tmp_pat
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(PlaybyearError, match="is truncated"):
         command(train, *TINY, *data(tmp_path / "data"), f"--output_dir={tmp_path / 'new'}")
+
+
+@pytest.mark.parametrize("name", ["file/run", "blocked/run"])
+def test_an_output_that_cannot_be_made_is_told_before_the_dataset_is_read(name, root, command, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "blocked").mkdir()
+    make = os.mkdir
+
+    def refuse(path, *more, **options):
+        if "blocked" in str(path):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return make(path, *more, **options)
+
+    monkeypatch.setattr(os, "mkdir", refuse)
+    monkeypatch.setattr(loop, "read_store", lambda *_: pytest.fail("the dataset was read"))
+
+    with pytest.raises(SystemExit, match=r"^error: --output_dir=.*/run cannot be written: (Perm|Not a dir).* wanted"):
+        command(train_script.main, *TINY, *data(root), f"--output_dir={tmp_path / name}")
+    assert list((tmp_path / "blocked").iterdir()) == []
 
 
 def test_the_command_says_in_one_line_what_is_wrong(command):

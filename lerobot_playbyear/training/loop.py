@@ -21,6 +21,7 @@ from torch import Tensor
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.datasets.errors import errors_of_input
+from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.datasets.mixture import StoreMixture, Windowed
 from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
@@ -41,6 +42,8 @@ from lerobot_playbyear.training.windows import PolicyWindows
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
+_OUTPUTS = "outputs/train"  # in which LeRobot makes folders for runs without a name
+
 
 def train(cfg: PlaybyearTrainConfig) -> Path:
     """Train a policy.
@@ -57,6 +60,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     """
     init_logging()
     with errors_of_input(FileNotFoundError, MemoryError):
+        output = cfg.output_dir or _OUTPUTS
+        check_can_be_made(Path(str(output)), f"--output_dir={output}")
         cfg.validate()
         for each in (cfg.dataset, *cfg.mix):
             check_dataset_files(each.repo_id, each.root, each.revision)
