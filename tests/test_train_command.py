@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
+from accelerate import Accelerator
 from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
@@ -131,6 +132,28 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(trained, command, tm
     resumed = weights_of(tmp_path / "checkpoints" / "last")
     expected = weights_of(trained / "checkpoints" / "last")
     assert all(torch.equal(resumed[key], expected[key]) for key in expected)
+
+
+def test_of_several_processes_a_resumed_one_draws_other_noise_than_at_the_begin(
+    trained, root, command, tmp_path, monkeypatch
+):
+    seeds = []
+    monkeypatch.setattr(Accelerator, "num_processes", 2)
+    monkeypatch.setattr(Accelerator, "process_index", 1)
+    monkeypatch.setattr(loop, "set_seed", seeds.append)
+    monkeypatch.setattr(loop, "read_store", lambda *_: 1 / 0)
+    resumed = [
+        ("--resume=true", f"--config_path={config_of(trained / 'checkpoints' / step)}") for step in ("000003", "000006")
+    ]
+
+    for options in ((*TINY, *data(root)), *resumed, resumed[0]):
+        with pytest.raises(ZeroDivisionError):
+            command(train, *options, f"--output_dir={tmp_path / 'out'}")
+
+    assert seeds[:2] == [1000, 1001]
+    assert seeds[2::2] == [1000] * 3
+    assert len({1000, *seeds[1::2]}) == 4
+    assert seeds[3] == seeds[7]
 
 
 def test_lerobot_train_and_playbyear_train_continue_each_other(trained, command, tmp_path):

@@ -33,7 +33,7 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConf
 from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
 from lerobot_playbyear.training.parts import TrainingParts, make_training_parts
 from lerobot_playbyear.training.prefetch import pinned, prefetched
-from lerobot_playbyear.training.processes import make_accelerator, share_of
+from lerobot_playbyear.training.processes import make_accelerator, noise_seed, share_of
 from lerobot_playbyear.training.reach import Reach, action_names
 from lerobot_playbyear.training.report import Report, is_due, print_results
 from lerobot_playbyear.training.validation import first_of_each_task, validation_loss
@@ -81,7 +81,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         meta = learned_meta(cfg, *(each.meta for each in datasets))
         parts = make_training_parts(cfg, meta, accelerator=accelerator)
         if cfg.seed is not None and accelerator.num_processes > 1:
-            set_seed(cfg.seed + accelerator.process_index)  # each its own noise
+            set_seed(noise_seed(cfg.seed, accelerator.process_index, parts.step))  # each its own
         policy = accelerator.unwrap_model(parts.policy)
         for module in policy.modules():
             if isinstance(module, SoundAugmentation):
