@@ -12,6 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_playbyear.datasets import episode_waveform, write_audio
 from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.repair import check_dataset
 
 FPS, RATE = 20, 16000
@@ -142,6 +143,16 @@ def test_what_does_not_fit_is_one_clear_error(silent, tmp_path, options, message
     with pytest.raises(AttachError, match=message):
         attach_audio(cfg)
     assert [path.name for path in tmp_path.iterdir()] == ["sound"]
+
+
+def test_a_copy_that_cannot_be_made_is_told_before_any_sound_is_read(silent, tmp_path):
+    (tmp_path / "file").touch()
+    nothing_there = config(silent, tmp_path / "file/heard", str(tmp_path / "{episode}.wav"))
+    with pytest.raises(
+        InputError, match=r"--output.root=.*/heard cannot be written: Not a directory in .*/file; wanted"
+    ):
+        attach_audio(nothing_there)
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_second_microphone_and_never_the_same_twice(silent, tmp_path):

@@ -213,6 +213,23 @@ def test_a_latency_of_37_ms_is_found_to_5_ms(kind, tmp_path, capsys):
         assert len(plot.convert("RGB").getcolors(1 << 16)) > 4
 
 
+def test_what_was_measured_is_told_where_its_plot_cannot_be_written(tmp_path, capsys):
+    Taps.begin()
+    cfg = CalibrateLatencyConfig(LampCameraConfig(), LateTapsConfig(), event="begins", plot=tmp_path)  # a folder
+    with pytest.raises(CalibrationError, match=r"--plot=.* cannot be written: Is a directory.* stands above and holds"):
+        calibrate_latency(cfg)
+    assert "Give the microphone latency_s: 0.0" in capsys.readouterr().out
+
+
+def test_a_plot_that_can_go_nowhere_is_told_before_anybody_taps(tmp_path):
+    (tmp_path / "file").touch()
+    cfg = CalibrateLatencyConfig(LampCameraConfig(works=False), LateTapsConfig(), plot=tmp_path / "file/latency.png")
+    with pytest.raises(
+        InputError, match=r"--plot=.*/latency.png cannot be written: Not a directory in .*/file; wanted"
+    ):
+        calibrate_latency(cfg)
+
+
 def test_a_camera_that_gives_no_pictures_ends_it_with_one_line(tmp_path):
     cfg = CalibrateLatencyConfig(LampCameraConfig(works=False), LateTapsConfig(), plot=tmp_path / "latency.png")
     with pytest.raises(CalibrationError, match="The camera gives no pictures: no picture came"):

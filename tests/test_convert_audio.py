@@ -275,6 +275,15 @@ def test_a_link_out_of_the_dataset_is_not_followed(with_files, tmp_path):
         convert(tmp_path / "files", tmp_path / "columns", "columns")
 
 
+@pytest.mark.parametrize("to", ["columns", "files"])
+def test_a_copy_that_cannot_be_made_is_told_before_the_dataset_is_read(tmp_path, to):
+    (tmp_path / "file").touch()
+    with pytest.raises(
+        InputError, match=r"--output.root=.*/there cannot be written: Not a directory in .*/file; wanted"
+    ):
+        convert(tmp_path / "nothing", tmp_path / "file/there", to)
+
+
 def test_options_that_do_not_fit_are_told(with_files, silent, tmp_path):
     with pytest.raises(InputError, match="--to=both is not known; wanted columns or files"):
         convert(with_files, tmp_path / "x", "both")

@@ -206,6 +206,18 @@ def test_runs_never_reach_out_of_their_episode_unless_it_is_shorter():
     assert weights.sum() == 13
 
 
+def test_the_last_frames_of_episodes_are_left_out_and_the_others_learned_from_evenly():
+    store = make_store(60, 3, 40)
+
+    weights = run_weights(store, 4, n_dropped=7)
+    covered = coverage(store, weights, 4)
+
+    assert weights[53:63].eq(0).all()
+    assert weights[96:].eq(0).all()
+    assert covered[53:63].eq(0).all()
+    assert torch.equal(weights[:53], run_weights(make_store(53), 4))
+
+
 def test_weighted_starts_are_drawn_more_often():
     store = make_store(100, 100)
     mask = start_frames(store, 10)

@@ -29,11 +29,11 @@ from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.film.video import at_a_rate_of_aac
 from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.hub.datasets import _files, push_dataset
 from lerobot_playbyear.hub.pushing import HubError
-from lerobot_playbyear.inspection.film import at_a_rate_of_aac
 from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 

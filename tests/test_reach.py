@@ -208,6 +208,15 @@ def test_actions_that_are_not_normalised_are_not_said_to_stand_still():
     assert "hardly moves" not in text
 
 
+def test_a_single_action_is_told_like_several():
+    """LeRobot keeps a column of shape (1,) as plain numbers."""
+    config = small_config()
+    stats = {"action": {"min": torch.tensor([0.0]), "max": torch.tensor([2.0])}}
+    reach = Reach(config, make_pre_post_processors(config, dataset_stats=stats)[0], None)
+    assert "'action[0]' in 25.0 % of 4 frames" in reach.warning(torch.tensor([0.0, 1.0, 2.0, 2.5]), "the dataset")
+    assert reach.warning(torch.tensor([0.0, 1.0]), "the dataset") is None
+
+
 def test_other_policies_reach_everything():
     assert Reach(object(), None, None).warning(torch.full((3, 2), 9.0), "x") is None
 

@@ -1,16 +1,21 @@
 """playbyear-train learns what lerobot-train learns, and either continues the other's checkpoints."""
 
+import errno
 import json
+import os
 import sys
+from types import SimpleNamespace
 
 import numpy as np
+import pyarrow as pa
 import pytest
 import torch
+from accelerate import Accelerator
 from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
 from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDataset
-from lerobot.policies import make_pre_post_processors
+from lerobot.policies import ACTConfig, make_pre_post_processors
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 from torch.utils.data import default_collate
@@ -24,6 +29,7 @@ from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.loop import frame_weights
 from lerobot_playbyear.training.presets import PRESETS, RECIPES, apply_preset, preset_options
+from lerobot_playbyear.training.validation import first_of_each_task, validation_runs
 from lerobot_playbyear.training.windows import PolicyWindows
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -128,6 +134,28 @@ def test_a_resumed_run_ends_where_an_uninterrupted_one_does(trained, command, tm
     assert all(torch.equal(resumed[key], expected[key]) for key in expected)
 
 
+def test_of_several_processes_a_resumed_one_draws_other_noise_than_at_the_begin(
+    trained, root, command, tmp_path, monkeypatch
+):
+    seeds = []
+    monkeypatch.setattr(Accelerator, "num_processes", 2)
+    monkeypatch.setattr(Accelerator, "process_index", 1)
+    monkeypatch.setattr(loop, "set_seed", seeds.append)
+    monkeypatch.setattr(loop, "read_store", lambda *_: 1 / 0)
+    resumed = [
+        ("--resume=true", f"--config_path={config_of(trained / 'checkpoints' / step)}") for step in ("000003", "000006")
+    ]
+
+    for options in ((*TINY, *data(root)), *resumed, resumed[0]):
+        with pytest.raises(ZeroDivisionError):
+            command(train, *options, f"--output_dir={tmp_path / 'out'}")
+
+    assert seeds[:2] == [1000, 1001]
+    assert seeds[2::2] == [1000] * 3
+    assert len({1000, *seeds[1::2]}) == 4
+    assert seeds[3] == seeds[7]
+
+
 def test_lerobot_train_and_playbyear_train_continue_each_other(trained, command, tmp_path):
     ours = trained / "checkpoints" / "last"
 
@@ -159,6 +187,7 @@ def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(
 
     tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (tuned["image_size"], tuned["vision_width"]) == (32, 8)
+    assert (tuned["n_memory_steps"], tuned["action_range"]) == (3, 1.0)
     assert tuned["n_supervised_steps"] == int(preset_options("cpu")["policy.n_supervised_steps"])
 
 
@@ -221,13 +250,73 @@ def test_the_policy_is_rolled_out_while_it_trains(trained, command, tmp_path):
 
 
 def test_another_policy_trains_from_memory_too(root, command, tmp_path):
-    act = ("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.dim_model=32")
-    small = ("--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.chunk_size=5", "--policy.n_action_steps=5")
-    scratch = ("--policy.pretrained_backbone_weights=null", "--steps=1", "--batch_size=2")
-
-    command(train, *act, *small, *scratch, *data(root), f"--output_dir={tmp_path / 'out'}")
+    command(train, *SMALL_ACT, *data(root), f"--output_dir={tmp_path / 'out'}")
 
     assert step_of(tmp_path / "out/checkpoints/000001") == 1
+
+
+SMALL_ACT = (
+    "--policy.type=act",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+    "--policy.dim_model=32",
+    "--policy.n_heads=2",
+    "--policy.dim_feedforward=32",
+    "--policy.chunk_size=5",
+    "--policy.n_action_steps=5",
+    "--policy.pretrained_backbone_weights=null",
+    "--steps=1",
+    "--batch_size=2",
+)
+
+
+def test_the_last_frames_that_a_policy_drops_are_not_drawn(root, command, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(ACTConfig, "drop_n_last_frames", 12, raising=False)  # as that of diffusion
+    monkeypatch.setattr(loop, "RunSampler", lambda weights, _: drawn.append(weights) or 1 / 0)
+
+    with pytest.raises(ZeroDivisionError):
+        command(train, *SMALL_ACT, *data(root), f"--output_dir={tmp_path / 'out'}")
+    assert drawn[0].nonzero().squeeze(1).tolist() == [*range(12, 17), 38, 39]  # of 12, 17, 9 and 14 frames
+
+    monkeypatch.setattr(ACTConfig, "drop_n_last_frames", 17)
+    with pytest.raises(PlaybyearError, match=r"drop_n_last_frames=17 leaves no frame of .* longest episode has 17"):
+        command(train, *SMALL_ACT, *data(root), f"--output_dir={tmp_path / 'out'}")
+    assert len(drawn) == 1
+
+
+def test_held_out_frames_are_as_many_as_asked_for(root, command, tmp_path, monkeypatch):
+    measured = []
+
+    def measure(parts, windows, store, batch_size, chosen):
+        measured.append((len(store), windows.n_windows, validation_runs(store, windows.n_windows, chosen).tolist()))
+        return 0.0
+
+    monkeypatch.setattr(loop, "validation_loss", measure)
+    options = ("--dataset.eval_split=0.5", "--eval_steps=1", "--steps=1", "--policy.n_supervised_steps=4")
+    for n_samples in (11, 0):
+        command(
+            train,
+            *TINY,
+            *data(root),
+            *options,
+            f"--max_eval_samples={n_samples}",
+            f"--output_dir={tmp_path / str(n_samples)}",
+        )
+
+    assert measured == [
+        (23, 4, [8, 4, 0, 10]),  # episodes of 9 and 14 frames
+        (23, 4, [8, 4, 0, 22, 18, 14, 10]),
+    ]
+
+
+def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
+    table = pa.table({"task_index": [3] * 5 + [1] * 2 + [3] * 4})
+    dataset = SimpleNamespace(hf_dataset=SimpleNamespace(data=table))
+
+    assert first_of_each_task(dataset, 9).nonzero().squeeze(1).tolist() == [0, 1, 2, 3, 5, 6]
+    assert first_of_each_task(dataset, 1).nonzero().squeeze(1).tolist() == [0, 5]
+    assert first_of_each_task(dataset, 0) is None
 
 
 @pytest.mark.parametrize(
@@ -268,6 +357,25 @@ def test_a_truncated_dataset_and_an_existing_output_are_refused(command, tmp_pat
         command(train, *TINY, *data(tmp_path / "data"), f"--output_dir={tmp_path / 'new'}")
 
 
+@pytest.mark.parametrize("name", ["file/run", "blocked/run"])
+def test_an_output_that_cannot_be_made_is_told_before_the_dataset_is_read(name, root, command, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    (tmp_path / "blocked").mkdir()
+    make = os.mkdir
+
+    def refuse(path, *more, **options):
+        if "blocked" in str(path):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return make(path, *more, **options)
+
+    monkeypatch.setattr(os, "mkdir", refuse)
+    monkeypatch.setattr(loop, "read_store", lambda *_: pytest.fail("the dataset was read"))
+
+    with pytest.raises(SystemExit, match=r"^error: --output_dir=.*/run cannot be written: (Perm|Not a dir).* wanted"):
+        command(train_script.main, *TINY, *data(root), f"--output_dir={tmp_path / name}")
+    assert list((tmp_path / "blocked").iterdir()) == []
+
+
 def test_the_command_says_in_one_line_what_is_wrong(command):
     with pytest.raises(SystemExit, match=r"^error: --preset=tpu is not known. The presets are: cpu .*; paper "):
         command(train_script.main, "--preset=tpu", "--dataset.repo_id=tests/noise")
@@ -298,7 +406,11 @@ def test_a_preset_leaves_checkpoints_and_the_hub_alone():
     resumed = apply_preset(["--preset=cpu", "--resume=true"])
     shared = apply_preset(["--preset=cpu", "--policy.repo_id=me/policy"])
 
-    assert not any(arg.startswith(("--policy.type", "--policy.vision_width")) for arg in tuned)
+    wider = apply_preset(["--preset=cpu", "--policy.path=somewhere", "--policy.action_range=1.5"])
+
+    kept = ("--policy.type", "--policy.vision_width", "--policy.n_memory_steps", "--policy.action_range")
+    assert not any(arg.startswith(kept) for arg in tuned)
+    assert [arg for arg in wider if arg.startswith(kept)] == ["--policy.action_range=1.5"]
     assert f"--batch_size={preset_options('cpu')['batch_size']}" in tuned
     assert resumed == ["--preset=cpu", "--resume=true"]
     assert "--policy.push_to_hub=false" not in shared

@@ -21,6 +21,7 @@ from lerobot_playbyear.calibration.listening import Motion, SoundLevel
 from lerobot_playbyear.calibration.plot import write_plot
 from lerobot_playbyear.compat import import_devices
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.microphones.config import MicrophoneConfig, make_microphone
 
 _LOOK_S = 0.2
@@ -56,7 +57,7 @@ class CalibrateLatencyConfig:
     def check(self) -> None:
         """
         Raises:
-            InputError: An option is out of range.
+            InputError: An option is out of range, or the plot's folder cannot be made.
         """
         if self.taps < FEWEST_TAPS:
             raise InputError(f"taps={self.taps}: give at least {FEWEST_TAPS}.")
@@ -64,13 +65,14 @@ class CalibrateLatencyConfig:
             raise InputError(f"event={self.event!r}: give one of {', '.join(EVENTS)}.")
         if not 1 <= self.timeout_s <= 3600:
             raise InputError(f"timeout_s={self.timeout_s}: give seconds from 1 to 3600.")
+        check_can_be_made(self.plot.parent, f"--plot={self.plot}")
 
 
 def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
-    """Measures how much later sound arrives than pictures, writes the plot, and prints which option to give.
+    """Measures how much later sound arrives than pictures, prints which option to give, and writes the plot.
 
     Raises:
-        CalibrationError: The camera gives no pictures, or the taps do not tell the latency.
+        CalibrationError: The camera gives no pictures, the taps do not tell the latency, or the plot cannot be written.
         MicrophoneError: The microphone cannot be opened.
     """
     cfg.check()
@@ -88,12 +90,18 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
         _wait_for_taps(cfg, level, motion)
         pictures, sound = motion.so_far(), level.so_far()
     found = estimate_latency(*pictures, *sound, cfg.event)
-    write_plot(cfg.plot, found, pictures, sound)
-    print(told(found, cfg.plot))
+    print(told(found), flush=True)  # first: nobody taps twice for a plot
+    try:
+        print(f"Plot: {write_plot(cfg.plot, found, pictures, sound)}")
+    except OSError as error:
+        raise CalibrationError(
+            f"--plot={cfg.plot} cannot be written: {error.strerror or error}; wanted a file that can be made. What was "
+            "measured stands above and holds; for the plot give another file, and tap again."
+        ) from error
     return found
 
 
-def told(found: Latency, plot: Path) -> str:
+def told(found: Latency) -> str:
     """What was found, and which option to give."""
     ms = found.latency_s * 1000
     side = f"{abs(ms):.0f} ms later than the picture" if ms >= 0 else f"{abs(ms):.0f} ms earlier than the picture"
@@ -109,7 +117,7 @@ def told(found: Latency, plot: Path) -> str:
         )
     else:
         lines.append(f"Give the camera --env.camera_latency_s={-found.latency_s:.3f}")
-    return "\n".join([*lines, f"Plot: {plot}"])
+    return "\n".join(lines)
 
 
 def _connected(config: CameraConfig) -> Any:

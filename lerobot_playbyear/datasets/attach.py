@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, list_files
+from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, check_can_be_made, list_files
 from lerobot_playbyear.datasets.journal import flush, flush_all
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
@@ -90,6 +90,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
 
     Raises:
         AttachError: Naming every episode whose sound is missing, too short, or of another kind.
+        InputError: The copy's folder cannot be made, before any sound is read.
         OSError: The copy cannot be written.
     """
     _check_source(cfg)
@@ -139,10 +140,12 @@ def new_folder(place: DatasetPlace) -> Path:
 
     Raises:
         AttachError: Something is there already.
+        InputError: It cannot be made.
     """
     target = Path(place.root) if place.root else HF_LEROBOT_HOME / place.repo_id
     if target.exists():
         raise AttachError(f"{target} is there already. Choose another --output.root, or delete it.")
+    check_can_be_made(target, f"--output.root={target}")
     return target
 
 

@@ -12,10 +12,13 @@ import fnmatch
 import glob
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
 from huggingface_hub.constants import HF_HOME
+
+from lerobot_playbyear.datasets.errors import InputError
 
 HF_LEROBOT_HOME = Path(os.getenv("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser()
 """LeRobot's own cache, where datasets without a root are."""
@@ -101,6 +104,28 @@ def naming(path: Path) -> Iterator[None]:
         if error.filename is not None or not error.errno:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def check_can_be_made(folder: Path, option: str) -> None:
+    """Whether a folder can be made, or written into where it is there already. It tries, and leaves nothing behind.
+
+    Args:
+        folder: The folder; those above it need not be there either.
+        option: What it was asked for with, such as "--output_dir=outputs/train", for the message.
+
+    Raises:
+        InputError: Nothing can be written there.
+    """
+    folder = folder.absolute()
+    there = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+    try:
+        with tempfile.TemporaryDirectory(prefix=".playbyear-", dir=there):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{option} cannot be written: {error.strerror or error} in {there}; wanted a folder that can be made. Give "
+            "another, or allow writing there."
+        ) from error
 
 
 def _names(folder: Path) -> list[str]:

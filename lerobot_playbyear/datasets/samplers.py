@@ -66,7 +66,9 @@ class RunSampler:
         self._seed, self._n_batches = int(state["seed"]), int(state["n_batches"])
 
 
-def run_weights(store: EpisodeStore, n_windows: int = 1, frame_weights: Tensor | None = None) -> Tensor:
+def run_weights(
+    store: EpisodeStore, n_windows: int = 1, frame_weights: Tensor | None = None, n_dropped: int = 0
+) -> Tensor:
     """How often to draw the run that ends at each frame, so that frames are learned from as often as they should.
 
     A run's weight is the mean weight of the frames that its windows end at. Runs that would reach before the episode
@@ -77,6 +79,7 @@ def run_weights(store: EpisodeStore, n_windows: int = 1, frame_weights: Tensor |
         store: The episodes.
         n_windows: K, the windows per run.
         frame_weights: (N,) how much each frame matters; None means all the same.
+        n_dropped: How many of the last frames of every episode no run reaches; an episode no longer is not drawn at all.
 
     Returns:
         (N,) float64, 0 for frames at which no run ends.
@@ -84,7 +87,10 @@ def run_weights(store: EpisodeStore, n_windows: int = 1, frame_weights: Tensor |
     frame_weights = torch.ones(len(store)) if frame_weights is None else frame_weights
     frame_weights = frame_weights.to("cpu", torch.float64)
     weights = torch.zeros(len(store), dtype=torch.float64)
-    for start, end in zip(store.starts, store.ends, strict=True):
+    for start, whole_end in zip(store.starts, store.ends, strict=True):
+        end = whole_end - n_dropped
+        if end <= start:
+            continue
         k = min(n_windows, end - start)
         means = frame_weights[start:end].unfold(0, k, 1).mean(dim=1)  # (L - K + 1,)
         weights[start + k - 1 : end] = means

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_playbyear.episodes.episode import Episode, Observation
-from lerobot_playbyear.film.video import amplify, compose, episode_sound, inset, write_film
+from lerobot_playbyear.film.video import amplify, at_a_rate_of_aac, compose, episode_sound, inset, write_film
 
 _AUDIO = "audio."  # how raw observations name microphones
 
@@ -20,8 +20,8 @@ def write_episode_film(episode: Episode, path: Path, fps: int) -> None:
         fps: Steps per second.
     """
     blocks = np.stack([_sound(observation) for observation in episode.observations])  # (T + 1, S, n_microphones)
-    sample_rate = blocks.shape[1] * fps or 16000
-    sound = amplify(episode_sound(blocks))
+    heard, sample_rate = at_a_rate_of_aac(amplify(episode_sound(blocks)), blocks.shape[1] * fps)
+    sound = heard[:]
     views = [_first_camera(observation) for observation in episode.observations]
     pictures = (p if v is None else inset(p, v) for p, v in zip(episode.watched, views, strict=True))
     write_film(path, compose(pictures, len(views), sound, sample_rate), fps, sound, sample_rate)

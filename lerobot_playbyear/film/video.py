@@ -9,10 +9,11 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lerobot_playbyear.datasets.audio_files import Channels
+from lerobot_playbyear.datasets.audio_files import Channels, Resampled
 
 _VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of FFmpeg has
 _AUDIO_CODECS = ("aac", "libmp3lame")
+_AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 _STRIP_HEIGHT = 120  # pixels
 _INSET_SHARE = 0.28  # of the picture's height
 TOP_FREQUENCY = 8000  # Hz, upper edge of spectrograms
@@ -53,6 +54,14 @@ def amplify(samples: np.ndarray) -> np.ndarray:
 def gain_of(peak: float) -> float:
     """What makes `peak`, as a share of full scale, 70 % of it; at most 40 dB."""
     return min(_LOUDEST / max(peak, 1e-6), _MAX_GAIN)
+
+
+def at_a_rate_of_aac(samples: Channels, sample_rate: int) -> tuple[Channels, int]:
+    """Resamples (n, channels) to the next higher rate that AAC has, where that is necessary."""
+    if samples.shape[1] == 0 or sample_rate in _AAC_RATES:
+        return samples, sample_rate or _AAC_RATES[-1]
+    rate = next((rate for rate in _AAC_RATES if rate > sample_rate), _AAC_RATES[-1])
+    return Resampled(samples, sample_rate, rate), rate
 
 
 def spectra(columns: np.ndarray, sample_rate: int) -> np.ndarray:

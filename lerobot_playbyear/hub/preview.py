@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_playbyear.film.video import amplify, compose, episode_sound, write_film
-from lerobot_playbyear.inspection.film import at_a_rate_of_aac, tile
+from lerobot_playbyear.film.video import amplify, at_a_rate_of_aac, compose, episode_sound, write_film
+from lerobot_playbyear.inspection.film import tile
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.structure_checks import fit_microphones
 

@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lerobot_playbyear.datasets.audio_files import Channels, Resampled
-from lerobot_playbyear.film.video import write_film
+from lerobot_playbyear.datasets.audio_files import Channels
+from lerobot_playbyear.film.video import at_a_rate_of_aac, write_film
 from lerobot_playbyear.inspection.waveform import EpisodeSound
 
-_AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 _SOUND_BIT_RATE = 200_000  # bits per second, of two channels
 _LOWEST_BIT_RATE = 60_000  # of the pictures
 _LIMITED_BIT_RATE = 20_000_000  # of the pictures; a film that may have more is not limited at all
@@ -99,7 +98,7 @@ def encode(
         most_bytes: About how large it may become: the film of an episode of hours is coarser, so that a browser can
             hold it.
     """
-    rate = sound[0].samples_per_frame * fps if sound else _AAC_RATES[-1]
+    rate = sound[0].samples_per_frame * fps if sound else 0
     silent: Channels = np.zeros((0, 0), np.int16)
     samples, sample_rate = at_a_rate_of_aac(FilmSound(sound, gain) if sound else silent, rate)
     # Key frames every second, so that stepping backwards is quick.
@@ -108,14 +107,6 @@ def encode(
     if bit_rate < _LIMITED_BIT_RATE:
         options |= {"maxrate": str(bit_rate), "bufsize": str(2 * bit_rate)}
     return write_film(path, pictures, fps, samples, sample_rate, options)
-
-
-def at_a_rate_of_aac(samples: Channels, sample_rate: int) -> tuple[Channels, int]:
-    """Resamples (n, channels) to the next higher rate that AAC has, where that is necessary."""
-    if samples.shape[1] == 0 or sample_rate in _AAC_RATES:
-        return samples, sample_rate or _AAC_RATES[-1]
-    rate = next((rate for rate in _AAC_RATES if rate > sample_rate), _AAC_RATES[-1])
-    return Resampled(samples, sample_rate, rate), rate
 
 
 def _fitted(size: int, limit: int) -> int:

@@ -21,6 +21,7 @@ from torch import Tensor
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.datasets.errors import errors_of_input
+from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.datasets.mixture import StoreMixture, Windowed
 from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
@@ -32,13 +33,16 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConf
 from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
 from lerobot_playbyear.training.parts import TrainingParts, make_training_parts
 from lerobot_playbyear.training.prefetch import pinned, prefetched
-from lerobot_playbyear.training.processes import make_accelerator, share_of
+from lerobot_playbyear.training.processes import make_accelerator, noise_seed, share_of
 from lerobot_playbyear.training.reach import Reach, action_names
 from lerobot_playbyear.training.report import Report, is_due, print_results
+from lerobot_playbyear.training.validation import first_of_each_task, validation_loss
 from lerobot_playbyear.training.windows import PolicyWindows
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
+
+_OUTPUTS = "outputs/train"  # in which LeRobot makes folders for runs without a name
 
 
 def train(cfg: PlaybyearTrainConfig) -> Path:
@@ -56,6 +60,8 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     """
     init_logging()
     with errors_of_input(FileNotFoundError, MemoryError):
+        output = cfg.output_dir or _OUTPUTS
+        check_can_be_made(Path(str(output)), f"--output_dir={output}")
         cfg.validate()
         for each in (cfg.dataset, *cfg.mix):
             check_dataset_files(each.repo_id, each.root, each.revision)
@@ -75,7 +81,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         meta = learned_meta(cfg, *(each.meta for each in datasets))
         parts = make_training_parts(cfg, meta, accelerator=accelerator)
         if cfg.seed is not None and accelerator.num_processes > 1:
-            set_seed(cfg.seed + accelerator.process_index)  # each its own noise
+            set_seed(noise_seed(cfg.seed, accelerator.process_index, parts.step))  # each its own
         policy = accelerator.unwrap_model(parts.policy)
         for module in policy.modules():
             if isinstance(module, SoundAugmentation):
@@ -83,20 +89,27 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         config = policy.config
         windows = PolicyWindows(config, meta, cfg.rename_map)
         is_shared = accelerator.num_processes > 1
+        for each in datasets:
+            windows.check_lengths(each)
         stores = [read_store(each, windows, cfg, is_shared) for each in datasets]
         is_validated = held_out is not None and (cfg.eval_steps > 0 or cfg.save_best)
-        validation_store = read_store(held_out, windows, cfg, is_shared) if is_validated else None
+        validation = None
+        if held_out is not None and is_validated:
+            chosen = first_of_each_task(held_out, cfg.max_eval_samples)
+            validation = (read_store(held_out, windows, cfg, is_shared), chosen)
 
     reach = Reach(config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
     for each, part in zip(datasets, stores, strict=True):
         reach.warn(part.column(ACTION), f"the dataset '{each.repo_id}'")
     store = stores[0] if len(stores) == 1 else StoreMixture(stores)
-    weights = [run_weights(part, windows.n_windows, frame_weights(part, cfg.sampling)) for part in stores]
+    weights = [
+        run_weights(part, windows.n_windows, frame_weights(part, cfg.sampling), windows.n_dropped) for part in stores
+    ]
     sampler = RunSampler(mixed_weights(weights, cfg), cfg.seed or 0)
     sampler.load_state_dict({**sampler.state_dict(), "n_batches": parts.step})
     _log_start(cfg, parts)
     with Report(cfg, store, parts) as report:
-        _loop(cfg, parts, windows, store, sampler, validation_store, report)
+        _loop(cfg, parts, windows, store, sampler, validation, report)
     if accelerator.is_main_process:
         print_results(cfg, report.success)
         if cfg.policy.push_to_hub:
@@ -118,24 +131,13 @@ def frame_weights(store: EpisodeStore, sampling: SamplingConfig) -> Tensor:
     return weights
 
 
-def validation_loss(parts: TrainingParts, windows: PolicyWindows, store: EpisodeStore, batch_size: int) -> float:
-    """The mean loss over held-out episodes: every frame lies in one run, the first of an episode may be shorter."""
-    ends = [
-        torch.arange(end - 1, start - 1, -windows.n_windows)
-        for start, end in zip(store.starts, store.ends, strict=True)
-    ]
-    batches = torch.cat(ends).split(batch_size)
-    losses = [parts.loss(windows.batch(store, last)) * len(last) for last in batches]
-    return sum(losses) / sum(len(last) for last in batches)
-
-
 def _loop(
     cfg: PlaybyearTrainConfig,
     parts: TrainingParts,
     windows: PolicyWindows,
     store: Windowed,
     sampler: RunSampler,
-    validation_store: EpisodeStore | None,
+    validation: tuple[EpisodeStore, Tensor | None] | None,
     report: Report,
 ) -> None:
     grad_clip_norm = cfg.optimizer.grad_clip_norm if cfg.optimizer is not None else 0.0
@@ -154,8 +156,9 @@ def _loop(
         is_saved = cfg.save_checkpoint and (is_due(parts.step, cfg.save_freq) or is_last)
         is_measured = is_due(parts.step, cfg.eval_steps) or is_last or (is_saved and cfg.save_best)
         loss = None
-        if validation_store is not None and is_first and is_measured:
-            loss = validation_loss(parts, windows, validation_store, cfg.batch_size)
+        if validation is not None and is_first and is_measured:
+            held_out, chosen = validation
+            loss = validation_loss(parts, windows, held_out, cfg.batch_size, chosen)
             report.write("validation", {"loss": loss})
         if is_saved and is_first:
             checkpoint = parts.save(cfg)

@@ -31,6 +31,8 @@ _NETWORK = (
     "normalize_encodings",
     "low_dimensional_gain",
     "hop_s",
+    "n_memory_steps",
+    "action_range",
     "audio_envelope_gain",
     "memory_displacement_gain",
     "memory_readers",
@@ -39,7 +41,7 @@ _NETWORK = (
     "auxiliary_balance",
     "auxiliary_way",
 )
-"""Options of the policy that fix what the network looks like: with `--policy.path` the checkpoint says it."""
+"""Options of the policy that fix what the network is and what its numbers mean: with `--policy.path` the checkpoint says it."""
 
 
 def preset_options(name: str) -> dict[str, str]:

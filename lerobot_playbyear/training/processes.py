@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from datetime import timedelta
 from typing import Any
 
+import numpy as np
 import torch
 from accelerate import Accelerator
 from accelerate.utils import DistributedDataParallelKwargs, InitProcessGroupKwargs
@@ -47,6 +48,19 @@ def share_of(accelerator: Accelerator, n: int) -> slice:
             f"{n} runs per update cannot be shared by {n_processes} processes: give a multiple of {n_processes}."
         )
     return slice(accelerator.process_index, None, n_processes)
+
+
+def noise_seed(seed: int, process_index: int, step: int) -> int:
+    """The seed of what a process of several draws by itself, such as augmentation, from an update on.
+
+    Args:
+        seed: Of the run.
+        process_index: Of the process.
+        step: Updates done before; a run that goes on draws other noise than at its begin.
+    """
+    if step == 0:
+        return seed + process_index
+    return int(np.random.SeedSequence([seed, process_index, step]).generate_state(1)[0])
 
 
 class Orders:

@@ -42,11 +42,12 @@ class Reach:
         """What to tell a person about actions that cannot be learned; None if there are none.
 
         Args:
-            actions: (N, n_actions), as recorded.
+            actions: (N, n_actions), as recorded; (N,) of a single one, as LeRobot keeps it.
             what: What they are, for the message.
         """
         if not isinstance(self._policy, PlaybyearConfig) or len(actions) == 0:
             return None
+        actions = actions.reshape(len(actions), -1)
         needed = self._normalized(actions).abs().cpu()  # (N, n_actions)
         is_out = needed > self._policy.action_range * (1 + _TOLERANCE)
         if not is_out.any():

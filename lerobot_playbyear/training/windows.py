@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata, resolve_delta_timestamps
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
@@ -28,6 +28,7 @@ class PolicyWindows:
     Attributes:
         image_size: Height and width at which the policy looks at pictures [pixels]; None: as they are recorded.
         n_windows: Windows per item that lie in a run of frames, K.
+        n_dropped: How many of the last frames of every episode the policy does not learn from, its `drop_n_last_frames`.
         action_deltas: Where the actions of an item lie, in frames from its last or, of a chunk, its first one; empty for a
             policy that learns single actions.
     """
@@ -46,6 +47,7 @@ class PolicyWindows:
             self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
         self.image_size = policy.image_size if isinstance(policy, PlaybyearConfig) else None
         self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
+        self.n_dropped: int = getattr(policy, "drop_n_last_frames", None) or 0
         self.action_deltas: list[int] = self._deltas.get(ACTION, [])
 
     @property
@@ -58,6 +60,21 @@ class PolicyWindows:
         """The rate at which each microphone is cut out [Hz]; of those alone whose feature says it."""
         rates = {key: sample_rate_in(self._meta.features[key]) for key in audio_keys(self._meta.features)}
         return {key: rate for key, rate in rates.items() if rate is not None}
+
+    def check_lengths(self, dataset: LeRobotDataset) -> None:
+        """Refuse a dataset of which no frame would be drawn.
+
+        Raises:
+            ValueError: No episode is longer than what the policy drops of each.
+        """
+        lengths = dataset.meta.episodes["length"]
+        used = range(dataset.num_episodes) if dataset.episodes is None else dataset.episodes
+        longest = max((int(lengths[episode]) for episode in used), default=0)
+        if longest <= self.n_dropped:
+            raise ValueError(
+                f"--policy.drop_n_last_frames={self.n_dropped} leaves no frame of '{dataset.repo_id}', whose longest "
+                f"episode has {longest}; wanted fewer than that. Give less, or a dataset with longer episodes."
+            )
 
     def batch(self, store: Windowed, last_frames: Tensor) -> dict[str, Any]:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""
