@@ -33,17 +33,16 @@ def value_pieces(dataset: LeRobotDataset | LongDataset, key: str, first: int = 0
     Floats come as float32, integers and booleans as they are stored.
 
     Raises:
-        ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values.
+        ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values, those before
+            `first` included.
     """
-    shape = _row_shape(dataset, key)
     column = dataset.hf_dataset.data.column(key)
-    rows = max(_VALUES_AT_ONCE // max(math.prod(shape), 1), 1)
     finite = np.ones(len(column), bool)
-    for position in range(first, len(column), rows):
-        read = read_rows(dataset, key, position, rows)
+    finite[:first] = finite_rows(dataset, key, first)
+    for position, read in _parts(dataset, key, first, len(column)):
         if np.issubdtype(read.dtype, np.floating):
             read = read.astype(np.float32, copy=False)
-            finite[position : position + rows] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
+            finite[position : position + len(read)] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
         yield read
     check_finite(finite, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
 
@@ -63,6 +62,28 @@ def read_rows(dataset: LeRobotDataset | LongDataset, key: str, first: int, n: in
             f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
             "Record the damaged episodes again, or leave them out with --dataset.episodes."
         ) from error
+
+
+def finite_rows(dataset: LeRobotDataset | LongDataset, key: str, n: int) -> np.ndarray:
+    """Of each of the first n rows of a numeric column whether all its values are finite as float32, (n,) bool.
+
+    Raises:
+        ValueError: As `read_rows`.
+    """
+    finite = np.ones(n, bool)
+    for position, read in _parts(dataset, key, 0, n):
+        if not np.issubdtype(read.dtype, np.floating):
+            break
+        values = read.astype(np.float32, copy=False).reshape(len(read), -1)
+        finite[position : position + len(read)] = np.isfinite(values).all(axis=1)
+    return finite
+
+
+def _parts(dataset: LeRobotDataset | LongDataset, key: str, first: int, stop: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The rows of a numeric column as `read_rows` gives them, in parts of bounded size, each with its first row."""
+    rows = max(_VALUES_AT_ONCE // max(math.prod(_row_shape(dataset, key)), 1), 1)
+    for position in range(first, stop, rows):
+        yield position, read_rows(dataset, key, position, min(rows, stop - position))
 
 
 def _row_shape(dataset: LeRobotDataset | LongDataset, key: str) -> tuple[int, ...]:
