@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -29,6 +30,7 @@ from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.hub.datasets import _files, push_dataset
@@ -181,6 +183,8 @@ def test_only_pictures_are_read_as_pictures(root):
     edit_column(root, CAMERA, lambda picture: {"bytes": postscript.getvalue(), "path": None})
     with pytest.raises(OSError, match="cannot identify"):
         EpisodeStore.load("a/b", str(root), device="cpu")
+    report = check_dataset(root)
+    assert "11 pictures are damaged" in str(report)
 
 
 def test_a_picture_of_another_size_is_refused_before_it_is_decoded(root):
@@ -189,6 +193,25 @@ def test_a_picture_of_another_size_is_refused_before_it_is_decoded(root):
     edit_column(root, CAMERA, lambda picture: {"bytes": bomb.getvalue(), "path": None})
     with pytest.raises(ValueError, match="12000 x 7000 pixels"):
         EpisodeStore.load("a/b", str(root), device="cpu")
+
+
+def test_a_film_of_another_size_is_refused_before_it_is_decoded(videos):
+    (path,) = videos.rglob("*.mp4")
+    with av.open(str(path), "w") as film:
+        stream = film.add_stream("libx264", rate=20)
+        stream.width, stream.height = 1920, 1080
+        for _ in range(11):
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((1080, 1920, 3), np.uint8), "rgb24")))
+        film.mux(stream.encode(None))
+    said = rf"'{CAMERA}': .*file-000.mp4' have 1920 x 1080 pixels; .*\(16, 16, 3\)"
+    with pytest.raises(ValueError, match=said):
+        EpisodeStore.load("a/b", str(videos), device="cpu", video_backend="pyav")
+    with pytest.raises(ValueError, match=said):  # by LeRobot's decoder
+        next(video_pictures(path, [0.1, 0.0], 1e-3, "pyav", CAMERA, (16, 16, 3)))
+    verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))
+    (verdict,) = [v for v in verdicts if v.check == "pictures"]
+    assert verdict.level == "error"
+    assert "1920 x 1080" in verdict.message
 
 
 @pytest.mark.parametrize(

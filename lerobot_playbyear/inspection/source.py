@@ -246,7 +246,8 @@ class DatasetSource:
         path = file_inside(Path(self.dataset.root), meta.get_video_file_path(episode.index, camera))
         offset = meta.episodes[episode.index][f"videos/{camera}/from_timestamp"]
         times = [offset + float(time) for time in self.values("timestamp")[episode.rows]]
-        yield from video_pictures(path, times, self.dataset.tolerance_s, self._video_backend)
+        shape = self.features[camera]["shape"]
+        yield from video_pictures(path, times, self.dataset.tolerance_s, self._video_backend, camera, shape)
 
     def _is_number(self, key: str, feature: dict[str, Any]) -> bool:
         from lerobot.datasets.language import LANGUAGE_COLUMNS
