@@ -1,6 +1,7 @@
 """`playbyear-inspect`: every fault is found where it is, and a sound dataset has none."""
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -213,6 +214,25 @@ def test_a_sample_rate_that_does_not_fit_is_an_error_and_stops_the_checks_of_sou
     assert list(found(verdicts)) == ["sample rate"]
     assert "48000 Hz and 20 frames per second it must be (2400,)" in found(verdicts)["sample rate"].message
     assert not any(verdict.check == "clipping" for verdict in verdicts)
+
+
+@pytest.mark.parametrize("rate", [float("nan"), float("inf")])
+def test_a_sample_rate_that_is_no_number_is_an_error_of_valid_json_and_the_page_is_written(
+    clean, tmp_path, monkeypatch, capsys, rate
+):
+    root, page = copy(clean, tmp_path), tmp_path / "page.html"
+    edit(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate=rate))
+
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    assert run(monkeypatch, f"--dataset.root={root}", f"--html={page}", "--json") == 1
+    printed = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert printed["dataset"]["microphones"] == {MICROPHONE: None}
+    (verdict,) = [verdict for verdict in printed["verdicts"] if verdict["check"] == "sample rate"]
+    assert (verdict["level"], verdict["feature"]) == ("error", MICROPHONE)
+    data = re.search(r'id="dataset">(.*?)</script>', page.read_text())[1]
+    assert json.loads(data, parse_constant=refuse)["facts"]["microphones"] == {MICROPHONE: None}
 
 
 def test_statistics_of_other_data_are_an_error(clean, tmp_path):

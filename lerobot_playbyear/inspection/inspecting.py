@@ -1,6 +1,5 @@
 """`playbyear-inspect`: all checks over a dataset, and the page. LeRobot is imported when its files have been looked at."""
 
-import json as json_module
 import sys
 from collections import deque
 from collections.abc import Iterator
@@ -68,7 +67,7 @@ def inspect(cfg: InspectConfig) -> list[Verdict]:
     options = cfg.dataset
     source = DatasetSource.open(options.repo_id, options.root, options.episodes, options.video_backend)
     from lerobot_playbyear.inspection.checking import check_numbers
-    from lerobot_playbyear.inspection.report import as_dict, as_text
+    from lerobot_playbyear.inspection.report import as_json, as_text
 
     verdicts = check_numbers(source, cfg.action_range)
     try:
@@ -76,7 +75,7 @@ def inspect(cfg: InspectConfig) -> list[Verdict]:
     except OSError as error:
         raise InspectionError(f"The page cannot be written to '{cfg.html}': {error}") from error
     if cfg.json:
-        print(json_module.dumps(as_dict(source, verdicts), indent=2))
+        print(as_json(source, verdicts))
         return verdicts
     print(as_text(source, verdicts, colour=sys.stdout.isatty()))
     if cfg.html is not None:
