@@ -45,16 +45,22 @@ def check_links(root: Path) -> None:
     Raises:
         OutsideError: Naming the link; or one to a folder where the dataset's files lie, which would be left out.
     """
+    check_links_out(root)
+    for path in entries_below(root):
+        name = path.relative_to(root)
+        if path.is_symlink() and path.is_dir() and fits(name, *_FOLDERS):
+            raise OutsideError(
+                f"'{path}' is a link to a folder, whose files would be left out. Put the folder itself there."
+            )
+
+
+def check_links_out(root: Path) -> None:
+    """As `check_links` for a page, which reads through links: those to folders within the dataset's are allowed."""
     for path in entries_below(root):
         if path.is_symlink() and not _is_at_home(path, root):
             raise OutsideError(
                 f"'{path}' is a link to '{_real(path)}', outside the dataset's folder. Put the file itself there if it "
                 "belongs to the dataset, or remove the link."
-            )
-        name = path.relative_to(root)
-        if path.is_symlink() and path.is_dir() and fits(name, *_FOLDERS):
-            raise OutsideError(
-                f"'{path}' is a link to a folder, whose files would be left out. Put the folder itself there."
             )
 
 
