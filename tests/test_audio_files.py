@@ -1,5 +1,6 @@
 """Sound from files and from a microphone's callback, and back into files."""
 
+import itertools
 import threading
 import time
 import wave
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 
 from lerobot_playbyear.datasets import MicrophoneBuffer, cut_into_frames, read_audio, resample, write_audio
-from lerobot_playbyear.datasets.audio_files import AudioFileError
+from lerobot_playbyear.datasets.audio_files import AudioFileError, audio_pieces
+from lerobot_playbyear.datasets.audio_import import _spool
+from lerobot_playbyear.datasets.audio_layout import AudioTrack
 from lerobot_playbyear.datasets.microphone import DropOut
 
 RATE, FPS = 16000, 20
@@ -93,6 +96,43 @@ def test_a_videos_sound_track_is_read_in_time_with_its_pictures(tmp_path):
     samples, rate = read_audio(tmp_path / "film.mkv")
     assert rate == RATE
     assert abs(int(np.argmax(samples[:, 0])) - (4000 + RATE // 2)) < 0.002 * RATE  # Matroska counts milliseconds
+
+
+def test_a_gap_of_hours_is_silence_in_small_pieces(tmp_path):
+    """A few kilobytes say that sound goes on after three hours: 345 MB of silence."""
+    write_sound_with_a_gap(tmp_path / "gap.mkv", gap_s=3 * 3600)
+    assert (tmp_path / "gap.mkv").stat().st_size < 100_000
+    pieces = list(itertools.islice(audio_pieces(tmp_path / "gap.mkv"), 100))
+    assert max(len(samples) for samples, _ in pieces) < 2 * RATE
+    sound = np.concatenate([samples for samples, _ in pieces])
+    assert (sound[:RATE] == 1000).all()
+    assert not sound[RATE:].any()
+
+
+def test_of_a_gap_no_more_silence_is_written_than_is_needed(tmp_path):
+    write_sound_with_a_gap(tmp_path / "gap.mkv", gap_s=3 * 3600)
+    track = AudioTrack("observation.audio.table", 1, RATE, 0.0, [])
+    samples, rate = _spool(track, tmp_path / "gap.mkv", 10.0, tmp_path / "spooled")
+    assert rate == RATE
+    assert 10 * RATE < len(samples) < 12 * RATE
+
+
+def test_sound_after_a_gap_is_at_its_time(tmp_path):
+    write_sound_with_a_gap(tmp_path / "gap.mkv", gap_s=5)
+    sound, _ = read_audio(tmp_path / "gap.mkv")
+    assert len(sound) == 7 * RATE
+    assert np.flatnonzero(np.diff(sound[:, 0])).tolist() == [RATE - 1, 6 * RATE - 1]
+
+
+def write_sound_with_a_gap(path, gap_s: float) -> None:
+    """A second of sound, a gap without any packet, and another second."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=RATE, layout="mono")
+        for start_s in (0, 1 + gap_s):
+            frame = av.AudioFrame.from_ndarray(np.full((1, RATE), 1000, np.int16), "s16", "mono")
+            frame.sample_rate, frame.pts, frame.time_base = RATE, round(start_s * RATE), Fraction(1, RATE)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
 
 
 def test_aac_sounds_alike(tmp_path):

@@ -1,5 +1,7 @@
 """What reads a dataset works in pieces of bounded size, and finds and writes the same as if it had all in memory."""
 
+import io
+import json
 import shutil
 import threading
 import tracemalloc
@@ -16,17 +18,20 @@ import torch
 from dataset_factory import CAMERA, MICROPHONE, make_dataset
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frames
+from PIL import Image
 from test_attach_audio import config as attach_config
 from test_attach_audio import silent_dataset, write_sounds
 
 from lerobot_playbyear.datasets import EpisodeStore, attached_sound, audio_feature, opening, parquet_files, resample
 from lerobot_playbyear.datasets.attach import attach_audio
 from lerobot_playbyear.datasets.audio_files import Resampled
+from lerobot_playbyear.datasets.columns import with_values
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.repair import carry_out, check_dataset, repair_dataset
+from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import episode_sound
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
@@ -154,18 +159,36 @@ def test_reading_a_long_video_holds_its_tensor_and_little_else(tmp_path):
     n_frames, size = 900, (240, 320)
     (path,) = tmp_path.rglob("*.mp4")
     write_video(path, n_frames, size, g=str(FPS))
+    dataset.meta.features[CAMERA]["shape"] = (*size, 3)
     columns = {
         "episode_index": np.zeros(n_frames, np.int64),
         "timestamp": (np.arange(n_frames) / FPS).astype(np.float32),
     }
     dataset.reader.hf_dataset = type(dataset.hf_dataset)(pa.table(columns))
     from lerobot_playbyear.datasets.reading import _gathered
-    from lerobot_playbyear.datasets.tensors import video_pieces
 
     kept: list[torch.Tensor] = []
     grown = peak_of_process(lambda: kept.append(_gathered(video_pieces(dataset, CAMERA, 0, "pyav"), n_frames)))
     assert kept[0].shape == (n_frames, 3, *size)
     assert grown < 1.5 * kept[0].nbytes
+
+
+def test_large_pictures_are_decoded_a_few_at_a_time(tmp_path):
+    n_frames, size = 100, 1024
+    make_dataset(tmp_path / "data", (n_frames,), image_size=16)
+    (path,) = (tmp_path / "data").glob("data/*/*.parquet")
+    picture = io.BytesIO()
+    Image.new("RGB", (size, size), (250, 5, 120)).save(picture, "PNG")
+    rows = [{"bytes": picture.getvalue(), "path": None}] * n_frames
+    pq.write_table(with_values(pq.read_table(path), CAMERA, rows), path)
+    info = json.loads((tmp_path / "data/meta/info.json").read_text())
+    info["features"][CAMERA]["shape"] = [size, size, 3]
+    (tmp_path / "data/meta/info.json").write_text(json.dumps(info))
+    dataset = LeRobotDataset("tests/noise", tmp_path / "data")
+    lengths: list[int] = []
+    grown = peak_of_arrays(lambda: lengths.extend(len(piece) for piece in image_pieces(dataset, CAMERA)))
+    assert sum(lengths) == n_frames
+    assert grown < n_frames * 3 * size**2 / 2  # of all of them
 
 
 def test_checking_numbers_and_sound_takes_no_memory_that_grows_with_the_episode(long_sound):

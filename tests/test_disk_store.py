@@ -11,9 +11,11 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
-from dataset_factory import CAMERA, MICROPHONE, make_dataset, random_frame
+from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset, random_frame
 from disk_forks import IMAGE_SIZE
 
 from lerobot_playbyear.datasets import EpisodeStore, disk_columns, reading
@@ -203,6 +205,55 @@ def test_what_was_cut_off_is_gone_on_with_and_never_read(root, tmp_path, monkeyp
     store = load(root, tmp_path)
     assert began[CAMERA] == 12  # two pieces of 5, and the rest of the first episode
     assert_same(store, in_memory(root))
+
+
+@pytest.fixture
+def with_nan(tmp_path):
+    """A dataset whose sound, as floats, and state hold one NaN in the fourth row."""
+    features = dataset_features(image_size=SIZE)
+    features[MICROPHONE]["dtype"] = "float32"
+    make_dataset(tmp_path / "noise", LENGTHS, features=features)
+    (path,) = (tmp_path / "noise").glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    for key in (MICROPHONE, "observation.state"):
+        field = table.schema.field(key)
+        values = np.array(table[key].to_pylist(), np.float32)
+        values[3, 2] = np.nan
+        table = table.set_column(table.column_names.index(key), field, pa.array(values.tolist(), field.type))
+    pq.write_table(table, path)
+    return tmp_path / "noise"
+
+
+@pytest.mark.parametrize(
+    ("key", "rates"), [("observation.state", None), (MICROPHONE, None), (MICROPHONE, {MICROPHONE: 8000})]
+)
+def test_nan_is_refused_by_every_run(with_nan, tmp_path, key, rates):
+    for _ in range(3):
+        with pytest.raises(ValueError, match=f"'{key}' holds NaN"):
+            load(with_nan, tmp_path / "cache", keys=[key], sample_rates=rates)
+
+
+@pytest.mark.parametrize(
+    ("key", "rates"), [("observation.state", None), (MICROPHONE, None), (MICROPHONE, {MICROPHONE: 8000})]
+)
+def test_nan_that_was_written_before_the_run_was_cut_off_is_refused(with_nan, tmp_path, monkeypatch, key, rates):
+    pieces = reading._pieces
+    monkeypatch.setattr(disk_columns, "_SAVED_EVERY_S", 0.0)
+    monkeypatch.setattr("lerobot_playbyear.datasets.tensors._VALUES_AT_ONCE", 7)  # one row
+    monkeypatch.setattr("lerobot_playbyear.datasets.resampling._SAMPLES_AT_ONCE", 1)
+
+    def fails_on_the_way(*args):
+        for number, piece in enumerate(pieces(*args)):
+            if args[-2] == key and number == 20:
+                raise KeyboardInterrupt
+            yield piece
+
+    with monkeypatch.context() as patch:
+        patch.setattr(reading, "_pieces", fails_on_the_way)
+        with pytest.raises(KeyboardInterrupt):
+            load(with_nan, tmp_path / "cache", keys=[key], sample_rates=rates)
+    with pytest.raises(ValueError, match=f"'{key}' holds NaN"):
+        load(with_nan, tmp_path / "cache", keys=[key], sample_rates=rates)
 
 
 @pytest.mark.parametrize("damage", ["shortened", "removed", "manifest"])

@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -29,6 +30,7 @@ from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import at_a_rate_of_aac
 from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.hub.dataset_card import describe_dataset
@@ -147,7 +149,13 @@ def test_a_picture_outside_the_folder_is_shown_nowhere(root, secret, tmp_path, m
         list(source.pictures(source.episodes[0], CAMERA))
     with pytest.raises(ValueError, match="outside its folder"):
         EpisodeStore.load("a/b", str(root), device="cpu")
-    verdicts, _ = looked(root, tmp_path)
+    if which == 2:
+        with pytest.raises(InspectionError, match="No page is written"):
+            looked(root, tmp_path)
+    else:
+        (root / "images" / "link.png").unlink()
+        looked(root, tmp_path)
+    verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
     (verdict,) = [v for v in verdicts if v.check == "pictures"]
     assert verdict.level == "error"
     assert "outside its folder" in verdict.message
@@ -181,6 +189,8 @@ def test_only_pictures_are_read_as_pictures(root):
     edit_column(root, CAMERA, lambda picture: {"bytes": postscript.getvalue(), "path": None})
     with pytest.raises(OSError, match="cannot identify"):
         EpisodeStore.load("a/b", str(root), device="cpu")
+    report = check_dataset(root)
+    assert "11 pictures are damaged" in str(report)
 
 
 def test_a_picture_of_another_size_is_refused_before_it_is_decoded(root):
@@ -189,6 +199,25 @@ def test_a_picture_of_another_size_is_refused_before_it_is_decoded(root):
     edit_column(root, CAMERA, lambda picture: {"bytes": bomb.getvalue(), "path": None})
     with pytest.raises(ValueError, match="12000 x 7000 pixels"):
         EpisodeStore.load("a/b", str(root), device="cpu")
+
+
+def test_a_film_of_another_size_is_refused_before_it_is_decoded(videos):
+    (path,) = videos.rglob("*.mp4")
+    with av.open(str(path), "w") as film:
+        stream = film.add_stream("libx264", rate=20)
+        stream.width, stream.height = 1920, 1080
+        for _ in range(11):
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((1080, 1920, 3), np.uint8), "rgb24")))
+        film.mux(stream.encode(None))
+    said = rf"'{CAMERA}': .*file-000.mp4' have 1920 x 1080 pixels; .*\(16, 16, 3\)"
+    with pytest.raises(ValueError, match=said):
+        EpisodeStore.load("a/b", str(videos), device="cpu", video_backend="pyav")
+    with pytest.raises(ValueError, match=said):  # by LeRobot's decoder
+        next(video_pictures(path, [0.1, 0.0], 1e-3, "pyav", CAMERA, (16, 16, 3)))
+    verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))
+    (verdict,) = [v for v in verdicts if v.check == "pictures"]
+    assert verdict.level == "error"
+    assert "1920 x 1080" in verdict.message
 
 
 @pytest.mark.parametrize(
@@ -289,15 +318,47 @@ def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, mon
     assert not hub.requests
 
 
-def test_a_snapshot_of_the_hubs_cache_may_be_links_into_the_cache(root, tmp_path):
+@pytest.mark.parametrize("part", ["videos", "film", "data"])
+def test_no_page_holds_what_a_link_leads_to(videos, tmp_path, part):
+    place = next(videos.rglob("*.mp4")) if part == "film" else videos / part
+    place.rename(tmp_path / "elsewhere")
+    place.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(InspectionError, match=r"No page is written.* is a link to .*elsewhere.*--dataset\.root"):
+        looked(videos, tmp_path)
+    assert not (tmp_path / "page.html").exists()
+    verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))  # as one's own, on another disk
+    assert {verdict.level for verdict in verdicts if verdict.check == "pictures"} == {"ok"}
+    assert len(EpisodeStore.load("a/b", str(videos), device="cpu", video_backend="pyav")) == 11
+
+
+def test_a_page_is_written_through_links_that_stay_at_home(videos, tmp_path):
+    (videos / "videos").rename(videos / "kept")
+    (videos / "videos").symlink_to("kept")
+    (tmp_path / "link").symlink_to(videos)
+    verdicts, _ = looked(tmp_path / "link", tmp_path)
+    assert {verdict.level for verdict in verdicts if verdict.check == "pictures"} == {"ok"}
+
+
+def test_a_page_is_written_of_a_snapshot_of_the_hubs_cache(videos, tmp_path):
+    verdicts, _ = looked(as_snapshot(videos, tmp_path), tmp_path)
+    assert {verdict.level for verdict in verdicts if verdict.check == "pictures"} == {"ok"}
+
+
+def as_snapshot(root: Path, tmp_path: Path) -> Path:
+    """The dataset as the Hub's cache has it."""
     cache = tmp_path / "hub" / "datasets--a--b"
     snapshot = cache / "snapshots" / "abc"
     (cache / "blobs").mkdir(parents=True)
-    for number, path in enumerate(path for path in root.rglob("*") if path.is_file()):
+    for number, path in enumerate([path for path in root.rglob("*") if path.is_file()]):
         place = snapshot / path.relative_to(root)
         place.parent.mkdir(parents=True, exist_ok=True)
         path.rename(cache / "blobs" / str(number))
         place.symlink_to(os.path.relpath(cache / "blobs" / str(number), place.parent))
+    return snapshot
+
+
+def test_a_snapshot_of_the_hubs_cache_may_be_links_into_the_cache(root, tmp_path):
+    snapshot = as_snapshot(root, tmp_path)
     output = DatasetPlace("a/c", str(tmp_path / "copy"))
     with pytest.raises(AttachError, match="Nothing was written"):  # only the sound is missing
         attach_audio(

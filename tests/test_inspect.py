@@ -1,6 +1,7 @@
 """`playbyear-inspect`: every fault is found where it is, and a sound dataset has none."""
 
 import json
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_playbyear.datasets.audio_feature import audio_feature
+from lerobot_playbyear.datasets.columns import with_values
 from lerobot_playbyear.inspection import InspectionError, Verdict
 from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.onsets import sudden_sounds
@@ -214,6 +216,25 @@ def test_a_sample_rate_that_does_not_fit_is_an_error_and_stops_the_checks_of_sou
     assert not any(verdict.check == "clipping" for verdict in verdicts)
 
 
+@pytest.mark.parametrize("rate", [float("nan"), float("inf")])
+def test_a_sample_rate_that_is_no_number_is_an_error_of_valid_json_and_the_page_is_written(
+    clean, tmp_path, monkeypatch, capsys, rate
+):
+    root, page = copy(clean, tmp_path), tmp_path / "page.html"
+    edit(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate=rate))
+
+    def refuse(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    assert run(monkeypatch, f"--dataset.root={root}", f"--html={page}", "--json") == 1
+    printed = json.loads(capsys.readouterr().out, parse_constant=refuse)
+    assert printed["dataset"]["microphones"] == {MICROPHONE: None}
+    (verdict,) = [verdict for verdict in printed["verdicts"] if verdict["check"] == "sample rate"]
+    assert (verdict["level"], verdict["feature"]) == ("error", MICROPHONE)
+    data = re.search(r'id="dataset">(.*?)</script>', page.read_text())[1]
+    assert json.loads(data, parse_constant=refuse)["facts"]["microphones"] == {MICROPHONE: None}
+
+
 def test_statistics_of_other_data_are_an_error(clean, tmp_path):
     root = copy(clean, tmp_path)
     edit(root, lambda stats: stats["action"].update(mean=[0.5, 0.5]), "stats.json")
@@ -259,6 +280,38 @@ def test_nan_is_named_and_the_other_checks_go_on(tmp_path):
     assert (faults["finite numbers"].level, faults["finite numbers"].feature) == ("error", "observation.state")
     assert list(faults["finite numbers"].episodes) == [1]
     assert len(verdicts) == len(look(root))
+
+
+@pytest.mark.parametrize(
+    ("key", "others"),
+    [
+        ("observation.state", []),
+        ("action", []),
+        ("next.success", []),
+        ("intervention", []),
+        ("task_index", []),
+        ("timestamp", ["rows"]),
+        (MICROPHONE, ["sample rate"]),
+    ],
+)
+def test_a_column_that_lacks_a_value_is_named_and_the_other_checks_go_on(
+    clean, tmp_path, monkeypatch, capsys, key, others
+):
+    root = copy(clean, tmp_path)
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    values = table[key].to_pylist()
+    values[LENGTH + 3] = None
+    pq.write_table(with_values(table, key, values), path)
+    assert run(monkeypatch, f"--dataset.root={root}", f"--html={tmp_path / 'page.html'}", "--json") == 1
+    verdicts = json.loads(capsys.readouterr().out)["verdicts"]
+    faults = {verdict["check"]: verdict for verdict in verdicts if verdict["level"] in ("warning", "error")}
+    assert list(faults) == ["columns", *others]
+    assert (faults["columns"]["feature"], faults["columns"]["level"]) == (key, "error")
+    assert "missing" in faults["columns"]["message"]
+    checks = {verdict["check"] for verdict in verdicts}
+    assert {"rows", "finite numbers", "statistics", "sample rate", "pictures", "frames that repeat"} <= checks
+    assert (tmp_path / "page.html").stat().st_size > 10_000
 
 
 def test_a_damaged_picture_is_an_error_and_the_page_is_written_all_the_same(clean, tmp_path):

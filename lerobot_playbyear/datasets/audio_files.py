@@ -11,6 +11,7 @@ import numpy as np
 from lerobot_playbyear.datasets.audio_feature import pcm_channels, samples_per_frame, to_pcm_s16, write_wav
 
 _GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
+_SILENCE_AT_ONCE = 2**14  # samples
 _FLAC_BLOCK = 4096  # samples
 _FILTER_WIDTH, _ROLLOFF = 64, 0.9475937167399596  # of the resampler
 _MOST_PHASES = 4096  # of its filter, which takes the square of them in memory
@@ -49,7 +50,7 @@ def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
 
 
 def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarray, int]]:
-    """As `read_audio`, in pieces of less than a second, each with the sample rate; a late sound track's silence is one.
+    """As `read_audio`, in pieces of bounded size, each with the sample rate; silence, how long it may be, is no exception.
 
     Args:
         path: The file.
@@ -74,8 +75,10 @@ def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarr
                 if position == 0 and start < 0:
                     samples, start = samples[-start:], 0
                 if start - position > (_GAP_SECONDS * rate if position else 0):
-                    yield np.zeros((start - position, samples.shape[1]), np.int16), rate
-                    position = start
+                    while position < start:  # a file may say that it goes on after years
+                        silence = np.zeros((min(start - position, _SILENCE_AT_ONCE), samples.shape[1]), np.int16)
+                        position += len(silence)
+                        yield silence, rate
                 position += len(samples)
                 yield samples, rate
     except (av.FFmpegError, ValueError) as error:

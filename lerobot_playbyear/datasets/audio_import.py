@@ -123,6 +123,8 @@ def _spool(track: AudioTrack, path: Path, last_s: float, target: Path) -> tuple[
     rate = n_samples = 0
     with target.open("wb") as file:
         for samples, rate in audio_pieces(path, _FORMATS):
+            if n_samples > last_s * rate:
+                break
             if samples.shape[1] != track.n_channels:
                 raise AudioFileError(
                     f"it has {samples.shape[1]} channels; the feature's shape says {track.n_channels}. Correct meta/info.json."
@@ -133,6 +135,4 @@ def _spool(track: AudioTrack, path: Path, last_s: float, target: Path) -> tuple[
                 )
             file.write(np.ascontiguousarray(samples).tobytes())
             n_samples += len(samples)
-            if n_samples > last_s * rate:
-                break
     return SpooledFile(target, track.n_channels), rate

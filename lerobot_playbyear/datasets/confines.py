@@ -10,7 +10,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
@@ -19,7 +19,9 @@ from PIL import Image
 
 from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, DEFAULT_VIDEO_PATH, INFO_PATH, entries_below, fits
 
-_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")  # of pictures; others have readers that start programs
+PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
+"""Of the pictures that are read; others have readers that start programs."""
+
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
 _MOST_FPS = 1000
@@ -43,16 +45,22 @@ def check_links(root: Path) -> None:
     Raises:
         OutsideError: Naming the link; or one to a folder where the dataset's files lie, which would be left out.
     """
+    check_links_out(root)
+    for path in entries_below(root):
+        name = path.relative_to(root)
+        if path.is_symlink() and path.is_dir() and fits(name, *_FOLDERS):
+            raise OutsideError(
+                f"'{path}' is a link to a folder, whose files would be left out. Put the folder itself there."
+            )
+
+
+def check_links_out(root: Path) -> None:
+    """As `check_links` for a page, which reads through links: those to folders within the dataset's are allowed."""
     for path in entries_below(root):
         if path.is_symlink() and not _is_at_home(path, root):
             raise OutsideError(
                 f"'{path}' is a link to '{_real(path)}', outside the dataset's folder. Put the file itself there if it "
                 "belongs to the dataset, or remove the link."
-            )
-        name = path.relative_to(root)
-        if path.is_symlink() and path.is_dir() and fits(name, *_FOLDERS):
-            raise OutsideError(
-                f"'{path}' is a link to a folder, whose files would be left out. Put the folder itself there."
             )
 
 
@@ -138,6 +146,11 @@ def file_inside(root: Path, name: str | PurePath) -> Path:
     return root / name
 
 
+def has_shape(height: int, width: int, shape: Sequence[int]) -> bool:
+    """Whether a picture has the size that a feature's shape says, (C, H, W) or (H, W, C)."""
+    return (height, width) in itertools.pairwise(shape)
+
+
 def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: Mapping[str, Any]) -> Image.Image:
     """Opens one picture of an image column; it is not decoded yet.
 
@@ -164,8 +177,8 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
         source: Any = root / name
     else:
         source = io.BytesIO(data)
-    image = Image.open(source, formats=_FORMATS)
-    if (image.height, image.width) not in itertools.pairwise(feature["shape"]):
+    image = Image.open(source, formats=PICTURE_FORMATS)
+    if not has_shape(image.height, image.width, feature["shape"]):
         size = f"{image.width} x {image.height}"
         image.close()
         raise ValueError(

@@ -33,7 +33,7 @@ DEFAULT_CACHE = HF_LEROBOT_HOME.with_name("lerobot_playbyear")
 """Where the columns are kept: beside LeRobot's own cache."""
 
 Pieces = Callable[[str, int], Iterator[np.ndarray]]
-"""Gives a column from a row on, in pieces (n, ...)."""
+"""Gives a column from a row on, in pieces (n, ...); what is wrong with an earlier row, too, is an error."""
 
 _FORMAT = 1
 _MANIFEST, _PART, _ROWS = "manifest.json", ".part", ".rows"
@@ -183,11 +183,14 @@ def _part(folder: Path) -> Path:
 
 
 def _write_column(path: Path, key: str, n_rows: int, pieces: Pieces, goes_on: Event) -> None:
-    """Appends what is missing. How many rows are safe on the disk stands in a file beside it."""
+    """Appends what is missing. How many rows are safe on the disk stands in a file beside it.
+
+    All rows are safe only when `pieces` has ended without an error: what is wrong with a column it may say last. A column
+    that an earlier run completed is asked once more, for what it says of the rows that are there.
+    """
     safe = path.with_suffix(_ROWS)
-    done, row_bytes = _safe_rows(safe)
-    if done == n_rows:
-        return
+    first, row_bytes = _safe_rows(safe)
+    done = first
     saved = time.monotonic()
     with path.open("r+b" if done else "wb") as file:
         if done:
@@ -200,14 +203,20 @@ def _write_column(path: Path, key: str, n_rows: int, pieces: Pieces, goes_on: Ev
                 header = {"descr": piece.dtype.str, "fortran_order": False, "shape": (n_rows, *piece.shape[1:])}
                 np.lib.format.write_array_header_1_0(file, header)
             file.write(np.ascontiguousarray(piece).data)
-            done += len(piece)
-            if time.monotonic() - saved > _SAVED_EVERY_S or done == n_rows:
-                file.flush()
-                os.fsync(file.fileno())
-                _write_whole(safe, json.dumps([done, piece.nbytes // len(piece)]))
+            done, row_bytes = done + len(piece), piece.nbytes // len(piece)
+            if time.monotonic() - saved > _SAVED_EVERY_S and done < n_rows:
+                _save(file, safe, done, row_bytes)
                 saved = time.monotonic()
+        if done == n_rows != first:
+            _save(file, safe, done, row_bytes)
     if done != n_rows:
         raise ValueError(f"'{key}' has {done} rows, and the dataset {n_rows}: playbyear-repair looks into it.")
+
+
+def _save(file: BinaryIO, safe: Path, done: int, row_bytes: int) -> None:
+    file.flush()
+    os.fsync(file.fileno())
+    _write_whole(safe, json.dumps([done, row_bytes]))
 
 
 def _safe_rows(path: Path) -> tuple[int, int]:

@@ -13,7 +13,7 @@ import numpy as np
 from lerobot_playbyear.datasets.audio_feature import samples_per_frame, to_pcm_s16
 from lerobot_playbyear.datasets.audio_files import Resampled
 from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
-from lerobot_playbyear.datasets.tensors import check_finite, read_rows
+from lerobot_playbyear.datasets.tensors import check_finite, finite_rows, read_rows
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -61,7 +61,8 @@ def resampled_pieces(
         first: The row to begin with.
 
     Raises:
-        ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values.
+        ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values, those before
+            `first` included.
     """
     old_rate = int(dataset.meta.features[key]["info"]["sample_rate"])
     n_samples = samples_per_frame(sample_rate, dataset.fps, key)
@@ -71,7 +72,10 @@ def resampled_pieces(
     n_edges = math.ceil(_EDGE / min(old, new))  # so many times `old` samples are exactly as many times `new` ones
     episode_index = column_to_numpy(dataset.hf_dataset.data.column("episode_index"))
     finite = np.ones(len(episode_index), bool)
+    finite[:first] = finite_rows(dataset, key, first)
     for start, end in zip(*episode_bounds(episode_index), strict=True):
+        if end <= first:
+            continue
         sound = _Mirrored(dataset, key, start, end, n_edges * old)
         resampled = Resampled(sound, old_rate, sample_rate)
         for row in range(max(start, first), end, n_rows):

@@ -25,6 +25,7 @@ from lerobot_playbyear.datasets.video_pictures import video_pictures
 _PICTURES_AT_ONCE = 32
 _ROWS_AT_ONCE = 128  # images
 _VALUES_AT_ONCE = 2**22
+_PICTURE_BYTES = 2**25  # decoded at once, whatever their size
 
 
 def value_pieces(dataset: LeRobotDataset | LongDataset, key: str, first: int = 0) -> Iterator[np.ndarray]:
@@ -33,17 +34,16 @@ def value_pieces(dataset: LeRobotDataset | LongDataset, key: str, first: int = 0
     Floats come as float32, integers and booleans as they are stored.
 
     Raises:
-        ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values.
+        ValueError: If rows are missing, differ from the feature's shape, or hold NaN or infinite values, those before
+            `first` included.
     """
-    shape = _row_shape(dataset, key)
     column = dataset.hf_dataset.data.column(key)
-    rows = max(_VALUES_AT_ONCE // max(math.prod(shape), 1), 1)
     finite = np.ones(len(column), bool)
-    for position in range(first, len(column), rows):
-        read = read_rows(dataset, key, position, rows)
+    finite[:first] = finite_rows(dataset, key, first)
+    for position, read in _parts(dataset, key, first, len(column)):
         if np.issubdtype(read.dtype, np.floating):
             read = read.astype(np.float32, copy=False)
-            finite[position : position + rows] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
+            finite[position : position + len(read)] = np.isfinite(read.reshape(len(read), -1)).all(axis=1)
         yield read
     check_finite(finite, key, column_to_numpy(dataset.hf_dataset.data.column("episode_index")))
 
@@ -63,6 +63,28 @@ def read_rows(dataset: LeRobotDataset | LongDataset, key: str, first: int, n: in
             f"'{key}' of dataset '{dataset.repo_id}' cannot be read as {len(column)} rows of shape {shape}: {error}. "
             "Record the damaged episodes again, or leave them out with --dataset.episodes."
         ) from error
+
+
+def finite_rows(dataset: LeRobotDataset | LongDataset, key: str, n: int) -> np.ndarray:
+    """Of each of the first n rows of a numeric column whether all its values are finite as float32, (n,) bool.
+
+    Raises:
+        ValueError: As `read_rows`.
+    """
+    finite = np.ones(n, bool)
+    for position, read in _parts(dataset, key, 0, n):
+        if not np.issubdtype(read.dtype, np.floating):
+            break
+        values = read.astype(np.float32, copy=False).reshape(len(read), -1)
+        finite[position : position + len(read)] = np.isfinite(values).all(axis=1)
+    return finite
+
+
+def _parts(dataset: LeRobotDataset | LongDataset, key: str, first: int, stop: int) -> Iterator[tuple[int, np.ndarray]]:
+    """The rows of a numeric column as `read_rows` gives them, in parts of bounded size, each with its first row."""
+    rows = max(_VALUES_AT_ONCE // max(math.prod(_row_shape(dataset, key)), 1), 1)
+    for position in range(first, stop, rows):
+        yield position, read_rows(dataset, key, position, min(rows, stop - position))
 
 
 def _row_shape(dataset: LeRobotDataset | LongDataset, key: str) -> tuple[int, ...]:
@@ -101,7 +123,7 @@ def image_pieces(dataset: LeRobotDataset | LongDataset, key: str, first: int = 0
     mode = "L" if 1 in _channel_candidates(feature) else "RGB"
     position, size = first, None
     with ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1)) as pool:
-        for rows in _few_rows(column):
+        for rows in _few_rows(column, _at_once(feature, _ROWS_AT_ONCE)):
             images = list(pool.map(lambda row: _decode_image(row, root, key, feature, mode), rows.to_pylist()))
             size = size or images[0].shape
             for image in images:
@@ -124,7 +146,12 @@ def video_pieces(
         key: The camera.
         first: The row to begin with.
         video_backend: LeRobot's decoder ("pyav", "torchcodec"); None takes its default.
+
+    Raises:
+        ValueError: If a video's pictures have another size than the feature says, or it lies outside the dataset's folder.
     """
+    shape = dataset.meta.features[key]["shape"]
+    n_at_once = _at_once(dataset.meta.features[key], _PICTURES_AT_ONCE)
     episode_index = column_to_numpy(dataset.hf_dataset.data.column("episode_index"))
     timestamps = column_to_numpy(dataset.hf_dataset.data.column("timestamp"))
     for start, end in zip(*episode_bounds(episode_index), strict=True):
@@ -134,15 +161,20 @@ def video_pieces(
         path = file_inside(Path(dataset.root), dataset.meta.get_video_file_path(episode, key))
         offset = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
         times = [offset + float(timestamp) for timestamp in timestamps[max(start, first) : end]]
-        pictures = video_pictures(path, times, dataset.tolerance_s, video_backend)
-        while piece := list(itertools.islice(pictures, _PICTURES_AT_ONCE)):
+        pictures = video_pictures(path, times, dataset.tolerance_s, video_backend, key, shape)
+        while piece := list(itertools.islice(pictures, n_at_once)):
             yield np.stack(piece).transpose(0, 3, 1, 2)
 
 
-def _few_rows(column: pa.ChunkedArray) -> Iterator[pa.StructArray]:
+def _at_once(feature: Mapping[str, Any], most: int) -> int:
+    """How many pictures of a camera are decoded together; none is larger than its feature says."""
+    return max(min(_PICTURE_BYTES // max(math.prod(feature["shape"]), 1), most), 1)
+
+
+def _few_rows(column: pa.ChunkedArray, n: int) -> Iterator[pa.StructArray]:
     """The column in parts: what is decoded ahead of being stored would otherwise be the whole column once more."""
     for chunk in column.chunks:
-        yield from (chunk.slice(first, _ROWS_AT_ONCE) for first in range(0, len(chunk), _ROWS_AT_ONCE))
+        yield from (chunk.slice(first, n) for first in range(0, len(chunk), n))
 
 
 def _decode_image(row: Mapping[str, Any], root: Path, key: str, feature: Mapping[str, Any], mode: str) -> np.ndarray:

@@ -8,6 +8,7 @@ from lerobot_playbyear.inspection.recording_checks import check_recording
 from lerobot_playbyear.inspection.sound_checks import check_sound
 from lerobot_playbyear.inspection.source import DatasetSource
 from lerobot_playbyear.inspection.structure_checks import (
+    check_columns,
     check_finite_numbers,
     check_lengths,
     check_rows,
@@ -26,6 +27,7 @@ def check_numbers(source: DatasetSource, action_range: Sequence[float] | None = 
         action_range: Lowest and highest action allowed; None: see `check_actions`.
     """
     verdicts: list[Verdict] = []
+    verdicts += _guarded("columns", check_columns, source)
     verdicts += _guarded("rows", check_rows, source)
     verdicts += _guarded("episode lengths", check_lengths, source)
     verdicts += _guarded("finite numbers", check_finite_numbers, source)

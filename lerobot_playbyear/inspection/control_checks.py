@@ -20,6 +20,8 @@ def check_actions(source: DatasetSource, bounds: Sequence[float] | None = None) 
         bounds: Lowest and highest value allowed; beyond them is an error. None: where nine values in ten lie in
             [-1, 1] that range is taken to be meant, and beyond it is a warning.
     """
+    if ACTION in source.unreadable:
+        return
     if ACTION not in source.numbers:
         yield Verdict("actions", "warning", f"no '{ACTION}' column: nothing can be learned from this dataset")
         return
@@ -50,6 +52,8 @@ def check_actions(source: DatasetSource, bounds: Sequence[float] | None = None) 
 
 def check_interventions(source: DatasetSource) -> Iterator[Verdict]:
     """How much of the dataset the expert acted in."""
+    if INTERVENTION in source.unreadable:
+        return
     if INTERVENTION not in source.numbers:
         yield Verdict("interventions", "info", f"no '{INTERVENTION}' column")
         return
@@ -70,6 +74,8 @@ def check_interventions(source: DatasetSource) -> Iterator[Verdict]:
 
 def check_success(source: DatasetSource) -> Iterator[Verdict]:
     """How many episodes reached the task's goal."""
+    if SUCCESS in source.unreadable:
+        return
     if SUCCESS not in source.numbers:
         yield Verdict("success", "info", f"no '{SUCCESS}' column")
         return

@@ -1,6 +1,5 @@
 """`playbyear-inspect`: all checks over a dataset, and the page. LeRobot is imported when its files have been looked at."""
 
-import json as json_module
 import sys
 from collections import deque
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_playbyear.datasets.confines import OutsideError, check_links_out
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 from lerobot_playbyear.inspection.verdict import Verdict
 
@@ -62,13 +62,16 @@ def inspect(cfg: InspectConfig) -> list[Verdict]:
         All verdicts.
 
     Raises:
-        InspectionError: There is no dataset, or an option is out of range, or the page cannot be written.
+        InspectionError: There is no dataset, or an option is out of range, or the page cannot be written, or would hold
+            what is not in the dataset's folder.
     """
     _check_options(cfg)
     options = cfg.dataset
     source = DatasetSource.open(options.repo_id, options.root, options.episodes, options.video_backend)
+    if cfg.html is not None:
+        _check_links(Path(source.dataset.root))
     from lerobot_playbyear.inspection.checking import check_numbers
-    from lerobot_playbyear.inspection.report import as_dict, as_text
+    from lerobot_playbyear.inspection.report import as_json, as_text
 
     verdicts = check_numbers(source, cfg.action_range)
     try:
@@ -76,7 +79,7 @@ def inspect(cfg: InspectConfig) -> list[Verdict]:
     except OSError as error:
         raise InspectionError(f"The page cannot be written to '{cfg.html}': {error}") from error
     if cfg.json:
-        print(json_module.dumps(as_dict(source, verdicts), indent=2))
+        print(as_json(source, verdicts))
         return verdicts
     print(as_text(source, verdicts, colour=sys.stdout.isatty()))
     if cfg.html is not None:
@@ -103,6 +106,19 @@ def _watch_pictures(cfg: InspectConfig, source: DatasetSource, verdicts: list[Ve
         if page is not None:
             page.finish(verdicts)
     return verdicts
+
+
+def _check_links(root: Path) -> None:
+    """A page is sent to others: it holds no film, sound or number that a stranger's link leads to."""
+    try:
+        check_links_out(root)
+    except OutsideError as error:
+        raise InspectionError(
+            f"No page is written, since it would hold what a link leads to: {error} Of a dataset that lies on another disk, "
+            "let the whole folder lie there, and name it with --dataset.root. Without --html it is checked as it is."
+        ) from error
+    except OSError as error:
+        raise InspectionError(f"The dataset in '{root}' cannot be read: {error}") from error
 
 
 def _check_options(cfg: InspectConfig) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from lerobot_playbyear.inspection.episode_data import EpisodeData
 from lerobot_playbyear.inspection.film import encode, tile
-from lerobot_playbyear.inspection.report import dataset_facts, summary
+from lerobot_playbyear.inspection.report import dataset_facts, finite, summary
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.structure_checks import fit_microphones
 from lerobot_playbyear.inspection.verdict import Verdict, worst
@@ -135,5 +135,5 @@ def _base64(path: Path) -> Iterator[str]:
 
 
 def _json(value: Any) -> str:
-    """JSON that cannot end the element it stands in."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    """JSON that every browser reads, and that cannot end the element it stands in."""
+    return json.dumps(finite(value), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

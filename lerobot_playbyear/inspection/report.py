@@ -1,7 +1,9 @@
 """Verdicts for a person at a terminal, and for a program."""
 
+import json
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lerobot_playbyear.inspection.source import DatasetSource
@@ -43,13 +45,23 @@ def as_text(source: DatasetSource, verdicts: Sequence[Verdict], colour: bool = F
     return "\n".join([*lines, "", summary(verdicts)])
 
 
-def as_dict(source: DatasetSource, verdicts: Sequence[Verdict]) -> dict[str, Any]:
-    """The same for JSON."""
-    return {
+def as_json(source: DatasetSource, verdicts: Sequence[Verdict]) -> str:
+    """The same for a program."""
+    report = {
         "dataset": dataset_facts(source),
         "worst": worst(verdicts),
         "verdicts": [verdict.to_dict() for verdict in verdicts],
     }
+    return json.dumps(finite(report), indent=2, allow_nan=False)
+
+
+def finite(value: Any) -> Any:
+    """The same for JSON, which has no NaN and no infinite numbers, though Python reads them in one: null for each."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: finite(each) for key, each in value.items()}
+    return [finite(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def summary(verdicts: Sequence[Verdict]) -> str:

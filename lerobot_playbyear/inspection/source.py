@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 SUCCESS = "next.success"
 INTERVENTION = "intervention"
 
+_INDEX_COLUMNS = ("timestamp", "frame_index", "task_index")
 _PICTURES_AT_ONCE = 128  # encoded ones that are taken out of the table together
 
 
@@ -69,7 +70,6 @@ class DatasetSource:
         features: Every feature, as `dataset.meta.features`.
         cameras: The keys of all colour cameras.
         microphones: The keys of all microphones.
-        numbers: The keys of all other numeric features of one dimension, without LeRobot's index columns.
     """
 
     def __init__(self, dataset: "LeRobotDataset | LongDataset", video_backend: str | None = "pyav") -> None:
@@ -82,7 +82,6 @@ class DatasetSource:
         self._samples_per_frame: dict[str, int] = {}
         self.cameras = [key for key in dataset.meta.camera_keys if key not in dataset.meta.depth_keys]
         self.microphones = audio_keys(self.features)
-        self.numbers = [key for key, feature in self.features.items() if self._is_number(key, feature)]
 
     @classmethod
     def open(
@@ -128,6 +127,26 @@ class DatasetSource:
         if len(index) == 0:
             return []
         return [Episode(int(index[start]), start, stop) for start, stop in zip(*episode_bounds(index), strict=True)]
+
+    @cached_property
+    def numbers(self) -> list[str]:
+        """The keys of all other numeric features of one dimension that can be read, without LeRobot's index columns."""
+        keys = [key for key, feature in self.features.items() if self._is_number(key, feature)]
+        return [key for key in keys if key not in self.unreadable]
+
+    @cached_property
+    def unreadable(self) -> dict[str, str]:
+        """The columns of numbers and of sound that lack values, or whose rows differ in length, and why."""
+        reasons = {}
+        for key, feature in self.features.items():
+            try:
+                if key in self.microphones:
+                    self.samples_per_frame(key)
+                elif key in _INDEX_COLUMNS or self._is_number(key, feature):
+                    self.values(key)
+            except ValueError as error:
+                reasons[key] = " ".join(str(error).split())
+        return reasons
 
     def values(self, key: str) -> np.ndarray:
         """A numeric column as stored, (N,) for one value per row and (N, D) for more; read once.
@@ -191,15 +210,15 @@ class DatasetSource:
         return EpisodeSound(self._table.column(key).slice(episode.start, len(episode)), self.samples_per_frame(key))
 
     def task(self, episode: Episode) -> str:
-        """The episode's task in words; empty if it has none."""
+        """The episode's task in words; empty if it has none, or which one cannot be read."""
         tasks = self.dataset.meta.tasks
-        if tasks is None or "task_index" not in self.features:
+        if tasks is None or "task_index" not in self.features or "task_index" in self.unreadable:
             return ""
         position = int(self.values("task_index")[episode.start])
         return str(tasks.index[position]) if 0 <= position < len(tasks) else ""
 
     def succeeded(self, episode: Episode) -> int | None:
-        """The first frame, counted from the episode's start, with success; -1 without success, None if not recorded."""
+        """The first frame, counted from the episode's start, with success; -1 without success, None if not known."""
         if SUCCESS not in self.numbers:
             return None
         frames = np.flatnonzero(self.values(SUCCESS)[episode.rows])
@@ -227,7 +246,8 @@ class DatasetSource:
         path = file_inside(Path(self.dataset.root), meta.get_video_file_path(episode.index, camera))
         offset = meta.episodes[episode.index][f"videos/{camera}/from_timestamp"]
         times = [offset + float(time) for time in self.values("timestamp")[episode.rows]]
-        yield from video_pictures(path, times, self.dataset.tolerance_s, self._video_backend)
+        shape = self.features[camera]["shape"]
+        yield from video_pictures(path, times, self.dataset.tolerance_s, self._video_backend, camera, shape)
 
     def _is_number(self, key: str, feature: dict[str, Any]) -> bool:
         from lerobot.datasets.language import LANGUAGE_COLUMNS

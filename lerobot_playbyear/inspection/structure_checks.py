@@ -13,6 +13,15 @@ _LENGTH_FACTOR = 4.0  # an episode this much longer or shorter than the median i
 _STATS_TOLERANCE = 0.02  # of a value's range; LeRobot sums statistics in float32, episode by episode
 
 
+def check_columns(source: DatasetSource) -> Iterator[Verdict]:
+    """Every column of numbers or sound can be read; the other checks leave those out that cannot."""
+    for key, reason in source.unreadable.items():
+        message = f"cannot be read: {reason}. Record these episodes again, or leave them out with --dataset.episodes"
+        yield Verdict("columns", "error", message, key)
+    if not source.unreadable:
+        yield Verdict("columns", "ok", "all can be read")
+
+
 def check_rows(source: DatasetSource) -> Iterator[Verdict]:
     """Every episode has frames 0 to n - 1, n / fps apart, and as many as the metadata says."""
     frame_index, timestamps = source.values("frame_index"), source.values("timestamp")
@@ -86,7 +95,7 @@ def fit_microphones(source: DatasetSource) -> list[str]:
 def check_finite_numbers(source: DatasetSource) -> Iterator[Verdict]:
     """No NaN and no infinite value in any column of floats."""
     n_columns = 0
-    for key in [*source.numbers, *source.microphones, "timestamp"]:
+    for key in _readable(source, *source.numbers, *source.microphones, "timestamp"):
         bad = _bad_rows(source, key)
         if bad is None:
             continue
@@ -107,7 +116,7 @@ def check_statistics(source: DatasetSource) -> Iterator[Verdict]:
         yield Verdict("statistics", "info", "not compared: only some of the episodes were opened")
         return
     wrong, missing, n_compared = [], [], 0
-    for key in [*source.numbers, *source.microphones]:
+    for key in _readable(source, *source.numbers, *source.microphones):
         if key not in stats:
             missing.append(key)
             continue
@@ -122,6 +131,10 @@ def check_statistics(source: DatasetSource) -> Iterator[Verdict]:
         yield Verdict("statistics", "warning", f"meta/stats.json lacks {', '.join(missing)}. {remedy}")
     if not wrong and not missing:
         yield Verdict("statistics", "ok", f"meta/stats.json fits the data of {n_compared} columns")
+
+
+def _readable(source: DatasetSource, *keys: str) -> list[str]:
+    return [key for key in keys if key not in source.unreadable]
 
 
 def _sample_rate(source: DatasetSource, key: str) -> int:

@@ -15,6 +15,7 @@ from lerobot.datasets.utils import DatasetInfo
 from PIL import Image, UnidentifiedImageError
 
 from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.confines import PICTURE_FORMATS
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
 from lerobot_playbyear.datasets.repair.info import check_columns, own_schema
@@ -247,7 +248,7 @@ def _look_at_pictures(column: pa.ChunkedArray, key: str) -> Iterator[tuple[int, 
     for row, picture in enumerate(value.as_py() for value in column):
         try:
             if picture["bytes"] is not None:
-                with Image.open(io.BytesIO(picture["bytes"])) as image:
+                with Image.open(io.BytesIO(picture["bytes"]), formats=PICTURE_FORMATS) as image:
                     image.verify()
                     yield row, (image.height, image.width)
         except UnidentifiedImageError:
