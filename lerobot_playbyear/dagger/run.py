@@ -42,11 +42,10 @@ from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.hub.training_run import METRICS_NAME
-from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.checkpoints import BEST_LINK
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.loop import read_store
-from lerobot_playbyear.training.parts import make_training_parts
+from lerobot_playbyear.training.parts import make_training_parts, read_recorded_noise
 from lerobot_playbyear.training.processes import Orders, share_of
 from lerobot_playbyear.training.reach import Reach, action_names
 from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
@@ -175,9 +174,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         forget_all(parts, cfg.seed)
     orders = Orders(parts.accelerator)
     stack.callback(orders.end)
-    for module in parts.accelerator.unwrap_model(parts.policy).modules():
-        if isinstance(module, SoundAugmentation):
-            module.read_recordings()
+    read_recorded_noise(parts.accelerator.unwrap_model(parts.policy))
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = read_store(demos, windows, training)
     check_actions_can_be_masked(parts, windows, demonstrations)

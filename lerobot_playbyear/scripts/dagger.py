@@ -50,7 +50,7 @@ What comes out
   --eval_every=5               rounds between two evaluations; 0: none
   --eval.n_episodes=50         episodes of an evaluation
   --eval_videos=0              of these, how many are filmed
-  --save_every=0               rounds between two checkpoints that stay, besides last, best and evaluated ones
+  --save_every=0               rounds between two checkpoints that stay; 0: last, best and evaluated
   --wandb.enable=false         report to Weights & Biases
   --resume=false               go on with the run in --output_dir; options not given again stay
 

@@ -27,11 +27,10 @@ from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
-from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.checkpoints import BestCheckpoint
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
-from lerobot_playbyear.training.parts import TrainingParts, make_training_parts
+from lerobot_playbyear.training.parts import TrainingParts, make_training_parts, read_recorded_noise
 from lerobot_playbyear.training.prefetch import pinned, prefetched
 from lerobot_playbyear.training.processes import make_accelerator, noise_seed, share_of
 from lerobot_playbyear.training.reach import Reach, action_names
@@ -83,9 +82,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         if cfg.seed is not None and accelerator.num_processes > 1:
             set_seed(noise_seed(cfg.seed, accelerator.process_index, parts.step))  # each its own
         policy = accelerator.unwrap_model(parts.policy)
-        for module in policy.modules():
-            if isinstance(module, SoundAugmentation):
-                module.read_recordings()
+        read_recorded_noise(policy)
         config = policy.config
         windows = PolicyWindows(config, meta, cfg.rename_map)
         is_shared = accelerator.num_processes > 1

@@ -28,6 +28,7 @@ from lerobot_playbyear.compat import (
 from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes
+from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.windows import dataset_names
 
@@ -209,6 +210,17 @@ def make_training_parts(
     policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
     policy.train()
     return TrainingParts(accelerator, policy, optimizer, scheduler, preprocessor, postprocessor, step)
+
+
+def read_recorded_noise(policy: torch.nn.Module) -> None:
+    """Reads the folder of recorded noise that a policy learns with, if there is one, before any work is done.
+
+    Raises:
+        InputError: The folder cannot be used.
+    """
+    for module in policy.modules():
+        if isinstance(module, SoundAugmentation):
+            module.read_recordings()
 
 
 def check_dataset_suits(
