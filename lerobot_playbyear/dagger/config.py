@@ -87,7 +87,7 @@ class DaggerConfig:
         warmup_updates: Over so many first updates of the run the rate rises, until Adam has its averages.
         seed: Of the random numbers of training, and of the first evaluation episode, as in lerobot-train.
         episode_seed: Of the first attempt; further ones take the next, but none of the evaluation's.
-        max_attempts: Attempts in a row without one to keep, after which the run ends.
+        max_attempts: Attempts in a row without one to keep, after which the run ends; not counting those without any help.
         eval_every: Rounds between two evaluations; there is one before the first round and one after the last. 0: none.
         eval: Size of an evaluation, as in lerobot-eval.
         eval_videos: Episodes of each evaluation that are filmed.
