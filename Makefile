@@ -9,6 +9,8 @@ TASK ?= OccludedGrasp-v1
 ALL_TASKS ?= OccludedGrasp-v1 OccludedPickPlace-v1 TellApart-v1 KeyBag-Easy-v1 KeyBag-Hard-v1
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
+# Images for containers often set it: then each start compiles PyTorch and LeRobot anew, which takes longer than all else of it.
+unexport PYTHONDONTWRITEBYTECODE
 
 # In the order of their names: otherwise the longest, which are few in their files, come last and one by one.
 PYTEST := $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder
