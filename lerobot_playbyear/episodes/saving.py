@@ -1,7 +1,6 @@
 """Saving an episode that a person may have made by hand: a full disk is a reason to ask, not to lose it."""
 
 import contextlib
-import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.recording_notes import note_recording
 from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.frames import episode_frames
+from lerobot_playbyear.episodes.terminal import ask
 
 
 def save_episode(episode: Episode, writer: DurableWriter) -> list[dict[str, Any]]:
@@ -61,15 +61,9 @@ def save_or_ask(writer: DurableWriter, frames: Sequence[dict[str, Any]] = ()) ->
 
 def _wants_again(error: DatasetWriteError, is_in_memory: bool) -> bool:
     """Asks at the terminal whether to try again; where there is none nobody wants it."""
-    if sys.stdin is None or not sys.stdin.isatty():
-        return False
-    print(f"\n{error}", file=sys.stderr)
     kept = "All of it is still in memory. " if is_in_memory else ""
-    try:
-        answer = input(f"{kept}Press Enter to save it again once there is room, or type q to give it up: ")
-    except EOFError:
-        return False
-    return answer.strip().lower() != "q"
+    answer = ask(str(error), f"{kept}Press Enter to save it again once there is room, or type q to give it up: ")
+    return answer is not None and answer.strip().lower() != "q"
 
 
 def _forget(writer: DurableWriter) -> None:

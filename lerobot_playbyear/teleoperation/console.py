@@ -1,15 +1,18 @@
 """Where a person beside a robot sees what goes on, and presses keys: a window, a terminal, or nothing."""
 
+import contextlib
 import os
 import re
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any, Protocol
 
 import numpy as np
 
 from lerobot_playbyear.episodes.expert import ExpertError
+from lerobot_playbyear.episodes.terminal import READERS
 from lerobot_playbyear.teleoperation.keyboard import WindowKeys
 from lerobot_playbyear.teleoperation.status import Status
 from lerobot_playbyear.teleoperation.window import Window
@@ -64,11 +67,11 @@ class TerminalConsole:
         self._file = sys.stdin.fileno()
         self._termios: Any = termios
         self._before = termios.tcgetattr(self._file)
-        tty.setcbreak(self._file)
         self._note, self._shown = "", 0.0
         self._stop_read, self._stop_write = os.pipe()
-        self._thread = threading.Thread(target=self._read, name="terminal", daemon=True)
-        self._thread.start()
+        self._set_cbreak: Any = tty.setcbreak
+        self._begin()
+        READERS.append(self._given_up)
 
     def show(self, status: Status, picture: np.ndarray | None = None) -> None:
         now = time.monotonic()
@@ -92,12 +95,34 @@ class TerminalConsole:
     def close(self) -> None:
         if self.is_open:
             self.is_open = False
-            os.write(self._stop_write, b"x")
-            self._thread.join()
-            self._termios.tcsetattr(self._file, self._termios.TCSADRAIN, self._before)
+            READERS.remove(self._given_up)
+            self._end(self._termios.TCSADRAIN)
             for end in (self._stop_read, self._stop_write):
                 os.close(end)
             self._write("\n")
+
+    def _begin(self) -> None:
+        """Takes the terminal: keys without Enter, noted as they come."""
+        with contextlib.suppress(self._termios.error):  # it is gone, as the thread will note
+            self._set_cbreak(self._file)
+        self._thread = threading.Thread(target=self._read, name="terminal", daemon=True)
+        self._thread.start()
+
+    def _end(self, when: int) -> None:
+        """Gives the terminal back as it was found; `when` is of `termios.tcsetattr`."""
+        os.write(self._stop_write, b"x")
+        self._thread.join()
+        os.read(self._stop_read, 1)
+        with contextlib.suppress(self._termios.error):
+            self._termios.tcsetattr(self._file, when, self._before)
+
+    @contextlib.contextmanager
+    def _given_up(self) -> Iterator[None]:
+        self._end(self._termios.TCSAFLUSH)  # what was pressed before is no answer
+        try:
+            yield
+        finally:
+            self._begin()
 
     def _write(self, text: str) -> None:
         self._out.write(text)
