@@ -83,6 +83,9 @@ def test_a_person_who_is_called_cannot_be_kept():
     method = RobotGatedConfig(hands_back=False).make(SimpleNamespace())
     with pytest.raises(ExpertError, match=r"--method\.hands_back=false.*--expert\.type=scripted"):
         attempt({}, method.beside)
+    method = RobotGatedConfig(redo_failed=True).make(SimpleNamespace())
+    with pytest.raises(ExpertError, match=r"--method\.redo_failed=true.*--expert\.type=scripted"):
+        attempt({}, method.beside)
 
 
 def test_nobody_labels_what_somebody_else_does():

@@ -16,6 +16,7 @@ from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSo
 from lerobot_playbyear.dagger.methods import redo
 from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Redoing, Staying, shifted
 from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
+from lerobot_playbyear.dagger.methods.robot_gated import RobotGatedConfig
 from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
 from lerobot_playbyear.dagger.same_run import differences
 from lerobot_playbyear.datasets.errors import PlaybyearError
@@ -297,6 +298,52 @@ def test_a_robot_that_asks_resumes_exactly(tmp_path, monkeypatch):
         assert_ended_alike(folder, tmp_path / "calm")
 
 
+def succeeds_from_the_first_step_on(expert, until_told=True):
+    expert.is_success |= expert.n == 0
+
+
+@pytest.mark.parametrize("kills", [(3,), pytest.param((1, 2, 4, 5), marks=pytest.mark.slow)])
+def test_what_fails_although_the_robot_may_ask_is_shown_from_its_first_step(tmp_path, monkeypatch, kills):
+    """Of two attempts that the policy makes alone one fails, and is made good; a run that is killed on the way ends alike."""
+    monkeypatch.setattr(Quick, "take_over", succeeds_from_the_first_step_on)
+    run = (*QUICK, *GATED, "--method.redo_failed=true", "--episodes=2", "--warmup_episodes=1", "--episode_seed=9998")
+    dagger(tmp_path / "calm", *run)
+    attempts = metrics(tmp_path / "calm", "attempt")
+    assert [line["outcome"] for line in attempts[:3]] == ["unneeded", "failed", "kept"]
+    assert [line["seed"] for line in attempts[:3]] == [9998, 9999, 9999]
+    cost = {
+        "n_expert_steps": 8,
+        "n_takeovers": 1,
+        "n_switches": 1,
+        "autonomy": 0.0,
+        "person_seconds": 0.4,
+        "n_calls": 0,
+    }
+    assert {key: attempts[2][key] for key in cost} == cost
+    assert attempts[3]["seed"] == 10000
+    marks = column(corrections(tmp_path / "calm"), "intervention")
+    assert marks[:8].all()
+    assert not attempts[0]["n_asked_steps"]
+    for after in kills:
+        folder = tmp_path / f"killed{after}"
+        with monkeypatch.context() as patch:
+            cut_power(patch, folder_module.RunFolder, "commit", after)
+            with pytest.raises(PowerCut):
+                dagger(folder, *run)
+        command("--resume=true", f"--output_dir={folder / 'out'}")
+        assert_ended_alike(folder, tmp_path / "calm")
+
+
+def test_what_the_expert_fails_at_too_is_left(tmp_path):
+    options = ("--method.redo_failed=true", "--method.rollouts=3", "--episodes=1", "--episode_seed=9999")
+    dagger(tmp_path, *QUICK, *GATED, *options, "--max_attempts=30")
+    attempts = metrics(tmp_path, "attempt")
+    shown = [line["seed"] for line in attempts if line["autonomy"] == 0 and line["n_calls"] == 0]
+    assert shown[0] == 9999
+    assert [line["seed"] for line in attempts[:4]] == [9999, 9999, 10000, 10001]
+    assert not any(line["n_asked_steps"] for line in attempts[:4])  # three of them count as first attempts
+
+
 @pytest.mark.slow
 def test_a_robot_asks_once_its_first_attempts_are_made(tmp_path):
     dagger(tmp_path, *QUICK, *GATED, "--episodes=1", "--max_attempts=30")
@@ -395,6 +442,10 @@ def test_no_robot_is_asked_to_set_up_a_scene_twice():
     source, robot = DatasetSource("a/b"), SimpleNamespace(is_real_time=True)
     with pytest.raises(PlaybyearError, match="redo sets up the scene of every failure a second time"):
         DaggerConfig(source, source, env=robot, method=redo.RedoConfig(), eval_every=0).check()
+    asking = RobotGatedConfig(redo_failed=True)
+    with pytest.raises(PlaybyearError, match="robot_gated sets up the scene of every failure a second time"):
+        DaggerConfig(source, source, env=robot, method=asking, eval_every=0).check()
+    DaggerConfig(source, source, env=robot, method=RobotGatedConfig(), eval_every=0).check()
     DaggerConfig(source, source, env=robot, eval_every=0).check()
 
 

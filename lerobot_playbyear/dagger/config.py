@@ -201,7 +201,7 @@ class DaggerConfig:
         if self.method.needs_simulation and getattr(self.env, "is_real_time", False):
             raise InputError(
                 f"--method.type={self.method.type} sets up the scene of every failure a second time, which only a simulation "
-                "does alike. On a robot leave it out, or record further demonstrations with playbyear-record."
+                "does alike. On a robot leave it, or --method.redo_failed, out, or record demonstrations with playbyear-record."
             )
         if not math.isfinite(self.takeover_delay_s):
             raise InputError(f"--takeover_delay_s={self.takeover_delay_s}: give a number of seconds.")

@@ -71,12 +71,18 @@ class Remembering:
         return [self._encoded(store, number, None) for number in range(store.n_episodes)]
 
     def attempts(self, seeds: range) -> list[Played]:
-        """The attempts with these seeds, in their order, which is that of time."""
+        """The attempts with these seeds, in their order, which is that of time.
+
+        Those that the expert made from the first step on come first, as demonstrations: they show no state that the policy
+        brings the robot to.
+        """
         attempts = []
         for store in (self._tools.corrections.store, self._others.store):
             for number, seed in enumerate(_seeds(store) if store is not None else ()):
                 if store is not None and seed in seeds:
-                    attempts.append(self._encoded(store, number, seed))
+                    span = slice(store.starts[number], store.ends[number])
+                    is_shown = bool(frames_by_expert(store)[span].all())
+                    attempts.append(self._encoded(store, number, None if is_shown else seed))
         return sorted(attempts, key=lambda each: each.seed)
 
     def now(self) -> Tensor:

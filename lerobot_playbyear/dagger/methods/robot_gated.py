@@ -15,11 +15,17 @@ from lerobot_playbyear.dagger.methods.beside import Beside
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Episode, Observation
 from lerobot_playbyear.episodes.expert import Expert, ExpertError
+from lerobot_playbyear.episodes.play import Seconds
 
 if TYPE_CHECKING:
+    from lerobot_playbyear.dagger.attempt import Scene
     from lerobot_playbyear.dagger.config import DaggerConfig
     from lerobot_playbyear.dagger.methods.gate_model import Asking
     from lerobot_playbyear.dagger.methods.remembering import Remembering
+
+FAILED, SHOWN = "failed_seed", "n_shown"
+"""In the state of a run: the attempt that the expert makes good next, and how many of them it has."""
+_OF_A_DEMONSTRATION = {"n_asked_steps": 0, "n_calls": 0, "n_switches": 1}
 
 
 @MethodConfig.register_subclass("robot_gated")
@@ -38,6 +44,8 @@ class RobotGatedConfig(MethodConfig):
         gate_updates: Of each head and of each success value, in every round.
         discount: Of a success, per step; ThriftyDAgger: 0.9999.
         memory: Last attempts from which thresholds are set.
+        redo_failed: Where an attempt fails all the same, the scene is set up again, and the expert demonstrates the task in it
+            from the first step on, as with `--method.type=redo`.
     """
 
     expert_decides: ClassVar[bool] = False
@@ -52,6 +60,11 @@ class RobotGatedConfig(MethodConfig):
     gate_updates: int = 400
     discount: float = 0.9999
     memory: int = 20
+    redo_failed: bool = False
+
+    @property
+    def needs_simulation(self) -> bool:  # type: ignore[override]
+        return self.redo_failed
 
     def check(self) -> None:
         if not 0 < self.intervention_share < 1:
@@ -87,6 +100,11 @@ class RobotGated(Method):
                 "--method.hands_back=false is for experts that the robot can call and keep, and this one hands back as it "
                 "likes: leave the option out, and act to the end once you have taken over, or give --expert.type=scripted."
             )
+        if expert.decides and self._config.redo_failed:
+            raise ExpertError(
+                "--method.redo_failed=true is for experts that can be told to act from the first step on, and this one acts as "
+                "it likes: leave the option out, give --expert.type=scripted, or demonstrate failures with --method.type=redo."
+            )
         self._expert = Asked(expert, self)
         return self._expert
 
@@ -112,25 +130,32 @@ class RobotGated(Method):
         if self._remembered is not None:
             self._remembered.close()
 
+    def attempt(self, scene: "Scene", seed: int, random_seed: int, seconds: Seconds) -> Episode:
+        assert self._expert is not None
+        failed = self._tools.state.method.get(FAILED)
+        self._expert.demonstrates = failed is not None
+        return scene.attempt(seed if failed is None else failed, random_seed, seconds)
+
     def prepare(self) -> None:
         """Learns what is new and what is risky to the policy of this round, from what there was when the round began.
 
         Thresholds are set anew before every attempt, with what was met in those of this round too.
         """
-        if self.is_alone:
+        state = self._tools.state
+        if self.is_alone or FAILED in state.method:
             return
         from lerobot_playbyear.dagger.methods.gate_model import thresholds_for
 
-        state = self._tools.state
         if state.method.get("round") != state.round:
-            state.method = {"round": state.round, "next_seed": state.next_seed}
+            state.method |= {"round": state.round, "next_seed": state.next_seed}
             self._tools.folder.commit(state)
         start = time.perf_counter()
         begun = state.method["next_seed"]
         if self._fitted_round != state.round:
             self._fit(begun)
         for each in self._remembering.attempts(range(max([begun - 1, *self._traces]) + 1, state.next_seed)):
-            self._traces[each.seed] = self._model.trace(each)
+            if each.is_visited:
+                self._traces[each.seed] = self._model.trace(each)
         latest = [self._traces[seed] for seed in sorted(self._traces)[-self._config.memory :]]
         share, calm_share = self._config.intervention_share, self._config.calm_share
         self._thresholds = thresholds_for(latest, share, self._n_least, calm_share)
@@ -146,12 +171,15 @@ class RobotGated(Method):
         seed = int(np.random.SeedSequence([self.cfg.seed, 2, state.round]).generate_state(1)[0])
         played = self._remembering.demonstrations() + attempts
         self._model = GateModel(played, config.n_heads, config.gate_updates, config.discount, seed)
-        self._traces = {each.seed: self._model.trace(each) for each in attempts[-config.memory :]}
+        visited = [each for each in attempts if each.is_visited]
+        self._traces = {each.seed: self._model.trace(each) for each in visited[-config.memory :]}
         self._fitted_round = state.round
 
     @property
     def is_alone(self) -> bool:
-        return self._tools.state.attempts - self._tools.state.discarded < self._config.rollouts
+        state = self._tools.state
+        shown = state.method.get(SHOWN, 0)
+        return FAILED not in state.method and state.attempts - state.discarded - shown < self._config.rollouts
 
     def asking(self) -> "Asking | None":
         """A fresh gate for an attempt; None while the policy is alone."""
@@ -167,16 +195,33 @@ class RobotGated(Method):
         return float(self._model.novelty(memory)[0]), float(self._model.risk(memory, action)[0])
 
     def note(self, episode: Episode, outcome: str) -> None:
+        assert self._expert is not None
+        if self._expert.demonstrates:
+            self._note_shown()
+            return
         if outcome in ("failed", "unneeded"):
             self._remembering.keep(episode)
+        if outcome == "failed" and self._config.redo_failed:
+            self._tools.state.method[FAILED] = episode.seed
+
+    def _note_shown(self) -> None:
+        """The failed attempt was made good, or the expert failed at it, too: another scene follows."""
+        method = self._tools.state.method
+        del method[FAILED]
+        method[SHOWN] = method.get(SHOWN, 0) + 1
 
     def figures(self) -> Mapping[str, Any]:
         assert self._expert is not None
         seconds, self._seconds = self._seconds, 0.0
+        if self._expert.demonstrates:
+            return _OF_A_DEMONSTRATION
         return {"n_asked_steps": self._expert.n_asked, "n_calls": self._expert.n_calls, "gate_s": round(seconds, 4)}
 
     def recovered_figures(self, cost: Mapping[str, Any]) -> Mapping[str, Any]:
         assert self._expert is not None
+        if FAILED in self._tools.state.method:
+            self._note_shown()
+            return _OF_A_DEMONSTRATION
         if self._expert.decides:
             return {}  # a person who is called may come or not: what was asked is lost
         return {"n_asked_steps": cost["n_expert_steps"], "n_calls": cost["n_takeovers"]}
@@ -191,19 +236,26 @@ class Asked(Beside):
 
     Attributes:
         n_asked, n_calls: Steps of the attempt in which the robot asked, and how often it began to.
+        demonstrates: Set it before the attempt: the expert acts all the time.
     """
 
     def __init__(self, expert: Expert, method: RobotGated) -> None:
         super().__init__(expert)
         self._method = method
         self.n_asked = self.n_calls = 0
+        self.demonstrates = False
 
     def reset(self, env: gym.Env) -> None:
         super().reset(env)
-        self._asking, self._asks = self._method.asking(), False
+        self._asking, self._asks = None if self.demonstrates else self._method.asking(), False
         self.n_asked = self.n_calls = 0
+        if self.demonstrates:
+            self.expert.take_over()
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        if self.demonstrates:
+            self.expert.wants_control(observation, policy_action)  # it looks
+            return True
         asked_before = self._asks
         if self._asking is not None:
             self._asks = self._asking.asks(*self._method.state_of_mind(policy_action))
