@@ -4,7 +4,7 @@ from argparse import Namespace
 from collections.abc import Sequence
 
 _ASKING = ("--method.type=robot_gated", "--method.intervention_share=0.45")
-"""The gates of the simulator take 32 to 50 % of the steps from policies of five demonstrations."""
+"""The gates of the simulator take 21 to 50 % of the steps from policies of five demonstrations."""
 METHODS: dict[str, tuple[str, ...]] = {
     "skip": (),
     "hg_dagger": ("--skip_s=0",),

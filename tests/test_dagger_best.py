@@ -3,7 +3,7 @@
 import shutil
 
 import pytest
-from dagger_factory import QUICK, command, dagger, state
+from dagger_factory import QUICK, command, dagger, metrics, state
 from test_dagger_resume import PowerCut
 
 from lerobot_playbyear.dagger.folder import RunFolder
@@ -86,6 +86,13 @@ def test_a_run_that_has_ended_is_evaluated_again_on_more_episodes_and_on_as_many
         assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
     command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=1", "--eval_every=0")
     assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
+
+
+def test_weights_that_stay_are_evaluated_once(tmp_path, gives):
+    gives += [30]
+    dagger(tmp_path, *RUN, "--episodes=3", "--updates_per_episode=0")
+    assert gives == []
+    assert [line["pc_success"] for line in metrics(tmp_path, "eval")] == [30]
 
 
 def test_the_best_of_other_episodes_is_kept_when_a_run_that_has_ended_is_evaluated_again(tmp_path, gives):

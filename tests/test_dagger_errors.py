@@ -13,7 +13,9 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, attempt
+from lerobot_playbyear.dagger.checks import check_places
 from lerobot_playbyear.dagger.config import DaggerEvalConfig, DatasetSource, with_saved_options
+from lerobot_playbyear.dagger.folder import RunFolder
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes import frames, saving
 from lerobot_playbyear.scripts import dagger as dagger_script
@@ -126,7 +128,54 @@ def test_an_environment_without_a_gate(tmp_path, monkeypatch):
         dagger(tmp_path, "--method.type=redo")
 
 
+def test_attempts_are_not_written_among_the_demonstrations(tmp_path):
+    demos = base_folder() / "demos"
+    (tmp_path / "link").symlink_to(demos)
+    before = {path: path.stat().st_mtime_ns for path in demos.rglob("*")}
+    for root in (demos, tmp_path / "link"):
+        with pytest.raises(PlaybyearError, match="--demos and --interventions are the same dataset"):
+            dagger(tmp_path, *QUICK, f"--interventions.root={root}")
+    assert {path: path.stat().st_mtime_ns for path in demos.rglob("*")} == before
+    assert not (tmp_path / "out").exists()
+
+
+def test_no_script_acts_on_a_robot_and_none_is_connected_to(tmp_path, monkeypatch):
+    from robot_factory import joint_config
+
+    from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
+    from lerobot_playbyear.robots.arm import Arm
+
+    monkeypatch.setattr(Arm, "connect", lambda self: pytest.fail("it was connected to"))
+    robot, source = joint_config(), DatasetSource("a/b")
+    with pytest.raises(PlaybyearError, match=r"no script can demonstrate on a robot; give --expert\.type=teleop"):
+        record(RecordConfig(robot, RecordDatasetConfig("a/b", str(tmp_path / "data")), num_workers=0))
+    cfg = DaggerConfig(source, DatasetSource("a/c"), env=robot, eval_every=0)
+    with pytest.raises(PlaybyearError, match=r"no script can correct a policy on a robot; give --expert\.type=teleop"):
+        check_places(cfg)
+
+
 # Output folders
+
+
+def test_only_one_run_works_in_a_folder(tmp_path):
+    folder = RunFolder(tmp_path / "out")
+    lock = folder.lock()
+    with pytest.raises(PlaybyearError, match="another playbyear-dagger is at work there"):
+        dagger(tmp_path, *QUICK, "--episodes=1")
+    assert folder.claim(resume=False) is None
+    lock.release()
+    assert not (tmp_path / "out").exists()
+    folder.lock().release()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_told_before_anything_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("lerobot_playbyear.dagger.run.check_dataset_files", lambda *_: pytest.fail("it was read"))
+    (tmp_path / "file").write_text("mine")
+    for place in ("file", "file/below"):
+        with pytest.raises(PlaybyearError, match=f"--output_dir=.*{place} cannot be written"):
+            dagger(tmp_path, *QUICK, f"--output_dir={tmp_path / place}")
+    assert (tmp_path / "file").read_text() == "mine"
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ import pytest
 import torch
 from dagger_factory import (
     QUICK,
+    Quick,
     arguments,
     base_folder,
     column,
@@ -29,6 +30,7 @@ from safetensors.torch import load_file
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.training.parts import TrainingParts
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -114,6 +116,19 @@ def test_one_attempt_that_was_saved_and_not_counted_is_all_that_was_wanted(tmp_p
     assert state(tmp_path / "cut")["kept"] == 0 < len(seeds(tmp_path / "cut"))
     command("--resume=true", f"--output_dir={tmp_path / 'cut/out'}")
     assert_ended_alike(tmp_path / "cut", tmp_path / "calm")
+
+
+def test_attempts_in_vain_count_on_after_a_resume(tmp_path, monkeypatch):
+    monkeypatch.setattr(Quick, "verdict", lambda self: Verdict.FAILURE if self.n >= self.n_steps else None)
+    run = (*QUICK, "--episodes=1", "--max_attempts=3")
+    with monkeypatch.context() as patch:
+        cut_power(patch, folder_module.RunFolder, "commit", 3)  # the third attempt does not count
+        with pytest.raises(PowerCut):
+            dagger(tmp_path, *run)
+    for n in (3, 6):  # who goes on with a run that has given up wants others
+        with pytest.raises(PlaybyearError, match="3 of 3 attempts in a row failed"):
+            command("--resume=true", f"--output_dir={tmp_path / 'out'}")
+        assert state(tmp_path)["failed"] == n
 
 
 def test_what_a_run_could_not_write_at_its_beginning_does_not_block_it(tmp_path):

@@ -218,5 +218,9 @@ def test_curves_and_their_table(tmp_path, monkeypatch, capsys):
     assert [row[1:5] for row in rows] == [["92", "20", "120", "120"], ["60", "20", "-", "-"]]
     assert picture.stat().st_size > 1000
     assert curves.curves_of(curves.read_lines(tmp_path / "hg"))["success"] == ([0, 120], [40, 92])
+    for place in ("missing/curves.png", "curves.poem"):
+        monkeypatch.setattr(sys, "argv", ["curves", *folders, f"--output={tmp_path / place}"])
+        with pytest.raises(SystemExit, match=f"{place} cannot be written"):
+            curves.main()
     with pytest.raises(InputError, match=r"there is no metrics\.jsonl"):
         curves.read_lines(tmp_path)

@@ -266,6 +266,17 @@ def teleop(env, leader, **options):
     return expert, expert.teleop
 
 
+def test_a_key_cannot_be_held_in_a_terminal_and_its_name_may_be_a_capital():
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    with robot_env(joint_config(), ScriptedConsole()) as env:
+        with pytest.raises(ExpertError, match=r"--expert\.takeover=hold: a terminal does not say when a key is let go"):
+            teleop(env, JointLeaderConfig(), takeover="hold")
+        expert, _ = teleop(env, JointLeaderConfig(), takeover_key="Space")
+        assert expert.override == "space"
+        expert.close()
+
+
 @pytest.mark.parametrize("has_motors", [False, True])
 def test_leader_and_follower_meet_before_a_person_takes_over(has_motors):
     from lerobot_robot_playbyear_sim import JointLeaderConfig
@@ -637,8 +648,14 @@ def test_after_a_pause_the_arms_meet_again_and_the_frame_is_that_of_then():
 def test_a_leader_that_does_not_answer_is_asked_about(first):
     from lerobot_robot_playbyear_sim import JointLeaderConfig
 
-    console = ScriptedConsole(lambda s: "p" if "Set the scene" in s.note else "s" if "leader" in s.note else None)
-    with robot_env(joint_config(episode_s=4.0), console) as env:
+    def press(status):
+        if "P tries again" in status.note:  # before the attempt, where nothing is to be judged
+            del leader.get_action
+            return "p"
+        return "p" if "Set the scene" in status.note else "s" if "leader" in status.note else None
+
+    console = ScriptedConsole(press)
+    with robot_env(joint_config(episode_s=1.0), console) as env:
         expert, leader = teleop(env, JointLeaderConfig())
 
         def keys(n):
@@ -647,9 +664,10 @@ def test_a_leader_that_does_not_answer_is_asked_about(first):
 
         keys(0)
         episode = play(env, acting(keys), seed=0, expert=expert)
-        del leader.get_action
+        vars(leader).pop("get_action", None)
         expert.close()
-    assert episode.success
+    assert episode.success is (first > 0)
+    assert (len(episode) == 20) is (first == 0)  # it goes on where the leader came back
     assert any("The leader does not answer: no status packet" in note for note in console.notes)
 
 

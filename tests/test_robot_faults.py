@@ -200,3 +200,115 @@ def test_interrupting_the_program_makes_the_arm_hold_and_lets_go():
     finally:
         child.kill()
     assert told.strip() == "True False", errors
+
+
+class Bus:
+    """Motors behind a port, as LeRobot closes them: first it takes the torque off, which a port that is gone refuses."""
+
+    def __init__(self) -> None:
+        self.is_open = self.is_gone = False
+        self.closed_by_force = 0
+
+    def connect(self) -> None:
+        if self.is_gone:
+            raise ConnectionError("no such port")
+        self.is_open = True
+
+    def disconnect(self, disable_torque: bool = True) -> None:
+        if disable_torque and self.is_gone:
+            raise ConnectionError("there is no status packet")
+        self.closed_by_force += not disable_torque
+        self.is_open = False
+
+
+def through_a_bus(device: Any, monkeypatch: Any) -> Bus:
+    """Lets a device be as connected as its motors are."""
+    bus = device.bus = Bus()
+    bus.is_open = True
+    answer = device.get_observation if hasattr(device, "get_observation") else device.get_action
+
+    def answers() -> Any:
+        if bus.is_gone or not bus.is_open:
+            raise ConnectionError("there is no status packet")
+        return answer()
+
+    name = answer.__name__
+    monkeypatch.setattr(device, name, answers)
+    monkeypatch.setattr(type(device), "is_connected", property(lambda self: self.bus.is_open))
+    monkeypatch.setattr(type(device), "connect", lambda self, calibrate=True: self.bus.connect())
+    monkeypatch.setattr(type(device), "disconnect", lambda self: self.bus.disconnect())
+    return bus
+
+
+def test_an_arm_whose_cable_was_pulled_is_connected_again(monkeypatch):
+    asked: list[str] = []
+
+    def press(status: Any) -> str | None:
+        if "P tries again" in status.note:
+            asked.append(status.note)
+            bus.is_gone = len(asked) < 2  # it is plugged in before the second press
+            return "p"
+        return "p" if "Set the scene" in status.note else "r" if "throws the attempt away" in status.note else None
+
+    with robot_env(joint_config(), ScriptedConsole(press)) as env:
+        bus = through_a_bus(env.arm.robot, monkeypatch)
+        env.reset(seed=0)
+        bus.is_gone = True
+        assert env.step(np.zeros(3, np.float32))[3]
+        env.reset(seed=1)
+        assert not env.step(np.zeros(3, np.float32))[3]
+        assert len(asked) == 2
+        assert bus.closed_by_force
+
+
+def test_a_leader_whose_cable_was_pulled_is_connected_again(monkeypatch):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+    from test_robot_env import acting, teleop
+
+    from lerobot_playbyear.episodes.play import play
+
+    asked: list[str] = []
+
+    def press(status: Any) -> str | None:
+        if "P tries again" in status.note:
+            asked.append(status.note)
+            bus.is_gone = len(asked) < 2
+            return "p"
+        return "p" if "Set the scene" in status.note else "r" if "throws the attempt away" in status.note else None
+
+    def pulls(n: int) -> None:
+        bus.is_gone |= n == 3
+
+    with robot_env(joint_config(episode_s=0.5), ScriptedConsole(press)) as env:
+        expert, leader = teleop(env, JointLeaderConfig())
+        bus = through_a_bus(leader, monkeypatch)
+        assert len(play(env, acting(pulls), seed=0, expert=expert)) < 10
+        assert len(play(env, acting(lambda n: None), seed=1, expert=expert)) == 10
+        assert len(asked) == 2
+        assert "Look at its cable" in asked[0]
+        bus.is_gone = True
+        expert.close()  # says nothing
+        assert bus.closed_by_force
+
+
+def test_a_leader_that_fails_while_the_arms_meet_is_asked_about(monkeypatch):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+    from test_robot_env import acting, teleop
+
+    from lerobot_playbyear.episodes.play import play
+
+    console = ScriptedConsole(
+        lambda s: "p" if "Set the scene" in s.note else "q" if "throws the attempt away" in s.note else None
+    )
+    with robot_env(joint_config(episode_s=2.0), console) as env:
+        expert, leader = teleop(env, JointLeaderConfig(has_motors=True))
+
+        def fails(feedback: Any) -> None:
+            raise ConnectionError("there is no status packet")
+
+        monkeypatch.setattr(leader, "send_feedback", fails)
+        episode = play(env, acting(lambda n: console.press("space") if n == 3 else None), seed=0, expert=expert)
+        expert.close()
+    assert not episode.success
+    assert len(episode) < 6
+    assert any("The leader does not answer: there is no status packet" in note for note in console.notes)

@@ -591,6 +591,10 @@ def test_the_keyboard_of_the_window_is_the_default():
         ({"speed": 0.0}, "speed=0"),
         ({"gripper_cooldown_s": -1.0}, "gripper_cooldown_s=-1"),
         ({"steps_per_second": 0.0}, "steps_per_second=0"),
+        ({"takeover_key": "f1"}, "takeover_key='f1': give a letter, a digit, or one of space"),
+        ({"takeover_key": " "}, "takeover_key=' ': give"),
+        ({"takeover_key": "P"}, "takeover_key='P' means something else"),
+        ({"takeover_key": "e"}, "takeover_key='e' means something else"),
     ],
 )
 def test_bad_options_are_refused_before_a_window_opens(options, message):

@@ -1,5 +1,7 @@
 """A person's terminal: what is pressed, and questions that are asked there meanwhile."""
 
+import contextlib
+import io
 import os
 import pty
 import select
@@ -12,6 +14,7 @@ from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.episodes.saving import save_or_ask
 from lerobot_playbyear.episodes.terminal import READERS
 from lerobot_playbyear.teleoperation.console import TerminalConsole
+from lerobot_playbyear.teleoperation.status import Status
 
 
 @pytest.fixture
@@ -69,6 +72,17 @@ def test_an_answer_about_a_full_disk_is_no_key(terminal, monkeypatch):
     waits_for(lambda: pressed.count("b") == 2)
     console.close()
     assert not READERS
+
+
+def test_a_console_that_is_made_during_an_evaluation_is_seen(terminal, monkeypatch):
+    """There standard error is silenced, for LeRobot's own progress bars."""
+    seen = io.StringIO()
+    monkeypatch.setattr("sys.__stderr__", seen)
+    with contextlib.redirect_stderr(io.StringIO()):
+        console = TerminalConsole()
+        console.show(Status(note="Press P to begin"))
+    console.close()
+    assert "Press P to begin" in seen.getvalue()
 
 
 def test_a_line_can_be_edited_while_a_question_is_asked(terminal, monkeypatch):

@@ -15,10 +15,27 @@ from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.expert import Expert, ExpertError
 from lerobot_playbyear.episodes.frames import INTERVENTION
+from lerobot_playbyear.episodes.scripted_expert import NO_SCRIPT, ScriptedExpertConfig
 from lerobot_playbyear.training.parts import TrainingParts, check_dataset_suits
 from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
 
 Features = Mapping[str, Mapping[str, Any]]
+
+
+def check_places(cfg: DaggerConfig) -> None:
+    """Refuse what would be found out only once a robot has moved, or once data were mixed.
+
+    Raises:
+        InputError: Attempts would be written among the demonstrations, or a script would have to act on a robot.
+    """
+    demos, interventions = (source.folder.resolve() for source in (cfg.demos, cfg.interventions))
+    if cfg.is_online and demos == interventions:
+        raise InputError(
+            f"--demos and --interventions are the same dataset, {demos}: attempts would be written among the demonstrations, "
+            "with what the policy did wrong in them. Give --interventions.repo_id and --interventions.root of their own."
+        )
+    if cfg.is_online and getattr(cfg.env, "is_real_time", False) and isinstance(cfg.expert, ScriptedExpertConfig):
+        raise InputError(NO_SCRIPT.format("correct a policy on"))
 
 
 def check_dataset(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]) -> None:

@@ -64,7 +64,7 @@ def draw_curves(runs: Mapping[str, Lines], path: Path) -> None:
         path: The picture; its ending says of which format.
 
     Raises:
-        InputError: matplotlib is not installed.
+        InputError: matplotlib is not installed, or the picture cannot be written.
     """
     try:
         from matplotlib.figure import Figure
@@ -79,7 +79,12 @@ def draw_curves(runs: Mapping[str, Lines], path: Path) -> None:
     panels[0].set_ylim(0, 100)
     panels[1].set_ylim(0, 100)
     panels[0].legend()
-    figure.savefig(path)
+    try:
+        figure.savefig(path)
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"--output={path} cannot be written: {error}. Give a folder that is there, and an ending such as .png."
+        ) from error
 
 
 def table_of(runs: Mapping[str, Lines]) -> str:

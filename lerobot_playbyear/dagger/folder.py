@@ -5,6 +5,7 @@ it. A checkpoint is written beside its place, put on the disk and renamed before
 removed when the run goes on.
 """
 
+import contextlib
 import json
 import os
 import shutil
@@ -14,11 +15,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
 from lerobot_playbyear.training.checkpoints import BEST_LINK
@@ -27,6 +30,7 @@ STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""
 
 _PARTIAL = ".partial"
+_LOCK = ".lock"
 
 
 @dataclass
@@ -44,6 +48,8 @@ class RunState:
             it; ended by the expert as void.
         next_seed: Of the next attempt.
         evaluated_round: The round after which the last evaluation took place; -1 for none.
+        evaluated_step: Updates that there had been; -1 for none, and where an older version evaluated.
+        fruitless: What became of the attempts since the last that was kept, but for those in which nobody could help.
         evaluated_episodes: How many it had; None before, and where an older version evaluated.
         success: What it gave [%].
         best: The best evaluation on the present seeds: its `success` [%], its `seeds` (first, number), and the `checkpoint`
@@ -66,13 +72,46 @@ class RunState:
     discarded: int = 0
     next_seed: int = 0
     evaluated_round: int = -1
+    evaluated_step: int = -1
     evaluated_episodes: int | None = None
     success: float | None = None
     best: dict[str, Any] = field(default_factory=dict)
     checkpoint: str | None = None
     milestones: list[str] = field(default_factory=list)
     method: dict[str, Any] = field(default_factory=dict)
+    fruitless: list[str] = field(default_factory=list)
     wandb_run_id: str | None = None
+
+
+class RunLock:
+    """Held from its making until `release`, or the end of the process, however it ends.
+
+    Args:
+        folder: The output folder; made where it is missing.
+
+    Raises:
+        InputError: Another process holds it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(folder / _LOCK, timeout=0, thread_local=False)
+        try:
+            self._lock.acquire()
+        except Timeout as error:
+            raise InputError(
+                f"--output_dir={folder}: another playbyear-dagger is at work there. Wait until it has ended, or choose another "
+                "folder."
+            ) from error
+
+    def release(self) -> None:
+        """Lets go; of a run that never began nothing is left."""
+        self._lock.release()
+        folder = Path(self._lock.lock_file).parent
+        with contextlib.suppress(OSError):
+            if [path.name for path in folder.iterdir()] in ([], [_LOCK]):
+                Path(self._lock.lock_file).unlink(missing_ok=True)
+                folder.rmdir()
 
 
 class RunFolder:
@@ -85,6 +124,15 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self.checkpoints = self.path / CHECKPOINTS_DIR
+
+    def lock(self) -> "RunLock":
+        """Makes this process the only one that works in the folder.
+
+        Raises:
+            InputError: It cannot be written, or another process works in it.
+        """
+        check_can_be_made(self.path, f"--output_dir={self.path}")
+        return RunLock(self.path)
 
     def claim(self, resume: bool) -> RunState | None:
         """Find out whether there is a run to go on with.
@@ -99,8 +147,8 @@ class RunFolder:
             InputError: The folder holds a run and `resume` is off, or it holds something else.
         """
         is_run = (self.path / CONFIG_NAME).is_file()
-        begun = CONFIG_NAME + _PARTIAL  # of a run that could not write even its options
-        if not self.path.exists() or {path.name for path in self.path.iterdir()} <= {begun}:
+        begun = {_LOCK, CONFIG_NAME + _PARTIAL}  # of a run that could not write even its options
+        if not self.path.exists() or {path.name for path in self.path.iterdir()} <= begun:
             return None
         if not is_run:
             raise InputError(

@@ -110,6 +110,7 @@ class Loop:
             )
         figures = self.corrections.last()
         state.attempts, state.kept, state.next_seed = state.attempts + 1, state.kept + 1, figures["seed"] + 1
+        state.fruitless.clear()
         cost = self._cost(self.corrections.last_by_expert())
         cost |= self.method.recovered_figures(cost)
         success = self.corrections.last_success()
@@ -119,13 +120,15 @@ class Loop:
 
     def _collect(self, seconds: Seconds) -> bool:
         """Attempts until one is kept. Returns False when there is none among `max_attempts` in which the expert might act."""
-        outcomes: list[str] = []
+        outcomes = self.state.fruitless
         while len(outcomes) < self.cfg.max_attempts:
             self.report.doing("acting")
             spent, is_alone = Seconds(), self.method.is_alone
             episode = self._attempt(spent)
             outcome = self.method.outcome(episode)
-            if not is_alone or outcome == "discarded":
+            if outcome == "kept":
+                outcomes.clear()
+            elif not is_alone or outcome == "discarded":
                 outcomes.append(outcome)
             if outcome == "kept":
                 with spent.of("episode_saving"):
@@ -141,6 +144,9 @@ class Loop:
                 self.reach.warn(by_expert, f"the corrections of attempt {self.state.attempts}")
                 return True
         n, n_failed, n_unneeded = len(outcomes), outcomes.count("failed"), outcomes.count("unneeded")
+        n_discarded = outcomes.count("discarded")
+        outcomes.clear()  # who goes on with the run wants others
+        self.folder.commit(self.state)
         if n_failed > n / 2:
             raise InputError(
                 f"{n_failed} of {n} attempts in a row failed in spite of the expert: it cannot rescue this policy. Begin with "
@@ -151,7 +157,7 @@ class Loop:
         else:
             logging.info(
                 f"None of {n} attempts in a row could be kept: {n_unneeded} needed no help, {n_failed} failed, and "
-                f"{outcomes.count('discarded')} were thrown away."
+                f"{n_discarded} were thrown away."
             )
         return False
 
@@ -249,14 +255,16 @@ class Loop:
         cfg, state = self.cfg, self.state
         wanted = cfg.eval_every > 0 and (is_last or is_due(state.round, cfg.eval_every))
         is_other = is_last and state.evaluated_episodes not in (None, cfg.eval.n_episodes)
-        if cfg.env is None or not wanted or (state.evaluated_round == state.round and not is_other):
+        is_same = state.evaluated_round == state.round or state.evaluated_step == state.step
+        if cfg.env is None or not wanted or (is_same and not is_other):
             return
         self.report.doing("evaluating")
         start = time.perf_counter()
         set_seed(self._random_seed(_EVALUATION, state.round))  # of policies that act by chance
         with contextlib.redirect_stderr(io.StringIO()):  # LeRobot's own progress bars; ours goes on
             info = self.parts.evaluate(self.training, cfg.eval_videos)
-        state.evaluated_round, state.evaluated_episodes = state.round, cfg.eval.n_episodes
+        state.evaluated_round, state.evaluated_step = state.round, state.step
+        state.evaluated_episodes = cfg.eval.n_episodes
         state.success = float(info["overall"]["pc_success"])
         seeds, is_trained = [cfg.seed, cfg.eval.n_episodes], state.checkpoint is not None or not cfg.new_weights
         is_best = state.best.get("seeds") != seeds or state.success >= state.best["success"]  # of equal ones the last

@@ -20,6 +20,7 @@ from lerobot_playbyear.dagger.checks import (
     check_alike,
     check_dataset,
     check_expert,
+    check_places,
 )
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
@@ -71,7 +72,10 @@ def run_dagger(cfg: DaggerConfig) -> Path:
     with ExitStack() as stack:
         with errors_of_input(FileNotFoundError, MemoryError):
             cfg.check()
+            check_places(cfg)
             folder = RunFolder(cfg.output_dir)
+            if is_first_process():
+                stack.callback(folder.lock().release)
             state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
             if not is_first_process():
                 help_to_learn(cfg, _training_options(cfg, folder, state))

@@ -70,7 +70,8 @@ def play(
     Args:
         env: The environment; `info["is_success"]` is there after every step, and `_max_episode_steps`, if it has that,
             limits their number. `info["verdict"]`, if it is there, ends the episode as a `Verdict`'s value says, and after
-            `info["was_stopped"]` the last action, which was not carried out, is the one before it.
+            `info["was_stopped"]` the last action, which was not carried out, is the one before it, and so is who chose it;
+            an episode of which no action was carried out is void.
         actor: Who acts.
         seed, options: For `env.reset`.
         expert: Who may take over.
@@ -90,7 +91,9 @@ def play(
     limit = env.get_wrapper_attr("_max_episode_steps") if env.has_wrapper_attr("_max_episode_steps") else np.inf
     observations = [observation] if sink is None else []
     actions: list[np.ndarray] = []
-    rewards, successes, interventions = [], [], []
+    rewards: list[float] = []
+    successes: list[bool] = []
+    interventions: list[bool] = []
     watched = [watch()] if watch else []
     verdict, ended = None, False
     while not ended:
@@ -106,9 +109,10 @@ def play(
             if expert is not None:
                 verdict = verdict or expert.verdict()
         if info.get("was_stopped") and actions:
-            action = actions[-1]  # this one was not carried out
+            action, by_expert = actions[-1], interventions[-1]  # this one was not carried out
         elif info.get("was_stopped"):
             action = np.nan_to_num(action, nan=0.0, posinf=0.0, neginf=0.0)
+            verdict = Verdict.DISCARD  # nothing was done
         seen, observation = observation, after
         actions.append(action)
         rewards.append(float(reward))

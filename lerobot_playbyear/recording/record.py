@@ -19,7 +19,7 @@ from lerobot_playbyear.episodes.expert import ExpertConfig
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
-from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
+from lerobot_playbyear.episodes.scripted_expert import NO_SCRIPT, ScriptedExpertConfig
 from lerobot_playbyear.hub.datasets import check_name, push_dataset
 from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
 from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
@@ -183,6 +183,8 @@ def _check_options(cfg: RecordConfig) -> None:
         raise InputError(
             f"--expert.type={cfg.expert.type} corrects a policy and does not demonstrate: give scripted or teleop."
         )
+    if getattr(cfg.env, "is_real_time", False) and isinstance(cfg.expert, ScriptedExpertConfig):
+        raise InputError(NO_SCRIPT.format("demonstrate on"))
     if getattr(cfg.expert, "person", False):
         raise InputError("--expert.person=true: it corrects a policy, and does not demonstrate; leave it out.")
     if cfg.dataset.push_to_hub:

@@ -2,7 +2,6 @@
 
 import copy
 import inspect
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -10,7 +9,8 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 
-from lerobot_playbyear.robots.parts import RobotError, close_parts, names_of
+from lerobot_playbyear.robots.parts import RobotError, names_of
+from lerobot_playbyear.teleoperation.leader import close_parts, let_go
 
 _VELOCITY = (".vel", "_vel")
 _MOVE_FPS, _PIECE_S = 30, 0.2
@@ -100,11 +100,7 @@ class Arm:
     def disconnect(self) -> None:
         """Lets go of it; errors are logged."""
         with self._lock:
-            try:
-                if self.robot.is_connected:
-                    self.robot.disconnect()
-            except Exception as error:
-                logging.warning(f"The robot {self.robot.name} could not be disconnected: {error}")
+            let_go(self.robot)
 
     def begin_episode(self, seed: int | None) -> None:
         """Of a simulated robot that has `reset_episode(seed)`: sets its scene up, as a person does with a real one.

@@ -57,11 +57,3 @@ def reconnect_cameras(robot: Robot) -> None:
                 camera.disconnect()
             with contextlib.suppress(Exception):
                 camera.connect()
-
-
-def close_parts(robot: Robot) -> None:
-    """Closes cameras and motors one by one: a robot that could not be connected as a whole leaves open what it had opened."""
-    parts: list[Any] = [*getattr(robot, "cameras", {}).values(), getattr(robot, "bus", None)]
-    for part in parts:
-        with contextlib.suppress(Exception):  # most were never opened
-            part.disconnect()

@@ -21,7 +21,7 @@ What is trained on
   --store.device=null          cpu or cuda; else cuda where there is room
 
 What is trained
-  --preset=null                named defaults: cpu (two cores, within the hour), paper (a GPU)
+  --preset=null                named defaults: cpu (two cores), gpu (5 minutes on an H200), paper
   --policy.type=...            playbyear, or any other policy that LeRobot knows
   --policy.path=...            go on from a checkpoint instead, a folder or a name on the Hub
   --policy.device=null         cuda, mps or cpu; else the best there is

@@ -16,11 +16,12 @@ from lerobot_playbyear.teleoperation.actions import BASE_DIRECTIONS, DELTAS, KNO
 from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import OVERRIDE, TAKEN
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
-from lerobot_playbyear.teleoperation.keyboard import KeyboardWindowTeleop, KeyboardWindowTeleopConfig
+from lerobot_playbyear.teleoperation.keyboard import MOVES, KeyboardWindowTeleop, KeyboardWindowTeleopConfig
 from lerobot_playbyear.teleoperation.levels import microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
 from lerobot_playbyear.teleoperation.window import Window
+from lerobot_playbyear.teleoperation.window_process import PRINTLESS
 
 import_devices(teleoperators)  # registers --expert.teleop.type=so101_leader and the others
 
@@ -84,6 +85,10 @@ class TeleopExpertConfig(ExpertConfig):
             known = BASE_DIRECTIONS if set(DELTAS) <= set(names or ()) else KNOWN_DIRECTIONS
             directions = self.directions or known.get(kind, "x,y,z")
             mapping = ActionMapping(_features(teleop), env.action_space, directions, self.speed, names)
+            if self.takeover == "hold" and not window.has_key_releases:
+                raise ExpertError(
+                    "--expert.takeover=hold: a terminal does not say when a key is let go; give toggle or auto."
+                )
             toggles = self.takeover == "toggle" or (self.takeover == "auto" and not window.has_key_releases)
             expert = TeleopExpert(
                 window=window,
@@ -92,17 +97,22 @@ class TeleopExpertConfig(ExpertConfig):
                 gripper=Gripper(round(self.gripper_cooldown_s * env_fps)),
                 pace=Pace(fps, waits=robot is None),
                 speaker=self._make_speaker(env, fps, env_fps),
-                keys=key_help(kind, mapping, demonstrates, toggles, self.takeover_key),
+                keys=key_help(kind, mapping, demonstrates, toggles, self._key),
                 begins_paused=self.begin_paused and robot is None,  # a robot's attempt begins when the person is ready
                 demonstrates=demonstrates,
                 toggles=toggles,
-                override=self.takeover_key,
+                override=self._key,
                 robot=robot,
             )
             stack.pop_all()
         if robot is not None:
             robot.person.has_expert = True
         return expert
+
+    @property
+    def _key(self) -> str:
+        """As windows and terminals name it."""
+        return self.takeover_key.lower()
 
     def _check(self, env: gym.Env) -> None:
         if env.render_mode != "rgb_array":
@@ -116,10 +126,15 @@ class TeleopExpertConfig(ExpertConfig):
             raise ExpertError(f"--expert.gripper_cooldown_s={self.gripper_cooldown_s}: give 0 or more seconds.")
         if self.steps_per_second is not None and not self.steps_per_second > 0:
             raise ExpertError(f"--expert.steps_per_second={self.steps_per_second}: give a number above 0.")
-        if self.takeover_key in TAKEN or not self.takeover_key:
+        if not (self._key in PRINTLESS or (len(self._key) == 1 and self._key.isprintable() and self._key != " ")):
+            raise ExpertError(
+                f"--expert.takeover_key={self.takeover_key!r}: give a letter, a digit, or one of {', '.join(PRINTLESS)}."
+            )
+        moves = MOVES if isinstance(self.teleop, KeyboardWindowTeleopConfig) else ()
+        if self._key in TAKEN or self._key in moves:
             raise ExpertError(
                 f"--expert.takeover_key={self.takeover_key!r} means something else already: give another one than "
-                f"{', '.join(sorted(TAKEN))}, such as space or b."
+                f"{', '.join(sorted({*TAKEN, *moves}))}, such as space or b."
             )
         if self.takeover not in ("auto", "hold", "toggle"):
             raise ExpertError(f"--expert.takeover={self.takeover!r}: give auto, hold or toggle.")

@@ -63,7 +63,10 @@ class TerminalConsole:
         self.keys = WindowKeys()
         self.keys.has_focus = True
         self.is_open = True
-        self._out = sys.stderr  # also while somebody silences it
+        is_silenced = not sys.stderr.isatty() and sys.__stderr__ is not None  # as during an evaluation
+        self._out = (
+            sys.__stderr__ if is_silenced and sys.__stderr__ is not None else sys.stderr
+        )  # also when somebody does
         self._file = sys.stdin.fileno()
         self._termios: Any = termios
         self._before = termios.tcgetattr(self._file)

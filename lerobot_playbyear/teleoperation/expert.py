@@ -11,11 +11,12 @@ from lerobot.teleoperators import Teleoperator
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.episode import Observation, Verdict
-from lerobot_playbyear.episodes.expert import Expert
+from lerobot_playbyear.episodes.expert import Expert, ExpertError
 from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.console import Console
 from lerobot_playbyear.teleoperation.controls import LEAVE, OVERRIDE, Controls, PersonLeftError, Wish
 from lerobot_playbyear.teleoperation.handover import hand_over
+from lerobot_playbyear.teleoperation.leader import connected_anew, let_go, problem_of
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
@@ -86,6 +87,8 @@ class TeleopExpert(Expert):
         self._verdict, self._last_command, self._is_paused = None, None, self.begins_paused
         status.control = Control.PERSON if self.demonstrates else Control.POLICY
         self._controls.reset()
+        if self.robot is not None and self.window.is_open:
+            self._connect_leader()
         if self._look()[0].leaves:  # all else that was pressed meanwhile was not meant for this attempt
             raise PersonLeftError
         self._controls.reset()
@@ -154,12 +157,25 @@ class TeleopExpert(Expert):
 
     def close(self) -> None:
         self.speaker.close()
-        if self.teleop.is_connected:
-            self.teleop.disconnect()
+        let_go(self.teleop)
         if self.robot is None:
             self.window.close()
         else:
             self.robot.person.has_expert = False
+
+    def _connect_leader(self) -> None:
+        """Connects anew to a leader that was lost, as often as the person wants it."""
+        problem = problem_of(self.teleop)
+        if not problem:
+            return
+        self.robot.hold()
+        problem = connected_anew(self.teleop)
+        while problem:
+            problem, person = f"{problem} Look at its cable and its power.", self.robot.person
+            if not person.is_there or not person.wants_again(problem):
+                raise ExpertError(problem)
+            problem = connected_anew(self.teleop)
+        self.robot.go_on()
 
     def _read(self) -> None:
         """What the person wants now."""

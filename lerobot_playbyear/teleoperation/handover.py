@@ -6,6 +6,8 @@ from typing import Any
 import gymnasium as gym
 from lerobot.teleoperators import Teleoperator
 
+from lerobot_playbyear.episodes.expert import ExpertError
+
 _LEADER_S, _FOLLOWER_S = 2.0, 1.0  # as in LeRobot's own hand-over
 
 
@@ -25,6 +27,7 @@ def hand_over(
 
     Raises:
         RobotError: The robot does not answer.
+        ExpertError: The leader does not.
     """
     from lerobot_playbyear.compat import teleop_smooth_move_to, teleop_supports_feedback  # seconds to import
 
@@ -32,8 +35,12 @@ def hand_over(
     robot_env.hold()
     if teleop_supports_feedback(teleop):
         leader: Any = teleop
-        teleop_smooth_move_to(leader, robot_env.arm.position(), _LEADER_S)
-        leader.disable_torque()  # the person moves it from here
+        place = robot_env.arm.position()
+        try:
+            teleop_smooth_move_to(leader, place, _LEADER_S)
+            leader.disable_torque()  # the person moves it from here
+        except Exception as error:  # its cable
+            raise ExpertError(f"The leader does not answer: {error}") from error
     else:
         robot_env.arm.move_to(target, _FOLLOWER_S, stop)
     if not stop():

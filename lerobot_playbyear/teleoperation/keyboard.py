@@ -10,7 +10,7 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 from lerobot_playbyear.teleoperation.actions import DELTAS
 
 _X, _Y, _Z = DELTAS
-_MOVES = {"right": (_X, 1), "left": (_X, -1), "up": (_Y, 1), "down": (_Y, -1), "e": (_Z, 1), "d": (_Z, -1)}
+MOVES = {"right": (_X, 1), "left": (_X, -1), "up": (_Y, 1), "down": (_Y, -1), "e": (_Z, 1), "d": (_Z, -1)}
 """Which displacement a key makes, and its sign."""
 
 
@@ -96,8 +96,8 @@ class KeyboardWindowTeleop(Teleoperator):
         """-1, 0 or 1 for each displacement: what the held keys add up to."""
         assert self._keys is not None
         moved = dict.fromkeys(DELTAS, 0.0)
-        for name in self._keys.held & _MOVES.keys():
-            axis, sign = _MOVES[name]
+        for name in self._keys.held & MOVES.keys():
+            axis, sign = MOVES[name]
             moved[axis] += sign
         return moved
 

@@ -16,7 +16,7 @@ from lerobot_playbyear.teleoperation.wire import Newest, receive, send
 
 _WAITING_AFTER_S = 0.7  # without a frame the control loop is busy with something else
 _LOOK_S = 0.25  # how often that is looked at
-_PRINTLESS = ("space", "escape", "left", "right", "up", "down")  # keys that have no letter for a name
+PRINTLESS = ("space", "escape", "left", "right", "up", "down")  # keys that have no letter for a name
 
 
 class Inbox(Newest):
@@ -103,7 +103,7 @@ class Screen:
 
 def run(glfw: Any, screen: Screen, inbox: Inbox, out: IO[bytes]) -> None:
     """Show what comes and tell what is pressed, until either side closes."""
-    printless = {getattr(glfw, f"KEY_{name.upper()}"): name for name in _PRINTLESS}
+    printless = {getattr(glfw, f"KEY_{name.upper()}"): name for name in PRINTLESS}
 
     def on_key(window: Any, key: int, scancode: int, action: int, modifiers: int) -> None:
         name = printless.get(key) or (glfw.get_key_name(key, scancode) or "").lower()
