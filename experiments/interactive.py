@@ -70,7 +70,8 @@ class Outcome:
         n_demonstrations: That it learned from.
         success, first_search: Percentages of the evaluation's episodes.
         failures: How the others ended.
-        kept: Attempts that were kept.
+        kept, attempts: Attempts that were kept, and that were made: so many scenes were set up, with `redo` and after a failure
+            that is shown again each twice. `attempts` is 0 in results that are older than it.
         expert_steps: Steps in which the expert acted, in these and in those that were not kept; of the control
             `demonstrations`, in the further ones.
         takeovers, switches, person_seconds, autonomy: As in `metrics.jsonl`, of all attempts so far.
@@ -84,6 +85,7 @@ class Outcome:
     first_search: float | None
     failures: str
     kept: int = 0
+    attempts: int = 0
     expert_steps: int = 0
     takeovers: int = 0
     switches: int = 0
@@ -249,7 +251,10 @@ class Study:
 
     def _outcome_of_round(self, number: int, policy: Path, updates: int) -> Outcome:
         lines = list(metrics_of(self.folders))
-        totals, figures = Totals.of(lines), ("expert_steps", "takeovers", "switches", "person_seconds", "autonomy")
+        totals, figures = (
+            Totals.of(lines),
+            ("expert_steps", "takeovers", "switches", "person_seconds", "autonomy", "attempts"),
+        )
         spent = {figure: getattr(totals, figure) for figure in figures}
         kept = sum(line.get("outcome") == "kept" for line in lines)
         name = f"-{self.how}-round{number}{self._grown(updates)}"
