@@ -104,6 +104,15 @@ def test_where_nothing_would_remain_all_is_learned_from():
     assert "".join("x" if frame else "." for frame in learned) == "..xxx..xx"
 
 
+def test_attempts_from_which_nothing_is_learned_are_counted():
+    """The second's only correction is short, nobody helped in the third, and the fourth begins with the expert."""
+    interventions = store([8, 6, 4, 4], "..xxxxx." + "..xx.." + "...." + "xx..")
+    for n_skipped, n_without in ((0, 0), (3, 1)):
+        batches = BalancedBatches(windows(2), store([40]), interventions, batch_size=12, n_skipped=n_skipped)
+        assert batches.n_attempts_without() == (n_without, 4)
+    assert BalancedBatches(windows(2), store([40]), None, batch_size=12).n_attempts_without() == (0, 0)
+
+
 def test_both_halves_weigh_the_same_in_the_loss():
     batches = BalancedBatches(windows(8), store([40]), store([len(ATTEMPTS)], ATTEMPTS), batch_size=12)
     for number in range(20):

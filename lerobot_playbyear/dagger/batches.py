@@ -78,6 +78,16 @@ class BalancedBatches:
         by_expert = frames_by_expert(self._interventions).cpu()
         return int((by_expert & self._is_learned).sum()), int(by_expert.sum())
 
+    def n_attempts_without(self) -> tuple[int, int]:
+        """In how many attempts the expert acted and nothing is learned from, and how many there are."""
+        store = self._interventions
+        if store is None:
+            return 0, 0
+        by_expert = frames_by_expert(store).cpu()
+        spans = [slice(start, end) for start, end in zip(store.starts, store.ends, strict=True)]
+        n_without = sum(bool(by_expert[span].any() and not self._is_learned[span].any()) for span in spans)
+        return n_without, len(spans)
+
     def batch(self, number: int) -> dict[str, Any]:
         """The batch of that number, counted from 0: the first half are demonstrations.
 

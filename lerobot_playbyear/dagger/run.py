@@ -249,6 +249,9 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
     left_out = (
         f"; the first {skipped_s:g} s of every correction are left out (--skip_s)" if n_learned < n_corrected else ""
     )
+    n_without, n_attempts = loop.batches.n_attempts_without()
+    if n_without:
+        left_out += f", and with that all of {n_without} of {n_attempts} attempts, whose corrections are shorter"
     print(f"Corrections: {n_learned} of {n_corrected} frames that the expert chose are learned from{left_out}")
     if state.success is not None:
         is_older = state.evaluated_round != state.round
