@@ -61,7 +61,7 @@ def shown_in(folder: Path) -> Shown:
 def holds_a_hop(closes: np.ndarray) -> bool:
     """Whether the gripper, (T,) bool, is told to close late, and after it was open for long."""
     begins = np.flatnonzero(closes[1:] & ~closes[:-1]) + 1
-    return any(begin > AFTER and not closes[begin - OPEN : begin].any() for begin in begins)
+    return any(begin >= AFTER and not closes[begin - OPEN : begin].any() for begin in begins)
 
 
 def main() -> None:

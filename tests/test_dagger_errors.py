@@ -18,6 +18,7 @@ from lerobot_playbyear.dagger.config import DaggerEvalConfig, DatasetSource, wit
 from lerobot_playbyear.dagger.folder import RunFolder
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes import frames, saving
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.scripts import dagger as dagger_script
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -128,6 +129,23 @@ def test_an_environment_without_a_gate(tmp_path, monkeypatch):
         dagger(tmp_path, "--method.type=redo")
 
 
+def test_options_that_would_do_nothing_are_refused(tmp_path):
+    late = DaggerConfig(DatasetSource("a/b"), DatasetSource("a/c"), episodes=0, updates=1, takeover_delay_s=0.5)
+    with pytest.raises(PlaybyearError, match=r"--takeover_delay_s=0\.5: with --episodes=0 nobody takes over"):
+        check_places(late)
+    with pytest.raises(PlaybyearError, match=r"--expert\.reaction_s=0\.5 is of a person: give --expert\.person=true"):
+        dagger(tmp_path, "--expert.reaction_s=0.5")
+    for dataset, option in (
+        ({"streaming_encoding": True}, "streaming_encoding"),
+        ({"rgb_encoder": RGBEncoderConfig("h264")}, "rgb_encoder"),
+    ):
+        cfg = RecordConfig(PlaybyearEnvConfig(), RecordDatasetConfig("a/b", str(tmp_path / "data"), **dataset))
+        with pytest.raises(PlaybyearError, match=f"--dataset.{option}.* encodes video: give --dataset.video=true"):
+            record(cfg)
+    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "data").exists()
+
+
 def test_attempts_are_not_written_among_the_demonstrations(tmp_path):
     demos = base_folder() / "demos"
     (tmp_path / "link").symlink_to(demos)
@@ -136,13 +154,14 @@ def test_attempts_are_not_written_among_the_demonstrations(tmp_path):
         with pytest.raises(PlaybyearError, match="--demos and --interventions are the same dataset"):
             dagger(tmp_path, *QUICK, f"--interventions.root={root}")
     assert {path: path.stat().st_mtime_ns for path in demos.rglob("*")} == before
+    with pytest.raises(PlaybyearError, match=r"--output_dir=.*out lies in the folder of --interventions"):
+        dagger(tmp_path, *QUICK, f"--interventions.root={tmp_path / 'out'}")
     assert not (tmp_path / "out").exists()
 
 
 def test_no_script_acts_on_a_robot_and_none_is_connected_to(tmp_path, monkeypatch):
     from robot_factory import joint_config
 
-    from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
     from lerobot_playbyear.robots.arm import Arm
 
     monkeypatch.setattr(Arm, "connect", lambda self: pytest.fail("it was connected to"))
@@ -165,8 +184,18 @@ def test_only_one_run_works_in_a_folder(tmp_path):
     assert folder.claim(resume=False) is None
     lock.release()
     assert not (tmp_path / "out").exists()
+    (tmp_path / "out").mkdir()
     folder.lock().release()
-    assert not (tmp_path / "out").exists()
+    assert not list((tmp_path / "out").iterdir())  # it was there before
+
+
+def test_a_disk_without_locks_is_warned_of(tmp_path, monkeypatch, caplog):
+    def refuses(*_, **__):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr("lerobot_playbyear.dagger.run_lock.FileLock.acquire", refuses)
+    RunFolder(tmp_path / "out").lock().release()
+    assert "let no other playbyear-dagger work there" in caplog.text
 
 
 def test_a_folder_that_cannot_be_made_is_told_before_anything_is_read(tmp_path, monkeypatch):

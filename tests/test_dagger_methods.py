@@ -13,7 +13,7 @@ from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource, with_saved_options
-from lerobot_playbyear.dagger.methods import redo
+from lerobot_playbyear.dagger.methods import gate_model, redo
 from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Redoing, Staying, shifted
 from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
 from lerobot_playbyear.dagger.methods.robot_gated import RobotGatedConfig
@@ -342,6 +342,31 @@ def test_what_the_expert_fails_at_too_is_left(tmp_path):
     assert shown[0] == 9999
     assert [line["seed"] for line in attempts[:4]] == [9999, 9999, 10000, 10001]
     assert not any(line["n_asked_steps"] for line in attempts[:4])  # three of them count as first attempts
+
+
+def test_a_run_does_not_end_before_the_scene_that_it_failed_in_is_shown(tmp_path, monkeypatch):
+    monkeypatch.setattr(Quick, "take_over", succeeds_from_the_first_step_on)
+    options = ("--method.redo_failed=true", "--method.rollouts=1", "--episodes=1", "--episode_seed=9999")
+    dagger(tmp_path, *QUICK, *GATED[:1], *options, "--max_attempts=1")
+    assert [line["outcome"] for line in metrics(tmp_path, "attempt")] == ["failed", "kept"]
+
+
+@pytest.mark.slow
+def test_a_robot_that_asks_at_once_and_fails_is_no_demonstration(tmp_path, monkeypatch):
+    seen, learn = [], gate_model.GateModel.__init__
+
+    def look(self, played, *args):
+        seen.append({each.seed: (each.is_visited, each.success) for each in played})
+        learn(self, played, *args)
+
+    monkeypatch.setattr(gate_model.GateModel, "__init__", look)
+    monkeypatch.setattr(gate_model.Asking, "asks", lambda *_: True)
+    options = ("--method.rollouts=1", "--episodes=3", "--episode_seed=9998", "--warmup_episodes=1")
+    dagger(tmp_path, *QUICK, *GATED, *options)
+    failed = [line["seed"] for line in metrics(tmp_path, "attempt") if line["outcome"] == "failed"]
+    learned = [seen[-1][seed] for seed in failed if seed in seen[-1]]  # one of the last round is learned from later
+    assert learned
+    assert set(learned) == {(True, False)}
 
 
 @pytest.mark.slow

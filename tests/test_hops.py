@@ -12,7 +12,7 @@ def closing(*pieces):
 
 
 def test_a_hop_ends_a_search_and_is_no_grasp_at_once():
-    assert holds_a_hop(closing((False, AFTER + 1), (True, 20)))
+    assert holds_a_hop(closing((False, AFTER), (True, 20)))
     assert holds_a_hop(closing((True, 40), (False, OPEN), (True, 20)))  # it opened, and searched anew
     assert not holds_a_hop(closing((False, AFTER - 1), (True, 20)))
     assert not holds_a_hop(closing((True, 60), (False, 10)))

@@ -26,13 +26,27 @@ def check_places(cfg: DaggerConfig) -> None:
     """Refuse what would be found out only once a robot has moved, or once data were mixed.
 
     Raises:
-        InputError: Attempts would be written among the demonstrations, or a script would have to act on a robot.
+        InputError: Attempts would be written among the demonstrations, a script would have to act on a robot, or takeovers are
+            to be late where there are none.
     """
     demos, interventions = (source.folder.resolve() for source in (cfg.demos, cfg.interventions))
     if cfg.is_online and demos == interventions:
         raise InputError(
             f"--demos and --interventions are the same dataset, {demos}: attempts would be written among the demonstrations, "
             "with what the policy did wrong in them. Give --interventions.repo_id and --interventions.root of their own."
+        )
+    if (
+        cfg.is_online
+        and cfg.output_dir.resolve().is_relative_to(interventions)
+        and not (interventions / "meta").exists()
+    ):
+        raise InputError(
+            f"--output_dir={cfg.output_dir} lies in the folder of --interventions, {interventions}, where a dataset is to be "
+            "made: give another one."
+        )
+    if cfg.takeover_delay_s and not cfg.is_online:
+        raise InputError(
+            f"--takeover_delay_s={cfg.takeover_delay_s}: with --episodes=0 nobody takes over; leave it out, or give --skip_s."
         )
     if cfg.is_online and getattr(cfg.env, "is_real_time", False) and isinstance(cfg.expert, ScriptedExpertConfig):
         raise InputError(NO_SCRIPT.format("correct a policy on"))

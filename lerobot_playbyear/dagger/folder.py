@@ -5,7 +5,6 @@ it. A checkpoint is written beside its place, put on the disk and renamed before
 removed when the run goes on.
 """
 
-import contextlib
 import json
 import os
 import shutil
@@ -15,13 +14,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
+from lerobot_playbyear.dagger.run_lock import LOCK, RunLock
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import check_can_be_made
+from lerobot_playbyear.datasets.files import TRIAL, check_can_be_made
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
 from lerobot_playbyear.training.checkpoints import BEST_LINK
@@ -30,7 +29,6 @@ STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""
 
 _PARTIAL = ".partial"
-_LOCK = ".lock"
 
 
 @dataclass
@@ -83,37 +81,6 @@ class RunState:
     wandb_run_id: str | None = None
 
 
-class RunLock:
-    """Held from its making until `release`, or the end of the process, however it ends.
-
-    Args:
-        folder: The output folder; made where it is missing.
-
-    Raises:
-        InputError: Another process holds it.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(folder / _LOCK, timeout=0, thread_local=False)
-        try:
-            self._lock.acquire()
-        except Timeout as error:
-            raise InputError(
-                f"--output_dir={folder}: another playbyear-dagger is at work there. Wait until it has ended, or choose another "
-                "folder."
-            ) from error
-
-    def release(self) -> None:
-        """Lets go; of a run that never began nothing is left."""
-        self._lock.release()
-        folder = Path(self._lock.lock_file).parent
-        with contextlib.suppress(OSError):
-            if [path.name for path in folder.iterdir()] in ([], [_LOCK]):
-                Path(self._lock.lock_file).unlink(missing_ok=True)
-                folder.rmdir()
-
-
 class RunFolder:
     """Reads and writes the output folder.
 
@@ -125,7 +92,7 @@ class RunFolder:
         self.path = Path(path)
         self.checkpoints = self.path / CHECKPOINTS_DIR
 
-    def lock(self) -> "RunLock":
+    def lock(self) -> RunLock:
         """Makes this process the only one that works in the folder.
 
         Raises:
@@ -147,8 +114,9 @@ class RunFolder:
             InputError: The folder holds a run and `resume` is off, or it holds something else.
         """
         is_run = (self.path / CONFIG_NAME).is_file()
-        begun = {_LOCK, CONFIG_NAME + _PARTIAL}  # of a run that could not write even its options
-        if not self.path.exists() or {path.name for path in self.path.iterdir()} <= begun:
+        begun = {LOCK, CONFIG_NAME + _PARTIAL}  # of a run that could not write even its options
+        names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
+        if {name for name in names if not name.startswith(TRIAL)} <= begun:
             return None
         if not is_run:
             raise InputError(

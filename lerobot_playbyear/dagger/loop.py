@@ -121,7 +121,7 @@ class Loop:
     def _collect(self, seconds: Seconds) -> bool:
         """Attempts until one is kept. Returns False when there is none among `max_attempts` in which the expert might act."""
         outcomes = self.state.fruitless
-        while len(outcomes) < self.cfg.max_attempts:
+        while len(outcomes) < self.cfg.max_attempts or self.method.owes:
             self.report.doing("acting")
             spent, is_alone = Seconds(), self.method.is_alone
             episode = self._attempt(spent)

@@ -106,6 +106,10 @@ def naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
+TRIAL = ".playbyear-"
+"""Begin of the name of a folder that is made for a moment, to see whether that can be done."""
+
+
 def check_can_be_made(folder: Path, option: str) -> None:
     """Whether a folder can be made, or written into where it is there already. It tries, and leaves nothing behind.
 
@@ -119,7 +123,7 @@ def check_can_be_made(folder: Path, option: str) -> None:
     folder = folder.absolute()
     there = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
     try:
-        with tempfile.TemporaryDirectory(prefix=".playbyear-", dir=there):
+        with tempfile.TemporaryDirectory(prefix=TRIAL, dir=there):
             pass
     except OSError as error:
         raise InputError(

@@ -1,6 +1,6 @@
 """The expert that comes with an environment, `--expert.type=scripted`; alone, or as a person with a person's imperfections."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gymnasium as gym
@@ -53,6 +53,12 @@ class ScriptedExpertConfig(ExpertConfig):
         if _SCRIPTS[0] not in scripts:
             return ScriptedDemonstrator()
         if not self.person:
+            given = [each for each in fields(self) if getattr(self, each.name) != each.default]
+            if given:
+                name = given[0].name
+                raise InputError(
+                    f"--expert.{name}={getattr(self, name)} is of a person: give --expert.person=true, or leave it out."
+                )
             return ScriptedExpert()
         for name in ("reaction_s", "tremor", "tremor_s", "wrong_per_minute", "wrong_s", "seed"):
             if not 0 <= getattr(self, name) < np.inf:

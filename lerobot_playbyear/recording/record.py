@@ -187,6 +187,13 @@ def _check_options(cfg: RecordConfig) -> None:
         raise InputError(NO_SCRIPT.format("demonstrate on"))
     if getattr(cfg.expert, "person", False):
         raise InputError("--expert.person=true: it corrects a policy, and does not demonstrate; leave it out.")
+    if not cfg.dataset.video:
+        needs_video = {
+            "streaming_encoding=true": cfg.dataset.streaming_encoding,
+            "rgb_encoder.*": cfg.dataset.rgb_encoder != RGBEncoderConfig(),
+        }
+        for option in (name for name, is_given in needs_video.items() if is_given):
+            raise InputError(f"--dataset.{option} encodes video: give --dataset.video=true, too, or leave it out.")
     if cfg.dataset.push_to_hub:
         check_name(cfg.dataset.repo_id)
         warn_without_login()

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 
+from lerobot_playbyear.episodes.terminal import alone
 from lerobot_playbyear.robots.parts import RobotError, names_of
 from lerobot_playbyear.teleoperation.leader import close_parts, let_go
 
@@ -86,7 +87,8 @@ class Arm:
             return
         try:
             takes = inspect.signature(self.robot.connect).parameters
-            self.robot.connect(**({"calibrate": self._calibrate} if "calibrate" in takes else {}))
+            with alone():  # it may ask for its calibration
+                self.robot.connect(**({"calibrate": self._calibrate} if "calibrate" in takes else {}))
         except Exception as error:
             close_parts(self.robot)  # LeRobot leaves open what it had opened, and then refuses to connect again
             with_cameras = f" with the cameras {', '.join(self.cameras)}" if self.cameras else ""

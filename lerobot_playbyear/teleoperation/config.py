@@ -1,5 +1,6 @@
 """`--expert.type=teleop`: its options, and how everything that a person needs is put together."""
 
+import logging
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -85,11 +86,11 @@ class TeleopExpertConfig(ExpertConfig):
             known = BASE_DIRECTIONS if set(DELTAS) <= set(names or ()) else KNOWN_DIRECTIONS
             directions = self.directions or known.get(kind, "x,y,z")
             mapping = ActionMapping(_features(teleop), env.action_space, directions, self.speed, names)
-            if self.takeover == "hold" and not window.has_key_releases:
-                raise ExpertError(
-                    "--expert.takeover=hold: a terminal does not say when a key is let go; give toggle or auto."
+            if self.takeover == "hold" and not window.has_key_releases and not demonstrates:
+                logging.warning(
+                    "--expert.takeover=hold: without a window nothing says when a key is let go; it is pressed once more."
                 )
-            toggles = self.takeover == "toggle" or (self.takeover == "auto" and not window.has_key_releases)
+            toggles = self.takeover == "toggle" or not window.has_key_releases
             expert = TeleopExpert(
                 window=window,
                 teleop=teleop,

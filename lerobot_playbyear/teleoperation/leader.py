@@ -7,6 +7,8 @@ from typing import Any
 from lerobot.robots import Robot
 from lerobot.teleoperators import Teleoperator
 
+from lerobot_playbyear.episodes.terminal import alone
+
 
 def let_go(device: Robot | Teleoperator) -> None:
     """Disconnects a device, also one that does not answer any more; what that says is logged."""
@@ -50,7 +52,8 @@ def connected_anew(leader: Any) -> str:
     """Lets go of a leader and connects to it. Returns why it cannot be used; empty if it can."""
     let_go(leader)
     try:
-        leader.connect()
+        with alone():  # it may ask for its calibration
+            leader.connect()
     except Exception as error:
         close_parts(leader)
         return f"The leader cannot be connected: {error}"

@@ -125,6 +125,11 @@ class Method:
         """Whether nobody helps in the next attempt, whatever happens: such a one counts for no `--max_attempts`."""
         return False
 
+    @property
+    def owes(self) -> bool:
+        """Whether the next attempt belongs to the last one, so that a run does not end before it."""
+        return False
+
     def prepare(self) -> None:
         """An attempt follows. What is made here must depend on the state of the run alone, so that it resumes exactly."""
 

@@ -1,5 +1,6 @@
 """What the policy remembers at every frame of demonstrations and attempts, for a gate that learns from it."""
 
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -70,18 +71,19 @@ class Remembering:
         store = self._tools.demonstrations
         return [self._encoded(store, number, None) for number in range(store.n_episodes)]
 
-    def attempts(self, seeds: range) -> list[Played]:
+    def attempts(self, seeds: range, shown: Container[int] = ()) -> list[Played]:
         """The attempts with these seeds, in their order, which is that of time.
 
-        Those that the expert made from the first step on come first, as demonstrations: they show no state that the policy
-        brings the robot to.
+        Args:
+            seeds: Which.
+            shown: Of corrections that are demonstrations of a scene. They come first, as demonstrations: they show no state
+                that the policy brings the robot to.
         """
         attempts = []
         for store in (self._tools.corrections.store, self._others.store):
             for number, seed in enumerate(_seeds(store) if store is not None else ()):
                 if store is not None and seed in seeds:
-                    span = slice(store.starts[number], store.ends[number])
-                    is_shown = bool(frames_by_expert(store)[span].all())
+                    is_shown = store is self._tools.corrections.store and seed in shown
                     attempts.append(self._encoded(store, number, None if is_shown else seed))
         return sorted(attempts, key=lambda each: each.seed)
 

@@ -20,11 +20,11 @@ from lerobot_playbyear.episodes.play import Seconds
 if TYPE_CHECKING:
     from lerobot_playbyear.dagger.attempt import Scene
     from lerobot_playbyear.dagger.config import DaggerConfig
-    from lerobot_playbyear.dagger.methods.gate_model import Asking
+    from lerobot_playbyear.dagger.methods.gate_model import Asking, Played
     from lerobot_playbyear.dagger.methods.remembering import Remembering
 
-FAILED, SHOWN = "failed_seed", "n_shown"
-"""In the state of a run: the attempt that the expert makes good next, and how many of them it has."""
+FAILED, SHOWN = "failed_seed", "shown_seeds"
+"""In the state of a run: the attempt that the expert makes good next, and those of which it has shown the scene."""
 _OF_A_DEMONSTRATION = {"n_asked_steps": 0, "n_calls": 0, "n_switches": 1}
 
 
@@ -142,7 +142,7 @@ class RobotGated(Method):
         Thresholds are set anew before every attempt, with what was met in those of this round too.
         """
         state = self._tools.state
-        if self.is_alone or FAILED in state.method:
+        if self.is_alone or self.owes:
             return
         from lerobot_playbyear.dagger.methods.gate_model import thresholds_for
 
@@ -153,7 +153,7 @@ class RobotGated(Method):
         begun = state.method["next_seed"]
         if self._fitted_round != state.round:
             self._fit(begun)
-        for each in self._remembering.attempts(range(max([begun - 1, *self._traces]) + 1, state.next_seed)):
+        for each in self._attempts(range(max([begun - 1, *self._traces]) + 1, state.next_seed)):
             if each.is_visited:
                 self._traces[each.seed] = self._model.trace(each)
         latest = [self._traces[seed] for seed in sorted(self._traces)[-self._config.memory :]]
@@ -167,7 +167,7 @@ class RobotGated(Method):
         from lerobot_playbyear.dagger.methods.gate_model import GateModel
 
         config, state = self._config, self._tools.state
-        attempts = self._remembering.attempts(range(before_seed))
+        attempts = self._attempts(range(before_seed))
         seed = int(np.random.SeedSequence([self.cfg.seed, 2, state.round]).generate_state(1)[0])
         played = self._remembering.demonstrations() + attempts
         self._model = GateModel(played, config.n_heads, config.gate_updates, config.discount, seed)
@@ -175,11 +175,18 @@ class RobotGated(Method):
         self._traces = {each.seed: self._model.trace(each) for each in visited[-config.memory :]}
         self._fitted_round = state.round
 
+    def _attempts(self, seeds: range) -> "list[Played]":
+        return self._remembering.attempts(seeds, self._tools.state.method.get(SHOWN, ()))
+
     @property
     def is_alone(self) -> bool:
         state = self._tools.state
-        shown = state.method.get(SHOWN, 0)
-        return FAILED not in state.method and state.attempts - state.discarded - shown < self._config.rollouts
+        n_shown = len(state.method.get(SHOWN, ()))
+        return not self.owes and state.attempts - state.discarded - n_shown < self._config.rollouts
+
+    @property
+    def owes(self) -> bool:
+        return FAILED in self._tools.state.method
 
     def asking(self) -> "Asking | None":
         """A fresh gate for an attempt; None while the policy is alone."""
@@ -197,18 +204,18 @@ class RobotGated(Method):
     def note(self, episode: Episode, outcome: str) -> None:
         assert self._expert is not None
         if self._expert.demonstrates:
-            self._note_shown()
+            self._note_shown(counts=outcome != "discarded")
             return
         if outcome in ("failed", "unneeded"):
             self._remembering.keep(episode)
         if outcome == "failed" and self._config.redo_failed:
             self._tools.state.method[FAILED] = episode.seed
 
-    def _note_shown(self) -> None:
+    def _note_shown(self, counts: bool = True) -> None:
         """The failed attempt was made good, or the expert failed at it, too: another scene follows."""
         method = self._tools.state.method
-        del method[FAILED]
-        method[SHOWN] = method.get(SHOWN, 0) + 1
+        seed = method.pop(FAILED)
+        method[SHOWN] = [*method.get(SHOWN, ()), *([seed] if counts else ())]
 
     def figures(self) -> Mapping[str, Any]:
         assert self._expert is not None
@@ -219,7 +226,7 @@ class RobotGated(Method):
 
     def recovered_figures(self, cost: Mapping[str, Any]) -> Mapping[str, Any]:
         assert self._expert is not None
-        if FAILED in self._tools.state.method:
+        if self.owes:
             self._note_shown()
             return _OF_A_DEMONSTRATION
         if self._expert.decides:
