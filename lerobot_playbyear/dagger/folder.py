@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.run_lock import LOCK, RunLock
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import TRIAL, check_can_be_made
+from lerobot_playbyear.datasets.files import check_can_be_made, is_trial
 from lerobot_playbyear.datasets.journal import flush
 from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
 from lerobot_playbyear.training.checkpoints import BEST_LINK
@@ -116,7 +116,7 @@ class RunFolder:
         is_run = (self.path / CONFIG_NAME).is_file()
         begun = {LOCK, CONFIG_NAME + _PARTIAL}  # of a run that could not write even its options
         names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
-        if {name for name in names if not name.startswith(TRIAL)} <= begun:
+        if {name for name in names if not is_trial(name)} <= begun:
             return None
         if not is_run:
             raise InputError(

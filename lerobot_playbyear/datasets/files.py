@@ -106,8 +106,12 @@ def naming(path: Path) -> Iterator[None]:
         raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-TRIAL = ".playbyear-"
-"""Begin of the name of a folder that is made for a moment, to see whether that can be done."""
+_trial = ".playbyear-"  # begin of the name of a folder that is made for a moment
+
+
+def is_trial(name: str) -> bool:
+    """Whether a folder of this name is one that `check_can_be_made` makes for a moment."""
+    return name.startswith(_trial)
 
 
 def check_can_be_made(folder: Path, option: str) -> None:
@@ -123,7 +127,7 @@ def check_can_be_made(folder: Path, option: str) -> None:
     folder = folder.absolute()
     there = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
     try:
-        with tempfile.TemporaryDirectory(prefix=TRIAL, dir=there):
+        with tempfile.TemporaryDirectory(prefix=_trial, dir=there):
             pass
     except OSError as error:
         raise InputError(
