@@ -251,10 +251,8 @@ class Study:
 
     def _outcome_of_round(self, number: int, policy: Path, updates: int) -> Outcome:
         lines = list(metrics_of(self.folders))
-        totals, figures = (
-            Totals.of(lines),
-            ("expert_steps", "takeovers", "switches", "person_seconds", "autonomy", "attempts"),
-        )
+        totals = Totals.of(lines)
+        figures = ("attempts", "expert_steps", "takeovers", "switches", "person_seconds", "autonomy")
         spent = {figure: getattr(totals, figure) for figure in figures}
         kept = sum(line.get("outcome") == "kept" for line in lines)
         name = f"-{self.how}-round{number}{self._grown(updates)}"

@@ -5,12 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from dagger_factory import QUICK, Quick, column, command, corrections, dagger, metrics
+from dagger_factory import QUICK, Quick, column, corrections, dagger, metrics
 from test_dagger import Scripted, scene
-from test_dagger_resume import PowerCut, assert_ended_alike, cut_power
+from test_dagger_resume import assert_a_power_cut_changes_nothing
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import folder as folder_module
 from lerobot_playbyear.dagger.attempt import Scene
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSource, with_saved_options
 from lerobot_playbyear.dagger.methods import gate_model, redo
@@ -187,7 +186,7 @@ def test_without_a_hand_back_an_attempt_ends_with_its_correction(tmp_path):
     assert [line["takeover_steps"] for line in metrics(tmp_path, "attempt") if line["outcome"] == "kept"] == [[6], [6]]
 
 
-def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, monkeypatch, capfd):
+def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, capfd):
     run = (*RUN, "--method.type=redo")
     dagger(tmp_path / "calm", *run)
     assert "context switches, autonomy 27%" in capfd.readouterr().out  # 3 steps of a try, 8 of a demonstration
@@ -197,12 +196,7 @@ def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, monkeypa
     assert [line["outcome"] for line in attempts] == ["kept", "kept"]
     cost = {"n_expert_steps": 8, "n_tried_steps": 3, "n_takeovers": 1, "n_switches": 1, "person_seconds": 0.55}
     assert all({key: line[key] for key in cost} == cost for line in attempts)
-    with monkeypatch.context() as patch:
-        cut_power(patch, folder_module.RunFolder, "commit", 3)
-        with pytest.raises(PowerCut):
-            dagger(tmp_path / "killed", *run)
-    command("--resume=true", f"--output_dir={tmp_path / 'killed/out'}")
-    assert_ended_alike(tmp_path / "killed", tmp_path / "calm")
+    assert_a_power_cut_changes_nothing(tmp_path / "killed", tmp_path / "calm", run, after=3)
 
 
 def test_what_a_policy_solves_alone_is_not_shown_and_what_it_fails_at_unseen_is(tmp_path, monkeypatch):
@@ -277,7 +271,7 @@ GATED = (
 
 
 @pytest.mark.slow
-def test_a_robot_that_asks_resumes_exactly(tmp_path, monkeypatch):
+def test_a_robot_that_asks_resumes_exactly(tmp_path):
     """Killed before it learned from its second round's attempts, after an attempt that is no correction was saved."""
     run = (*QUICK, *GATED, "--episodes=3", "--warmup_episodes=1")
     dagger(tmp_path / "calm", *run)
@@ -289,13 +283,7 @@ def test_a_robot_that_asks_resumes_exactly(tmp_path, monkeypatch):
     assert others
     n_commits = len(attempts) + 2
     for after in (2, 4, n_commits):
-        folder = tmp_path / f"killed{after}"
-        with monkeypatch.context() as patch:
-            cut_power(patch, folder_module.RunFolder, "commit", after)
-            with pytest.raises(PowerCut):
-                dagger(folder, *run)
-        command("--resume=true", f"--output_dir={folder / 'out'}")
-        assert_ended_alike(folder, tmp_path / "calm")
+        assert_a_power_cut_changes_nothing(tmp_path / f"killed{after}", tmp_path / "calm", run, after)
 
 
 def succeeds_from_the_first_step_on(expert, until_told=True):
@@ -325,13 +313,7 @@ def test_what_fails_although_the_robot_may_ask_is_shown_from_its_first_step(tmp_
     assert marks[:8].all()
     assert not attempts[0]["n_asked_steps"]
     for after in kills:
-        folder = tmp_path / f"killed{after}"
-        with monkeypatch.context() as patch:
-            cut_power(patch, folder_module.RunFolder, "commit", after)
-            with pytest.raises(PowerCut):
-                dagger(folder, *run)
-        command("--resume=true", f"--output_dir={folder / 'out'}")
-        assert_ended_alike(folder, tmp_path / "calm")
+        assert_a_power_cut_changes_nothing(tmp_path / f"killed{after}", tmp_path / "calm", run, after)
 
 
 def test_what_the_expert_fails_at_too_is_left(tmp_path):

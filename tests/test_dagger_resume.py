@@ -86,6 +86,16 @@ def cut_power(monkeypatch, owner, name, after):
     monkeypatch.setattr(owner, name, wrapped)
 
 
+def assert_a_power_cut_changes_nothing(folder, expected, run, after, owner=folder_module.RunFolder, name="commit"):
+    """A run that is stopped there, and goes on, ends as one that was not."""
+    with pytest.MonkeyPatch.context() as patch:
+        cut_power(patch, owner, name, after)
+        with pytest.raises(PowerCut):
+            dagger(folder, *run)
+    command("--resume=true", f"--output_dir={folder / 'out'}")
+    assert_ended_alike(folder, expected)
+
+
 @pytest.mark.parametrize(
     ("owner", "name", "after"),
     [
@@ -97,13 +107,8 @@ def cut_power(monkeypatch, owner, name, after):
     ],
     ids=["counting", "placing", "cleaning", "writing", "saving"],
 )
-def test_wherever_it_stops_it_ends_alike(undisturbed, tmp_path, monkeypatch, owner, name, after):
-    with monkeypatch.context() as patch:
-        cut_power(patch, owner, name, after)
-        with pytest.raises(PowerCut):
-            dagger(tmp_path, *RUN)
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}")
-    assert_ended_alike(tmp_path, undisturbed)
+def test_wherever_it_stops_it_ends_alike(undisturbed, tmp_path, owner, name, after):
+    assert_a_power_cut_changes_nothing(tmp_path, undisturbed, RUN, after, owner, name)
 
 
 def test_one_attempt_that_was_saved_and_not_counted_is_all_that_was_wanted(tmp_path, monkeypatch):

@@ -50,16 +50,12 @@ class ScriptedExpertConfig(ExpertConfig):
                 f"`intervention_gate()`, and {type(env.unwrapped).__name__} has none. Give another --expert.type, or write an "
                 "expert (examples/own_expert.py)."
             )
-        if _SCRIPTS[0] not in scripts:
-            return ScriptedDemonstrator()
         if not self.person:
-            given = [each for each in fields(self) if getattr(self, each.name) != each.default]
-            if given:
-                name = given[0].name
+            for name in (each.name for each in fields(self) if getattr(self, each.name) != each.default):
                 raise InputError(
                     f"--expert.{name}={getattr(self, name)} is of a person: give --expert.person=true, or leave it out."
                 )
-            return ScriptedExpert()
+            return ScriptedExpert() if _SCRIPTS[0] in scripts else ScriptedDemonstrator()
         for name in ("reaction_s", "tremor", "tremor_s", "wrong_per_minute", "wrong_s", "seed"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise InputError(f"--expert.{name}={getattr(self, name)}: give 0 or more.")

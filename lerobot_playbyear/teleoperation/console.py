@@ -63,10 +63,8 @@ class TerminalConsole:
         self.keys = WindowKeys()
         self.keys.has_focus = True
         self.is_open = True
-        is_silenced = not sys.stderr.isatty() and sys.__stderr__ is not None  # as during an evaluation
-        self._out = (
-            sys.__stderr__ if is_silenced and sys.__stderr__ is not None else sys.stderr
-        )  # also when somebody does
+        is_seen = sys.stderr.isatty() or sys.__stderr__ is None  # somebody may silence it, now or later
+        self._out: Any = sys.stderr if is_seen else sys.__stderr__
         self._file = sys.stdin.fileno()
         self._termios: Any = termios
         self._before = termios.tcgetattr(self._file)

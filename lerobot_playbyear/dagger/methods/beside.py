@@ -66,24 +66,37 @@ class Staying(Beside):
         return self._stays and not has_left
 
 
-class Redoing(Beside):
-    """In a try the policy acts, and the expert's wish to take over ends it; in a demonstration the expert acts all the time.
+class Demonstrating(Beside):
+    """In an attempt that is a demonstration the expert takes over before its first step, to stay.
 
     Attributes:
         demonstrates: Set it before the attempt.
-        was_needed: Whether the expert ended the last try by taking over.
     """
 
     def __init__(self, expert: Expert) -> None:
         super().__init__(expert)
-        self.demonstrates = self.was_needed = False
+        self.demonstrates = False
 
     def reset(self, env: gym.Env) -> None:
         super().reset(env)
         if self.demonstrates:
             self.expert.take_over()
-        else:
-            self.was_needed = False
+
+
+class Redoing(Demonstrating):
+    """In a try the policy acts, and the expert's wish to take over ends it; in a demonstration the expert acts all the time.
+
+    Attributes:
+        was_needed: Whether the expert ended the last try by taking over.
+    """
+
+    def __init__(self, expert: Expert) -> None:
+        super().__init__(expert)
+        self.was_needed = False
+
+    def reset(self, env: gym.Env) -> None:
+        super().reset(env)
+        self.was_needed &= self.demonstrates
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
         wants = super().wants_control(observation, policy_action)

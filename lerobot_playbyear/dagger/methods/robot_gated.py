@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from lerobot_playbyear.dagger.methods.base import Method, MethodConfig, Tools
-from lerobot_playbyear.dagger.methods.beside import Beside
+from lerobot_playbyear.dagger.methods.beside import Demonstrating
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.episode import Episode, Observation
 from lerobot_playbyear.episodes.expert import Expert, ExpertError
@@ -234,7 +234,7 @@ class RobotGated(Method):
         return {"n_asked_steps": cost["n_expert_steps"], "n_calls": cost["n_takeovers"]}
 
 
-class Asked(Beside):
+class Asked(Demonstrating):
     """An expert that acts when the robot asks or, if it is one that decides, that is called then.
 
     Args:
@@ -243,21 +243,17 @@ class Asked(Beside):
 
     Attributes:
         n_asked, n_calls: Steps of the attempt in which the robot asked, and how often it began to.
-        demonstrates: Set it before the attempt: the expert acts all the time.
     """
 
     def __init__(self, expert: Expert, method: RobotGated) -> None:
         super().__init__(expert)
         self._method = method
         self.n_asked = self.n_calls = 0
-        self.demonstrates = False
 
     def reset(self, env: gym.Env) -> None:
         super().reset(env)
         self._asking, self._asks = None if self.demonstrates else self._method.asking(), False
         self.n_asked = self.n_calls = 0
-        if self.demonstrates:
-            self.expert.take_over()
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
         if self.demonstrates:
