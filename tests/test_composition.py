@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gym_playbyear.arena import TABLE_TOP, loose_box
-from gym_playbyear.options import make_definition
+from gym_playbyear.options import OptionError, make_definition
 from gym_playbyear.rules import Solved
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.task_env import TaskEnv
@@ -112,6 +112,87 @@ def test_a_thing_may_be_left_out_of_an_episode():
 def test_a_prop_that_lacks_its_name_is_refused(prop, message):
     with pytest.raises(ValueError, match=message):
         TaskEnv(task(prop), sound="none")
+
+
+@pytest.mark.parametrize(("seconds", "n_steps"), [(0.0, 1), (0.5, 10)])
+def test_a_condition_alone_has_to_last_as_long_as_is_said(seconds, n_steps):
+    wanted = replace(task(block("a")), success=Solved(lambda env: env.n_asked() != 3, seconds=seconds))
+    env = TaskEnv(wanted, sound="none")
+    env.n_asked = iter(range(100)).__next__
+    env.begin_episode(seed=0)
+    ends = [env.advance(STAY)[1] for _ in range(n_steps + 4)]
+    first = 1 if seconds == 0 else 4 + n_steps  # the fourth step breaks the row
+    assert ends.index(True) + 1 == first
+
+
+WALL = '<body name="wall"><geom name="wall" type="box" size="0.01 0.1 0.1" pos="0 0 0.9"/></body>'
+
+
+def turn_the_wall_at_times(env, options) -> dict:
+    if env.np_random.random() < 0.5:
+        env.put("wall", (0.1, 0.0, 0.0), yaw=0.5)
+        env.take_away("a")
+    return {}
+
+
+def test_no_episode_depends_on_the_one_before():
+    made = replace(task(block("a"), Prop("wall", WALL, "table")), place=turn_the_wall_at_times)
+    worn, scenes = TaskEnv(made, sound="none"), set()
+    for seed in range(6):
+        worn.begin_episode(seed=seed)
+        fresh = TaskEnv(made, sound="none")
+        fresh.begin_episode(seed=seed)
+        for array, of_fresh in zip(worn._places(), fresh._places(), strict=True):
+            np.testing.assert_array_equal(array, of_fresh)
+        np.testing.assert_array_equal(worn.data.qpos, fresh.data.qpos)
+        scenes.add(float(worn.model.body("wall").quat[0]))
+    assert len(scenes) == 2
+
+
+def test_forces_of_the_hands_parts_are_known_of_loose_things_alone():
+    env = TaskEnv(task(block("a"), Prop("wall", WALL, "table")), sound="none")
+    env.begin_episode(seed=0)
+    assert env.hand_forces("a").shape[1:] == (len(env.definition.arm.touching), 3)
+    with pytest.raises(ValueError, match=r"loose things with a material alone \(a\), 'wall' is none"):
+        env.hand_forces("wall")
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        (
+            "OccludedGrasp-v1",
+            {"cube_positon": (0, 0.1)},
+            "cube_positon=.*the task's options of reset are cube_position, cube_",
+        ),
+        ("OccludedGrasp-v1", {"cube_position": (0, 0.9)}, "cube_position=.*on the table, nearer than 0.4 m"),
+        ("OccludedPickPlace-v1", {"bin_position": 0.1}, "bin_position=.*give x and y"),
+        ("TellApart-v1", {"pouch_position": (np.nan, 0)}, "pouch_position"),
+        ("KeyBag-Easy-v1", {"botom": 0.1}, "botom=0.1 .*bottom, contents_position"),
+    ],
+)
+def test_a_misspelt_option_of_reset_and_an_impossible_place_are_refused(name, options, message):
+    env = TaskEnv(name, sound="none")
+    with pytest.raises(OptionError, match=message):
+        env.begin_episode(seed=0, options=options)
+
+
+def test_a_material_of_what_is_not_there_is_refused():
+    def place(env, options) -> dict:
+        env.materials["aa"] = "glass"
+        return put_on_table(env, options)
+
+    env = TaskEnv(replace(task(block("a")), place=place), image_size=8)
+    with pytest.raises(ValueError, match=r"materials names \['aa'\], .*there are a, gripper, table"):
+        env.begin_episode(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"horizon": 0}, "horizon=0 .*at least 1"), ({"task": lambda: 3}, "an int|a int")]
+)
+def test_what_is_no_task_and_no_time_is_refused(options, message):
+    with pytest.raises(OptionError, match=message):
+        TaskEnv(**{"task": task(block("a")), "sound": "none", **options})
 
 
 def test_unknown_things_of_an_episode_are_no_attributes():

@@ -175,6 +175,12 @@ def test_the_pouch_is_found_with_its_own_rate_and_options():
         ("fps=30", "20 Hz"),
         ("microphones=[]", "at least one"),
         ("visualization_width=100", "square"),
+        ("image_size=4", "8 or more"),
+        ("noise_level=-1", "0 (silent) or more"),
+        ("render_mode=video", "rgb_array, human"),
+        ("episode_length=0", "1 or more"),
+        ("room_noise_level=8", "name a WAV file"),
+        ("sound=none microphone_response=phone", "no sound that it could change"),
     ],
 )
 def test_a_wrong_option_says_what_would_work(argument, wanted):

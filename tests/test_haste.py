@@ -15,6 +15,7 @@ from experiments.training import told_of_attempts
 from gym_playbyear.haste import ClosedUnheard
 from gym_playbyear.task_env import TaskEnv
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_env_playbyear.attempts import AttemptsFile
 
 OPEN, CLOSE = -1.0, 1.0
 
@@ -55,6 +56,24 @@ def test_a_hand_that_closes_in_the_air_was_early_and_one_that_stays_open_was_not
         env.begin_episode(seed=3)
         told = {"is_success": False, "end": "time", "acted_early": early, "n_closings": int(early)}
         assert after(env, *commands) == told
+
+
+def test_what_a_task_kept_secret_stands_in_the_file_as_numbers(tmp_path):
+    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", disable_env_checker=True, horizon=1, sound="none")
+    keeps = AttemptsFile(env, str(tmp_path / "attempts.jsonl"))
+    keeps.reset(seed=0)
+    env.unwrapped.secrets |= {
+        "kind": np.int64(2),
+        "heavy": np.True_,
+        "where": (0.5, np.float32(0.25)),
+        "env": env,
+        "no": None,
+    }
+    keeps.step(np.zeros(4))
+    told = json.loads((tmp_path / "attempts.jsonl").read_text())
+    assert {key: told[key] for key in ("kind", "heavy", "where")} == {"kind": 2, "heavy": True, "where": [0.5, 0.25]}
+    assert not {"env", "no"} & told.keys()
+    env.close()
 
 
 def test_every_closing_counts_once():

@@ -207,6 +207,22 @@ def test_the_expert_acts_on_what_it_felt_alone(task):
     assert solved >= 3
 
 
+def test_the_force_that_stands_for_sound_is_felt_wherever_the_keys_lie():
+    """They lie up to 10 cm above the table, where the cube tasks' proxy is silent because their cube was lifted."""
+    for bottom in (0.03, 0.095):
+        env = make(EASY, sound="contact_force", image_size=8)
+        observation, _ = env.reset(seed=1, options={"bottom": bottom})
+        expert, touches, over = env.scripted_expert(), [], False
+        while not over:
+            observation, _, terminated, truncated, info = env.step(expert.act())
+            touches.append((env.contact_forces[f"gripper-{CONTENTS}"], np.abs(observation["contact_force"]).max()))
+            over = terminated or truncated
+        assert info["is_success"]
+        first = next(felt for force, felt in touches if force > 1.0)
+        assert first > 0.1
+        assert touches[-1][1] == 0.0  # in the air
+
+
 def test_a_cloth_is_mute():
     """To touch it is much quieter than to touch keys."""
     levels = {}

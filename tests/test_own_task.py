@@ -7,6 +7,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import draccus
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -16,9 +17,11 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 import gym_playbyear
 from gym_playbyear.materials_v2 import material
+from gym_playbyear.options import make_definition
 from gym_playbyear.plugins import PluginError
 from gym_playbyear.task_env import TaskEnv
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.recording.record import RecordConfig
 from lerobot_playbyear.scripts import record, train
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "own_task"
@@ -115,6 +118,18 @@ def test_a_microphone_of_another_distribution_hears_in_our_tasks():
 def test_a_microphone_that_is_none_says_so(options, message):
     with pytest.raises(ValueError, match=message):
         TaskEnv("OccludedGrasp-v1", **options)
+
+
+def test_a_tasks_own_options_keep_their_types(monkeypatch):
+    given = {}
+    monkeypatch.setitem(
+        gym_playbyear.ALL_TASKS._own,
+        "Own-v1",
+        lambda *, slippery, height: given.update(a=slippery, b=height) or make_definition("OccludedGrasp-v1", {}),
+    )
+    options = ["--env.type=playbyear", "--env.task=Own-v1", "--env.task_options={slippery: false, height: 0.2}"]
+    draccus.parse(RecordConfig, args=[*options, "--dataset.repo_id=a/b"])
+    assert given == {"a": False, "b": 0.2}
 
 
 def test_a_material_that_is_none_says_so():

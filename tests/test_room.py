@@ -4,6 +4,7 @@ import copy
 import itertools
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import gymnasium as gym
@@ -16,6 +17,7 @@ from scipy.io import wavfile
 
 from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.options import OptionError
+from gym_playbyear.room import _recording
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.policy.recorded_noise import RecordedNoise
 
@@ -60,6 +62,18 @@ def test_a_recording_is_added_at_its_level_and_goes_on_from_step_to_step(chirp):
     )  # the recording, once around
     np.testing.assert_allclose(added[8000:], added[: len(added) - 8000], atol=1.1 / 32767)  # and again
     assert np.abs(np.diff(added)).max() < 0.02 * 8  # no clicks between steps
+
+
+def test_a_recording_with_an_offset_is_as_loud_as_one_without():
+    time = np.arange(8000) / 16000
+    tone = 0.05 * np.sin(2 * np.pi * 400 * time)
+    recordings = []
+    for offset in (0.0, 0.5):
+        with tempfile.TemporaryDirectory() as folder:
+            path = f"{folder}/tone.wav"
+            wavfile.write(path, 16000, (32767 * (tone + offset)).astype(np.int16))
+            recordings.append(_recording(path, 16000))
+    np.testing.assert_allclose(recordings[0], recordings[1], atol=2e-3)
 
 
 def test_the_usual_background_is_as_loud_as_the_unit_says():

@@ -1,10 +1,12 @@
 """The table, and boxes and trays to put on it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from gym_playbyear.looks_props import table_on_legs
+from gym_playbyear.options import OptionError
 from gym_playbyear.plugins import Registry
 from gym_playbyear.task import Camera, Prop
 
@@ -27,6 +29,20 @@ TABLE = Prop(
     looks=table_on_legs,
 )
 """A table of 0.8 x 0.8 m, and the light above it."""
+
+
+def on_table(option: str, place: Sequence[float]) -> tuple[float, float]:
+    """Where an option of `reset` wants a thing, (x, y) [m, world].
+
+    Raises:
+        OptionError: It is not on the table.
+    """
+    where = np.asarray(place, dtype=float)
+    if where.shape != (2,) or not (np.abs(where) < TABLE_HALF_SIZE).all():
+        wanted = f"give x and y on the table, nearer than {TABLE_HALF_SIZE} m to its middle"
+        raise OptionError(f"reset(options) {option}", place, wanted)
+    return float(where[0]), float(where[1])
+
 
 ALL_PROPS = Registry("props", {"table": TABLE})
 """Ours, and those of other distributions, for tasks that choose among them."""

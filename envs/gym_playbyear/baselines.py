@@ -52,9 +52,11 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.n_episodes)
     results = []
-    for task in arguments.task:
-        own = {} if arguments.variant == "default" else {"variant": arguments.variant}
-        blind = make_definition(task, own, warn=False).blind
+    own = {} if arguments.variant == "default" else {"variant": arguments.variant}
+    scripts = {task: make_definition(task, own, warn=False).blind for task in arguments.task}  # all, before any plays
+    if arguments.output:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+    for task, blind in scripts.items():
         rates = success_rates(task, (EXPERT, *blind), seeds, horizon=arguments.horizon, **own)
         options = {"variant": arguments.variant, "horizon": arguments.horizon}
         results.append({"task": task, **options, "seeds": [seeds[0], seeds[-1]], "success": rates})

@@ -9,9 +9,9 @@ where a limit is broken.
 
 import argparse
 import json
-import math
 import sys
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -19,10 +19,12 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from scipy.stats import binomtest
+
 from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players, promised_limits
 from gym_playbyear.adversaries.progress import Progress
 from gym_playbyear.adversaries.scripts import Outcome
-from gym_playbyear.adversaries.twin import TwinResult, twin_test
+from gym_playbyear.adversaries.twin import TwinError, TwinResult, Twins, twin_test
 
 FIRST_SEED = 80000  # nothing was tuned on episodes from here on
 
@@ -34,7 +36,7 @@ class Limits:
     Attributes:
         expert: The expert solves at least this share.
         blind: No blind script solves more.
-        deaf_margin: Nobody deaf solves more than this above the best blind script.
+        deaf_margin: Nobody deaf solves more than this above the best blind script, or, where none is played, above `blind`.
         auc: No classifier tells twin worlds apart better.
     """
 
@@ -52,7 +54,7 @@ class Row:
         name, kind: Who played; `expert`, `blind`, `deaf`, or `learned`.
         successes, n_episodes: How often it solved the task.
         ends: How its attempts ended, and how often.
-        limit: What it must reach (expert) or must not exceed, as a share; None if nothing is promised of it.
+        limit: What it must reach (expert) or must not exceed, as a share; None before it is judged.
         holds: Whether it keeps to the limit.
     """
 
@@ -110,8 +112,9 @@ def check(
         progress: A file of who has played already; a check that was stopped goes on from there.
 
     Raises:
-        ValueError: A name is not among the task's players.
+        ValueError: A name is not among the task's players, or a learner's result is of another task.
     """
+    by_learners = [_row_of(result, task) for result in learned or []]
     options = options or {}
     limits = limits or Limits(**promised_limits(task, **options))
     known = players(task, **options)
@@ -123,33 +126,52 @@ def check(
     play = partial(outcomes, task, seeds=seeds, options=options)
     done = Progress(progress, {"task": task, "options": options, "seeds": [first_seed, n_episodes]})
     missing = [name for name in chosen if done.attempts(name) is None]
-    found: TwinResult | None
+    found: TwinResult | None = None
+    faults: list[str] = []
+    if twin:
+        try:
+            Twins(task, **options).close()
+        except TwinError as error:
+            twin, faults = False, [str(error)]
     if jobs > 1:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             pending = pool.submit(partial(twin_test, task, seeds, **options)) if twin else None
             for name, attempts in zip(missing, pool.map(play, missing), strict=True):
                 done.keep(name, _told(name, attempts))
-            found = pending.result() if pending else None
+            if pending:
+                found, faults = _compared(pending.result)
     else:
         for name in missing:
             done.keep(name, _told(name, play(name)))
-        found = twin_test(task, seeds, **options) if twin else None
+        if twin:
+            found, faults = _compared(partial(twin_test, task, seeds, **options))
     rows = []
     for name, kind in chosen.items():
         attempts = done.attempts(name) or []
         ends = dict(Counter(attempt.end for attempt in attempts).most_common())
         rows.append(Row(name, kind, sum(attempt.success for attempt in attempts), n_episodes, ends))
-    for result in learned or []:
-        if result.get("task", task) != task or "hears" not in result:
-            raise ValueError(
-                f"learned: {result.get('name', result.get('task'))!r} is no learner's result on {task!r}: give files that "
-                "`python -m experiments.adversaries` wrote for it."
-            )
-        kind = "learned, hears" if result["hears"] else "learned, deaf"
-        rows.append(Row(result["name"], kind, result["successes"], result["n_episodes"], {}))
-    judged = judge(rows, limits)
-    broken = [describe(row) for row in judged if not row.holds] + twin_faults(found, limits)
+    judged = judge(rows + by_learners, limits)
+    broken = [describe(row) for row in judged if not row.holds] + faults + twin_faults(found, limits)
     return Report(task, options, first_seed, judged, found, limits, broken)
+
+
+def _row_of(result: dict[str, Any], task: str) -> Row:
+    """A learned adversary's row."""
+    if result.get("task", task) != task or not {"hears", "name", "successes", "n_episodes"} <= result.keys():
+        raise ValueError(
+            f"learned: {result.get('name', result.get('task'))!r} is no learner's result on {task!r}: give files that "
+            "`python -m experiments.adversaries` wrote for it."
+        )
+    kind = "learned, hears" if result["hears"] else "learned, deaf"
+    return Row(result["name"], kind, result["successes"], result["n_episodes"], {})
+
+
+def _compared(compare: Callable[[], TwinResult]) -> tuple[TwinResult | None, list[str]]:
+    """What twin worlds gave, or why they gave nothing."""
+    try:
+        return compare(), []
+    except TwinError as error:
+        return None, [str(error)]
 
 
 def _told(name: str, attempts: list[Outcome]) -> list[Outcome]:
@@ -164,7 +186,7 @@ def judge(rows: list[Row], limits: Limits) -> list[Row]:
     A learned adversary that hears must exceed what nobody deaf may; else the deaf one's failure proves nothing.
     """
     blind = [row.rate for row in rows if row.kind == "blind"]
-    above_blind = max(blind) + limits.deaf_margin if blind else None
+    above_blind = max(blind, default=limits.blind) + limits.deaf_margin
     wanted = {
         "expert": limits.expert,
         "blind": limits.blind,
@@ -175,7 +197,7 @@ def judge(rows: list[Row], limits: Limits) -> list[Row]:
     judged = []
     for row in rows:
         limit, must_reach = wanted[row.kind], row.kind in ("expert", "learned, hears")
-        holds = limit is None or (row.rate >= limit - 1e-9 if must_reach else row.rate <= limit + 1e-9)
+        holds = row.rate >= limit - 1e-9 if must_reach else row.rate <= limit + 1e-9
         judged.append(Row(row.name, row.kind, row.successes, row.n_episodes, row.ends, limit, holds))
     return judged
 
@@ -205,7 +227,7 @@ def as_text(report: Report) -> str:
     lines = [f"{report.task} {report.options or ''}".rstrip()]
     lines.append(f"{'player':<16}{'kind':<16}{'success':>16}{'limit':>8}  ends")
     for row in report.rows:
-        low, high = interval(row.successes, row.n_episodes)
+        low, high = binomtest(row.successes, row.n_episodes).proportion_ci(method="wilson")
         success = f"{_percent(row.rate)} ({100 * low:.0f}-{100 * high:.0f})"
         limit = "" if row.limit is None else _percent(row.limit)
         ends = ", ".join(f"{count} {end}" for end, count in row.ends.items())
@@ -221,14 +243,6 @@ def as_text(report: Report) -> str:
             lines.append(f"  pictures that differ after it: {100 * twin.pictures_after_touch:.0f} %")
     lines += [f"broken: {fault}" for fault in report.broken] or ["all limits hold"]
     return "\n".join(lines)
-
-
-def interval(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
-    rate, scale = successes / n, 1 + z * z / n
-    centre = (rate + z * z / (2 * n)) / scale
-    half = z / scale * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    return max(0.0, centre - half), min(1.0, centre + half)
 
 
 def _percent(share: float | None) -> str:
@@ -253,7 +267,10 @@ def main() -> int:
     parser.add_argument("--output", type=Path, help="a JSON file for the results; a check that was stopped goes on")
     arguments = parser.parse_args()
     given = {"variant": arguments.variant, "horizon": arguments.horizon}
-    progress = arguments.output.with_suffix(".partial") if arguments.output else None
+    progress = None
+    if arguments.output:  # before the hours that it takes
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        progress = arguments.output.with_suffix(".partial")
     report = check(
         arguments.task,
         arguments.episodes,

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_playbyear.arena import CUBE_HALF_SIZE, FRONT_CAMERA, TABLE, TABLE_TOP, loose_box
+from gym_playbyear.arena import CUBE_HALF_SIZE, FRONT_CAMERA, TABLE, TABLE_TOP, loose_box, on_table
 from gym_playbyear.arm import FINGER_FRICTION
 from gym_playbyear.gates import InterventionGate
 from gym_playbyear.haste import ClosedUnheard
@@ -51,7 +51,7 @@ def place_cube(env: Any, options: dict[str, Any]) -> float:
     variant: Variant = env.variant
     x, y = (env.np_random.uniform(*limits) for limits in (variant.cube_x, variant.cube_y))
     yaw = env.np_random.uniform(-variant.cube_yaw, variant.cube_yaw)
-    x, y = options.get("cube_position", (x, y))
+    x, y = on_table("cube_position", options.get("cube_position", (x, y)))
     env.put(CUBE, (x, y, TABLE_TOP + CUBE_HALF_SIZE), options.get("cube_yaw", yaw))
     return float(y)
 

@@ -137,7 +137,17 @@ class MaterialEars:
         self.choose({})
 
     def choose(self, materials: Mapping[str, str]) -> None:
-        """What bodies are made of from now on, where that is not the usual."""
+        """What bodies are made of from now on, where that is not the usual.
+
+        Raises:
+            ValueError: No contact of such a body can be heard.
+        """
+        unheard = set(materials) - {body for pair in self._pairs for body in pair.bodies}
+        if unheard:
+            heard = sorted({body for pair in self._pairs for body in pair.bodies})
+            raise ValueError(
+                f"materials names {sorted(unheard)}, which no contact is heard of: there are {', '.join(heard)}."
+            )
         key = tuple(sorted(materials.items()))
         if key not in self._made:
             self._made[key] = self._make([_made_of(pair, materials) for pair in self._pairs], *self._rest)

@@ -44,7 +44,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
     """
     ## Description
     A red cube lies somewhere behind a wall that hides it from the camera. A blue panel in front of the wall shows which
-    quarter of the table's width holds the cube, not where in the quarter. The arm has to go behind that quarter, sweep until
+    half of the table's width holds the cube, not where in the half. The arm has to go behind that half, sweep until
     it hears itself touch the cube, hop over it, grasp it, lift it and hold it still. After Du et al., "Play it by Ear"
     (RSS 2022).
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, tray
+from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, on_table, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
 from gym_playbyear.ears_v2 import SyntheticEars
@@ -134,7 +134,7 @@ def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...
 def _place(env: Any, options: dict[str, Any]) -> dict[str, Any]:
     place_cube(env, options)
     place = (0.0, BIN_Y - env.np_random.uniform(0, BIN_Y_RANGE))
-    bin_position = np.array([*options.get("bin_position", place), TABLE_TOP])
+    bin_position = np.array([*on_table("bin_position", options.get("bin_position", place)), TABLE_TOP])
     env.put("bin", bin_position)
     return {"hidden_range": env.variant.cube_y, "bin_position": bin_position}
 

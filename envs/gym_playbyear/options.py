@@ -3,6 +3,7 @@
 import inspect
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
 from typing import Any
 
 from gym_playbyear import ALL_TASKS
@@ -24,6 +25,36 @@ class OptionError(ValueError):
     def __init__(self, option: str, value: Any, wanted: str):
         super().__init__(f"{option}={value!r} is not known: {wanted}.")
         self.option, self.wanted = option, wanted
+
+
+class ResetOptions(dict[str, Any]):
+    """Options of `reset`, which know what a task's `place` asked for: nobody is to think that a misspelt one had an effect.
+
+    Those of others, such as LeRobot's wrappers, pass.
+    """
+
+    def __init__(self, options: Mapping[str, Any]):
+        super().__init__(options)
+        self._asked: dict[str, None] = {}
+
+    def __getitem__(self, name: str) -> Any:
+        self._asked[name] = None
+        return super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        self._asked[str(name)] = None
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        self._asked[name] = None
+        return super().get(name, default)
+
+    def check_spelling(self) -> None:
+        """Raises OptionError for one that nobody asked for and that is spelt like one that was asked for."""
+        for name in self.keys() - self._asked.keys():
+            if get_close_matches(name, self._asked, n=1, cutoff=0.75):
+                known = ", ".join(self._asked)
+                raise OptionError(f"reset(options) {name}", self[name], f"the task's options of reset are {known}")
 
 
 _WARNED: set[str] = set()
@@ -57,6 +88,8 @@ def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str
             has = f"its own options are {', '.join(known)}" if known else "it has none of its own"
             raise OptionError(name, value, f"{task if isinstance(task, str) else 'the task'} has no such option, {has}")
     definition = named if isinstance(named, Task) else named(**options)
+    if not isinstance(definition, Task):
+        raise OptionError("task", task, f"it gave a {type(definition).__name__}, wanted a gym_playbyear.task.Task")
     if warn and definition.is_old and definition.name not in _WARNED:
         _WARNED.add(definition.name)
         _warn(definition.name)

@@ -119,7 +119,7 @@ class PrivilegedState:
 
     def hand_forces(self, name: str) -> np.ndarray:
         """Forces between the parts of the hand (`arm.touching`) and a loose prop in the last control step's T physics steps
-        (T, parts, 3) [N, world axes]."""
+        (T, parts, 3) [N, world axes]. ValueError for any other."""
         return self.contacts.hand_forces(self._rollout_sensors[0], name)
 
     def position(self, name: str) -> np.ndarray:
@@ -151,6 +151,17 @@ class PrivilegedState:
         """Leaves a loose prop out of the episode, for a task's `place`: it floats far below until `put` fetches it."""
         self.put(name, (0.0, 0.0, _FAR_BELOW - self.model.body(name).id))
         self._weigh(name, False)
+
+    def _remember_places(self) -> None:
+        """Keeps what `put` and `take_away` change in the model, so that no episode depends on the one before."""
+        self._usual_places = [array.copy() for array in self._places()]
+
+    def _put_back(self) -> None:
+        for array, usual in zip(self._places(), self._usual_places, strict=True):
+            array[:] = usual
+
+    def _places(self) -> tuple[np.ndarray, ...]:
+        return self.model.body_pos, self.model.body_quat, self.model.body_gravcomp
 
     def _weigh(self, name: str, falls: bool) -> None:
         root = self.model.body(name).id

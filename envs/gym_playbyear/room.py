@@ -100,8 +100,7 @@ def _recording(path: str, sample_rate: int) -> np.ndarray:
     except (ValueError, EOFError) as error:
         raise OptionError("room_noise", path, f"it cannot be read as a WAV file ({error})") from error
     wave = samples.astype(np.float64).reshape(len(samples), -1).mean(axis=1)
-    if samples.dtype == np.uint8:
-        wave -= 128.0
+    wave -= wave.mean() if len(wave) else 0.0  # nobody hears it, and the level must not count it
     divisor = gcd(rate, sample_rate)
     wave = signal.resample_poly(wave, sample_rate // divisor, rate // divisor)
     level = np.sqrt(np.mean(np.square(wave))) if len(wave) else 0.0

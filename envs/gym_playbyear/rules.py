@@ -32,7 +32,7 @@ class Solved(Rule):
     Args:
         condition: `condition(env)`: whether all is as it should be.
         prop: What has to stay where it is meanwhile; None: nothing.
-        seconds: For how long.
+        seconds: For how long; 0: the first step at which it is so, or of a `prop` the second.
         tolerance: How far it may move in that time [m].
     """
 
@@ -49,14 +49,13 @@ class Solved(Rule):
 
     def applies(self, env: Any) -> bool:
         if not self.condition(env):
-            self._since = None
+            self._since, self._n_steps = None, 0
             return False
-        if self.prop is None:
-            return True
-        place = env.position(self.prop)
-        if self._since is None or np.linalg.norm(place - self._since) > self.tolerance:
-            self._since, self._n_steps = place, 0
-            return False
+        if self.prop is not None:
+            place = env.position(self.prop)
+            if self._since is None or np.linalg.norm(place - self._since) > self.tolerance:
+                self._since, self._n_steps = place, 0
+                return False
         self._n_steps += 1
         return self._n_steps >= self.seconds * env.control_hz
 
@@ -94,7 +93,7 @@ class Pressed(Rule):
     is judged at every physics step.
 
     Args:
-        prop: What must not be pressed on.
+        prop: What must not be pressed on, a loose thing.
         limit: Largest force of one part of the hand [N]. A stiff arm gives 80 N and more when it comes down on a thing.
         friction: Between the hand and the thing.
     """

@@ -153,7 +153,16 @@ class Contacts:
         return np.add.reduceat(np.sqrt(np.einsum("tpc,tpc->tp", vectors, vectors)), self._first_part, axis=1)
 
     def hand_forces(self, sensordata: np.ndarray, name: str) -> np.ndarray:
-        """Forces between the parts of the hand and a loose thing (T, parts, 3) [N, world axes]."""
+        """Forces between the parts of the hand and a loose thing (T, parts, 3) [N, world axes].
+
+        Raises:
+            ValueError: There is no such thing, or the hand's contact with it is measured as a whole.
+        """
+        if name not in self._loose:
+            raise ValueError(
+                f"The parts of the hand are told apart on loose things with a material alone ({', '.join(sorted(self._loose))}"
+                f"), {name!r} is none: `contact_forces` has what the whole hand does to it."
+            )
         first = 3 * int(self._first_part[self.pairs.index((GRIPPER, name))])
         n_parts = len(self._arm.touching)
         return sensordata[:, first : first + 3 * n_parts].reshape(len(sensordata), n_parts, 3)

@@ -12,10 +12,10 @@ from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from mujoco import rollout
 
-from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.ears import MaterialEars, Moment
+from gym_playbyear.force_proxy import ForceProxy
 from gym_playbyear.looks import PeopleView
-from gym_playbyear.options import check_option, make_definition
+from gym_playbyear.options import OptionError, ResetOptions, check_option, make_definition
 from gym_playbyear.privileged import PrivilegedState
 from gym_playbyear.proprioception import Proprioception
 from gym_playbyear.rendering import SceneRenderer
@@ -26,7 +26,6 @@ from gym_playbyear.task import Task
 
 SOUND_MODES = ("waveform", "contact_force", "none")
 _SETTLE_STEPS = 10
-_LIFTED_SILENCE_HEIGHT = TABLE_TOP + 0.04  # m: above it the paper's force proxy is silent (the authors' code)
 _ROOM_MICROPHONE = np.array((0.6, 0.0, 1.2))  # m, world frame: for microphones that no part of the arm carries
 
 
@@ -79,7 +78,9 @@ class TaskEnv(PrivilegedState, gym.Env):
             raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
         self.task, self.task_description, self.variant = definition.name, definition.description, definition.numbers
         self.metadata = {**self.metadata, "render_fps": definition.control_hz}
-        self._max_episode_steps = int(horizon or definition.horizon)
+        if horizon is not None and horizon < 1:
+            raise OptionError("horizon", horizon, "give at least 1 step, or None for the task's own")
+        self._max_episode_steps = int(definition.horizon if horizon is None else horizon)
         self.render_mode, self._render_size = render_mode, render_size
         self._image_size, self._sound_mode, self._hidden_object = image_size, sound, hidden_object
         self.microphones = tuple(microphones or definition.microphones)
@@ -89,7 +90,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._success, self._ends, self._haste = copy.deepcopy((definition.success, definition.ends, definition.haste))
 
         arm = definition.arm
-        self.contacts = Contacts(definition)
+        self.contacts, self._force_proxy = Contacts(definition), ForceProxy()
         self._sound: Any = None
         if sound == "waveform":
             rates = (self._sample_rate, definition.control_hz, definition.physics_dt)
@@ -100,6 +101,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         if self._sound is not None:
             self._sound.add_sensors(spec)
         self.model = spec.compile()
+        self._remember_places()
         self.data = mujoco.MjData(self.model)
         self._controller = arm.controller(definition.control_hz, definition.physics_dt)
         self._fingers = slice(arm.n_joints, arm.n_joints + 2)
@@ -175,7 +177,10 @@ class TaskEnv(PrivilegedState, gym.Env):
         self.data.qpos[: len(joints)] = joints
         self.data.ctrl[:] = self._controller.hold()
         self.secrets, self.materials = {}, {}
-        self.shown = self.definition.place(self, dict(options or {}))
+        self._put_back()
+        asked = ResetOptions(options or {})
+        self.shown = self.definition.place(self, asked)
+        asked.check_spelling()
         self._expert_rng = np.random.default_rng(self.np_random.integers(2**63))
         if self._sound is not None:
             self._sound.choose(self.materials)
@@ -186,7 +191,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)
         for _ in range(_SETTLE_STEPS):
             self._advance(hold)
-        for rule in (self._success, *self._ends, self._haste):
+        for rule in (self._success, *self._ends, self._haste, self._force_proxy):
             rule.begin(self)
 
     def step(self, action):
@@ -273,10 +278,7 @@ class TaskEnv(PrivilegedState, gym.Env):
             for microphone, block in self._sound.step(self.model, self.moment()).items():
                 observation[f"audio.{microphone}"] = block
         if self._sound_mode == "contact_force":
-            felt = self.definition.felt
-            is_silent = felt is None or self.position(felt)[2] > _LIFTED_SILENCE_HEIGHT
-            force = np.zeros(6) if is_silent else self.contacts.felt(self._rollout_sensors[0]).mean(axis=0)
-            observation["contact_force"] = force.astype(np.float32)
+            observation["contact_force"] = self._force_proxy.observe(self, self._rollout_sensors[0])
         if self.render_mode == "human":
             self.render()
         return observation

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP
+from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP, on_table
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.haste import MovedUnheard
@@ -137,7 +137,7 @@ def _place(env: Any, options: dict[str, Any], *, contents: str | None) -> dict[s
     drawn = CONTENTS[env.np_random.integers(len(CONTENTS))]
     chosen = options.get("contents", contents or drawn)
     check_option("contents", chosen, CONTENTS)
-    x, y = options.get("pouch_position", (x, y))
+    x, y = on_table("pouch_position", options.get("pouch_position", (x, y)))
     put_pouch(env, x, y, options.get("pouch_yaw", yaw))
     env.secrets["contents"] = chosen
     env.materials |= dict.fromkeys(PIECES, chosen)

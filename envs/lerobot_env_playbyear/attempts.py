@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 
 class AttemptsFile(gym.Wrapper):
@@ -38,11 +39,20 @@ class AttemptsFile(gym.Wrapper):
         _, _, terminated, truncated, info = outcome
         if (terminated or truncated) and not self._is_over:
             self._is_over = True
-            told = {key: value for key, value in info.items() if isinstance(value, bool | int | float | str)}
+            told = {key: _plain(value) for key, value in info.items() if _can_be_told(value)}
             line = json.dumps({"seed": self._seed, "steps": self._n_steps, **told})
             with self._path.open("a") as file:
                 file.write(line + "\n")  # one write: lines of several processes do not mix
         return outcome
+
+
+def _can_be_told(value: Any) -> bool:
+    """Whether it is a text, a number or a truth value, or numbers: what JSON has, too."""
+    return isinstance(value, str) or np.asarray(value).dtype.kind in "biuf"
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, str) else np.asarray(value).tolist()
 
 
 def with_attempts_file(make: Callable[[], gym.Env], path: str | None) -> Callable[[], gym.Env]:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:  # of the other distribution, which is needed for these pictur
     from lerobot_playbyear.datasets.sound_picture import SoundPicture
 
 SOUND_MODES = ("waveform", "contact_force", "none")
+RENDER_MODES = ("rgb_array", "human")
 _STATE_DIM, _ACTION_DIM, _FORCE_DIM = 7, 4, 6
 
 
@@ -82,7 +83,7 @@ class PlaybyearEnvConfig(EnvConfig):
     # Task
     cube_material: str = "cube"
     variant: str = "default"
-    task_options: dict[str, str] = field(default_factory=dict)
+    task_options: dict[str, Any] = field(default_factory=dict)
     hidden_object: bool = True
     # For people
     visualization_width: int = 480
@@ -182,11 +183,11 @@ class PlaybyearEnvConfig(EnvConfig):
 
     def _room(self) -> dict[str, Any] | None:
         """Options of `gym_playbyear.room.Room`, or None for the task's own room."""
-        if self.room_noise is None and self.microphone_response == "flat":
+        if self.sound != "waveform" or (self.room_noise is None and self.microphone_response == "flat"):
             return None
         return {"noise": self.room_noise, "noise_level": self.room_noise_level, "response": self.microphone_response}
 
-    def _own_options(self) -> dict[str, str]:
+    def _own_options(self) -> dict[str, Any]:
         """Those that belong to the task. What has its default is left out: not every task knows it."""
         defaults = {"cube_material": "cube", "variant": "default"}
         changed = {name: getattr(self, name) for name, value in defaults.items() if getattr(self, name) != value}
@@ -237,8 +238,15 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("microphones", "give at least one name and each only once")
         if self.microphone_response not in RESPONSES:
             raise self._error("microphone_response", f"choose one of {', '.join(RESPONSES)}")
+        for name in ("room_noise", "microphone_response"):
+            if self.sound != "waveform" and getattr(self, name) not in (None, "flat"):
+                raise self._error(
+                    name, f"--env.sound={self.sound} has no sound that it could change; leave one of them out"
+                )
         if self.room_noise is not None and not Path(self.room_noise).is_file():
             raise self._error("room_noise", "there is no such file, give a WAV file")
+        if self.room_noise is None and self.room_noise_level != 1.0:
+            raise self._error("room_noise_level", "no noise plays in the room; name a WAV file with --env.room_noise")
         if self.attempts_file is not None and Path(self.attempts_file).is_dir():
             raise self._error("attempts_file", "it is a folder, give a file in it, such as attempts.jsonl")
         if not 0 <= self.room_noise_level < float("inf"):
@@ -247,6 +255,13 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("spectrogram", f"--env.sound={self.sound} has no sound to show; leave one of them out")
         if self.sound_as_state and self.sound != "waveform":
             raise self._error("sound_as_state", f"--env.sound={self.sound} has no samples; leave one of them out")
+        for name, least in (("image_size", 8), ("visualization_width", 1), ("episode_length", 1)):
+            if getattr(self, name) is not None and getattr(self, name) < least:
+                raise self._error(name, f"give {least} or more")
+        if not 0 <= self.noise_level < float("inf"):
+            raise self._error("noise_level", "give 0 (silent) or more")
+        if self.render_mode not in RENDER_MODES:
+            raise self._error("render_mode", f"choose one of {', '.join(RENDER_MODES)}")
         if self.visualization_width != self.visualization_height:
             raise self._error("visualization_width", "the picture is square: give both sides the same")
 

@@ -1,6 +1,7 @@
 """What a check has played so far, in a file, so that one that was stopped goes on with the next player."""
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,12 @@ class Progress:
             kept = json.loads(path.read_text())
             if kept["settings"] == self.settings:
                 self._played = kept["played"]
+                if self._played:
+                    print(
+                        f"{path} has {', '.join(self._played)} of a check that was stopped: they do not play again. Remove it "
+                        "if the task has changed since.",
+                        file=sys.stderr,
+                    )
 
     def attempts(self, player: str) -> list[Outcome] | None:
         """How a player's attempts ended; None if it has not played yet."""

@@ -64,18 +64,32 @@ class _Run:
     touched_at: int | None
 
 
+class TwinError(ValueError):
+    """A task has no twin worlds to compare, or its expert touched too little in them."""
+
+
 class Twins:
     """Both worlds of a task.
 
     Args:
         task: Its name.
         options: For `gymnasium.make`.
+
+    Raises:
+        TwinError: The worlds differ by what is hidden, and nothing is.
     """
 
     def __init__(self, task: str, **options: Any):
         asked = DeafTask(task, **options)
-        first, second = asked.env.definition.twins
+        definition = asked.env.definition
+        first, second = definition.twins
         asked.close()
+        hides = {True, False} <= {world.get("hidden_object", True) for world in (first, second)}
+        if hides and not any(prop.hidden and prop.material for prop in definition.props):
+            raise TwinError(
+                f"twin worlds: {definition.name} hides nothing that can be touched, so that both worlds are the same and prove "
+                "nothing. Give what only hearing finds Prop(hidden=True, material=...), or the task other twins."
+            )
         self.worlds = DeafTask(task, **{**options, **first}), DeafTask(task, **{**options, **second})
         self.can_be_touched = self.worlds[0].can_be_touched
 
@@ -176,7 +190,7 @@ def twin_test(task: str, seeds: range, *, n_pictured: int = 3, **options: Any) -
         options: For `gymnasium.make`.
 
     Raises:
-        ValueError: The expert touched the object in fewer than four episodes.
+        TwinError: As of `Twins`, or the expert touched the object in fewer than four episodes.
     """
     twins = Twins(task, **options)
     features, labels, episodes = [], [], []
@@ -206,7 +220,10 @@ def twin_test(task: str, seeds: range, *, n_pictured: int = 3, **options: Any) -
     can_be_touched = twins.can_be_touched
     twins.close()
     if n_episodes < 4:
-        raise ValueError(f"The expert touched the hidden object in {n_episodes} episodes of {len(seeds)}: give more.")
+        raise TwinError(
+            f"twin worlds: the expert touched the hidden object in {n_episodes} of {len(seeds)} episodes, which is too few to "
+            "compare them: four are needed."
+        )
     of_episode = np.array(episodes)
     held_out = of_episode % 2 == 1
     return TwinResult(
