@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The main job with LeRobot's own commands, small enough to watch: four demonstrations, eight updates, two episodes.
+# The main job with LeRobot's own commands, small enough to watch: four demonstrations, eight updates, one episode.
 # Enough to see that everything works, far too little to learn; `make demo` is the real thing.
 set -euo pipefail
 export MUJOCO_GL=${MUJOCO_GL:-egl}
@@ -14,4 +14,4 @@ lerobot-train --policy.type=playbyear --policy.push_to_hub=false --policy.device
   --batch_size=4 --steps=8 --num_workers=0 --output_dir="$folder/train"
 
 lerobot-eval --policy.path="$folder/train/checkpoints/last/pretrained_model" \
-  --env.type=playbyear --env.task=OccludedGrasp-v1 --eval.n_episodes=2 --eval.batch_size=2 --output_dir="$folder/eval"
+  --env.type=playbyear --env.task=OccludedGrasp-v1 --eval.n_episodes=1 --eval.batch_size=1 --output_dir="$folder/eval"

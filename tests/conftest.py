@@ -1,6 +1,21 @@
 """Fixtures of several test modules, and a failure told when it happens."""
 
+import gc
+import logging
+from functools import cache
+
 import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _options_are_documented_once():
+    """draccus searches the sources for the help of all 2,000 options whenever a command starts: here several hundred times."""
+    from draccus.wrappers import docstring
+
+    logging.getLogger("draccus").setLevel(logging.INFO)  # else as many lines of what it decodes are kept for each test
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(docstring, "get_attribute_docstring", cache(docstring.get_attribute_docstring))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -14,6 +29,12 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(n_threads)
+
+
+def pytest_collection_finish():
+    """What was imported stays: the garbage collector need not look through PyTorch and LeRobot again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 class ToldAtOnce:

@@ -96,6 +96,7 @@ def test_a_checkpoint_keeps_it_all_and_one_with_heads_acts_without_them(tmp_path
     assert torch.equal(step_through(bare, [episode]), step_through(policy, [episode]))
 
 
+@pytest.mark.slow
 def test_a_training_step_with_everything_traces_as_one_graph():
     policy = make_policy(**EVERYTHING, audio_noise_db=0.0, audio_colour_db=3.0)
     batch = batch_of(policy, last=4)

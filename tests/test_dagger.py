@@ -6,7 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
-from dagger_factory import ENV, arguments, base_folder, column, command, corrections, dagger, metrics, seeds, state
+from dagger_factory import (
+    ENV,
+    QUICK,
+    arguments,
+    base_folder,
+    column,
+    command,
+    corrections,
+    dagger,
+    metrics,
+    seeds,
+    state,
+)
 from lerobot.envs import make_env, make_env_pre_post_processors
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval, lerobot_train
@@ -31,8 +43,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def finished(tmp_path_factory):
     """A run of three kept attempts with an evaluation before, after the second round, and at the end."""
     folder = tmp_path_factory.mktemp("dagger")
-    time = "--env.episode_length=200"  # enough to rescue a policy that has learned nothing
-    dagger(folder, "--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1", time)
+    dagger(folder, *QUICK, "--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1")
     return folder
 
 
@@ -62,8 +73,8 @@ class Scripted(Expert):
         return self.verdicts.get(self.n)
 
 
-def scene(expert=None):
-    env_cfg = PlaybyearEnvConfig(image_size=16)
+def scene(expert=None, n_steps=40):
+    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=n_steps)
     policy = PlaybyearPolicy.from_pretrained(base_folder() / "policy")
     processors = make_pre_post_processors(policy.config, str(base_folder() / "policy"))
     return env_spec(env_cfg).make(), PolicyActor(policy, env_cfg, *processors), expert or Scripted()
@@ -72,7 +83,7 @@ def scene(expert=None):
 def test_a_policy_acts_as_in_lerobots_rollout():
     env, actor, expert = scene()
     episode = play(env, actor, seed=5, expert=expert)
-    env_cfg = PlaybyearEnvConfig(image_size=16)
+    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=40)
     policy = PlaybyearPolicy.from_pretrained(base_folder() / "policy").eval()
     own = make_pre_post_processors(policy.config, str(base_folder() / "policy"))
     vec = make_env(env_cfg)["playbyear"][0]

@@ -126,7 +126,7 @@ def test_an_expert_that_redoes_ends_a_try_and_acts_from_the_first_step_in_a_demo
 
 @pytest.mark.parametrize("is_person", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_tasks_script_acts_from_the_first_step_if_it_is_told_to(is_person):
-    env, actor, _ = scene()
+    env, actor, _ = scene(n_steps=None)
     redoing = Redoing(ScriptedExpertConfig(person=is_person).make(env))
     redoing.demonstrates = True
     episode = play(env, actor, seed=5, expert=redoing)
@@ -231,7 +231,7 @@ def test_other_frames_are_learned_from(tmp_path, options, capfd):
 
 def test_a_run_skips_the_beginning_of_corrections(tmp_path, capfd):
     losses = {}
-    for options in ((), ("--skip_s=0.1",), ("--skip_s=0",)):  # corrections of 3 frames, a memory of 2
+    for options in ((), ("--skip_s=0",)):  # corrections of 3 frames, a memory of 2
         folder = tmp_path / str(len(losses))
         dagger(folder, *RUN, *options)
         losses[options] = [line["loss_interventions"] for line in metrics(folder, "round")]
@@ -240,8 +240,8 @@ def test_a_run_skips_the_beginning_of_corrections(tmp_path, capfd):
         n = 6 if options == ("--skip_s=0",) else 2  # of two attempts
         assert f"Corrections: {n} of 6 frames that the expert chose are learned from" in said.out
         assert ("the first 0.1 s of every correction are left out" in said.out) is (n == 2)
-    by_default, memory, nothing = losses.values()
-    assert by_default == memory != nothing
+    by_default, nothing = losses.values()
+    assert by_default != nothing
     dagger(tmp_path / "long", *RUN, "--skip_s=60")
     assert "No correction is longer than the 1200 frames" in capfd.readouterr().err
 
@@ -290,7 +290,7 @@ def succeeds_from_the_first_step_on(expert, until_told=True):
     expert.is_success |= expert.n == 0
 
 
-@pytest.mark.parametrize("kills", [(3,), pytest.param((1, 2, 4, 5), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [(), pytest.param((1, 2, 3, 4, 5), marks=pytest.mark.slow)])
 def test_what_fails_although_the_robot_may_ask_is_shown_from_its_first_step(tmp_path, monkeypatch, kills):
     """Of two attempts that the policy makes alone one fails, and is made good; a run that is killed on the way ends alike."""
     monkeypatch.setattr(Quick, "take_over", succeeds_from_the_first_step_on)

@@ -57,7 +57,9 @@ def call(command, *arguments: str | Path) -> None:
         command.main()
 
 
-@pytest.mark.parametrize("command", [train, lerobot_train], ids=["playbyear-train", "lerobot-train"])
+@pytest.mark.parametrize(
+    "command", [train, pytest.param(lerobot_train, marks=pytest.mark.slow)], ids=["playbyear-train", "lerobot-train"]
+)
 def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, dataset, tmp_path):
     call(
         command,

@@ -150,7 +150,11 @@ def test_the_optimizer_of_such_a_policy_is_saved_and_goes_on(tmp_path, one_buffe
     assert all(torch.equal(a, b) for a, b in zip(policy.parameters(), again.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("script", [train, lerobot_train.train], ids=["playbyear-train", "lerobot-train"])
+@pytest.mark.parametrize(
+    "script",
+    [train, pytest.param(lerobot_train.train, marks=pytest.mark.slow)],
+    ids=["playbyear-train", "lerobot-train"],
+)
 def test_a_training_saves_its_checkpoints_and_is_resumed(script, root, tmp_path, monkeypatch):
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={root}", "--seed=3")
     run(script, *TINY, *data, "--steps=2", f"--output_dir={tmp_path / 'plain'}")

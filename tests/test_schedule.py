@@ -132,7 +132,11 @@ def jumps(capfd):
     return [line for line in "\n".join(capfd.readouterr()).splitlines() if "The learning rate rises" in line]
 
 
-@pytest.mark.parametrize("script", [train, lerobot_train.train], ids=["playbyear-train", "lerobot-train"])
+@pytest.mark.parametrize(
+    "script",
+    [train, pytest.param(lerobot_train.train, marks=pytest.mark.slow)],
+    ids=["playbyear-train", "lerobot-train"],
+)
 def test_a_rate_that_rises_because_the_run_shall_be_longer_is_said(script, trained, command, tmp_path, capfd):
     resumed = ("--resume=true", f"--config_path={trained}", "--steps=20")
 

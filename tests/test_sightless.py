@@ -34,6 +34,7 @@ def test_the_half_of_the_table_is_guessed_or_not_told_at_all():
     env.close()
 
 
+@pytest.mark.slow
 def test_half_of_the_table_can_be_searched_without_seeing_which_one_and_the_tray_cannot():
     seeds = range(300, 312)
     assert attempts("OccludedGrasp-v1", "everywhere", seeds).count("success") >= 11

@@ -439,7 +439,9 @@ def test_presets_are_options_that_exist(name, command, monkeypatch, root):
     assert seen[0].steps == int(preset_options(name)["steps"])
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize(
+    "name", [name if name == "cpu" else pytest.param(name, marks=pytest.mark.slow) for name in PRESETS]
+)
 def test_a_preset_is_a_configuration_file_as_well(name, command, monkeypatch, root):
     seen = []
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
