@@ -14,7 +14,7 @@ METHODS: dict[str, tuple[str, ...]] = {
     "sirius": ("--method.type=weighted",),
     "iwr": ("--method.type=weighted", "--method.paper=iwr"),
     "robot_gated": (*_ASKING, "--method.hands_back=true"),
-    "robot_gated_no_handback": (*_ASKING, "--method.hands_back=false"),
+    "robot_gated_no_handback": (*_ASKING, "--method.hands_back=false", "--method.redo_failed=false"),
     "robot_gated_redo": (*_ASKING, "--method.hands_back=false", "--method.redo_failed=true"),
     "early": ("--takeover_delay_s=-0.5",),
     "late": ("--takeover_delay_s=0.5",),

@@ -328,7 +328,7 @@ def test_what_the_expert_fails_at_too_is_left(tmp_path):
 
 def test_a_run_does_not_end_before_the_scene_that_it_failed_in_is_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(Quick, "take_over", succeeds_from_the_first_step_on)
-    options = ("--method.redo_failed=true", "--method.rollouts=1", "--episodes=1", "--episode_seed=9999")
+    options = ("--method.rollouts=1", "--episodes=1", "--episode_seed=9999")  # by default
     dagger(tmp_path, *QUICK, *GATED[:1], *options, "--max_attempts=1")
     assert [line["outcome"] for line in metrics(tmp_path, "attempt")] == ["failed", "kept"]
 
@@ -368,6 +368,21 @@ def test_attempts_in_which_nobody_could_be_asked_do_not_end_a_run(tmp_path):
     attempts = metrics(tmp_path, "attempt")
     assert len(attempts) > 4
     assert attempts[-1]["outcome"] == "kept"
+
+
+@pytest.mark.parametrize(
+    ("options", "hands_back", "is_real_time", "redoes"),
+    [
+        ({}, False, False, True),
+        ({}, True, False, False),
+        ({}, False, True, False),
+        ({"redo_failed": False}, False, False, False),
+    ],
+)
+def test_what_fails_is_shown_by_a_script_that_acts_to_the_end_in_a_simulation(
+    options, hands_back, is_real_time, redoes
+):
+    assert RobotGatedConfig(**options).redoes(hands_back, is_real_time) is redoes
 
 
 @pytest.mark.slow

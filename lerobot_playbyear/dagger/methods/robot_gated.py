@@ -45,7 +45,7 @@ class RobotGatedConfig(MethodConfig):
         discount: Of a success, per step; ThriftyDAgger: 0.9999.
         memory: Last attempts from which thresholds are set.
         redo_failed: Where an attempt fails all the same, the scene is set up again, and the expert demonstrates the task in it
-            from the first step on, as with `--method.type=redo`.
+            from the first step on, as with `--method.type=redo`. None: in a simulation, where a script acts to the end.
     """
 
     expert_decides: ClassVar[bool] = False
@@ -60,11 +60,15 @@ class RobotGatedConfig(MethodConfig):
     gate_updates: int = 400
     discount: float = 0.9999
     memory: int = 20
-    redo_failed: bool = False
+    redo_failed: bool | None = None
 
     @property
     def needs_simulation(self) -> bool:  # type: ignore[override]
-        return self.redo_failed
+        return bool(self.redo_failed)
+
+    def redoes(self, hands_back: bool, is_real_time: bool) -> bool:
+        """Whether what fails is shown from its first step."""
+        return not (hands_back or is_real_time) if self.redo_failed is None else self.redo_failed
 
     def check(self) -> None:
         if not 0 < self.intervention_share < 1:
@@ -90,6 +94,7 @@ class RobotGated(Method):
         super().__init__(cfg)
         self._config = config
         self._expert: Asked | None = None
+        self._redoes = False
         self._fitted_round = -1
         self._seconds = 0.0  # that the gate took to learn
         self._remembered: Remembering | None = None
@@ -118,6 +123,7 @@ class RobotGated(Method):
         self._tools = tools
         hands_back = self._expert.decides if self._config.hands_back is None else self._config.hands_back
         self._n_least = round(self._config.least_s * tools.facts.fps) if hands_back else FOR_GOOD
+        self._redoes = self._config.redoes(hands_back, getattr(self.cfg.env, "is_real_time", False))
 
     @property
     def _remembering(self) -> "Remembering":
@@ -208,7 +214,7 @@ class RobotGated(Method):
             return
         if outcome in ("failed", "unneeded"):
             self._remembering.keep(episode)
-        if outcome == "failed" and self._config.redo_failed:
+        if outcome == "failed" and self._redoes:
             self._tools.state.method[FAILED] = episode.seed
 
     def _note_shown(self, counts: bool = True) -> None:
