@@ -290,6 +290,14 @@ def test_a_card_that_gives_nothing_but_zeros_is_told():
             assert until_problem(ears, 0.7)[0] == ""
 
 
+def test_a_dead_channel_of_a_card_is_told_by_its_microphones_name(tmp_path):
+    samples = np.ones((RATE, 3), np.int16) * np.array([1, 0, 0], np.int16)
+    path = str(write_wav(tmp_path / "sound.wav", samples, RATE))
+    configs = {name: FileMicrophoneConfig(path=path, channel=i) for i, name in enumerate(("left", "right"))}
+    with listening(Ears(configs, FPS, silent_s=0.2)) as ears:
+        assert "The microphone right has given nothing but zeros for 0." in until_problem(ears, 3)[0]
+
+
 _CHILD = """
 import json, time, numpy as np
 from lerobot_playbyear.microphones.config import PortAudioMicrophoneConfig

@@ -28,7 +28,7 @@ class Ears:
         configs: By their names.
         fps: Ticks per second [Hz].
         stalled_s: A card that brings nothing for as long is taken for dead [s].
-        silent_s: A card that gives nothing but zeros for as long is taken for unplugged [s]; 0: never.
+        silent_s: A microphone that gives nothing but zeros for as long is taken for unplugged [s]; 0: never.
 
     Raises:
         ValueError: The rate of ticks does not divide a sample rate.
@@ -118,10 +118,11 @@ class Ears:
             return f"The microphone {names} is gone: {microphone.problem}."
         if microphone.silent_for_s > self._stalled_s:
             return f"The microphone {names} has brought nothing for {microphone.silent_for_s:.1f} s."
-        if card.recording.silent_s > self._silent_s > 0:
+        zeros_s = {name: for_s for name, for_s in card.recording.zeros_s.items() if for_s > self._silent_s > 0}
+        if zeros_s:
             return (
-                f"The microphone {names} has given nothing but zeros for {card.recording.silent_s:.1f} s: it is muted, or "
-                "unplugged."
+                f"The microphone {', '.join(zeros_s)} has given nothing but zeros for {max(zeros_s.values()):.1f} s: it is "
+                "muted, or unplugged."
             )
         return ""
 
