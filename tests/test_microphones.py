@@ -414,7 +414,14 @@ def test_a_file_that_does_not_fit_is_refused(options, said, tmp_path):
         microphone.connect()
 
 
-def test_channels_of_one_card_cannot_have_two_latencies():
-    configs = {str(i): FileMicrophoneConfig(path="x.wav", channel=i, latency_s=i / 100) for i in range(2)}
-    with pytest.raises(MicrophoneError, match="give them the same"):
-        Ears(configs, FPS)
+@pytest.mark.parametrize("option", ["latency_s", "sample_rate", "card_channels", "block_s", "wait_s"])
+def test_options_of_a_card_are_the_same_for_all_of_its_microphones(option):
+    values = {"latency_s": 0.01, "sample_rate": 16000, "card_channels": 4, "block_s": 0.02, "wait_s": 0.05}
+    left = PortAudioMicrophoneConfig(device=2)
+    right = PortAudioMicrophoneConfig(device="2", channel=1, **{option: values[option]})
+    with pytest.raises(
+        MicrophoneError, match=rf"left and right .* {option}=\S+ and {values[option]}: give them the same"
+    ):
+        Ears({"left": left, "right": right}, FPS)
+    setattr(left, option, values[option])
+    assert list(Ears({"left": left, "right": right}, FPS).drop_outs) == ["left", "right"]

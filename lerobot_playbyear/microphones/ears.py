@@ -2,7 +2,7 @@
 
 from collections.abc import Hashable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -32,7 +32,7 @@ class Ears:
 
     Raises:
         ValueError: The rate of ticks does not divide a sample rate.
-        MicrophoneError: Microphones of one card are to have different latencies.
+        MicrophoneError: Options of two microphones on one card differ.
     """
 
     def __init__(
@@ -133,13 +133,15 @@ class Ears:
 
 
 def _make_card(microphones: Mapping[str, MicrophoneConfig], fps: int) -> _Card:
-    first = next(iter(microphones.values()))
-    latencies = {config.latency_s for config in microphones.values()}
-    if len(latencies) > 1:
-        raise MicrophoneError(
-            f"The microphones {', '.join(microphones)} are channels of one card, and have latency_s={sorted(latencies)}: give "
-            "them the same."
-        )
+    (first_name, first), *others = microphones.items()
+    for name, config in others:
+        for option in (field.name for field in fields(config) if field.name != "channel"):
+            values = [str(getattr(each, option, None)) for each in (first, config)]  # device: 2 is the same as "2"
+            if values[0] != values[1]:
+                raise MicrophoneError(
+                    f"The microphones {first_name} and {name} are channels of one card, and have {option}={values[0]} and "
+                    f"{values[1]}: give them the same."
+                )
     channels = {name: config.channel for name, config in microphones.items()}
     recording = CardRecording(first.sample_rate, fps, channels)
     return _Card(first.make(max(channels.values()) + 1), recording, first.latency_s)
