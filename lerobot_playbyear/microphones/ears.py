@@ -20,6 +20,15 @@ class _Card:
     recording: CardRecording
     latency_s: float
 
+    def open(self) -> None:
+        """
+        Raises:
+            MicrophoneError: It cannot be opened.
+        """
+        if not self.microphone.is_connected:
+            self.recording.forget()
+            self.microphone.connect(self.recording.write)
+
 
 class Ears:
     """The microphones of a robot.
@@ -56,9 +65,7 @@ class Ears:
             for card in self._cards:
                 if self._problem_of(card):
                     card.microphone.disconnect()
-                if not card.microphone.is_connected:
-                    card.recording.forget()
-                    card.microphone.connect(card.recording.write)
+            self._open()
             for card in self._cards:
                 if card.recording.wait_for_sound(_FIRST_SOUND_S):
                     continue
@@ -71,6 +78,23 @@ class Ears:
                         "hears."
                     )
             stack.pop_all()
+
+    def _open(self) -> None:
+        """Opens all cards that are not open.
+
+        PortAudio looks for what was plugged in only while none of its cards is open. So where one cannot be opened beside
+        others, all are closed, and that one comes first.
+        """
+        for card in self._cards:
+            try:
+                card.open()
+            except MicrophoneError:
+                if not any(other.microphone.is_connected for other in self._cards):
+                    raise
+                self.disconnect()
+                for again in [card, *self._cards]:
+                    again.open()
+                return
 
     def restart(self, now_s: float) -> None:
         """An episode begins at `now_s` [s of time.perf_counter]."""

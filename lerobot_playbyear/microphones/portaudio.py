@@ -142,8 +142,11 @@ def channels_to_open(card: SoundCard, needed: int, wanted: int | None = None) ->
 
 def _has_open_stream() -> bool:
     """Whether a stream of this process is open, anyone's; PortAudio would close it when it looks again."""
-    kind = stream_kind(load_sounddevice())
+    kind, is_frozen = stream_kind(load_sounddevice()), gc.get_freeze_count() > 0
+    gc.unfreeze()  # what is frozen, as before each attempt, is not among the objects
     streams = [thing for thing in gc.get_objects() if issubclass(type(thing), kind)]
+    if is_frozen:
+        gc.freeze()
     # One that could not be opened, and to which its error still refers, never got a rate.
     return any(hasattr(stream, "samplerate") and not stream.closed for stream in streams)
 
