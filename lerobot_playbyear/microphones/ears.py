@@ -9,9 +9,7 @@ import numpy as np
 from lerobot_playbyear.datasets.microphone import DropOut
 from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.config import MicrophoneConfig
-from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
-
-_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
+from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, wait_for_first_sound
 
 
 @dataclass
@@ -67,16 +65,7 @@ class Ears:
                     card.microphone.disconnect()
             self._open()
             for card in self._cards:
-                if card.recording.wait_for_sound(_FIRST_SOUND_S):
-                    continue
-                card.microphone.disconnect()  # through a sound server a stream that was opened now and then never begins
-                card.microphone.connect(card.recording.write)
-                if not card.recording.wait_for_sound(_FIRST_SOUND_S):
-                    raise MicrophoneError(
-                        f"From {card.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened "
-                        "again. Is it plugged in, and used by no other program? `playbyear-find-microphones` shows whether it "
-                        "hears."
-                    )
+                wait_for_first_sound(card.microphone, card.recording.write, card.recording.wait_for_sound)
             stack.pop_all()
 
     def _open(self) -> None:
