@@ -37,6 +37,11 @@ class SoundCard:
     sample_rate: int
     is_default: bool
 
+    @property
+    def lasting_name(self) -> str:
+        """The name without ALSA's number, such as " (hw:1,0), ALSA", which changes with the order of plugging."""
+        return self.name.partition(" (hw:")[0]
+
 
 def load_sounddevice() -> ModuleType:
     """The package `sounddevice`.
@@ -85,6 +90,14 @@ def sound_cards(fresh: bool = False) -> list[SoundCard]:
         raise MicrophoneError(f"PortAudio does not start: {error}.") from error
 
 
+def cards_called(text: str, cards: list[SoundCard]) -> list[SoundCard]:
+    """Those cards of which a text is the number, or the name, whole or without the sound system; otherwise a part of it."""
+    if text.isdecimal():
+        return [card for card in cards if card.number == int(text)]
+    exact = [card for card in cards if text in (card.name, card.name.rpartition(", ")[0], card.lasting_name)]
+    return exact or [card for card in cards if text.lower() in card.name.lower()]
+
+
 def find_card(wanted: str | int, channels: int) -> SoundCard:
     """The card that is asked for, and never another one.
 
@@ -100,11 +113,7 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
     text = str(wanted).strip()
     if not text:
         raise MicrophoneError(f"device='' of a microphone: name the sound card, of these: {listed}. {_FIND}")
-    if text.isdecimal():
-        found = [card for card in cards if card.number == int(text)]
-    else:
-        exact = [card for card in cards if text in (card.name, card.name.rpartition(", ")[0])]
-        found = exact or [card for card in cards if text.lower() in card.name.lower()]
+    found = cards_called(text, cards)
     if len(found) != 1:
         what = "is no sound card with an input" if not found else "fits more than one sound card"
         raise MicrophoneError(f"device={text!r} {what}. There are: {listed}. {_FIND}")
