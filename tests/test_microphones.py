@@ -340,7 +340,7 @@ class MadeUpPortAudio(ModuleType):
             while not stream.closed:
                 time.sleep(blocksize / samplerate)
                 if self.plugged_in.get(name) == handle:
-                    callback(np.ones((blocksize, 1), np.int16), blocksize, None, SimpleNamespace(input_overflow=False))
+                    callback(np.ones((blocksize, 1), np.int16), blocksize, None, None)
 
         stream.start = threading.Thread(target=play, daemon=True).start
         return stream

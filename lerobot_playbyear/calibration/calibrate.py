@@ -28,6 +28,7 @@ from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
 _LOOK_S = 0.2
 _STALLED_S = 2.0  # a microphone that brings nothing for as long is gone
 _AFTER_LAST_S = 0.7
+_MOST_FPS = 1000
 _ASKED = {
     "stops": "Tap the table, or clap, {n} times, and let the hand rest after each for half a second.",
     "begins": "Make {n} sounds at which something in the picture begins to move or to shine, a second apart.",
@@ -93,7 +94,7 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
         _wait_for_taps(cfg, level, motion, microphone)
         pictures, sound = motion.so_far(), level.so_far()
     found = estimate_latency(*pictures, *sound, cfg.event)
-    print(told(found), flush=True)  # first: nobody taps twice for a plot
+    print(told(found, cfg.microphone.sample_rate), flush=True)  # first: nobody taps twice for a plot
     try:
         print(f"Plot: {write_plot(cfg.plot, found, pictures, sound)}")
     except OSError as error:
@@ -104,8 +105,8 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
     return found
 
 
-def told(found: Latency) -> str:
-    """What was found, and which option to give."""
+def told(found: Latency, sample_rate: int) -> str:
+    """What was found, and which options to give, with a microphone of this rate [Hz]."""
     ms = found.latency_s * 1000
     side = f"{abs(ms):.0f} ms later than the picture" if ms >= 0 else f"{abs(ms):.0f} ms earlier than the picture"
     lines = [
@@ -114,10 +115,13 @@ def told(found: Latency) -> str:
         f"{found.spread_s * 1000:.0f} ms. Each tap alone is as coarse as the camera's pictures.",
     ]
     if ms >= 0:
+        latency_s = round(found.latency_s, 3)
+        fastest = max(fps for fps in range(1, _MOST_FPS + 1) if latency_s < 1 / fps and sample_rate % fps == 0)
         lines.append(
-            f"Give the microphone latency_s: {found.latency_s:.3f}, such as "
-            f"--env.microphones='{{table: {{type: portaudio, device: ..., latency_s: {found.latency_s:.3f}}}}}'"
+            f"Give the microphone latency_s: {latency_s:.3f}, such as "
+            f"--env.microphones='{{table: {{type: portaudio, device: ..., latency_s: {latency_s:.3f}}}}}'"
         )
+        lines.append(f"Every tick has to be longer than that: give --env.fps={fastest} or less.")
     else:
         lines.append(f"Give the camera --env.camera_latency_s={-found.latency_s:.3f}")
     return "\n".join(lines)

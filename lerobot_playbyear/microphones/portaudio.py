@@ -172,7 +172,6 @@ class PortAudioMicrophone(Microphone):
         super().__init__(f"the microphone {config.device!r}", config.sample_rate, channels)
         self._config = config
         self._stream: Any = None
-        self.n_overflows = 0
 
     def _open(self) -> None:
         """PortAudio knows the cards that were there when it looked; where none of these can be opened, it looks again."""
@@ -224,8 +223,6 @@ class PortAudioMicrophone(Microphone):
 
     def _take(self, chunk: np.ndarray, n: int, when: Any, status: Any) -> None:
         now = time.perf_counter()
-        if status.input_overflow:
-            self.n_overflows += 1
         # PortAudio's own times are estimates that may be too early, and on ALSA they may stand at 0.
         self._heard(chunk[:, : self.channels], now)
 
