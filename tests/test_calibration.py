@@ -13,12 +13,14 @@ from lerobot.cameras import Camera, CameraConfig
 from PIL import Image
 from sound_server import RATE, Player, started, why_not
 
+from lerobot_playbyear.calibration import calibrate
 from lerobot_playbyear.calibration.calibrate import CalibrateLatencyConfig, calibrate_latency
 from lerobot_playbyear.calibration.estimator import CalibrationError, estimate_latency
 from lerobot_playbyear.calibration.listening import SoundLevel
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.microphones import microphone as microphones
 from lerobot_playbyear.microphones.config import MicrophoneConfig, PortAudioMicrophoneConfig
-from lerobot_playbyear.microphones.microphone import Microphone
+from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
 
 
 def recorded(
@@ -242,6 +244,52 @@ def test_where_nobody_taps_it_ends_in_time_and_says_so(tmp_path):
     with pytest.raises(CalibrationError, match="5 are needed"):
         calibrate_latency(cfg)
     assert not cfg.plot.exists()
+
+
+class FailingTaps(LateTaps):
+    """Brings nothing before it is opened for the so-manieth time, and only so many chunks of 5 ms."""
+
+    def __init__(self, opening: int, most: float, reason: str) -> None:
+        super().__init__("the microphone 'tin can'", RATE, 1)
+        self.opening, self.most, self.reason = opening, most, reason
+        self.n_openings = self.n_heard = 0
+
+    def _open(self) -> None:
+        self.n_openings += 1
+        super()._open()
+
+    def _heard(self, chunk: np.ndarray, came_s: float) -> None:
+        if self.n_openings >= self.opening:
+            self.n_heard += 1
+            if self.n_heard <= self.most:
+                super()._heard(chunk, came_s)
+            elif self.reason:
+                self._end(self.reason)
+
+
+@pytest.mark.parametrize(
+    ("taps", "error", "said", "n_openings"),
+    [
+        ((3, 0, ""), MicrophoneError, "nothing after it was opened again. Is it plugged in", 2),
+        ((2, np.inf, ""), CalibrationError, "5 are needed", 2),
+        ((1, 60, ""), MicrophoneError, "tin can' no more sound comes: nothing has come for 0.", 1),
+        ((1, 60, "its server is gone"), MicrophoneError, "no more sound comes: its server is gone", 1),
+    ],
+)
+def test_a_microphone_that_is_dead_is_told_and_no_person_is_blamed(
+    taps, error, said, n_openings, tmp_path, monkeypatch
+):
+    failing, Taps.times = FailingTaps(*taps), np.zeros(0)
+    monkeypatch.setattr(microphones, "_FIRST_SOUND_S", 0.2)
+    monkeypatch.setattr(calibrate, "_STALLED_S", 0.5)
+    monkeypatch.setattr(calibrate, "make_microphone", lambda config: failing)
+    timeout_s = 1 if error is CalibrationError else 60
+    cfg = CalibrateLatencyConfig(LampCameraConfig(), LateTapsConfig(), timeout_s=timeout_s, plot=tmp_path / "plot.png")
+    begins = time.perf_counter()
+    with pytest.raises(error, match=said):
+        calibrate_latency(cfg)
+    assert time.perf_counter() - begins < 10
+    assert failing.n_openings == n_openings
 
 
 @pytest.mark.parametrize("options", [{"taps": 4}, {"event": "jumps"}, {"timeout_s": 0}])

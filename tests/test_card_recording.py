@@ -102,6 +102,18 @@ def test_a_card_that_begins_late_in_an_episode_is_heard_from_then_on():
     assert set(simulation.noted) == {"late"}
 
 
+def test_zeros_are_counted_for_each_microphone_and_not_for_channels_that_none_uses():
+    recording = CardRecording(RATE, FPS, {"left": 0, "right": 2}, timeout_s=0)
+    chunk = np.ones((CHUNK, 3), np.int16)
+    chunk[:, 1:] = 0  # the middle channel is no microphone's
+    for k in range(200):
+        recording.write(chunk, (k + 1) * CHUNK / RATE)
+    assert recording.zeros_s == {"left": 0.0, "right": 1.0}
+    chunk[CHUNK // 2 - 1, 2] = -1
+    recording.write(chunk, 201 * CHUNK / RATE)
+    assert recording.zeros_s == {"left": 0.0, "right": CHUNK / 2 / RATE}
+
+
 def test_channels_of_a_card_are_aligned_to_the_sample_whatever_is_lost():
     recording = CardRecording(RATE, FPS, {"left": 0, "right": 2}, timeout_s=0)
     rng, n_blocks = np.random.default_rng(0), 0

@@ -8,9 +8,15 @@ from sound_server import RATE, Player, started, why_not
 
 from lerobot_playbyear.datasets.audio_files import read_audio
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.microphones.finding import FindMicrophonesConfig, described, find_microphones, level_text
+from lerobot_playbyear.microphones.finding import (
+    FindMicrophonesConfig,
+    described,
+    find_microphones,
+    level_text,
+    suggested_device,
+)
 from lerobot_playbyear.microphones.microphone import MicrophoneError
-from lerobot_playbyear.microphones.portaudio import SoundCard, sound_cards
+from lerobot_playbyear.microphones.portaudio import SoundCard, cards_called, sound_cards
 
 needs_server = pytest.mark.skipif(bool(why_not()), reason=why_not())
 
@@ -76,8 +82,37 @@ def test_the_meter_shows_each_channel_from_minus_60_db_to_full_scale():
     assert f"[{'#' * 20}]  clips" in said
 
 
+def plugged_in(*names: str) -> list[SoundCard]:
+    return [SoundCard(number, name, 1, 48000, False) for number, name in enumerate(names)]
+
+
+def test_the_name_that_is_suggested_holds_in_another_order_of_plugging():
+    """ALSA numbers cards as they come, and one's name may be a part of another's."""
+    before = plugged_in("USB Mic: Audio (hw:1,0), ALSA", "My USB Mic: Audio (hw:2,0), ALSA", "pulse, ALSA")
+    after = plugged_in("My USB Mic: Audio (hw:0,0), ALSA", "pulse, ALSA", "USB Mic: Audio (hw:3,0), ALSA")
+    suggested = [suggested_device(card, before) for card in before]
+    assert suggested == [("USB Mic: Audio", True), ("My USB Mic: Audio", True), ("pulse, ALSA", True)]
+    assert [cards_called(name, after) for name, _ in suggested] == [[after[2]], [after[0]], [after[1]]]
+
+
+@pytest.mark.parametrize(
+    ("names", "device"),
+    [
+        (("USB Mic: Audio (hw:1,0), ALSA", "USB Mic: Audio (hw:2,0), ALSA"), "USB Mic: Audio (hw:1,0), ALSA"),
+        (("USB Mic, Core Audio", "USB Mic, Core Audio"), "0"),
+    ],
+)
+def test_cards_that_cannot_be_told_apart_are_told_to_be_so(names, device):
+    cards = plugged_in(*names)
+    *_, option, warning = described(cards[0], (48000,), cards)
+    assert f'device: "{device}"' in option
+    assert "may swap after a restart" in warning
+    assert len(cards_called(cards[0].lasting_name, cards)) == 2
+
+
 def test_a_name_with_quotes_stays_one_name():
-    (*_, option) = described(SoundCard(1, 'The "good" one', 1, 44100, False), (44100,))
+    card = SoundCard(1, 'The "good" one', 1, 44100, False)
+    (*_, option) = described(card, (44100,), [card])
     assert 'device: "The \\"good\\" one", sample_rate: 44100' in option
 
 

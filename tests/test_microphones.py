@@ -1,6 +1,7 @@
 """Microphones through PortAudio and a real sound server, and from files: which card, which block, what goes wrong."""
 
 import contextlib
+import gc
 import json
 import os
 import signal
@@ -11,6 +12,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import draccus
 import numpy as np
@@ -290,6 +292,87 @@ def test_a_card_that_gives_nothing_but_zeros_is_told():
             assert until_problem(ears, 0.7)[0] == ""
 
 
+class MadeUpPortAudio(ModuleType):
+    """Cards of one channel that are found by their names, and get another handle when they are plugged in again."""
+
+    class PortAudioError(Exception):
+        pass
+
+    class _StreamBase:
+        samplerate: float
+
+        def __init__(self) -> None:
+            self.closed = False
+
+        def close(self, ignore_errors: bool = True) -> None:
+            self.closed = True
+
+        abort = close
+
+    def __init__(self, **handles: int) -> None:
+        super().__init__("sounddevice")
+        self.plugged_in, self.seen = dict(handles), dict(handles)
+        self.default = SimpleNamespace(device=(0, 0))
+        self.open: list[MadeUpPortAudio._StreamBase] = []
+
+    def query_hostapis(self) -> list[dict[str, str]]:
+        return [{"name": "Core Audio"}]
+
+    def query_devices(self) -> list[dict[str, object]]:
+        rest = {"hostapi": 0, "max_input_channels": 1, "default_samplerate": RATE}
+        return [{"name": name, **rest} for name in self.seen]
+
+    def _terminate(self) -> None:
+        assert all(stream.closed for stream in self.open)
+
+    def _initialize(self) -> None:
+        self.seen = dict(self.plugged_in)
+
+    def InputStream(self, samplerate, blocksize, device, callback, **options):  # noqa: N802
+        name, handle = list(self.seen.items())[device]
+        if self.plugged_in.get(name) != handle:
+            raise self.PortAudioError("Device unavailable")
+        stream = self._StreamBase()
+        stream.samplerate = samplerate
+        self.open.append(stream)
+
+        def play() -> None:
+            while not stream.closed:
+                time.sleep(blocksize / samplerate)
+                if self.plugged_in.get(name) == handle:
+                    callback(np.ones((blocksize, 1), np.int16), blocksize, None, None)
+
+        stream.start = threading.Thread(target=play, daemon=True).start
+        return stream
+
+
+@pytest.mark.parametrize("pulled", ["left", "right"])
+def test_one_of_two_cards_that_is_plugged_in_again_is_found(pulled, monkeypatch):
+    """Also where the other card's stream is frozen, as an attempt's beginning freezes all that there is."""
+    port_audio = MadeUpPortAudio(left=10, right=11)
+    monkeypatch.setitem(sys.modules, "sounddevice", port_audio)
+    configs = {name: PortAudioMicrophoneConfig(device=name) for name in ("left", "right")}
+    with listening(Ears(configs, FPS, stalled_s=0.3)) as ears:
+        del port_audio.plugged_in[pulled]
+        assert f"The microphone {pulled} has brought nothing" in until_problem(ears, 5)[0]
+        port_audio.plugged_in[pulled] = 12
+        gc.freeze()
+        try:
+            ears.connect()
+        finally:
+            gc.unfreeze()
+        assert ears.problem == ""
+        assert sum(not stream.closed for stream in port_audio.open) == 2
+
+
+def test_a_dead_channel_of_a_card_is_told_by_its_microphones_name(tmp_path):
+    samples = np.ones((RATE, 3), np.int16) * np.array([1, 0, 0], np.int16)
+    path = str(write_wav(tmp_path / "sound.wav", samples, RATE))
+    configs = {name: FileMicrophoneConfig(path=path, channel=i) for i, name in enumerate(("left", "right"))}
+    with listening(Ears(configs, FPS, silent_s=0.2)) as ears:
+        assert "The microphone right has given nothing but zeros for 0." in until_problem(ears, 3)[0]
+
+
 _CHILD = """
 import json, time, numpy as np
 from lerobot_playbyear.microphones.config import PortAudioMicrophoneConfig
@@ -406,7 +489,14 @@ def test_a_file_that_does_not_fit_is_refused(options, said, tmp_path):
         microphone.connect()
 
 
-def test_channels_of_one_card_cannot_have_two_latencies():
-    configs = {str(i): FileMicrophoneConfig(path="x.wav", channel=i, latency_s=i / 100) for i in range(2)}
-    with pytest.raises(MicrophoneError, match="give them the same"):
-        Ears(configs, FPS)
+@pytest.mark.parametrize("option", ["latency_s", "sample_rate", "card_channels", "block_s", "wait_s"])
+def test_options_of_a_card_are_the_same_for_all_of_its_microphones(option):
+    values = {"latency_s": 0.01, "sample_rate": 16000, "card_channels": 4, "block_s": 0.02, "wait_s": 0.05}
+    left = PortAudioMicrophoneConfig(device=2)
+    right = PortAudioMicrophoneConfig(device="2", channel=1, **{option: values[option]})
+    with pytest.raises(
+        MicrophoneError, match=rf"left and right .* {option}=\S+ and {values[option]}: give them the same"
+    ):
+        Ears({"left": left, "right": right}, FPS)
+    setattr(left, option, values[option])
+    assert list(Ears({"left": left, "right": right}, FPS).drop_outs) == ["left", "right"]

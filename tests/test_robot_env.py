@@ -724,6 +724,22 @@ def test_a_latency_longer_than_a_tick_is_refused():
         joint_config(microphones={"gripper": FileMicrophoneConfig(path="x.wav", sample_rate=16000, latency_s=0.06)})
 
 
+@pytest.mark.parametrize(("latency_s", "fps"), [(0.038, 25), (0.0396, 24), (0.004, 240), (0.6, 1)])
+def test_the_calibration_tells_the_fastest_ticks_that_a_latency_allows(latency_s, fps):
+    from draccus.utils import DecodingError
+
+    from lerobot_playbyear.calibration.calibrate import told
+    from lerobot_playbyear.calibration.estimator import Latency
+    from lerobot_playbyear.microphones.config import FileMicrophoneConfig
+
+    assert f"--env.fps={fps} or less" in told(Latency(latency_s, latency_s, 0.0, 0.0, (), 10), 48000)
+    microphones = {"gripper": FileMicrophoneConfig(path="x.wav", latency_s=round(latency_s, 3))}
+    assert joint_config(fps=fps, microphones=microphones).fps == fps
+    faster = next(n for n in range(fps + 1, 48000) if 48000 % n == 0)
+    with pytest.raises(DecodingError, match="wait for longer"):
+        joint_config(fps=faster, microphones=microphones)
+
+
 def test_one_robot_has_one_set_of_options():
     with robot_env(joint_config()), pytest.raises(RobotError, match="other options"), robot_env(joint_config(fps=10)):
         pass

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from robot_factory import ScriptedConsole, joint_config, robot_env
+from robot_factory import ScriptedConsole, joint_config, noise_file, robot_env
 from sound_server import Player, SoundServer, why_not
 
 from lerobot_playbyear.microphones.config import FileMicrophoneConfig, PortAudioMicrophoneConfig
@@ -127,8 +127,6 @@ def test_the_process_is_stopped_for_two_seconds(caplog):
 
 
 def test_a_clock_that_is_fast_costs_no_attempt(tmp_path):
-    from robot_factory import noise_file
-
     wav = noise_file(tmp_path, 16000)
     microphones = {"gripper": FileMicrophoneConfig(path=str(wav), sample_rate=16000, speed=1.005)}
     with robot_env(joint_config(microphones=microphones, episode_s=6.0)) as env:
@@ -259,6 +257,28 @@ def test_an_arm_whose_cable_was_pulled_is_connected_again(monkeypatch):
         assert not env.step(np.zeros(3, np.float32))[3]
         assert len(asked) == 2
         assert bus.closed_by_force
+
+
+def test_an_arm_is_not_let_go_of_where_a_microphone_cannot_be_opened(tmp_path, monkeypatch):
+    asked: list[str] = []
+    wav = tmp_path / "noise.wav"  # it is not there yet
+
+    def press(status: Any) -> str | None:
+        if "P tries again" in status.note:
+            asked.append(status.note)
+            if len(asked) == 2:
+                noise_file(tmp_path, 16000)
+            return "p"
+        return "p" if "Set the scene" in status.note else None
+
+    with robot_env(joint_config(wav), ScriptedConsole(press)) as env:
+        let_go: list[bool] = []
+        disconnect = env.arm.disconnect
+        monkeypatch.setattr(env.arm, "disconnect", lambda: (let_go.append(True), disconnect()))
+        env.reset(seed=0)
+        assert not let_go
+        assert len(asked) == 2
+        assert not any("Hold the arm" in note for note in asked)
 
 
 def test_a_leader_whose_cable_was_pulled_is_connected_again(monkeypatch):

@@ -23,9 +23,12 @@ from lerobot_playbyear.compat import import_devices
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.microphones.config import MicrophoneConfig, make_microphone
+from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, wait_for_first_sound
 
 _LOOK_S = 0.2
+_STALLED_S = 2.0  # a microphone that brings nothing for as long is gone
 _AFTER_LAST_S = 0.7
+_MOST_FPS = 1000
 _ASKED = {
     "stops": "Tap the table, or clap, {n} times, and let the hand rest after each for half a second.",
     "begins": "Make {n} sounds at which something in the picture begins to move or to shine, a second apart.",
@@ -73,7 +76,7 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
 
     Raises:
         CalibrationError: The camera gives no pictures, the taps do not tell the latency, or the plot cannot be written.
-        MicrophoneError: The microphone cannot be opened.
+        MicrophoneError: The microphone cannot be opened, or brings nothing.
     """
     cfg.check()
     level = SoundLevel(cfg.microphone.sample_rate, cfg.microphone.channel)
@@ -86,11 +89,12 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
         stack.callback(motion.end)
         microphone.connect(level.listen)
         stack.callback(microphone.disconnect)
+        wait_for_first_sound(microphone, level.listen, level.wait_for_sound)
         print(_ASKED[cfg.event].format(n=cfg.taps), flush=True)
-        _wait_for_taps(cfg, level, motion)
+        _wait_for_taps(cfg, level, motion, microphone)
         pictures, sound = motion.so_far(), level.so_far()
     found = estimate_latency(*pictures, *sound, cfg.event)
-    print(told(found), flush=True)  # first: nobody taps twice for a plot
+    print(told(found, cfg.microphone.sample_rate), flush=True)  # first: nobody taps twice for a plot
     try:
         print(f"Plot: {write_plot(cfg.plot, found, pictures, sound)}")
     except OSError as error:
@@ -101,8 +105,8 @@ def calibrate_latency(cfg: CalibrateLatencyConfig) -> Latency:
     return found
 
 
-def told(found: Latency) -> str:
-    """What was found, and which option to give."""
+def told(found: Latency, sample_rate: int) -> str:
+    """What was found, and which options to give, with a microphone of this rate [Hz]."""
     ms = found.latency_s * 1000
     side = f"{abs(ms):.0f} ms later than the picture" if ms >= 0 else f"{abs(ms):.0f} ms earlier than the picture"
     lines = [
@@ -111,10 +115,13 @@ def told(found: Latency) -> str:
         f"{found.spread_s * 1000:.0f} ms. Each tap alone is as coarse as the camera's pictures.",
     ]
     if ms >= 0:
+        latency_s = round(found.latency_s, 3)
+        fastest = max(fps for fps in range(1, _MOST_FPS + 1) if latency_s < 1 / fps and sample_rate % fps == 0)
         lines.append(
-            f"Give the microphone latency_s: {found.latency_s:.3f}, such as "
-            f"--env.microphones='{{table: {{type: portaudio, device: ..., latency_s: {found.latency_s:.3f}}}}}'"
+            f"Give the microphone latency_s: {latency_s:.3f}, such as "
+            f"--env.microphones='{{table: {{type: portaudio, device: ..., latency_s: {latency_s:.3f}}}}}'"
         )
+        lines.append(f"Every tick has to be longer than that: give --env.fps={fastest} or less.")
     else:
         lines.append(f"Give the camera --env.camera_latency_s={-found.latency_s:.3f}")
     return "\n".join(lines)
@@ -134,7 +141,7 @@ def _connected(config: CameraConfig) -> Any:
     return camera
 
 
-def _wait_for_taps(cfg: CalibrateLatencyConfig, level: SoundLevel, motion: Motion) -> None:
+def _wait_for_taps(cfg: CalibrateLatencyConfig, level: SoundLevel, motion: Motion, microphone: Microphone) -> None:
     end, n_told = time.perf_counter() + cfg.timeout_s, 0
     while time.perf_counter() < end:
         time.sleep(_LOOK_S)
@@ -146,3 +153,15 @@ def _wait_for_taps(cfg: CalibrateLatencyConfig, level: SoundLevel, motion: Motio
         if n_heard >= cfg.taps:
             time.sleep(_AFTER_LAST_S)
             return
+        _check(microphone)
+
+
+def _check(microphone: Microphone) -> None:
+    """
+    Raises:
+        MicrophoneError: It is gone.
+    """
+    silent_for_s = microphone.silent_for_s
+    if microphone.problem or silent_for_s > _STALLED_S:
+        why = microphone.problem or f"nothing has come for {silent_for_s:.1f} s"
+        raise MicrophoneError(f"From {microphone.name} no more sound comes: {why}. Look at its cable, and tap again.")

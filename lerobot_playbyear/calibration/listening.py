@@ -31,6 +31,7 @@ class SoundLevel:
         self._written, self._last = 0, 0.0
         self._rest: np.ndarray = np.zeros(0)
         self._lock = threading.Lock()
+        self._has_come = threading.Event()
         self._times: list[np.ndarray] = []
         self._levels: list[np.ndarray] = []
 
@@ -49,6 +50,11 @@ class SoundLevel:
         with self._lock:
             self._times.append(starts)
             self._levels.append(pending[: n * self._size].reshape(n, self._size).max(axis=1))
+        self._has_come.set()
+
+    def wait_for_sound(self, timeout_s: float) -> bool:
+        """Waits for the first chunk: whether it has come in time [s]."""
+        return self._has_come.wait(timeout_s)
 
     def so_far(self) -> tuple[np.ndarray, np.ndarray]:
         """Times (n,) [s of time.perf_counter] and levels (n,), ascending."""

@@ -50,15 +50,15 @@ class CardRecording:
         self._written = 0
         self._stop: int | None = None  # where the last block ended
         self._tick = 0
-        self._zeros = 0  # samples at the end that are exactly 0 in all channels
+        self._zeros: np.ndarray = np.zeros(len(channels), np.int64)  # samples at the end of each that are exactly 0
 
     def write(self, chunk: np.ndarray, came_s: float) -> None:
         """Takes a chunk (n, channels of the card), whose last sample came at `came_s` [s of time.perf_counter]."""
         samples = to_pcm_s16(chunk[:, self._columns])
         with self._changed:
             self._put(samples)
-            heard = np.flatnonzero(samples.any(axis=1))
-            self._zeros = self._zeros + len(samples) if len(heard) == 0 else len(samples) - 1 - int(heard[-1])
+            is_sound = samples[::-1] != 0
+            self._zeros = np.where(is_sound.any(axis=0), is_sound.argmax(axis=0), self._zeros + len(samples))
             lost = self._clock.note(self._written, came_s)
             if lost:  # known a quarter of a second later: then silence stands where sound goes on
                 self._note(self._written, lost, "lost")
@@ -75,7 +75,7 @@ class CardRecording:
         """The card begins anew, such as after it was plugged in again."""
         with self._changed:
             self._clock.restart()
-            self._stop, self._zeros = None, 0
+            self._stop, self._zeros = None, np.zeros_like(self._zeros)
 
     def skip_to(self, now_s: float) -> None:
         """What was heard until `now_s` belongs to no frame, such as during a pause."""
@@ -112,9 +112,9 @@ class CardRecording:
             return self._changed.wait_for(lambda: self._clock.is_set, timeout_s)
 
     @property
-    def silent_s(self) -> float:
-        """For how long it has given nothing but zeros [s]; no microphone in a room does."""
-        return self._zeros / self._rate
+    def zeros_s(self) -> dict[str, float]:
+        """For how long each microphone has given nothing but zeros [s]; none in a room does."""
+        return {name: int(n) / self._rate for name, n in zip(self.channels, self._zeros, strict=True)}
 
     def _place(self, time_s: float) -> int:
         return round(self._clock.written_at(time_s))

@@ -61,7 +61,7 @@ class MicrophoneConfig(draccus.ChoiceRegistry, abc.ABC):
     @property
     @abc.abstractmethod
     def card(self) -> Hashable:
-        """What tells cards apart: microphones with the same one share a stream and a clock."""
+        """What tells cards apart: microphones with the same one share a stream and a clock, and all options but `channel`."""
 
     @abc.abstractmethod
     def make(self, channels: int) -> Microphone:
@@ -100,7 +100,7 @@ class PortAudioMicrophoneConfig(MicrophoneConfig):
 
     @property
     def card(self) -> Hashable:
-        return "portaudio", str(self.device), self.sample_rate, self.card_channels
+        return "portaudio", str(self.device)
 
     def make(self, channels: int) -> Microphone:
         from lerobot_playbyear.microphones.portaudio import PortAudioMicrophone
@@ -125,7 +125,7 @@ class FileMicrophoneConfig(MicrophoneConfig):
 
     @property
     def card(self) -> Hashable:
-        return "file", self.path, self.sample_rate
+        return "file", self.path
 
     def make(self, channels: int) -> Microphone:
         from lerobot_playbyear.microphones.file import FileMicrophone

@@ -2,16 +2,14 @@
 
 from collections.abc import Hashable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from lerobot_playbyear.datasets.microphone import DropOut
 from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.config import MicrophoneConfig
-from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
-
-_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
+from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, wait_for_first_sound
 
 
 @dataclass
@@ -19,6 +17,15 @@ class _Card:
     microphone: Microphone
     recording: CardRecording
     latency_s: float
+
+    def open(self) -> None:
+        """
+        Raises:
+            MicrophoneError: It cannot be opened.
+        """
+        if not self.microphone.is_connected:
+            self.recording.forget()
+            self.microphone.connect(self.recording.write)
 
 
 class Ears:
@@ -28,11 +35,11 @@ class Ears:
         configs: By their names.
         fps: Ticks per second [Hz].
         stalled_s: A card that brings nothing for as long is taken for dead [s].
-        silent_s: A card that gives nothing but zeros for as long is taken for unplugged [s]; 0: never.
+        silent_s: A microphone that gives nothing but zeros for as long is taken for unplugged [s]; 0: never.
 
     Raises:
         ValueError: The rate of ticks does not divide a sample rate.
-        MicrophoneError: Microphones of one card are to have different latencies.
+        MicrophoneError: Options of two microphones on one card differ.
     """
 
     def __init__(
@@ -56,21 +63,27 @@ class Ears:
             for card in self._cards:
                 if self._problem_of(card):
                     card.microphone.disconnect()
-                if not card.microphone.is_connected:
-                    card.recording.forget()
-                    card.microphone.connect(card.recording.write)
+            self._open()
             for card in self._cards:
-                if card.recording.wait_for_sound(_FIRST_SOUND_S):
-                    continue
-                card.microphone.disconnect()  # through a sound server a stream that was opened now and then never begins
-                card.microphone.connect(card.recording.write)
-                if not card.recording.wait_for_sound(_FIRST_SOUND_S):
-                    raise MicrophoneError(
-                        f"From {card.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened "
-                        "again. Is it plugged in, and used by no other program? `playbyear-find-microphones` shows whether it "
-                        "hears."
-                    )
+                wait_for_first_sound(card.microphone, card.recording.write, card.recording.wait_for_sound)
             stack.pop_all()
+
+    def _open(self) -> None:
+        """Opens all cards that are not open.
+
+        PortAudio looks for what was plugged in only while none of its cards is open. So where one cannot be opened beside
+        others, all are closed, and that one comes first.
+        """
+        for card in self._cards:
+            try:
+                card.open()
+            except MicrophoneError:
+                if not any(other.microphone.is_connected for other in self._cards):
+                    raise
+                self.disconnect()
+                for again in [card, *self._cards]:
+                    again.open()
+                return
 
     def restart(self, now_s: float) -> None:
         """An episode begins at `now_s` [s of time.perf_counter]."""
@@ -118,10 +131,11 @@ class Ears:
             return f"The microphone {names} is gone: {microphone.problem}."
         if microphone.silent_for_s > self._stalled_s:
             return f"The microphone {names} has brought nothing for {microphone.silent_for_s:.1f} s."
-        if card.recording.silent_s > self._silent_s > 0:
+        zeros_s = {name: for_s for name, for_s in card.recording.zeros_s.items() if for_s > self._silent_s > 0}
+        if zeros_s:
             return (
-                f"The microphone {names} has given nothing but zeros for {card.recording.silent_s:.1f} s: it is muted, or "
-                "unplugged."
+                f"The microphone {', '.join(zeros_s)} has given nothing but zeros for {max(zeros_s.values()):.1f} s: it is "
+                "muted, or unplugged."
             )
         return ""
 
@@ -132,13 +146,15 @@ class Ears:
 
 
 def _make_card(microphones: Mapping[str, MicrophoneConfig], fps: int) -> _Card:
-    first = next(iter(microphones.values()))
-    latencies = {config.latency_s for config in microphones.values()}
-    if len(latencies) > 1:
-        raise MicrophoneError(
-            f"The microphones {', '.join(microphones)} are channels of one card, and have latency_s={sorted(latencies)}: give "
-            "them the same."
-        )
+    (first_name, first), *others = microphones.items()
+    for name, config in others:
+        for option in (field.name for field in fields(config) if field.name != "channel"):
+            values = [str(getattr(each, option, None)) for each in (first, config)]  # device: 2 is the same as "2"
+            if values[0] != values[1]:
+                raise MicrophoneError(
+                    f"The microphones {first_name} and {name} are channels of one card, and have {option}={values[0]} and "
+                    f"{values[1]}: give them the same."
+                )
     channels = {name: config.channel for name, config in microphones.items()}
     recording = CardRecording(first.sample_rate, fps, channels)
     return _Card(first.make(max(channels.values()) + 1), recording, first.latency_s)

@@ -17,6 +17,7 @@ from lerobot_playbyear.microphones.microphone import MicrophoneError
 from lerobot_playbyear.microphones.portaudio import (
     PortAudioMicrophone,
     SoundCard,
+    cards_called,
     channels_to_open,
     load_sounddevice,
     sound_cards,
@@ -69,7 +70,7 @@ def find_microphones(cfg: FindMicrophonesConfig) -> None:
     n_heard = 0
     for card in cards:
         rates = accepted_rates(card)
-        print("\n".join(described(card, rates)), flush=True)
+        print("\n".join(described(card, rates, cards)), flush=True)
         if not cfg.list:
             try:
                 print(f"  {_listen(card, suggested_rate(card, rates), cfg)}\n", flush=True)
@@ -100,15 +101,28 @@ def suggested_rate(card: SoundCard, rates: tuple[int, ...]) -> int:
     return next((rate for rate in _LIKED_RATES if rate in rates), card.sample_rate)
 
 
-def described(card: SoundCard, rates: tuple[int, ...]) -> Iterator[str]:
-    """A card, line by line, with the option that chooses it."""
+def suggested_device(card: SoundCard, cards: list[SoundCard]) -> tuple[str, bool]:
+    """What chooses a card among all, and whether it still does so when they were plugged in in another order."""
+    for name in (card.lasting_name, card.name):
+        if cards_called(name, cards) == [card]:
+            return name, name == card.lasting_name
+    return str(card.number), False
+
+
+def described(card: SoundCard, rates: tuple[int, ...], cards: list[SoundCard]) -> Iterator[str]:
+    """One card of all, line by line, with the option that chooses it."""
     yield f"{card.number}: {card.name}{' (default)' if card.is_default else ''}"
     served = "" if channels_to_open(card, 1) == card.channels else ", as a sound server says; the card itself has fewer"
     yield f"  channels: {card.channels}{served}"
     yield f"  sample rates: {', '.join(map(str, rates)) or 'none that is usual'} Hz; its own is {card.sample_rate} Hz"
-    device = card.name.replace('"', '\\"')
-    rate = suggested_rate(card, rates)
-    yield f"  --env.microphones='{{table: {{type: portaudio, device: \"{device}\", sample_rate: {rate}}}}}'"
+    device, is_lasting = suggested_device(card, cards)
+    quoted, rate = device.replace('"', '\\"'), suggested_rate(card, rates)
+    yield f"  --env.microphones='{{table: {{type: portaudio, device: \"{quoted}\", sample_rate: {rate}}}}}'"
+    if not is_lasting:
+        yield (
+            "  Another card has the same name. They cannot be told apart, and may swap after a restart or another order of "
+            "plugging: take one card with two channels, or cards of two kinds."
+        )
 
 
 def level_text(samples: np.ndarray) -> str:

@@ -13,6 +13,7 @@ Listener = Callable[[np.ndarray, float], None]
 """Takes a chunk (n, channels), int16 PCM or floats in [-1, 1], and when its last sample came [s of time.perf_counter]."""
 
 _MOST_KEPT_S = 60.0
+_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
 
 
 class MicrophoneError(PlaybyearError, RuntimeError):
@@ -114,3 +115,26 @@ class Microphone(abc.ABC):
     def _end(self, reason: str) -> None:
         """No more sound will come."""
         self._ended = self._ended or reason
+
+
+def wait_for_first_sound(microphone: Microphone, listener: Listener, has_come: Callable[[float], bool]) -> None:
+    """Waits until something is heard. A card that brings nothing is opened once more: through a sound server a stream that was
+    opened now and then never begins.
+
+    Args:
+        microphone: Connected with this listener.
+        listener: Gets its chunks.
+        has_come: Waits for the first one at most for as long [s], and says whether it came.
+
+    Raises:
+        MicrophoneError: Nothing comes, or it cannot be opened again.
+    """
+    if has_come(_FIRST_SOUND_S):
+        return
+    microphone.disconnect()
+    microphone.connect(listener)
+    if not has_come(_FIRST_SOUND_S):
+        raise MicrophoneError(
+            f"From {microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened again. Is it "
+            "plugged in, and used by no other program? `playbyear-find-microphones` shows whether it hears."
+        )

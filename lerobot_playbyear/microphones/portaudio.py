@@ -37,6 +37,11 @@ class SoundCard:
     sample_rate: int
     is_default: bool
 
+    @property
+    def lasting_name(self) -> str:
+        """The name without ALSA's number, such as " (hw:1,0), ALSA", which changes with the order of plugging."""
+        return self.name.partition(" (hw:")[0]
+
 
 def load_sounddevice() -> ModuleType:
     """The package `sounddevice`.
@@ -85,6 +90,14 @@ def sound_cards(fresh: bool = False) -> list[SoundCard]:
         raise MicrophoneError(f"PortAudio does not start: {error}.") from error
 
 
+def cards_called(text: str, cards: list[SoundCard]) -> list[SoundCard]:
+    """Those cards of which a text is the number, or the name, whole or without the sound system; otherwise a part of it."""
+    if text.isdecimal():
+        return [card for card in cards if card.number == int(text)]
+    exact = [card for card in cards if text in (card.name, card.name.rpartition(", ")[0], card.lasting_name)]
+    return exact or [card for card in cards if text.lower() in card.name.lower()]
+
+
 def find_card(wanted: str | int, channels: int) -> SoundCard:
     """The card that is asked for, and never another one.
 
@@ -100,11 +113,7 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
     text = str(wanted).strip()
     if not text:
         raise MicrophoneError(f"device='' of a microphone: name the sound card, of these: {listed}. {_FIND}")
-    if text.isdecimal():
-        found = [card for card in cards if card.number == int(text)]
-    else:
-        exact = [card for card in cards if text in (card.name, card.name.rpartition(", ")[0])]
-        found = exact or [card for card in cards if text.lower() in card.name.lower()]
+    found = cards_called(text, cards)
     if len(found) != 1:
         what = "is no sound card with an input" if not found else "fits more than one sound card"
         raise MicrophoneError(f"device={text!r} {what}. There are: {listed}. {_FIND}")
@@ -142,8 +151,11 @@ def channels_to_open(card: SoundCard, needed: int, wanted: int | None = None) ->
 
 def _has_open_stream() -> bool:
     """Whether a stream of this process is open, anyone's; PortAudio would close it when it looks again."""
-    kind = stream_kind(load_sounddevice())
+    kind, is_frozen = stream_kind(load_sounddevice()), gc.get_freeze_count() > 0
+    gc.unfreeze()  # what is frozen, as before each attempt, is not among the objects
     streams = [thing for thing in gc.get_objects() if issubclass(type(thing), kind)]
+    if is_frozen:
+        gc.freeze()
     # One that could not be opened, and to which its error still refers, never got a rate.
     return any(hasattr(stream, "samplerate") and not stream.closed for stream in streams)
 
@@ -160,7 +172,6 @@ class PortAudioMicrophone(Microphone):
         super().__init__(f"the microphone {config.device!r}", config.sample_rate, channels)
         self._config = config
         self._stream: Any = None
-        self.n_overflows = 0
 
     def _open(self) -> None:
         """PortAudio knows the cards that were there when it looked; where none of these can be opened, it looks again."""
@@ -212,8 +223,6 @@ class PortAudioMicrophone(Microphone):
 
     def _take(self, chunk: np.ndarray, n: int, when: Any, status: Any) -> None:
         now = time.perf_counter()
-        if status.input_overflow:
-            self.n_overflows += 1
         # PortAudio's own times are estimates that may be too early, and on ALSA they may stand at 0.
         self._heard(chunk[:, : self.channels], now)
 

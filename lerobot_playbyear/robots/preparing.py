@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.robots.parts import RobotError
 from lerobot_playbyear.robots.person import Person
 from lerobot_playbyear.robots.rig import Rig
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
@@ -50,10 +51,11 @@ def connect_or_ask(rig: Rig, person: Person) -> None:
             return
         except PlaybyearError as error:
             ask_to_try_again(person, error)
-            connect = rig.connect_anew
+            connect = rig.connect_anew if isinstance(error, RobotError) else rig.connect
 
 
 def ask_to_try_again(person: Person, error: PlaybyearError) -> None:
     """Returns if the person wants it, and raises the error otherwise."""
-    if not person.is_there or not person.wants_again(f"{error} Hold the arm: it may let go of its joints."):
+    warning = " Hold the arm: it may let go of its joints." if isinstance(error, RobotError) else ""
+    if not person.is_there or not person.wants_again(f"{error}{warning}"):
         raise error
