@@ -242,6 +242,41 @@ def test_a_standstill_before_a_tick_and_one_after_it_are_both_told():
     assert ticks.standstill_s(0.2) == 0
 
 
+def test_ticks_that_come_late_are_told_where_they_are_many(caplog):
+    now = [0.0]
+    ticks = Ticks(10, clock=lambda: now[0], sleep=lambda seconds: now.__setitem__(0, now[0] + seconds))
+    for late in [0.0] * 38 + [0.11] * 2:
+        now[0] += late
+        ticks.wait()
+    assert ticks.account(2) == {"ticks": 40, "late_ticks": 2, "holds": 2}
+    assert not caplog.text
+    now[0] += 0.11
+    ticks.wait()
+    assert ticks.account(0) == {"ticks": 41, "late_ticks": 3, "holds": 0}
+    assert "3 of 41 ticks came late" in caplog.text
+
+
+def test_an_attempt_of_a_policy_that_is_too_slow_says_so(caplog):
+    with robot_env(joint_config(fps=50, episode_s=0.2)) as env:
+        for seed in (0, 1):  # the holds of the one are not those of the other
+            env.reset(seed=seed)
+            time.sleep(0.1)  # before the first action it may take long
+            steps = [env.step(REST)]
+            while not steps[-1][3]:
+                assert "ticks" not in steps[-1][4]
+                time.sleep(0.06)
+                steps.append(env.step(REST))
+            info = steps[-1][4]
+            assert info["ticks"] == 10
+            assert info["late_ticks"] > 5
+            assert 5 <= info["holds"] <= 10
+    warnings = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(warnings) == 2
+    assert "of 10 ticks came late" in warnings[0]
+    assert f"the arm was held {info['holds']} times for want of an action" in warnings[1]
+    assert "longer than a tick's 20 ms" in warnings[1]
+
+
 def test_lerobot_makes_one_robot_however_many_environments_it_asks_for(wav):
     from lerobot.envs import make_env
 
