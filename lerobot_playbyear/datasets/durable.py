@@ -131,6 +131,11 @@ class DurableWriter:
         """Frames on disk, without those of the episode in progress."""
         return self._n_frames
 
+    @property
+    def n_waiting(self) -> int:
+        """Pictures of the episode in progress that are in memory, and no thread compresses yet."""
+        return 0 if self._episode is None else self._episode.n_waiting
+
     def add_frame(self, frame: dict[str, Any]) -> None:
         """Adds one frame to the episode in progress. After an error it is not part of it, and the episode goes on.
 
