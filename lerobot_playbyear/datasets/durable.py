@@ -52,7 +52,7 @@ class DurableWriter:
         fps: Frames per second.
         features: LeRobot features of what `add_frame` gets, without the ones LeRobot adds itself.
         resume: Append to the dataset in `root` if there is one. Otherwise an existing one is an error.
-        robot_type: Noted in a new dataset's metadata.
+        robot_type: Noted in a new dataset's metadata; one that notes another is refused.
         image_writer_threads: Threads that compress pictures. 0: `add_frame` does it.
         streaming_encoding: Encode video while frames come in, not in `save_episode`. The pictures are then nowhere but
             in the video: an episode of which the encoder dropped a frame, or failed, is refused and cannot be saved.
@@ -60,8 +60,8 @@ class DurableWriter:
 
     Raises:
         FileExistsError: `root` holds a dataset, or other files, and `resume` is off.
-        ValueError: Nothing can be recorded with these features; or the dataset in `root` has another fps or other
-            features. The message names them.
+        ValueError: Nothing can be recorded with these features; or the dataset in `root` has another fps, other
+            features or another robot. The message names them.
         DatasetWriteError: `root` cannot be read or written, or another process is writing to it.
         DatasetDamagedError: The dataset in `root` is damaged; the message says how, and what to do.
         JournalError: What the dataset's scratch folder says is to be moved lies outside the dataset.
@@ -106,7 +106,7 @@ class DurableWriter:
             finish_journal(self.root)
             if has_dataset(self.root):
                 check_undamaged(self.root)
-                check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features)
+                check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features, robot_type)
             self._count()
             if remove_leftovers(self.root):
                 logger.warning(
