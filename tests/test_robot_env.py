@@ -13,6 +13,7 @@ from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.frames import dataset_features
 from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.robots import arm
 from lerobot_playbyear.robots.parts import RobotError
 from lerobot_playbyear.robots.ticks import Ticks
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
@@ -82,6 +83,45 @@ def test_an_action_changes_by_no_more_than_the_limit(wav):
 def test_the_limit_of_the_robot_itself_is_on_by_default():
     with robot_env(joint_config()) as env:
         assert env.arm.robot.config.max_relative_target == 20.0
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The options that robots were made with; each is an arm of joints, whatever its options."""
+    from lerobot_robot_playbyear_sim import JointArmConfig
+    from lerobot_robot_playbyear_sim.joints import JointArm
+
+    configs = []
+
+    def make(config):
+        configs.append(config)
+        return JointArm(JointArmConfig())
+
+    monkeypatch.setattr(arm, "make_robot_from_config", make)
+    return configs
+
+
+def test_each_arm_of_a_robot_with_two_has_the_limit(made, caplog):
+    from lerobot.robots.bi_so_follower import BiSOFollowerConfig
+    from lerobot.robots.so_follower import SOFollowerConfig
+
+    left, right = SOFollowerConfig(port="x"), SOFollowerConfig(port="y", max_relative_target=5.0)
+    arm.Arm(BiSOFollowerConfig(left_arm_config=left, right_arm_config=right), 20.0)
+    assert (made[0].left_arm_config.max_relative_target, made[0].right_arm_config.max_relative_target) == (20.0, 5.0)
+    assert left.max_relative_target is None
+    assert not caplog.text
+
+
+def test_a_robot_that_cannot_be_limited_so_is_named(made, caplog):
+    from lerobot.robots.hope_jr import HopeJrHandConfig
+
+    hand = HopeJrHandConfig(port="x", side="left")
+    arm.Arm(hand, None)
+    assert not caplog.text
+    arm.Arm(hand, 20.0, max_step=2.0)
+    assert (
+        "--env.max_relative_target=20.0 does nothing: --env.robot.type=hope_jr_hand has no such option" in caplog.text
+    )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
