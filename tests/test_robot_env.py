@@ -512,6 +512,25 @@ def test_the_arm_goes_to_rest_when_the_person_says_so():
     assert notes[0][1] == pytest.approx(8)  # it had not moved yet
 
 
+def test_no_demonstration_begins_where_the_disk_has_no_room_for_one(tmp_path, monkeypatch):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    from lerobot_playbyear.datasets.durable import DurableWriter
+    from lerobot_playbyear.recording import demonstrations
+
+    asked_for = []
+    monkeypatch.setattr(demonstrations, "check_room", lambda writer, n_bytes: asked_for.append(n_bytes))
+    with robot_env(joint_config(fps=50, episode_s=0.3), ScriptedConsole(begins)) as env:
+        facts = env_facts(env)
+        with DurableWriter("tests/arm", tmp_path / "data", facts.fps, dataset_features(facts)) as writer:
+            expert, _ = teleop(env, JointLeaderConfig())
+            episodes = demonstrations.PersonRollouts(env, expert, writer).episodes(range(2))
+            assert len([*episodes]) == 2
+            expert.close()
+    assert asked_for[0] is None
+    assert asked_for[1] > 10 * 48 * 64  # of noise, without loss
+
+
 KEYS = [("\x1b", ["escape"]), ("\x1b[A p", ["up", "space", "p"]), ("\x1bOP\x1b[3~S", ["s"])]
 
 

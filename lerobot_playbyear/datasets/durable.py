@@ -19,7 +19,8 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_playbyear.datasets.episode_checks import IncompleteEpisodeError, LostFramesError
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_compatible, check_root, check_undamaged, has_dataset
-from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, publish
+from lerobot_playbyear.datasets.files import entries_below
+from lerobot_playbyear.datasets.journal import EPISODE, JOURNAL, finish_journal, publish
 from lerobot_playbyear.datasets.locking import DatasetLock
 from lerobot_playbyear.datasets.repair.replacing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
@@ -135,6 +136,10 @@ class DurableWriter:
     def n_waiting(self) -> int:
         """Pictures of the episode in progress that are in memory, and no thread compresses yet."""
         return 0 if self._episode is None else self._episode.n_waiting
+
+    def episode_bytes(self) -> int:
+        """What the episode in progress takes on the disk now."""
+        return sum(path.lstat().st_size for path in entries_below(self.root / EPISODE))
 
     def add_frame(self, frame: dict[str, Any]) -> None:
         """Adds one frame to the episode in progress. After an error it is not part of it, and the episode goes on.
