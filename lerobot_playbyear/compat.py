@@ -120,6 +120,11 @@ def set_streaming_encoder(writer: "DatasetWriter", encoder: Any) -> None:
     writer._streaming_encoder = encoder
 
 
+def pictures_waiting(writer: "DatasetWriter") -> int:
+    """Pictures that no thread has begun to write yet; LeRobot takes any number of them."""
+    return 0 if writer.image_writer is None else writer.image_writer.queue.qsize()
+
+
 def held_keys(teleop: "KeyboardTeleop") -> dict[Any, bool]:
     """The keyboard's keys and whether each is down; the teleoperator's own, which can be changed."""
     return teleop.current_pressed

@@ -458,3 +458,20 @@ def test_a_dataset_of_another_kind_is_refused(tmp_path):
     (tmp_path / "data" / "demo.hdf5").write_bytes(b"\x89HDF")
     with pytest.raises(FileExistsError, match="is not empty and holds no dataset"):
         writer(tmp_path)
+
+
+def arm(*joints: str) -> dict[str, Any]:
+    return {**FEATURES, "action": {**FEATURES["action"], "names": [f"{joint}.pos" for joint in joints]}}
+
+
+def test_another_robot_or_other_joints_are_not_appended(tmp_path):
+    joints = ("pan", "lift", "elbow", "grip")
+    write(tmp_path / "data", [0], arm(*joints), robot_type="so101_follower")
+    swapped = "the numbers of action are pan.pos, lift.pos, elbow.pos, grip.pos there and lift.pos, pan.pos, elbow.pos"
+    with pytest.raises(ValueError, match=swapped):
+        writer(tmp_path / "data", arm("lift", "pan", "elbow", "grip"), robot_type="so101_follower")
+    with pytest.raises(ValueError, match="the robot is so101_follower there and koch_follower here"):
+        writer(tmp_path / "data", arm(*joints), robot_type="koch_follower")
+    write(tmp_path / "data", [1], arm(*joints), robot_type="so101_follower")
+    write(tmp_path / "data", [2])  # says neither
+    assert is_as_recorded(tmp_path / "data", range(3))

@@ -13,6 +13,7 @@ from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Verdict
 from lerobot_playbyear.episodes.frames import dataset_features
 from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.robots import arm
 from lerobot_playbyear.robots.parts import RobotError
 from lerobot_playbyear.robots.ticks import Ticks
 from lerobot_playbyear.teleoperation.controls import PersonLeftError
@@ -82,6 +83,45 @@ def test_an_action_changes_by_no_more_than_the_limit(wav):
 def test_the_limit_of_the_robot_itself_is_on_by_default():
     with robot_env(joint_config()) as env:
         assert env.arm.robot.config.max_relative_target == 20.0
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """The options that robots were made with; each is an arm of joints, whatever its options."""
+    from lerobot_robot_playbyear_sim import JointArmConfig
+    from lerobot_robot_playbyear_sim.joints import JointArm
+
+    configs = []
+
+    def make(config):
+        configs.append(config)
+        return JointArm(JointArmConfig())
+
+    monkeypatch.setattr(arm, "make_robot_from_config", make)
+    return configs
+
+
+def test_each_arm_of_a_robot_with_two_has_the_limit(made, caplog):
+    from lerobot.robots.bi_so_follower import BiSOFollowerConfig
+    from lerobot.robots.so_follower import SOFollowerConfig
+
+    left, right = SOFollowerConfig(port="x"), SOFollowerConfig(port="y", max_relative_target=5.0)
+    arm.Arm(BiSOFollowerConfig(left_arm_config=left, right_arm_config=right), 20.0)
+    assert (made[0].left_arm_config.max_relative_target, made[0].right_arm_config.max_relative_target) == (20.0, 5.0)
+    assert left.max_relative_target is None
+    assert not caplog.text
+
+
+def test_a_robot_that_cannot_be_limited_so_is_named(made, caplog):
+    from lerobot.robots.hope_jr import HopeJrHandConfig
+
+    hand = HopeJrHandConfig(port="x", side="left")
+    arm.Arm(hand, None)
+    assert not caplog.text
+    arm.Arm(hand, 20.0, max_step=2.0)
+    assert (
+        "--env.max_relative_target=20.0 does nothing: --env.robot.type=hope_jr_hand has no such option" in caplog.text
+    )
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -240,6 +280,41 @@ def test_a_standstill_before_a_tick_and_one_after_it_are_both_told():
     assert ticks.standstill_s(0.2) == pytest.approx(2.05)  # the tick came late
     ticks.wait()
     assert ticks.standstill_s(0.2) == 0
+
+
+def test_ticks_that_come_late_are_told_where_they_are_many(caplog):
+    now = [0.0]
+    ticks = Ticks(10, clock=lambda: now[0], sleep=lambda seconds: now.__setitem__(0, now[0] + seconds))
+    for late in [0.0] * 38 + [0.11] * 2:
+        now[0] += late
+        ticks.wait()
+    assert ticks.account(2) == {"ticks": 40, "late_ticks": 2, "holds": 2}
+    assert not caplog.text
+    now[0] += 0.11
+    ticks.wait()
+    assert ticks.account(0) == {"ticks": 41, "late_ticks": 3, "holds": 0}
+    assert "3 of 41 ticks came late" in caplog.text
+
+
+def test_an_attempt_of_a_policy_that_is_too_slow_says_so(caplog):
+    with robot_env(joint_config(fps=50, episode_s=0.2)) as env:
+        for seed in (0, 1):  # the holds of the one are not those of the other
+            env.reset(seed=seed)
+            time.sleep(0.1)  # before the first action it may take long
+            steps = [env.step(REST)]
+            while not steps[-1][3]:
+                assert "ticks" not in steps[-1][4]
+                time.sleep(0.06)
+                steps.append(env.step(REST))
+            info = steps[-1][4]
+            assert info["ticks"] == 10
+            assert info["late_ticks"] > 5
+            assert 5 <= info["holds"] <= 10
+    warnings = [r.getMessage() for r in caplog.records if r.levelno == logging.WARNING]
+    assert len(warnings) == 2
+    assert "of 10 ticks came late" in warnings[0]
+    assert f"the arm was held {info['holds']} times for want of an action" in warnings[1]
+    assert "longer than a tick's 20 ms" in warnings[1]
 
 
 def test_lerobot_makes_one_robot_however_many_environments_it_asks_for(wav):
@@ -435,6 +510,25 @@ def test_the_arm_goes_to_rest_when_the_person_says_so():
     asked = [note for note, _ in notes if note]
     assert asked == ["Press P to let the arm go to its rest pose", "Set the scene up, then press P to begin"]
     assert notes[0][1] == pytest.approx(8)  # it had not moved yet
+
+
+def test_no_demonstration_begins_where_the_disk_has_no_room_for_one(tmp_path, monkeypatch):
+    from lerobot_robot_playbyear_sim import JointLeaderConfig
+
+    from lerobot_playbyear.datasets.durable import DurableWriter
+    from lerobot_playbyear.recording import demonstrations
+
+    asked_for = []
+    monkeypatch.setattr(demonstrations, "check_room", lambda writer, n_bytes: asked_for.append(n_bytes))
+    with robot_env(joint_config(fps=50, episode_s=0.3), ScriptedConsole(begins)) as env:
+        facts = env_facts(env)
+        with DurableWriter("tests/arm", tmp_path / "data", facts.fps, dataset_features(facts)) as writer:
+            expert, _ = teleop(env, JointLeaderConfig())
+            episodes = demonstrations.PersonRollouts(env, expert, writer).episodes(range(2))
+            assert len([*episodes]) == 2
+            expert.close()
+    assert asked_for[0] is None
+    assert asked_for[1] > 10 * 48 * 64  # of noise, without loss
 
 
 KEYS = [("\x1b", ["escape"]), ("\x1b[A p", ["up", "space", "p"]), ("\x1bOP\x1b[3~S", ["s"])]

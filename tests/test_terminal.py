@@ -5,13 +5,15 @@ import io
 import os
 import pty
 import select
+import shutil
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from lerobot_playbyear.datasets.errors import DatasetWriteError
-from lerobot_playbyear.episodes.saving import save_or_ask
+from lerobot_playbyear.episodes.saving import check_room, save_or_ask
 from lerobot_playbyear.episodes.terminal import READERS
 from lerobot_playbyear.teleoperation.console import TerminalConsole
 from lerobot_playbyear.teleoperation.status import Status
@@ -101,3 +103,46 @@ def test_a_line_can_be_edited_while_a_question_is_asked(terminal, monkeypatch):
     assert not is_by_line()
     console.close()
     assert is_by_line()
+
+
+@pytest.fixture
+def disk(monkeypatch, tmp_path):
+    """The MiB that are left on a disk, first to last, as often as they are looked at."""
+    left = []
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=left.pop(0) << 20))
+    return left
+
+
+def answers(monkeypatch, *given):
+    """What is typed, in turn; the questions that it answers."""
+    asked, typed = [], list(given)
+    monkeypatch.setattr("builtins.input", lambda prompt: asked.append(prompt) or typed.pop(0))
+    return asked
+
+
+ROOM = SimpleNamespace(root=Path("nowhere"), num_episodes=4)
+
+
+def test_a_person_makes_room_before_they_show_anything(terminal, monkeypatch, disk, capsys):
+    asked = answers(monkeypatch, "", "what?", "b", "q")
+    disk += [20, 35, 36]  # twice 10 and 16 are wanted
+    check_room(ROOM, 10 << 20)
+    assert len(asked) == 2
+    assert "has 20 MiB left; wanted 36 MiB" in capsys.readouterr().err
+    disk += [35]
+    check_room(ROOM, 10 << 20)  # they begin all the same
+    disk += [255]
+    with pytest.raises(DatasetWriteError, match=r"has 255 MiB left; wanted 256 MiB.*4 episodes.*--resume=true"):
+        check_room(ROOM, None)
+
+
+def test_where_nobody_is_at_the_terminal_a_guess_stops_nobody(monkeypatch, disk, caplog):
+    monkeypatch.setattr("sys.stdin", None)
+    disk += [20]
+    check_room(ROOM, None)
+    assert "has 20 MiB left; wanted 256 MiB" in caplog.text
+    disk += [18, 18]
+    check_room(ROOM, 1 << 20)  # an episode of 1 MiB needs no 256
+    with pytest.raises(DatasetWriteError, match="wanted 20 MiB"):
+        check_room(ROOM, 2 << 20)

@@ -19,7 +19,8 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_playbyear.datasets.episode_checks import IncompleteEpisodeError, LostFramesError
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_compatible, check_root, check_undamaged, has_dataset
-from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, publish
+from lerobot_playbyear.datasets.files import entries_below
+from lerobot_playbyear.datasets.journal import EPISODE, JOURNAL, finish_journal, publish
 from lerobot_playbyear.datasets.locking import DatasetLock
 from lerobot_playbyear.datasets.repair.replacing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
@@ -52,7 +53,7 @@ class DurableWriter:
         fps: Frames per second.
         features: LeRobot features of what `add_frame` gets, without the ones LeRobot adds itself.
         resume: Append to the dataset in `root` if there is one. Otherwise an existing one is an error.
-        robot_type: Noted in a new dataset's metadata.
+        robot_type: Noted in a new dataset's metadata; one that notes another is refused.
         image_writer_threads: Threads that compress pictures. 0: `add_frame` does it.
         streaming_encoding: Encode video while frames come in, not in `save_episode`. The pictures are then nowhere but
             in the video: an episode of which the encoder dropped a frame, or failed, is refused and cannot be saved.
@@ -60,8 +61,8 @@ class DurableWriter:
 
     Raises:
         FileExistsError: `root` holds a dataset, or other files, and `resume` is off.
-        ValueError: Nothing can be recorded with these features; or the dataset in `root` has another fps or other
-            features. The message names them.
+        ValueError: Nothing can be recorded with these features; or the dataset in `root` has another fps, other
+            features or another robot. The message names them.
         DatasetWriteError: `root` cannot be read or written, or another process is writing to it.
         DatasetDamagedError: The dataset in `root` is damaged; the message says how, and what to do.
         JournalError: What the dataset's scratch folder says is to be moved lies outside the dataset.
@@ -106,7 +107,7 @@ class DurableWriter:
             finish_journal(self.root)
             if has_dataset(self.root):
                 check_undamaged(self.root)
-                check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features)
+                check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features, robot_type)
             self._count()
             if remove_leftovers(self.root):
                 logger.warning(
@@ -130,6 +131,15 @@ class DurableWriter:
     def num_frames(self) -> int:
         """Frames on disk, without those of the episode in progress."""
         return self._n_frames
+
+    @property
+    def n_waiting(self) -> int:
+        """Pictures of the episode in progress that are in memory, and no thread compresses yet."""
+        return 0 if self._episode is None else self._episode.n_waiting
+
+    def episode_bytes(self) -> int:
+        """What the episode in progress takes on the disk now."""
+        return sum(path.lstat().st_size for path in entries_below(self.root / EPISODE))
 
     def add_frame(self, frame: dict[str, Any]) -> None:
         """Adds one frame to the episode in progress. After an error it is not part of it, and the episode goes on.

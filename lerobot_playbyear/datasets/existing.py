@@ -73,8 +73,12 @@ def check_undamaged(root: Path) -> None:
         raise DatasetDamagedError(f"{error} Nothing was changed.") from error
 
 
-def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str, dict]) -> None:
-    """Whether frames of `features` at `fps` can be appended to an existing dataset.
+def check_compatible(
+    meta: LeRobotDatasetMetadata, fps: int, features: dict[str, dict], robot_type: str | None = None
+) -> None:
+    """Whether frames of `features` at `fps`, of a robot of this type, can be appended to an existing dataset.
+
+    Names of numbers, such as joints, and types of robots are compared where both sides have them.
 
     Raises:
         ValueError: With every difference in the message.
@@ -89,6 +93,14 @@ def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str,
         for key in sorted(there.keys() | here.keys())
         if there.get(key) != here.get(key)
     ]
+    names = ((key, _names(meta.features.get(key)), _names(feature)) for key, feature in features.items())
+    differences += [
+        f"the numbers of {key} are {', '.join(old)} there and {', '.join(new)} here"
+        for key, old, new in names
+        if old and new and old != new
+    ]
+    if meta.robot_type and robot_type and meta.robot_type != robot_type:
+        differences.append(f"the robot is {meta.robot_type} there and {robot_type} here")
     if differences:
         raise ValueError(
             f"The dataset in {meta.root} does not fit what is to be appended: {'; '.join(differences)}. "
@@ -99,3 +111,9 @@ def check_compatible(meta: LeRobotDatasetMetadata, fps: int, features: dict[str,
 def _signature(feature: dict) -> str:
     rate = (feature.get("info") or {}).get("sample_rate")
     return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
+
+
+def _names(feature: dict | None) -> list[str]:
+    """What the numbers of a vector are called; those of a picture's axes tell nothing."""
+    names = None if feature is None or len(feature["shape"]) != 1 else feature.get("names")
+    return [str(name) for name in names] if isinstance(names, list | tuple | dict) else []

@@ -19,7 +19,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot.utils.utils import SuppressProgressBars
 from torch import Tensor
 
-from lerobot_playbyear.compat import forget_unsaved_rows, set_streaming_encoder, streaming_encoder
+from lerobot_playbyear.compat import forget_unsaved_rows, pictures_waiting, set_streaming_encoder, streaming_encoder
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.episode_checks import check_pictures, check_videos
 from lerobot_playbyear.datasets.files import take_over
@@ -76,6 +76,11 @@ class Staging:
     def is_complete(self) -> bool:
         """Whether saving has begun, so that no frame can be added any more."""
         return self._frames is not None
+
+    @property
+    def n_waiting(self) -> int:
+        """Pictures that no thread has begun to write yet."""
+        return pictures_waiting(self._writer)
 
     @property
     def _writer(self) -> DatasetWriter:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +14,7 @@ from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
 from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
 from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.saving import check_room
 from lerobot_playbyear.episodes.streaming import FrameStream
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
@@ -31,6 +32,7 @@ class PersonRollouts:
     env: gym.Env
     expert: Expert
     writer: DurableWriter | None = None
+    _most_bytes: int | None = field(default=None, init=False)
 
     def facts(self) -> EnvFacts:
         """What the environment looks like; a person needs no script."""
@@ -46,10 +48,12 @@ class PersonRollouts:
     def _play(self, seed: int) -> Episode:
         if self.writer is None or not getattr(self.env.unwrapped, "is_real_time", False):
             return play(self.env, Nobody(), seed, expert=self.expert)
+        check_room(self.writer, self._most_bytes)
         stream = FrameStream(self.writer, seed, task_description(self.env))
         try:
             episode = play(self.env, Nobody(), seed, expert=self.expert, sink=stream)
             stream.finish()
+            self._most_bytes = max(self._most_bytes or 0, self.writer.episode_bytes())
         except BaseException:
             with suppress(Exception):  # the first error says more
                 stream.abandon()

@@ -2,6 +2,7 @@
 
 import copy
 import inspect
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -10,7 +11,7 @@ import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
 
 from lerobot_playbyear.episodes.terminal import alone
-from lerobot_playbyear.robots.parts import RobotError, names_of
+from lerobot_playbyear.robots.parts import RobotError, fill_in_limit, names_of
 from lerobot_playbyear.teleoperation.leader import close_parts, let_go
 
 _VELOCITY = (".vel", "_vel")
@@ -25,7 +26,7 @@ class Arm:
 
     Args:
         config: Of the robot.
-        max_relative_target: Filled in where the robot has this option and was not given it.
+        max_relative_target: Filled in where the robot, or an arm of one that has two, has this option and was not given it.
         max_step: How much what a joint is told may change from one action to the next; None: no limit.
         calibrate: Whether LeRobot asks for a calibration when there is none.
 
@@ -48,8 +49,7 @@ class Arm:
         calibrate: bool = True,
     ) -> None:
         config = copy.deepcopy(config)
-        if max_relative_target is not None and getattr(config, "max_relative_target", 0) is None:
-            config.max_relative_target = max_relative_target  # type: ignore[attr-defined]
+        is_limited = max_relative_target is None or fill_in_limit(config, max_relative_target)
         try:
             self.robot: Robot = make_robot_from_config(config)
             observations, actions = self.robot.observation_features, self.robot.action_features
@@ -59,6 +59,11 @@ class Arm:
         self.state_names, self.cameras, self.action_names = names_of(config.type, observations, actions)
         # What is told and seen under one name is a place to be at, unless it is a velocity: it holds by being told where it is.
         self._is_place = np.array([n in self.state_names and not n.endswith(_VELOCITY) for n in self.action_names])
+        if not is_limited and self.has_a_position:
+            logging.warning(
+                f"--env.max_relative_target={max_relative_target} does nothing: --env.robot.type={config.type} has no such "
+                f"option. Only --env.max_step={max_step} limits what a joint is told, by how much it changes in a tick."
+            )
         self._lock = threading.RLock()
         self._last: np.ndarray | None = None
         self.sent: np.ndarray | None = None

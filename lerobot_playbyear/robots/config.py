@@ -55,8 +55,8 @@ class RobotEnvConfig(EnvConfig):
         rest_s: How long it takes to go there [s].
         wait_for_person: Whether every attempt begins when a person says so.
         console: Where a person sees what goes on, and presses keys: `window`, `terminal`, `none`, or `auto`: what there is.
-        max_relative_target: For robots that have this option and were not given it: how far from where it is a joint may be
-            told to go, in its units. None: as far as it likes.
+        max_relative_target: For robots, and each arm of those with two, that have this option and were not given it: how far
+            from where it is a joint may be told to go, in its units. None: as far as it likes.
         max_step: How much what a joint is told may change from one tick to the next, in its units. None: no limit.
         stall_s: An attempt ends when the loop stood still for as long [s].
         frozen_s: A camera whose picture is the same to the last bit for as long is taken for dead [s]; 0: never.

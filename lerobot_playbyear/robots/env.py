@@ -119,7 +119,6 @@ class RobotEnv(gym.Env):
         if self._stopped is not None:  # by an expert, in this step
             return self._outcome(self._stopped, is_stopped=True, was_sent=False)
         rig, problem, was_sent = self._rig, "", False
-        n_holds = rig.watchdog.n_holds
         if self._ticks.n == 0 and time.perf_counter() - self._tick_at > 1 / self.config.fps:
             rig.ears.skip_to(self._begin() - self.config.camera_latency_s)  # a policy's first action takes long
         try:
@@ -145,8 +144,6 @@ class RobotEnv(gym.Env):
         problem = problem or self._frozen.problem(self._pictures) or rig.ears.problem
         if problem:
             return self._end(problem, was_sent)
-        if rig.watchdog.n_holds > n_holds:
-            logging.debug("The arm held for a moment: an action came late.")
         try:
             verdict = self.person.look(self._last, self.render, self._ticks, rig.ears.drop_outs)
             if self.person.wants_pause and verdict is None:
@@ -251,6 +248,7 @@ class RobotEnv(gym.Env):
     def _begin(self) -> float:
         """The first tick is now: when that is [s of time.perf_counter]."""
         self._began_at = time.time()
+        self._held_before = self._rig.watchdog.n_holds
         return self._ticks.start()
 
     def _hold_now(self) -> None:
@@ -294,5 +292,7 @@ class RobotEnv(gym.Env):
         if not is_stopped and (is_over or verdict is not None):
             self._rig.watchdog.rest()
             self._hold_now()
+        if is_stopped or is_over or verdict is not None:
+            info |= self._ticks.account(self._rig.watchdog.n_holds - self._held_before)
         ends = verdict is not None and not is_stopped
         return self._last, float(info["is_success"]), ends, is_stopped or is_over, info

@@ -2,9 +2,10 @@
 
 import contextlib
 from collections.abc import Mapping
+from dataclasses import is_dataclass
 from typing import Any
 
-from lerobot.robots import Robot
+from lerobot.robots import Robot, RobotConfig
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 
@@ -44,6 +45,24 @@ def names_of(
     if not told or len(told) < len(actions):
         raise RobotError(f"--env.robot.type={robot_type} takes {dict(actions)}; wanted numbers by name.")
     return states, cameras, told
+
+
+def fill_in_limit(config: RobotConfig, limit: float) -> bool:
+    """Gives a robot's options, and those of each arm of one that has two, a `max_relative_target` where they have none.
+
+    Args:
+        config: Of the robot; it is changed.
+        limit: How far from where it is a joint may be told to go, in its units.
+
+    Returns:
+        Whether the robot has such an option at all.
+    """
+    parts = [part for part in (config, *vars(config).values()) if is_dataclass(part)]
+    limited: list[Any] = [part for part in parts if hasattr(part, "max_relative_target")]
+    for part in limited:
+        if part.max_relative_target is None:
+            part.max_relative_target = limit
+    return bool(limited)
 
 
 def reconnect_cameras(robot: Robot) -> None:

@@ -1,9 +1,11 @@
 """The ticks of a real robot: each at its time, and an account of those that were not."""
 
+import logging
 import time
 from collections.abc import Callable
 
 _LATE_S = 0.005
+_MANY = 0.05  # of an attempt's ticks: from here on it says little of who acted
 
 
 class Ticks:
@@ -79,3 +81,21 @@ class Ticks:
             "late_ticks": self.n_late,
             "worst_lateness_s": round(max(self.lateness, default=0.0), 4),
         }
+
+    def account(self, n_holds: int) -> dict[str, int]:
+        """At an attempt's end: how well its time was kept; a warning where it was not.
+
+        Args:
+            n_holds: How often the arm was held meanwhile because no action came.
+
+        Returns:
+            `ticks`, `late_ticks` and `holds`, for the attempt's last `info`.
+        """
+        if max(self.n_late, n_holds) > _MANY * self.n > 0:
+            logging.warning(
+                f"{self.n_late} of {self.n} ticks came late, the worst by {1000 * max(self.lateness):.0f} ms, and the arm was "
+                f"held {n_holds} times for want of an action: who acts takes longer than a tick's {1000 * self._period:.0f} "
+                "ms, or the machine is too busy, and how the attempt ended says little. Take a GPU, or train with a smaller "
+                "--policy.image_size, or record and train with a lower --env.fps; and let nothing else run."
+            )
+        return {"ticks": self.n, "late_ticks": self.n_late, "holds": n_holds}
