@@ -30,7 +30,8 @@ class PushOptions:
     """How something is uploaded.
 
     Args:
-        private: Whether a repository that is created is private. None: as the account's default says.
+        private: Whether a repository that is created is private. True: nothing goes to one that is there and public. None: as
+            the account's default says.
         tags: For the card, besides those that it gets by itself.
         license: As the Hub names licences. None: the policy's own, or else apache-2.0.
         preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
@@ -114,10 +115,17 @@ def push_meanwhile(push: Callable[[], object], path: Path) -> None:
 def reason(error: BaseException) -> str:
     """Why the Hub could not be used, in one line."""
     for cause in _causes(error):
+        if isinstance(cause, HubError):
+            return str(cause).rstrip(".")
         if isinstance(cause, OfflineModeIsEnabled):
             return "the environment variable HF_HUB_OFFLINE forbids it"
         if isinstance(cause, HfHubHTTPError):
-            status = cause.response.status_code
+            status, said = cause.response.status_code, (cause.server_message or "").partition("\n")[0].rstrip(".")
+            if status == 403 and said and get_token():  # it may be a quota
+                return (
+                    f"{constants.ENDPOINT} refused (status 403): {said}. If that is about the token, log in with "
+                    "`hf auth login`, with one that may write there"
+                )
             if status in (401, 403):
                 return (
                     f"{constants.ENDPOINT} refused (status {status}): log in with `hf auth login`, with a token that may "

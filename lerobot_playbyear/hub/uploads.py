@@ -39,7 +39,8 @@ class PushConfig(PushOptions):
     Args:
         dataset: The dataset to upload.
         policy: The policy to upload.
-        private: Whether a repository that is created is private. None: as the account's default says.
+        private: Whether a repository that is created is private. True: nothing goes to one that is there and public. None: as
+            the account's default says.
         tags: For the card, besides those that it gets by itself.
         license: As the Hub names licences. None: the policy's own, or else apache-2.0.
         preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.

@@ -41,7 +41,8 @@ class RecordDatasetConfig:
         streaming_encoding: Whether video is encoded while it is recorded, as by lerobot-record; otherwise after each episode.
         rgb_encoder: Codec and quality of video, such as `--dataset.rgb_encoder.vcodec=h264`.
         push_to_hub: Whether to upload it when it is complete.
-        private: Whether the uploaded repository is private. None: as the account's default says.
+        private: Whether the uploaded repository is private. True: nothing goes to one that is there and public. None: as the
+            account's default says.
         tags: For its card on the Hub.
     """
 
