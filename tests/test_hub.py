@@ -17,7 +17,7 @@ from hub_client import HubClient, Result
 from hub_faults import down_after, every_second, everything_fails, nothing_fails, one_in
 from hub_repositories import File, Repository, git_oid
 from hub_server import TOKEN, HubServer
-from huggingface_hub import HfApi, get_session, set_client_factory
+from huggingface_hub import HfApi, ModelCard, get_session, set_client_factory
 from huggingface_hub.errors import HfHubHTTPError
 from huggingface_hub.utils import _http, hf_raise_for_status
 
@@ -25,8 +25,9 @@ from lerobot_playbyear.datasets.locking import DatasetLock
 from lerobot_playbyear.hub import datasets as pushing_datasets
 from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.hub.datasets import push_dataset
+from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import HubError, PushOptions, reason
-from lerobot_playbyear.hub.repository import HubRepository
+from lerobot_playbyear.hub.repository import HubRepository, check_card
 from lerobot_playbyear.hub.training_run import evaluation_of
 
 DATASET = "tester/grasp"
@@ -201,7 +202,19 @@ def test_without_a_login_the_message_says_so_at_once(pushed, hub, client):
         ((), "Give either --dataset.repo_id"),
         (("--dataset.repo_id=me/nothing", "--dataset.root=/nowhere"), "There is no LeRobotDataset in '/nowhere'"),
         (("--dataset.repo_id=nameless", "--dataset.root={root}"), "give it as user/name"),
+        (
+            ("--dataset.repo_id=me/no name", "--dataset.root={root}"),
+            "dataset.repo_id='me/no name' cannot be pushed: Repo id",
+        ),
         (("--policy.path={root}", "--policy.repo_id=me/policy"), "there is no checkpoint with config.json"),
+        (
+            ("--policy.path={root}", "--policy.repo_id=me/no name"),
+            "policy.repo_id='me/no name' cannot be pushed: Repo id",
+        ),
+        (("--policy.path={root}", "--dataset.repo_id=me/set"), "Give either --dataset.repo_id"),
+        (("--policy.path={root}",), "needs --policy.repo_id, the policy's name on the Hub"),
+        (("--dataset.root={root}",), "needs --dataset.repo_id, the dataset's name on the Hub"),
+        (("--dataset.repo_id=me/set", "--dataset.root={root}", "--preview={root}/meta/info.json"), "cards show mp4"),
     ],
 )
 def test_what_cannot_be_pushed_is_refused(pushed, hub, client, options, message):
@@ -467,7 +480,9 @@ def uploads(here, monkeypatch):
 
 
 def test_a_dataset_that_is_being_recorded_to_is_not_uploaded(dataset, uploads):
-    options = PushOptions(preview=dataset / "meta" / "info.json")
+    film = dataset.parent / "film.mp4"
+    film.touch()
+    options = PushOptions(preview=film)
     lock = DatasetLock(dataset)
     with pytest.raises(HubError, match=f"Not pushed. {dataset} is being recorded to"):
         push_dataset("me/set", dataset, options)
@@ -527,6 +542,30 @@ def test_a_refusal_says_what_the_hub_says_of_it(monkeypatch, status, token, want
     said = reason(refused.value)
     assert re.search(wanted, said)
     assert "\n" not in said
+
+
+def test_a_card_that_the_hub_refuses_costs_no_upload_and_is_told(here, uploads, dataset, tmp_path):
+    (tmp_path / "film.mp4").touch()
+    options = PushOptions(license="CC BY 4.0", preview=tmp_path / "film.mp4")
+    with pytest.raises(
+        HubError, match=r"refuses its card, give another license.*license.* must be one of \[apache-2.0"
+    ):
+        push_dataset("me/set", dataset, options)
+    assert not uploads
+
+
+def test_a_policys_card_that_the_hub_refuses_is_told(here):
+    with patient_hub(), pytest.raises(HubError, match="refuses its card"):
+        check_card(ModelCard("---\nlicense: CC BY 4.0\n---\n"), "model")
+
+
+@pytest.mark.parametrize("config", ['{"type": "play', '{"type": "none_such"}', '{"type": "act", "device": "cpu"}'])
+def test_a_damaged_policy_is_told_in_one_line(tmp_path, config):
+    (tmp_path / "config.json").write_text(config)
+    (tmp_path / "model.safetensors").write_text("cut off")
+    with pytest.raises(HubError, match=f"Not pushed. The policy in {tmp_path} cannot be loaded: ") as refused:
+        push_policy(tmp_path, "me/policy", PushOptions())
+    assert "\n" not in str(refused.value)
 
 
 # What is known of a policy's success

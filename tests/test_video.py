@@ -176,6 +176,7 @@ def test_a_loaded_policy_acts_bit_for_bit_as_in_lerobot_eval(tmp_path, use_amp):
 @pytest.mark.parametrize(
     ("output", "options", "wanted"),
     [
+        ("film.mp4", {"seed": -1}, "seed=-1: give 0 or more"),
         ("film", {}, r"--output=.*film: films are mp4; give a name that ends with .mp4"),
         ("film.gif", {}, r"--output=.*film.gif: films are mp4"),
         ("folder.mp4", {}, r"--output=.*folder.mp4: that is a folder"),

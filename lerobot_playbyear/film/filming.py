@@ -86,6 +86,8 @@ def _check_options(cfg: VideoConfig) -> None:
     """What would otherwise show only after the episode, which on a robot is a person's work."""
     if cfg.attempts < 1:
         raise InputError(f"attempts={cfg.attempts}: give at least 1.")
+    if cfg.seed < 0:
+        raise InputError(f"seed={cfg.seed}: give 0 or more.")
     if cfg.output.suffix.lower() != ".mp4":
         raise InputError(f"--output={cfg.output}: films are mp4; give a name that ends with .mp4.")
     if cfg.output.is_dir():

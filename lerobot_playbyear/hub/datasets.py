@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from huggingface_hub import HfApi
+from huggingface_hub import DatasetCard, HfApi
 
 from lerobot_playbyear.datasets.confines import OutsideError, check_links
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, entries_below
@@ -15,8 +15,8 @@ from lerobot_playbyear.datasets.journal import JournalError
 from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview
-from lerobot_playbyear.hub.pushing import HubError, PushOptions, push_patiently
-from lerobot_playbyear.hub.repository import HubRepository
+from lerobot_playbyear.hub.pushing import HubError, PushOptions, check_name, push_patiently
+from lerobot_playbyear.hub.repository import HubRepository, check_card
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
 CARD = "README.md"
@@ -45,7 +45,7 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         HubError: There is no whole dataset in the folder, somebody writes to it, or it could not be uploaded.
     """
     folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
-    check_name(repo_id)
+    check_name("dataset.repo_id", repo_id, needs_user=True)
     options.check()
     with _locked(folder), TemporaryDirectory() as scratch:
         try:
@@ -59,12 +59,6 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         push = partial(_push, repo_id, files, card, options.private, check)
         later = [f"--dataset.repo_id={repo_id}", *([f"--dataset.root={root}"] if root is not None else [])]
         return push_patiently(push, f"The dataset is complete in {folder}", later, options)
-
-
-def check_name(repo_id: str) -> None:
-    """Raise a HubError if a dataset of this name has no place on the Hub."""
-    if "/" not in repo_id:
-        raise HubError(f"dataset.repo_id={repo_id!r}: to push, give it as user/name.")
 
 
 @contextlib.contextmanager
@@ -115,6 +109,7 @@ def _push(
 ) -> str:
     from lerobot.datasets import CODEBASE_VERSION
 
+    check_card(DatasetCard.load(card[CARD]), "dataset")
     check()
     repository = HubRepository(repo_id, "dataset", private)
     # LeRobot reads every file in data/: one that is no longer there must go.

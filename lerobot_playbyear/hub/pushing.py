@@ -10,7 +10,8 @@ from pathlib import Path
 
 import httpx
 from huggingface_hub import constants, get_token
-from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineModeIsEnabled
+from huggingface_hub.utils import validate_repo_id
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.hub.client import patient_hub
@@ -46,6 +47,8 @@ class PushOptions:
         """Raise a HubError if there is no such film."""
         if self.preview is not None and not self.preview.is_file():
             raise HubError(f"preview={self.preview}: there is no such file.")
+        if self.preview is not None and self.preview.suffix.lower() != ".mp4":
+            raise HubError(f"preview={self.preview}: cards show mp4; give a film as playbyear-video makes them.")
 
     def on_command_line(self) -> list[str]:
         """As `playbyear-push` takes them."""
@@ -135,6 +138,25 @@ def reason(error: BaseException) -> str:
         if isinstance(cause, httpx.TransportError):
             return f"{constants.ENDPOINT} cannot be reached ({type(cause).__name__}: {_first_line(cause)})"
     return f"{type(error).__name__}: {_first_line(error)}"
+
+
+def check_name(option: str, repo_id: str, needs_user: bool = False) -> None:
+    """Whether there can be a repository of a name on the Hub.
+
+    Args:
+        option: What the name was given with, such as "policy.repo_id", for the message.
+        repo_id: The name, `user/name`.
+        needs_user: Whether the user's name may not be left out.
+
+    Raises:
+        HubError: There can be none.
+    """
+    if needs_user and "/" not in repo_id:
+        raise HubError(f"{option}={repo_id!r}: to push, give it as user/name.")
+    try:
+        validate_repo_id(repo_id)
+    except HFValidationError as error:
+        raise HubError(f"{option}={repo_id!r} cannot be pushed: {_first_line(error)}.") from error
 
 
 def warn_without_login() -> None:

@@ -8,10 +8,27 @@ import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoUrl
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoCard, RepoUrl
 from huggingface_hub.errors import RevisionNotFoundError
 
 from lerobot_playbyear.hub.pushing import HubError, insist
+
+
+def check_card(card: RepoCard, kind: str) -> None:
+    """Asks the Hub whether it takes a card: of a commit it says so last, and `create_commit` says not why in one line.
+
+    Args:
+        card: The card.
+        kind: "model" or "dataset".
+
+    Raises:
+        HubError: It does not, because of what the options say.
+    """
+    try:
+        insist(lambda: card.validate(kind))
+    except ValueError as error:
+        said = " ".join(str(error).split())
+        raise HubError(f"the Hub refuses its card, give another license or other tags: {said}") from error
 
 
 class HubRepository:

@@ -20,8 +20,8 @@ from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.episodes.scripted_expert import NO_SCRIPT, ScriptedExpertConfig
-from lerobot_playbyear.hub.datasets import check_name, push_dataset
-from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
+from lerobot_playbyear.hub.datasets import push_dataset
+from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
 from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
@@ -196,7 +196,7 @@ def _check_options(cfg: RecordConfig) -> None:
         for option in (name for name, is_given in needs_video.items() if is_given):
             raise InputError(f"--dataset.{option} encodes video: give --dataset.video=true, too, or leave it out.")
     if cfg.dataset.push_to_hub:
-        check_name(cfg.dataset.repo_id)
+        check_name("dataset.repo_id", cfg.dataset.repo_id, needs_user=True)
         warn_without_login()
 
 
