@@ -110,6 +110,8 @@ class HubServer:
         data = yaml.safe_load(found[1]) if found else None
         if not isinstance(data, dict) or not isinstance(data.get("license"), str):
             return Answer({"errors": [{"message": "metadata with a license is wanted"}], "warnings": []}, 400)
+        if not re.fullmatch(r"[a-z0-9.-]+", data["license"]):
+            return Answer({"errors": [{"message": '"license" must be one of [apache-2.0, mit]'}], "warnings": []}, 400)
         return Answer({"errors": [], "warnings": []})
 
     def preupload(self, request: "_Handler", kind: str, name: str, revision: str) -> Answer:

@@ -60,6 +60,7 @@ def test_demonstrations_that_the_policy_was_not_made_for(features, message, tmp_
         (("--env.sound=none",), "'observation.audio.gripper' is int16 .* there and absent here"),
         (("--env.microphones=[ceiling]",), "does not start.*ceiling"),
         (("--policy.push_to_hub=true",), "--policy.push_to_hub=true needs a name: give --policy.repo_id"),
+        (("--policy.push_to_hub=true", "--policy.repo_id=me/no name"), "policy.repo_id='me/no name' cannot be pushed"),
     ],
 )
 def test_options_that_do_not_go_together(options, message, tmp_path):

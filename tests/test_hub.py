@@ -2,7 +2,9 @@
 
 import itertools
 import json
+import re
 import shlex
+import shutil
 import threading
 from pathlib import Path
 
@@ -10,14 +12,22 @@ import av
 import httpx
 import pytest
 import yaml
+from dataset_factory import make_dataset
 from hub_client import HubClient, Result
 from hub_faults import down_after, every_second, everything_fails, nothing_fails, one_in
 from hub_repositories import File, Repository, git_oid
 from hub_server import TOKEN, HubServer
-from huggingface_hub import HfApi, get_session, set_client_factory
-from huggingface_hub.utils import _http
+from huggingface_hub import HfApi, ModelCard, get_session, set_client_factory
+from huggingface_hub.errors import HfHubHTTPError
+from huggingface_hub.utils import _http, hf_raise_for_status
 
+from lerobot_playbyear.datasets.locking import DatasetLock
+from lerobot_playbyear.hub import datasets as pushing_datasets
 from lerobot_playbyear.hub.client import patient_hub
+from lerobot_playbyear.hub.datasets import push_dataset
+from lerobot_playbyear.hub.policies import push_policy
+from lerobot_playbyear.hub.pushing import HubError, PushOptions, reason
+from lerobot_playbyear.hub.repository import HubRepository, check_card
 from lerobot_playbyear.hub.training_run import evaluation_of
 
 DATASET = "tester/grasp"
@@ -192,7 +202,19 @@ def test_without_a_login_the_message_says_so_at_once(pushed, hub, client):
         ((), "Give either --dataset.repo_id"),
         (("--dataset.repo_id=me/nothing", "--dataset.root=/nowhere"), "There is no LeRobotDataset in '/nowhere'"),
         (("--dataset.repo_id=nameless", "--dataset.root={root}"), "give it as user/name"),
+        (
+            ("--dataset.repo_id=me/no name", "--dataset.root={root}"),
+            "dataset.repo_id='me/no name' cannot be pushed: Repo id",
+        ),
         (("--policy.path={root}", "--policy.repo_id=me/policy"), "there is no checkpoint with config.json"),
+        (
+            ("--policy.path={root}", "--policy.repo_id=me/no name"),
+            "policy.repo_id='me/no name' cannot be pushed: Repo id",
+        ),
+        (("--policy.path={root}", "--dataset.repo_id=me/set"), "Give either --dataset.repo_id"),
+        (("--policy.path={root}",), "needs --policy.repo_id, the policy's name on the Hub"),
+        (("--dataset.root={root}",), "needs --dataset.repo_id, the dataset's name on the Hub"),
+        (("--dataset.repo_id=me/set", "--dataset.root={root}", "--preview={root}/meta/info.json"), "cards show mp4"),
     ],
 )
 def test_what_cannot_be_pushed_is_refused(pushed, hub, client, options, message):
@@ -410,6 +432,140 @@ def test_a_thread_that_is_done_leaves_the_others_their_patience(hub):
         assert get_session() is session
         assert api.whoami()["name"] == "tester"
     assert _http._GLOBAL_CLIENT_FACTORY is before
+
+
+# What an upload looks at before, and beside, its work
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    root = tmp_path_factory.mktemp("made") / "set"
+    make_dataset(root, (3,), image_size=16)
+    return root
+
+
+@pytest.fixture
+def dataset(made, tmp_path):
+    shutil.copytree(made, tmp_path / "set")
+    return tmp_path / "set"
+
+
+@pytest.fixture
+def here(hub, monkeypatch):
+    """The Hub on loopback, for this process."""
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.url)
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    return hub
+
+
+@pytest.fixture
+def uploads(here, monkeypatch):
+    """What a Hub that takes everything was asked for."""
+    done: list[str] = []
+
+    class Everything:
+        url = "the Hub"
+
+        def __init__(self, repo_id, kind, private):
+            done.append("create")
+
+        def commit(self, files, message, is_stale=None):
+            done.append(message)
+
+        def set_tag(self, tag, move):
+            done.append(tag)
+
+    monkeypatch.setattr(pushing_datasets, "HubRepository", Everything)
+    return done
+
+
+def test_a_dataset_that_is_being_recorded_to_is_not_uploaded(dataset, uploads):
+    film = dataset.parent / "film.mp4"
+    film.touch()
+    options = PushOptions(preview=film)
+    lock = DatasetLock(dataset)
+    with pytest.raises(HubError, match=f"Not pushed. {dataset} is being recorded to"):
+        push_dataset("me/set", dataset, options)
+    lock.release()
+    assert not uploads
+    assert push_dataset("me/set", dataset, options) == "the Hub"
+    assert uploads == ["create", "Upload dataset", "Upload card", "v3.0"]
+    assert not (dataset / "images" / ".lock").exists()
+
+
+@pytest.mark.parametrize("when", ["before", "while"])
+def test_a_dataset_that_changes_meanwhile_gets_no_tag(dataset, uploads, monkeypatch, when):
+    """Another tool writes, or the folder is of a disk where no lock can be made."""
+
+    def change(*_: object) -> None:
+        (dataset / "meta" / "info.json").write_text((dataset / "meta" / "info.json").read_text() + "\n")
+
+    def no_lock(root):
+        raise PermissionError(13, "Permission denied", str(root))
+
+    monkeypatch.setattr(pushing_datasets, "DatasetLock", no_lock)
+    if when == "before":
+        monkeypatch.setattr(pushing_datasets, "film_preview", change)
+    else:
+        monkeypatch.setattr(pushing_datasets.HubRepository, "commit", lambda self, *_, **__: change())
+    said = r"could not be uploaded: it was changed meanwhile \(meta/info.json\)"
+    with pytest.raises(HubError, match=said):
+        push_dataset("me/set", dataset)
+    assert uploads == ([] if when == "before" else ["create"])
+
+
+def test_nothing_private_goes_to_a_repository_that_is_public(here):
+    public = here.repositories["datasets", "tester/public"] = Repository("datasets", "tester/public")
+    with pytest.raises(HubError, match=r"private=true, but .*/datasets/tester/public is public. Make it private"):
+        HubRepository("tester/public", "dataset", private=True)
+    HubRepository("tester/public", "dataset")
+    public.private = True
+    HubRepository("tester/public", "dataset", private=True)
+    HubRepository("tester/new", "dataset", private=True)
+    assert here.dataset("tester/new").private
+
+
+@pytest.mark.parametrize(
+    ("status", "token", "wanted"),
+    [
+        (403, TOKEN, r"\(status 403\): Private repository storage limit reached. If that is about the token"),
+        (403, None, r"\(status 403\): log in with"),
+        (401, TOKEN, r"\(status 401\): log in with"),
+    ],
+)
+def test_a_refusal_says_what_the_hub_says_of_it(monkeypatch, status, token, wanted):
+    monkeypatch.setattr("lerobot_playbyear.hub.pushing.get_token", lambda: token)
+    request = httpx.Request("POST", "https://huggingface.co/datasets/me/x.git/info/lfs/objects/batch")
+    answer = httpx.Response(status, request=request, json={"error": "Private repository storage limit reached."})
+    with pytest.raises(HfHubHTTPError) as refused:
+        hf_raise_for_status(answer)
+    said = reason(refused.value)
+    assert re.search(wanted, said)
+    assert "\n" not in said
+
+
+def test_a_card_that_the_hub_refuses_costs_no_upload_and_is_told(here, uploads, dataset, tmp_path):
+    (tmp_path / "film.mp4").touch()
+    options = PushOptions(license="CC BY 4.0", preview=tmp_path / "film.mp4")
+    with pytest.raises(
+        HubError, match=r"refuses its card, give another license.*license.* must be one of \[apache-2.0"
+    ):
+        push_dataset("me/set", dataset, options)
+    assert not uploads
+
+
+def test_a_policys_card_that_the_hub_refuses_is_told(here):
+    with patient_hub(), pytest.raises(HubError, match="refuses its card"):
+        check_card(ModelCard("---\nlicense: CC BY 4.0\n---\n"), "model")
+
+
+@pytest.mark.parametrize("config", ['{"type": "play', '{"type": "none_such"}', '{"type": "act", "device": "cpu"}'])
+def test_a_damaged_policy_is_told_in_one_line(tmp_path, config):
+    (tmp_path / "config.json").write_text(config)
+    (tmp_path / "model.safetensors").write_text("cut off")
+    with pytest.raises(HubError, match=f"Not pushed. The policy in {tmp_path} cannot be loaded: ") as refused:
+        push_policy(tmp_path, "me/policy", PushOptions())
+    assert "\n" not in str(refused.value)
 
 
 # What is known of a policy's success

@@ -329,17 +329,22 @@ def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
         ({}, ("--sampling.start_weight=0",), "sampling.start_weight must be above 0"),
         (
             {},
+            ("--policy.push_to_hub=true", "--policy.repo_id=me/no name"),
+            "policy.repo_id='me/no name' cannot be pushed",
+        ),
+        (
+            {},
             ("--policy.audio_noise_db=18", "--policy.audio_noise_files=nowhere"),
             "files=nowhere: there is no such folder",
         ),
     ],
-    ids=["fps", "sample rate", "no microphone", "image transforms", "weight", "noise"],
+    ids=["fps", "sample rate", "no microphone", "image transforms", "weight", "name", "noise"],
 )
 def test_bad_input_is_refused_before_any_work(features, options, message, command, tmp_path):
     fps = features.get("fps", FPS)
     make_dataset(tmp_path / "data", (3,), fps, features=dataset_features(image_size=8, **features))
 
-    with pytest.raises((ValueError, SystemExit), match=message):
+    with pytest.raises((ValueError, SystemExit, PlaybyearError), match=message):
         command(train, *TINY, *data(tmp_path / "data"), *options, f"--output_dir={tmp_path / 'out'}")
 
     assert not (tmp_path / "out").exists()

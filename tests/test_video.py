@@ -14,6 +14,7 @@ from lerobot.policies import ACTConfig, make_policy, make_policy_config, make_pr
 from lerobot.scripts.lerobot_eval import rollout
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import RolloutError, env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
@@ -170,6 +171,42 @@ def test_a_loaded_policy_acts_bit_for_bit_as_in_lerobot_eval(tmp_path, use_amp):
     vec.close()
     np.testing.assert_array_equal(episode.actions, result["action"][0].clamp(-1, 1))
     assert episode.actions.any()
+
+
+@pytest.mark.parametrize(
+    ("output", "options", "wanted"),
+    [
+        ("film.mp4", {"seed": -1}, "seed=-1: give 0 or more"),
+        ("film", {}, r"--output=.*film: films are mp4; give a name that ends with .mp4"),
+        ("film.gif", {}, r"--output=.*film.gif: films are mp4"),
+        ("folder.mp4", {}, r"--output=.*folder.mp4: that is a folder"),
+        ("file/film.mp4", {}, r"--output=.*film.mp4 cannot be written: Not a directory"),
+        ("film.mp4", {"env": SimpleNamespace(is_real_time=True)}, "No script can act on a robot: give --policy.path"),
+        (
+            "film.mp4",
+            {"policy": ACTConfig(device="cpu"), "baseline": "search"},
+            "--baseline=search: it acts without a policy",
+        ),
+    ],
+)
+def test_what_cannot_be_filmed_is_told_before_anything_is_played(tmp_path, output, options, wanted):
+    (tmp_path / "folder.mp4").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=wanted):
+        film(VideoConfig(**{"env": SimpleNamespace(), "output": tmp_path / output, **options}))
+
+
+def test_of_microphones_of_two_rates_the_first_is_heard_and_an_odd_side_is_cut(tmp_path):
+    tone = (10000 * np.sin(2 * np.pi * 440 / SAMPLE_RATE * np.arange(20 * BLOCK))).astype(np.int16).reshape(20, -1)
+    observations = [{"audio.a": block, "audio.b": np.zeros(3 * BLOCK, np.int16)} for block in tone]
+    episode = SimpleNamespace(observations=observations, watched=[np.zeros((33, 35, 3), np.uint8)] * 20)
+
+    write_episode_film(episode, tmp_path / "film.mp4", FPS)
+
+    pictures, heard = decode(tmp_path / "film.mp4")
+    assert pictures.shape == (20, 152, 34, 3)
+    assert len(heard) == 1
+    assert np.abs(heard).max() > 0.5
 
 
 def test_an_interrupted_film_leaves_no_file(tmp_path):

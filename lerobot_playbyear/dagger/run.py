@@ -41,7 +41,7 @@ from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.policies import push_policy
-from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
+from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
 from lerobot_playbyear.hub.training_run import METRICS_NAME
 from lerobot_playbyear.training.checkpoints import BEST_LINK
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
@@ -127,6 +127,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
             "--policy.push_to_hub=true needs a name: give --policy.repo_id, or --policy.push_to_hub=false."
         )
     if cfg.policy.push_to_hub:
+        check_name("policy.repo_id", str(cfg.policy.repo_id))
         warn_without_login()
     return state
 

@@ -1,4 +1,4 @@
-"""At most one process writes to a dataset."""
+"""At most one process writes to a dataset, and none while it is uploaded."""
 
 import contextlib
 import os
@@ -13,7 +13,7 @@ _MOST_TRIES = 100  # each loses against another process that lets the lock go at
 
 
 class DatasetLockedError(DatasetWriteError):
-    """Another process writes to the dataset."""
+    """Another process writes to the dataset, or uploads it."""
 
 
 class DatasetLock:
@@ -48,7 +48,7 @@ class DatasetLock:
                 self._lock = lock
                 self._file = os.stat(self._path)
                 return
-        raise DatasetLockedError(f"Another process is writing to {root}: wait until it has ended.")
+        raise DatasetLockedError(f"Another process is writing to {root}, or uploading it: wait until it has ended.")
 
     @property
     def is_held(self) -> bool:

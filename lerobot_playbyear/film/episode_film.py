@@ -15,7 +15,8 @@ def write_episode_film(episode: Episode, path: Path, fps: int) -> None:
     """Writes a film with the policy's camera in a corner, the spectrogram below, and the sound as loud as it can be.
 
     Args:
-        episode: Has watched T + 1 pictures (H, W, 3) uint8; its sound is int16.
+        episode: Has watched T + 1 pictures (H, W, 3) uint8; its sound is int16. Microphones of another rate than the
+            first one's are not heard.
         path: Of the film, an mp4.
         fps: Steps per second.
     """
@@ -33,6 +34,7 @@ def _first_camera(observation: Observation) -> np.ndarray | None:
 
 
 def _sound(observation: Observation) -> np.ndarray:
-    """(S, n_microphones) int16; without one (0, 0)."""
+    """(S, n_microphones) int16, of those with the first one's rate; without one (0, 0)."""
     blocks = [block for key, block in observation.items() if key.startswith(_AUDIO)]
+    blocks = [block for block in blocks if len(block) == len(blocks[0])]
     return np.stack(blocks, axis=-1) if blocks else np.zeros((0, 0), np.int16)

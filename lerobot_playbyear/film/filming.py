@@ -9,6 +9,8 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig, make_env
 from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.script import Script
@@ -56,11 +58,10 @@ def film(cfg: VideoConfig) -> Path:
         The film's path.
 
     Raises:
-        ValueError: An option is out of range.
+        InputError: An option is out of range, or the film cannot be written there.
         RolloutError: No policy is given and the environment has no script.
     """
-    if cfg.attempts < 1:
-        raise ValueError(f"attempts={cfg.attempts}: give at least 1.")
+    _check_options(cfg)
     env = env_spec(cfg.env).make() if cfg.policy is None else _env_of_lerobot(cfg.env)
     try:
         actor: Actor = Script(cfg.baseline)
@@ -79,6 +80,23 @@ def film(cfg: VideoConfig) -> Path:
     outcome = "success" if episode.success else "failure"
     print(f"Film: {cfg.output} (seed {episode.seed}, {len(episode)} steps, {outcome})")
     return cfg.output
+
+
+def _check_options(cfg: VideoConfig) -> None:
+    """What would otherwise show only after the episode, which on a robot is a person's work."""
+    if cfg.attempts < 1:
+        raise InputError(f"attempts={cfg.attempts}: give at least 1.")
+    if cfg.seed < 0:
+        raise InputError(f"seed={cfg.seed}: give 0 or more.")
+    if cfg.output.suffix.lower() != ".mp4":
+        raise InputError(f"--output={cfg.output}: films are mp4; give a name that ends with .mp4.")
+    if cfg.output.is_dir():
+        raise InputError(f"--output={cfg.output}: that is a folder; give the name of a file.")
+    check_can_be_made(cfg.output.parent, f"--output={cfg.output}")
+    if cfg.policy is None and getattr(cfg.env, "is_real_time", False):
+        raise InputError("No script can act on a robot: give --policy.path.")
+    if cfg.policy is not None and cfg.baseline is not None:
+        raise InputError(f"--baseline={cfg.baseline}: it acts without a policy; leave it or --policy.path out.")
 
 
 def _env_of_lerobot(env_cfg: EnvConfig) -> gym.Env:

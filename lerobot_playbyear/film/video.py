@@ -123,7 +123,7 @@ def compose(
     """Puts each picture above the spectrogram strip, with a cursor at the picture's time.
 
     Args:
-        pictures: T + 1 pictures (H, W, 3) uint8; H and W even.
+        pictures: T + 1 pictures (H, W, 3) uint8.
         n_pictures: T + 1.
         sound: (n, n_microphones) int16, as long as the film. The strip shows the first microphone; without a
             microphone there is no strip.
@@ -160,7 +160,7 @@ def write_film(
 
     Args:
         path: Of the file; its folder is made.
-        frames: (H, W, 3) uint8, H and W even.
+        frames: (H, W, 3) uint8; of an odd side the last row or column is left out, as H.264 wants it.
         fps: Frames per second.
         sound: (n, n_microphones) int16; it is read frame by frame. One microphone is mono, two are left and right, of
             more only the first two are heard; none makes a silent film.
@@ -179,8 +179,9 @@ def write_film(
             audio = _add_audio_stream(film, sample_rate, n_channels) if n_channels else None
             video = None
             for index, picture in enumerate(frames):
+                height, width = (size - size % 2 for size in picture.shape[:2])
+                picture = picture[:height, :width]
                 if video is None:
-                    height, width = picture.shape[:2]
                     video = _add_video_stream(film, fps, height, width, x264_options or {})
                 film.mux(video.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
                 if audio is not None:

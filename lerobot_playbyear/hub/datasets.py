@@ -1,18 +1,22 @@
 """Uploads a dataset: LeRobot's files, its card with a film beside it, and the tag that LeRobot looks for."""
 
+import contextlib
 import logging
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from huggingface_hub import HfApi
+from huggingface_hub import DatasetCard, HfApi
 
 from lerobot_playbyear.datasets.confines import OutsideError, check_links
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, entries_below
+from lerobot_playbyear.datasets.journal import JournalError
+from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview
-from lerobot_playbyear.hub.pushing import HubError, PushOptions, push_patiently
-from lerobot_playbyear.hub.repository import HubRepository
+from lerobot_playbyear.hub.pushing import HubError, PushOptions, check_name, push_patiently
+from lerobot_playbyear.hub.repository import HubRepository, check_card
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
 CARD = "README.md"
@@ -38,28 +42,41 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         Its address on the Hub.
 
     Raises:
-        HubError: There is no whole dataset in the folder, or it could not be uploaded.
+        HubError: There is no whole dataset in the folder, somebody writes to it, or it could not be uploaded.
     """
     folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
-    check_name(repo_id)
+    check_name("dataset.repo_id", repo_id, needs_user=True)
     options.check()
-    try:
-        source = DatasetSource.open(repo_id, folder)
-        check_links(folder)
-        files = _files(folder)
-    except (InspectionError, OutsideError, OSError) as error:
-        raise HubError(f"Not pushed. {error}") from error
-    with TemporaryDirectory() as scratch:
+    with _locked(folder), TemporaryDirectory() as scratch:
+        try:
+            source = DatasetSource.open(repo_id, folder)
+            check_links(folder)
+            files = _files(folder)
+            check = partial(_check_unchanged, folder, _stamps(files))
+        except (InspectionError, OutsideError, OSError) as error:
+            raise HubError(f"Not pushed. {error}") from error
         card = _make_card(source, repo_id, Path(scratch), options)
-        push = partial(_push, repo_id, files, card, options.private)
+        push = partial(_push, repo_id, files, card, options.private, check)
         later = [f"--dataset.repo_id={repo_id}", *([f"--dataset.root={root}"] if root is not None else [])]
         return push_patiently(push, f"The dataset is complete in {folder}", later, options)
 
 
-def check_name(repo_id: str) -> None:
-    """Raise a HubError if a dataset of this name has no place on the Hub."""
-    if "/" not in repo_id:
-        raise HubError(f"dataset.repo_id={repo_id!r}: to push, give it as user/name.")
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keeps recordings away from a dataset; where no lock can be made, only `_check_unchanged` notices them."""
+    try:
+        lock = DatasetLock(folder) if folder.is_dir() else None
+    except DatasetLockedError as error:
+        raise HubError(
+            f"Not pushed. {folder} is being recorded to, repaired or uploaded by another process: push when it has ended."
+        ) from error
+    except (OSError, JournalError):
+        lock = None
+    try:
+        yield
+    finally:
+        if lock is not None:
+            lock.release()
 
 
 def _make_card(source: DatasetSource, repo_id: str, scratch: Path, options: PushOptions) -> dict[str, Path]:
@@ -87,13 +104,18 @@ def _make_card(source: DatasetSource, repo_id: str, scratch: Path, options: Push
     return {CARD: scratch / CARD} | ({FILM: film} if film is not None else {})
 
 
-def _push(repo_id: str, files: dict[str, Path], card: dict[str, Path], private: bool | None) -> str:
+def _push(
+    repo_id: str, files: dict[str, Path], card: dict[str, Path], private: bool | None, check: Callable[[], None]
+) -> str:
     from lerobot.datasets import CODEBASE_VERSION
 
+    check_card(DatasetCard.load(card[CARD]), "dataset")
+    check()
     repository = HubRepository(repo_id, "dataset", private)
     # LeRobot reads every file in data/: one that is no longer there must go.
     repository.commit(files, "Upload dataset", is_stale=lambda name: name.startswith(_CONTENT))
     repository.commit(card, "Upload card")
+    check()  # before anyone loads this version
     repository.set_tag(CODEBASE_VERSION, move=True)
     return str(repository.url)
 
@@ -102,3 +124,17 @@ def _files(folder: Path) -> dict[str, Path]:
     """What goes up, by the names there."""
     names = {path.relative_to(folder): path for path in entries_below(folder) if path.is_file()}
     return {name.as_posix(): path for name, path in names.items() if name.parts[0] not in _LEFT_OUT}
+
+
+def _stamps(files: dict[str, Path]) -> dict[str, tuple[int, int]]:
+    """Size and time of change of each file [bytes, ns]: other tools write without a lock of ours."""
+    stats = {name: path.stat() for name, path in files.items()}
+    return {name: (stat.st_size, stat.st_mtime_ns) for name, stat in stats.items()}
+
+
+def _check_unchanged(folder: Path, before: dict[str, tuple[int, int]]) -> None:
+    """Raise a HubError if a dataset is not what it was when its files were listed."""
+    now = _stamps(_files(folder))
+    changed = sorted(name for name in before.keys() | now.keys() if before.get(name) != now.get(name))
+    if changed:
+        raise HubError(f"it was changed meanwhile ({', '.join(changed[:3])}). Wait until nothing writes to it any more")

@@ -13,8 +13,8 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME
 
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.hub.datasets import CARD, FILM
-from lerobot_playbyear.hub.pushing import PushOptions, push_patiently
-from lerobot_playbyear.hub.repository import HubRepository
+from lerobot_playbyear.hub.pushing import HubError, PushOptions, check_name, push_patiently, reason
+from lerobot_playbyear.hub.repository import HubRepository, check_card
 from lerobot_playbyear.hub.training_run import evaluation_of, find_checkpoint
 from lerobot_playbyear.policy.card import write_card
 
@@ -35,15 +35,19 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
         Its address on the Hub.
 
     Raises:
-        HubError: There is no checkpoint, or it could not be uploaded.
+        HubError: There is no checkpoint, it cannot be loaded, or it could not be uploaded.
     """
+    check_name("policy.repo_id", repo_id)
     folder = find_checkpoint(Path(path))
     options.check()
-    config = PreTrainedConfig.from_pretrained(folder)
-    config.repo_id, config.device = repo_id, "cpu"
-    config.license = options.license or (word(config.license) if config.license else None)
-    config.tags = [*(config.tags or []), *(options.tags or [])]
-    policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+    try:
+        config = PreTrainedConfig.from_pretrained(folder)
+        config.repo_id, config.device = repo_id, "cpu"
+        config.license = options.license or (word(config.license) if config.license else None)
+        config.tags = [*(config.tags or []), *(options.tags or [])]
+        policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+    except Exception as error:  # whatever LeRobot, JSON or safetensors raise
+        raise HubError(f"Not pushed. The policy in {folder} cannot be loaded: {reason(error)}.") from error
 
     def push() -> str:
         repository = HubRepository(repo_id, "model", options.private)
@@ -56,6 +60,7 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
                 url = f"{repository.api.endpoint}/{repository.repo_id}/resolve/main/{FILM}"
                 card.text = f'\n<video controls width="480" src="{url}"></video>\n{card.text}'
             files[CARD] = Path(scratch) / CARD
+            check_card(card, "model")
             card.save(files[CARD])
             repository.commit(files, "Upload policy")
         return str(repository.url)

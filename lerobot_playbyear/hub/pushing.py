@@ -10,7 +10,8 @@ from pathlib import Path
 
 import httpx
 from huggingface_hub import constants, get_token
-from huggingface_hub.errors import HfHubHTTPError, OfflineModeIsEnabled
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineModeIsEnabled
+from huggingface_hub.utils import validate_repo_id
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.hub.client import patient_hub
@@ -30,7 +31,8 @@ class PushOptions:
     """How something is uploaded.
 
     Args:
-        private: Whether a repository that is created is private. None: as the account's default says.
+        private: Whether a repository that is created is private. True: nothing goes to one that is there and public. None: as
+            the account's default says.
         tags: For the card, besides those that it gets by itself.
         license: As the Hub names licences. None: the policy's own, or else apache-2.0.
         preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
@@ -45,6 +47,8 @@ class PushOptions:
         """Raise a HubError if there is no such film."""
         if self.preview is not None and not self.preview.is_file():
             raise HubError(f"preview={self.preview}: there is no such file.")
+        if self.preview is not None and self.preview.suffix.lower() != ".mp4":
+            raise HubError(f"preview={self.preview}: cards show mp4; give a film as playbyear-video makes them.")
 
     def on_command_line(self) -> list[str]:
         """As `playbyear-push` takes them."""
@@ -114,10 +118,17 @@ def push_meanwhile(push: Callable[[], object], path: Path) -> None:
 def reason(error: BaseException) -> str:
     """Why the Hub could not be used, in one line."""
     for cause in _causes(error):
+        if isinstance(cause, HubError):
+            return str(cause).rstrip(".")
         if isinstance(cause, OfflineModeIsEnabled):
             return "the environment variable HF_HUB_OFFLINE forbids it"
         if isinstance(cause, HfHubHTTPError):
-            status = cause.response.status_code
+            status, said = cause.response.status_code, (cause.server_message or "").partition("\n")[0].rstrip(".")
+            if status == 403 and said and get_token():  # it may be a quota
+                return (
+                    f"{constants.ENDPOINT} refused (status 403): {said}. If that is about the token, log in with "
+                    "`hf auth login`, with one that may write there"
+                )
             if status in (401, 403):
                 return (
                     f"{constants.ENDPOINT} refused (status {status}): log in with `hf auth login`, with a token that may "
@@ -127,6 +138,25 @@ def reason(error: BaseException) -> str:
         if isinstance(cause, httpx.TransportError):
             return f"{constants.ENDPOINT} cannot be reached ({type(cause).__name__}: {_first_line(cause)})"
     return f"{type(error).__name__}: {_first_line(error)}"
+
+
+def check_name(option: str, repo_id: str, needs_user: bool = False) -> None:
+    """Whether there can be a repository of a name on the Hub.
+
+    Args:
+        option: What the name was given with, such as "policy.repo_id", for the message.
+        repo_id: The name, `user/name`.
+        needs_user: Whether the user's name may not be left out.
+
+    Raises:
+        HubError: There can be none.
+    """
+    if needs_user and "/" not in repo_id:
+        raise HubError(f"{option}={repo_id!r}: to push, give it as user/name.")
+    try:
+        validate_repo_id(repo_id)
+    except HFValidationError as error:
+        raise HubError(f"{option}={repo_id!r} cannot be pushed: {_first_line(error)}.") from error
 
 
 def warn_without_login() -> None:

@@ -8,10 +8,27 @@ import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoUrl
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, RepoCard, RepoUrl
 from huggingface_hub.errors import RevisionNotFoundError
 
-from lerobot_playbyear.hub.pushing import insist
+from lerobot_playbyear.hub.pushing import HubError, insist
+
+
+def check_card(card: RepoCard, kind: str) -> None:
+    """Asks the Hub whether it takes a card: of a commit it says so last, and `create_commit` says not why in one line.
+
+    Args:
+        card: The card.
+        kind: "model" or "dataset".
+
+    Raises:
+        HubError: It does not, because of what the options say.
+    """
+    try:
+        insist(lambda: card.validate(kind))
+    except ValueError as error:
+        said = " ".join(str(error).split())
+        raise HubError(f"the Hub refuses its card, give another license or other tags: {said}") from error
 
 
 class HubRepository:
@@ -20,7 +37,11 @@ class HubRepository:
     Args:
         repo_id: Its name, `user/name`; without a user, the one who is logged in is its owner.
         kind: "model" or "dataset".
-        private: Whether it is private if it is created. None: as the account's default says.
+        private: Whether it is private if it is created. True: nothing goes to one that is there and public. None: as the
+            account's default says.
+
+    Raises:
+        HubError: It has to be private, and is public.
 
     Attributes:
         url: Its address on the Hub.
@@ -35,6 +56,10 @@ class HubRepository:
             lambda: self.api.create_repo(repo_id, repo_type=kind, private=private, exist_ok=True)
         )
         self.repo_id: str = self.url.repo_id
+        if private and not insist(lambda: self.api.repo_info(self.repo_id, repo_type=kind)).private:
+            raise HubError(
+                f"private=true, but {self.url} is public. Make it private in its settings there, or leave the option out"
+            )
 
     def commit(self, files: Mapping[str, Path], message: str, is_stale: Callable[[str], bool] | None = None) -> str:
         """Makes one commit, or none where all is there already.

@@ -39,7 +39,8 @@ class PushConfig(PushOptions):
     Args:
         dataset: The dataset to upload.
         policy: The policy to upload.
-        private: Whether a repository that is created is private. None: as the account's default says.
+        private: Whether a repository that is created is private. True: nothing goes to one that is there and public. None: as
+            the account's default says.
         tags: For the card, besides those that it gets by itself.
         license: As the Hub names licences. None: the policy's own, or else apache-2.0.
         preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
@@ -59,14 +60,18 @@ def push(cfg: PushConfig) -> str:
         HubError: An option is missing, there is nothing to upload, or it could not be uploaded.
     """
     dataset, policy = cfg.dataset, cfg.policy
-    if (dataset.repo_id is None) == (policy.repo_id is None):
+    if (dataset == PushDatasetConfig()) == (policy == PushPolicyConfig()):
         raise HubError("Give either --dataset.repo_id (and --dataset.root), or --policy.path and --policy.repo_id.")
     if dataset.repo_id is not None:
         url = push_dataset(dataset.repo_id, dataset.root, cfg)
         print(f"Dataset: {url}\nLoad it anywhere: playbyear-inspect --dataset.repo_id={dataset.repo_id}")
         return url
-    if policy.path is None or policy.repo_id is None:
+    if dataset.root is not None:
+        raise HubError(f"--dataset.root={dataset.root} needs --dataset.repo_id, the dataset's name on the Hub.")
+    if policy.path is None:
         raise HubError("--policy.repo_id needs --policy.path, the folder of a checkpoint.")
+    if policy.repo_id is None:
+        raise HubError(f"--policy.path={policy.path} needs --policy.repo_id, the policy's name on the Hub.")
     from lerobot.utils.import_utils import register_third_party_plugins
 
     from lerobot_playbyear.hub.policies import push_policy

@@ -20,8 +20,8 @@ from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.episodes.scripted_expert import NO_SCRIPT, ScriptedExpertConfig
-from lerobot_playbyear.hub.datasets import check_name, push_dataset
-from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
+from lerobot_playbyear.hub.datasets import push_dataset
+from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
 from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
@@ -41,7 +41,8 @@ class RecordDatasetConfig:
         streaming_encoding: Whether video is encoded while it is recorded, as by lerobot-record; otherwise after each episode.
         rgb_encoder: Codec and quality of video, such as `--dataset.rgb_encoder.vcodec=h264`.
         push_to_hub: Whether to upload it when it is complete.
-        private: Whether the uploaded repository is private. None: as the account's default says.
+        private: Whether the uploaded repository is private. True: nothing goes to one that is there and public. None: as the
+            account's default says.
         tags: For its card on the Hub.
     """
 
@@ -195,7 +196,7 @@ def _check_options(cfg: RecordConfig) -> None:
         for option in (name for name, is_given in needs_video.items() if is_given):
             raise InputError(f"--dataset.{option} encodes video: give --dataset.video=true, too, or leave it out.")
     if cfg.dataset.push_to_hub:
-        check_name(cfg.dataset.repo_id)
+        check_name("dataset.repo_id", cfg.dataset.repo_id, needs_user=True)
         warn_without_login()
 
 

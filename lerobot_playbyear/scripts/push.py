@@ -9,7 +9,8 @@ An upload that was interrupted goes on with the same command.
   --dataset.root=null          its folder; else LeRobot's cache
   --policy.path=null           a checkpoint's folder, or the output folder of a training
   --policy.repo_id=null        the policy's name on the Hub, user/name
-  --private=null               whether a new repository is private; else the account's default
+  --private=null               whether a new repository is private; else the account's default.
+                               With true nothing goes to one that is there and public
   --tags=null                  for the card, like [franka,glass], besides its own
   --license=null               as the Hub names licences; else the policy's own, or apache-2.0
   --preview=null               an mp4 for the card; else one is made of a dataset

@@ -7,7 +7,7 @@
   --env.task=...               its task, such as OccludedGrasp-v1 or TellApart-v1
   --policy.path=...            who acts, a checkpoint's folder or a name on the Hub; else a script
   --baseline=null              without a policy, the environment's blind baseline of this name acts
-  --output=outputs/rollout.mp4  the film
+  --output=outputs/rollout.mp4  the film, an mp4
   --seed=1000                  of the first episode
   --attempts=1                 episodes, at most, until one succeeds; the last one is filmed
 

@@ -26,7 +26,7 @@ from lerobot_playbyear.datasets.mixture import StoreMixture, Windowed
 from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
 from lerobot_playbyear.hub.policies import push_policy
-from lerobot_playbyear.hub.pushing import PushOptions, warn_without_login
+from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
 from lerobot_playbyear.training.checkpoints import BestCheckpoint
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
 from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
@@ -65,6 +65,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         for each in (cfg.dataset, *cfg.mix):
             check_dataset_files(each.repo_id, each.root, each.revision)
         if cfg.policy is not None and cfg.policy.push_to_hub:
+            check_name("policy.repo_id", str(cfg.policy.repo_id))
             warn_without_login()
         if cfg.policy is None:
             raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
