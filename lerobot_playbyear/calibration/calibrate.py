@@ -116,7 +116,8 @@ def told(found: Latency, sample_rate: int) -> str:
     ]
     if ms >= 0:
         latency_s = round(found.latency_s, 3)
-        fastest = max(fps for fps in range(1, _MOST_FPS + 1) if latency_s < 1 / fps and sample_rate % fps == 0)
+        can_be = (fps for fps in range(1, _MOST_FPS + 1) if latency_s < 1 / fps and sample_rate % fps == 0)
+        fastest = max(can_be, default=1)
         lines.append(
             f"Give the microphone latency_s: {latency_s:.3f}, such as "
             f"--env.microphones='{{table: {{type: portaudio, device: ..., latency_s: {latency_s:.3f}}}}}'"
