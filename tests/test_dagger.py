@@ -43,7 +43,8 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def finished(tmp_path_factory):
     """A run of three kept attempts with an evaluation before, after the second round, and at the end."""
     folder = tmp_path_factory.mktemp("dagger")
-    dagger(folder, *QUICK, "--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1")
+    seed = "--episode_seed=10007"  # of the next seed, 10011, the task's own expert makes something, and few of those before
+    dagger(folder, *QUICK, seed, "--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1")
     return folder
 
 
