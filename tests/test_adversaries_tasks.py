@@ -29,6 +29,7 @@ def test_every_task_has_players():
     assert players(POUCH) == {"expert": "expert", "lift": "blind", "leave": "blind", "coin": "blind"}
 
 
+@pytest.mark.slow
 def test_twin_bags_are_the_same_until_the_touch_and_hard_to_tell_apart_after_it():
     result = twin_test(HARD, range(60000, 60006), n_pictured=1)
     assert result.can_be_touched
@@ -36,6 +37,7 @@ def test_twin_bags_are_the_same_until_the_touch_and_hard_to_tell_apart_after_it(
     assert all(spread.value <= 0.6 for spread in result.auc.values())
 
 
+@pytest.mark.slow
 def test_twin_pouches_are_the_same_to_the_end():
     result = twin_test(POUCH, range(60000, 60004), n_pictured=1)
     assert not result.can_be_touched

@@ -95,6 +95,7 @@ def test_weights_that_stay_are_evaluated_once(tmp_path, gives):
     assert [line["pc_success"] for line in metrics(tmp_path, "eval")] == [30]
 
 
+@pytest.mark.slow
 def test_the_best_of_other_episodes_is_kept_when_a_run_that_has_ended_is_evaluated_again(tmp_path, gives):
     gives += [10, 60]
     dagger(tmp_path, *RUN, "--episodes=1")  # evaluated at its end, which is no milestone

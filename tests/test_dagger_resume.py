@@ -143,6 +143,7 @@ def test_what_a_run_could_not_write_at_its_beginning_does_not_block_it(tmp_path)
     assert state(tmp_path)["kept"] == 1
 
 
+@pytest.mark.slow
 def test_a_policys_options_stay_until_there_is_a_checkpoint(tmp_path, monkeypatch):
     """Those of a file and of a resume; and the policy that a link named when the run began."""
     policy, link, options = (base_folder() / "policy").resolve(), tmp_path / "link", tmp_path / "run.yaml"
@@ -183,6 +184,7 @@ def test_a_finished_run_stays_as_it_is(undisturbed):
     assert (figures(undisturbed), state(undisturbed), seeds(undisturbed)) == before
 
 
+@pytest.mark.slow
 def test_resuming_where_there_is_nothing_begins(undisturbed, tmp_path):
     dagger(tmp_path, *RUN, "--resume=true")
     assert_ended_alike(tmp_path, undisturbed)
@@ -263,6 +265,7 @@ def assert_complete(folder, n_episodes):
     assert len(list((base_folder() / "demos/data").rglob("*.parquet"))) > 0
 
 
+@pytest.mark.slow
 def test_killed_in_an_evaluation_it_evaluates_again(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         cut_power(patch, TrainingParts, "evaluate", 1)
@@ -316,7 +319,9 @@ def small_disk(n_bytes):
 @pytest.mark.parametrize(
     ("n_bytes", "message"),
     [
-        (300_000, r"Cannot write to .*out.*What was saved before is complete.*--resume=true"),
+        pytest.param(
+            300_000, r"Cannot write to .*out.*What was saved before is complete.*--resume=true", marks=pytest.mark.slow
+        ),
         pytest.param(80_000, r"Episode 2 could not be written.*2 episodes before it", marks=pytest.mark.slow),
     ],
     ids=["checkpoint", "attempt"],

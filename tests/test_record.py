@@ -233,6 +233,7 @@ def test_an_environment_that_breaks_its_word_in_the_middle_is_an_error_of_input(
         record(config(tmp_path / "dataset"))
 
 
+@pytest.mark.slow
 def test_the_command_prints_one_line_for_an_unknown_task(tmp_path):
     command = [sys.executable, "-m", "lerobot_playbyear.scripts.record", "--env.type=playbyear", "--env.task=Nope-v0"]
     command += ["--dataset.repo_id=a/b", f"--dataset.root={tmp_path}"]

@@ -468,7 +468,7 @@ def damage_and_repair(original: Path, features: dict[str, Any], root: Path, seed
     assert not wrong, f"{story}: {wrong} {report}"
 
 
-@pytest.mark.parametrize("name", ["ours", "one file", "lerobot"])
+@pytest.mark.parametrize("name", ["ours", "one file", pytest.param("lerobot", marks=pytest.mark.slow)])
 def test_random_damage(originals, tmp_path, name):
     for seed in range(7):
         damage_and_repair(*originals[name], tmp_path / str(seed), seed, tells=seed % 2 == 0)

@@ -93,6 +93,7 @@ def test_a_policy_that_hears_says_that_there_is_no_sound_and_moves_nothing(polic
         rollout(monkeypatch, checkpoint, "--inference.type=rtc")
 
 
+@pytest.mark.slow
 def test_a_policy_that_does_not_hear_acts(policy, told, monkeypatch):
     rollout(monkeypatch, policy("--policy.use_audio=false"))
     assert 5 <= len(told) <= 11

@@ -157,7 +157,11 @@ def test_an_environment_without_samples_is_refused_and_so_is_recording_with_the_
 
 
 @pytest.mark.parametrize(
-    "name", ["act", pytest.param("diffusion", marks=[needs("diffusers", "diffusion"), pytest.mark.slow])]
+    "name",
+    [
+        pytest.param("act", marks=pytest.mark.slow),  # tests/test_sound_picture.py does the same with pictures of sound
+        pytest.param("diffusion", marks=[needs("diffusers", "diffusion"), pytest.mark.slow]),
+    ],
 )
 def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path, one_thread, monkeypatch):
     monkeypatch.setattr(others, "dataset_of", lambda task, condition: recorded)
