@@ -292,14 +292,14 @@ def test_killed_twenty_times_it_ends_complete_and_alike(processes, tmp_path):
         "--eval.n_episodes=2",
         "--warmup_episodes=2",
         "--updates_per_episode=20",
-        "--episodes=12",  # of which each takes some attempts: no machine has ended before the twentieth kill
+        "--episodes=8",  # of which each takes some attempts: no machine has ended before the twentieth kill
         "--env.episode_length=200",  # in less the expert rescues nobody
         "--max_attempts=1000",  # attempts in vain count on after each kill
     )
     found = run_and_kill(processes, tmp_path / "killed", 20, 2.0, 12.0, *options)
     print("\n".join(found))
     assert len(found) == 20
-    assert_complete(tmp_path / "killed", 12)
+    assert_complete(tmp_path / "killed", 8)
     assert run_and_kill(processes, tmp_path / "calm", 0, 0, 0, *options) == []
     assert_ended_alike(tmp_path / "killed", tmp_path / "calm")
 
