@@ -395,8 +395,8 @@ ears.disconnect()
 """
 
 
-@needs_server
-def test_a_process_that_was_stopped_for_two_seconds_hears_in_time_again():
+def errors_around_a_stop() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How late or early taps are heard before a process stands still, soon after it goes on, and later [s]."""
     with started(table=2) as server, Player(server.fifo("table"), 2) as player:
         command = [sys.executable, "-c", _CHILD]
         environment = {**os.environ, **server.environment}
@@ -418,13 +418,21 @@ def test_a_process_that_was_stopped_for_two_seconds_hears_in_time_again():
 
     def errors(begin: float, end: float) -> np.ndarray:
         onsets = np.array([onset for onset in heard["onsets"] if begin < onset < end])
-        return (onsets - first + 0.1) % 0.2 - 0.1
+        return np.abs((onsets - first + 0.1) % 0.2 - 0.1)
 
-    before, soon, later = errors(first, goes_on - 2.1), errors(goes_on + 0.6, taps[-1]), errors(goes_on + 1.6, taps[-1])
+    return errors(first, goes_on - 2.1), errors(goes_on + 0.6, taps[-1]), errors(goes_on + 1.6, taps[-1])
+
+
+@needs_server
+def test_a_process_that_was_stopped_for_two_seconds_hears_in_time_again():
+    for _ in range(3):  # a busy machine may stand still once
+        before, soon, later = errors_around_a_stop()
+        if max(before.max(), later.max()) < 0.005:
+            break
     assert len(before) >= 3
     assert len(later) >= 5
-    assert max(np.abs(before).max(), np.quantile(np.abs(later), 0.8)) < 0.005  # a busy machine is late now and then
-    assert np.abs(soon).max() < 0.015  # what was lost beyond the noted is less than 10 ms, and is made up in a second
+    assert max(before.max(), later.max()) < 0.005
+    assert soon.max() < 0.015  # what was lost beyond the noted is less than 10 ms, and is made up in a second
 
 
 # Other people's microphones

@@ -92,7 +92,7 @@ def test_frame_t_is_the_observation_at_t_and_the_action_taken_then(recorded):
 def test_workers_and_resuming_do_not_change_the_dataset(recorded, tmp_path):
     root = tmp_path / "dataset"
     record(config(root, num_episodes=1, num_workers=2))
-    record(config(root, num_episodes=3, resume=True))
+    record(config(root, num_episodes=3, num_workers=2, resume=True))
     assert tables(root) == tables(recorded)
 
 

@@ -24,7 +24,7 @@ from scipy.stats import binomtest
 from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players, promised_limits
 from gym_playbyear.adversaries.progress import Progress
 from gym_playbyear.adversaries.scripts import Outcome
-from gym_playbyear.adversaries.twin import TwinError, TwinResult, Twins, twin_test
+from gym_playbyear.adversaries.twin import TwinError, TwinResult, twin_test
 
 FIRST_SEED = 80000  # nothing was tuned on episodes from here on
 
@@ -128,11 +128,6 @@ def check(
     missing = [name for name in chosen if done.attempts(name) is None]
     found: TwinResult | None = None
     faults: list[str] = []
-    if twin:
-        try:
-            Twins(task, **options).close()
-        except TwinError as error:
-            twin, faults = False, [str(error)]
     if jobs > 1:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             pending = pool.submit(partial(twin_test, task, seeds, **options)) if twin else None
