@@ -24,6 +24,9 @@ class PlaybyearSimLampConfig(CameraConfig):
 
 
 class PlaybyearSimLamp(Camera):
+    config_class = PlaybyearSimLampConfig
+    name = "playbyear_sim_lamp"
+
     def __init__(self, config: PlaybyearSimLampConfig) -> None:
         super().__init__(config)
         self._path = config.socket
@@ -44,13 +47,21 @@ class PlaybyearSimLamp(Camera):
         return self.async_read()
 
     def async_read(self, timeout_ms: float = 200) -> np.ndarray:
-        assert self._link is not None
+        """The next picture, when it is taken."""
         assert self.fps is not None
         time.sleep(max(self._next - time.perf_counter(), 0))
+        picture = self._picture(self._next)
+        self._next = max(self._next + 1 / self.fps, time.perf_counter())
+        return picture
+
+    def read_latest(self, max_age_ms: int = 500) -> np.ndarray:
+        return self._picture(time.perf_counter())
+
+    def _picture(self, at_s: float) -> np.ndarray:
+        assert self._link is not None
         taps = np.array(self._link.ask("taps")["heard_at_s"])
         picture = np.full((120, 160, 3), 40, np.uint8)
-        picture[40:80, 60:100] += np.uint8(150 * (int((taps <= self._next).sum()) % 2))
-        self._next = max(self._next + 1 / self.fps, time.perf_counter())
+        picture[40:80, 60:100] += np.uint8(150 * (int((taps <= at_s).sum()) % 2))
         return picture
 
     def disconnect(self) -> None:

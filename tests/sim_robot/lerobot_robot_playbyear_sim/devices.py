@@ -1,53 +1,69 @@
 """The robot and its leader, as LeRobot sees them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from lerobot.cameras import CameraConfig
+from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
 
 from lerobot_robot_playbyear_sim.link import Link
 
-ACTIONS = ("dx", "dy", "dz", "grip")
-STATES = ("x", "y", "z", "finger_left", "finger_right", "finger_left_speed", "finger_right_speed")
+# In the order of the environment's `action` and `agent_pos`; LeRobot hands on what ends in .pos or .vel.
+ACTIONS = ("dx.vel", "dy.vel", "dz.vel", "grip.pos")
+STATES = (
+    *("x.pos", "y.pos", "z.pos", "finger_left.pos", "finger_right.pos"),
+    *("finger_left_speed.vel", "finger_right_speed.vel"),
+)
 
 
 @RobotConfig.register_subclass("playbyear_sim")
 @dataclass(kw_only=True)
 class PlaybyearSimConfig(RobotConfig):
-    """The arm of the task that `simulation.py` runs behind a socket."""
+    """The arm of the task that `simulation.py` runs behind a socket.
+
+    Args:
+        socket: Of the simulation.
+        image_size: Of its own camera `front` [pixels].
+        cameras: Further ones, microphones among them.
+    """
 
     socket: str
     image_size: int = 84
+    cameras: dict[str, CameraConfig] = field(default_factory=dict)
 
 
 class PlaybyearSim(Robot):
     config_class = PlaybyearSimConfig
     name = "playbyear_sim"
+    is_calibrated = True
 
     def __init__(self, config: PlaybyearSimConfig) -> None:
         super().__init__(config)
         self.config = config
+        self.cameras = make_cameras_from_configs(config.cameras)
         self._link: Link | None = None
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
-        return {**dict.fromkeys(STATES, float), "front": (self.config.image_size, self.config.image_size, 3)}
+        further = {name: (camera.height, camera.width, 3) for name, camera in self.cameras.items()}
+        return {**dict.fromkeys(STATES, float), "front": (self.config.image_size, self.config.image_size, 3), **further}
 
     @cached_property
     def action_features(self) -> dict[str, Any]:
         return dict.fromkeys(ACTIONS, float)
 
-    is_calibrated = True
-
     @property
     def is_connected(self) -> bool:
-        return self._link is not None
+        return self._link is not None and all(camera.is_connected for camera in self.cameras.values())
 
     def connect(self, calibrate: bool = True) -> None:
         self._link = Link(self.config.socket)
+        for camera in self.cameras.values():
+            camera.connect()
 
     def calibrate(self) -> None: ...
 
@@ -59,9 +75,12 @@ class PlaybyearSim(Robot):
 
     def get_observation(self) -> dict[str, Any]:
         answer = self._ask("observe")
-        return {**dict(zip(STATES, answer["state"], strict=True)), "front": answer["picture"]}
+        pictures = {name: camera.read_latest() for name, camera in self.cameras.items()}
+        return {**dict(zip(STATES, answer["state"], strict=True)), "front": answer["picture"], **pictures}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
+        if not action.keys() >= set(ACTIONS):  # a place to go to: this arm knows speeds alone, and holds
+            return {}
         values = [float(action[name]) for name in ACTIONS]
         assert np.isfinite(values).all(), "the robot was told to go to a place that is not finite"
         self._ask("act", action=values)
@@ -71,6 +90,9 @@ class PlaybyearSim(Robot):
         link, self._link = self._link, None
         if link is not None:
             link.close()
+        for camera in self.cameras.values():
+            if camera.is_connected:
+                camera.disconnect()
 
     def _ask(self, what: str, **more: Any) -> dict[str, Any]:
         if self._link is None:
@@ -126,9 +148,8 @@ class PlaybyearSimLeader(Teleoperator):
 
     def get_action(self) -> dict[str, Any]:
         assert self._link is not None
-        return dict(
-            zip(ACTIONS, self._link.ask("script", demonstrates=self.config.demonstrates)["action"], strict=True)
-        )
+        answer = self._link.ask("script", demonstrates=self.config.demonstrates)
+        return dict(zip(ACTIONS, answer["action"], strict=True))
 
     def get_teleop_events(self) -> dict[TeleopEvents, bool]:
         assert self._link is not None

@@ -1,9 +1,10 @@
 """A process of its own: the task's arm in real time, its sound played into a sound server's FIFO.
 
-    python -m lerobot_robot_playbyear_sim.simulation --socket=PATH --fifo=PATH --task=OccludedGrasp-v0
+    python -m lerobot_robot_playbyear_sim.simulation --socket=PATH --fifo=PATH --task=OccludedGrasp-v1
 
 An action moves the arm for one control step; where none comes in time, it holds. The picture is that of the last step's
-end. The sound of a step is played while it is made, behind it by `LAG_S`; between attempts the room is heard.
+end. The sound of a step is played while it is made, behind it by `LAG_S`; between episodes the room is heard. A scene that
+was set up with `waits` stays as it is, whatever the arm is told, until `begin`.
 """
 
 import argparse
@@ -46,13 +47,12 @@ class Loudspeaker:
 class Simulation:
     """The task, stepped by whoever asks, in one thread."""
 
-    def __init__(self, task: str, fifo: str, image_size: int, sample_rate: int, variant: str) -> None:
+    def __init__(self, task: str, fifo: str, image_size: int, sample_rate: int) -> None:
         self.env = gym.make(
             f"gym_playbyear:gym_playbyear/{task}",
             disable_env_checker=True,
             image_size=image_size,
             sample_rate=sample_rate,
-            variant=variant,
             render_mode="rgb_array",
         ).unwrapped
         self.speaker = Loudspeaker(fifo, sample_rate) if fifo else None
@@ -62,7 +62,9 @@ class Simulation:
         self._seed = 0
         self.reset(0)
 
-    def reset(self, seed: int | None) -> dict[str, Any]:
+    def reset(self, seed: int | None, waits: bool = False) -> dict[str, Any]:
+        """A person sets the scene up, and keeps a hand on the arm if it `waits`."""
+        self.is_waiting = waits
         self._seed = self._seed + 1 if seed is None else seed
         self.observation, _ = self.env.reset(seed=self._seed)
         self.room = self.observation["audio.gripper"]
@@ -70,12 +72,20 @@ class Simulation:
         self.gate, self.demonstrator = self.env.intervention_gate(), self.env.scripted_expert()
         self.scripted: dict[tuple[int, bool], list[float]] = {}
         self.n_steps, self.last_grip, self.n_holds = 0, -1.0, 0
+        self.first_step_s = self.last_step_s = 0.0
         self.next_hold, self.next_room = time.perf_counter() + 1e9, time.perf_counter()
         if self.speaker:
             self._hear()
         return {}
 
+    def begin(self) -> dict[str, Any]:
+        """The arm may move."""
+        self.is_waiting = False
+        return {}
+
     def act(self, action: list[float]) -> dict[str, Any]:
+        if self.is_waiting:
+            return {}
         self._step(np.array(action, np.float32))
         self.wants_control = bool(self.gate.wants_control(np.array(action, np.float32)))
         return {}
@@ -86,6 +96,8 @@ class Simulation:
         return {"state": self.observation["agent_pos"].tolist(), "picture": self.observation["pixels"]["front"]}
 
     def script(self, demonstrates: bool) -> dict[str, Any]:
+        if self.is_waiting:
+            return {"action": [0.0, 0.0, 0.0, self.last_grip]}
         key = (self.n_steps, demonstrates)  # asked twice in a step, it says the same
         if key not in self.scripted:
             script = self.demonstrator if demonstrates else self.gate
@@ -93,8 +105,10 @@ class Simulation:
         return {"action": self.scripted[key]}
 
     def status(self) -> dict[str, Any]:
-        names = ("success", "failed", "wants_control", "n_steps", "n_holds")
-        return {name: getattr(self, name) for name in names} | {"seed": self._seed}
+        names = ("success", "failed", "wants_control", "is_waiting", "n_steps", "n_holds")
+        now = {name: getattr(self, name) for name in names}
+        seconds = round(self.last_step_s - self.first_step_s, 3)  # what n_steps - 1 steps took
+        return {**now, "seed": self._seed, "most_steps": self.env._max_episode_steps, "seconds": seconds}
 
     def tap(self) -> dict[str, Any]:
         """A short loud sound, now."""
@@ -134,6 +148,8 @@ class Simulation:
             self.next_hold = time.perf_counter() + 1e9
             return
         self.observation, _, terminated, _, info = self.env.step(action)
+        self.last_step_s = time.perf_counter()
+        self.first_step_s = self.first_step_s or self.last_step_s
         self.last_grip, self.n_steps = float(action[3]), self.n_steps + 1
         self.success = bool(info["is_success"])
         self.failed = terminated and not self.success
@@ -172,12 +188,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--socket", required=True)
     parser.add_argument("--fifo", default="")
-    parser.add_argument("--task", default="OccludedGrasp-v0")
-    parser.add_argument("--variant", default="default")
+    parser.add_argument("--task", default="OccludedGrasp-v1")
     parser.add_argument("--image_size", type=int, default=84)
     parser.add_argument("--sample_rate", type=int, default=16000)
     args = parser.parse_args()
-    simulation = Simulation(args.task, args.fifo, args.image_size, args.sample_rate, args.variant)
+    simulation = Simulation(args.task, args.fifo, args.image_size, args.sample_rate)
     listener = Listener(args.socket, "AF_UNIX")
 
     def accept() -> None:
