@@ -45,9 +45,9 @@ from experiments.protocol import (
     wilson_interval,
 )
 from experiments.training import Job, clocked, evaluate
+from lerobot_playbyear.audio.sound_picture import read_pictures
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.sound_as_state import sound_as_state
-from lerobot_playbyear.datasets.sound_picture import read_pictures
 
 STUDY = "others"
 CONDITIONS = ("picture", "state", "deaf")

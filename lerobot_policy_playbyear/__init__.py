@@ -1,5 +1,5 @@
-"""The module that LeRobot's plugin discovery imports: it registers the policy `playbyear` and the environment
-`playbyear_robot`, and changes nothing else.
+"""The module that LeRobot's plugin discovery imports: it registers the policy `playbyear` and the camera type `microphone`,
+and changes nothing else.
 
 Every command of LeRobot imports it, so that it brings no more than the registration takes: LeRobot finds the network and the
 processors by their modules' names. Import `lerobot_playbyear` in programs of your own.
@@ -8,19 +8,20 @@ processors by their modules' names. Import `lerobot_playbyear` in programs of yo
 from typing import TYPE_CHECKING
 
 from lerobot_playbyear import __version__, lazy_names
+from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
-from lerobot_playbyear.robots.config import RobotEnvConfig
 
 if TYPE_CHECKING:
     from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
     from lerobot_playbyear.policy.processor_playbyear import make_playbyear_pre_post_processors
 
 __all__ = [
+    "MicrophoneCamera",
+    "MicrophoneCameraConfig",
     "Pcm16ToFloatProcessorStep",
     "PlaybyearConfig",
     "PlaybyearPolicy",
-    "RobotEnvConfig",
     "__version__",
     "make_playbyear_pre_post_processors",
 ]

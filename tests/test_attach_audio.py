@@ -10,8 +10,8 @@ import pytest
 from dataset_factory import CAMERA, dataset_features, make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import episode_waveform, write_audio
-from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.repair import check_dataset
 

@@ -10,10 +10,10 @@ import av
 import numpy as np
 import pytest
 
+from lerobot_playbyear.audio.audio_import import _spool
+from lerobot_playbyear.audio.audio_layout import AudioTrack
 from lerobot_playbyear.datasets import MicrophoneBuffer, cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.audio_files import AudioFileError, audio_pieces
-from lerobot_playbyear.datasets.audio_import import _spool
-from lerobot_playbyear.datasets.audio_layout import AudioTrack
 from lerobot_playbyear.datasets.microphone import DropOut
 
 RATE, FPS = 16000, 20

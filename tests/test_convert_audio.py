@@ -12,9 +12,9 @@ from audio_layout_factory import EARS, PRE_ROLL_S, TABLE, add_files_of_sound, de
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_attach_audio import FPS, LENGTHS, RATE, SIZE, silent_dataset
 
+from lerobot_playbyear.audio.attach import AttachError, DatasetPlace
+from lerobot_playbyear.audio.convert_audio import ConvertAudioConfig, convert_audio
 from lerobot_playbyear.datasets import AUDIO_PREFIX, audio_export, episode_waveform
-from lerobot_playbyear.datasets.attach import AttachError, DatasetPlace
-from lerobot_playbyear.datasets.convert_audio import ConvertAudioConfig, convert_audio
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.repair import check_dataset
 

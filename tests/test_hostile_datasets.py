@@ -26,8 +26,8 @@ from hub_server import HubServer
 from lerobot.datasets import LeRobotDatasetMetadata
 from PIL import Image
 
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.repair import check_dataset
 from lerobot_playbyear.datasets.video_pictures import video_pictures

@@ -12,8 +12,8 @@ import pytest
 from dataset_factory import CAMERA, MICROPHONE, make_dataset
 from PIL import Image
 
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import EpisodeStore, write_audio
-from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset, repair_dataset
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.inspection.source import DatasetSource

@@ -12,9 +12,9 @@ from dataset_factory import dataset_features, make_dataset, random_frame
 from lerobot.datasets import LeRobotDataset
 from test_attach_audio import KEY, RATE, load
 
+from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.clock_drift import ClockLine, MarksError, Steady, read_marks
 from lerobot_playbyear.datasets import cut_into_frames, episode_waveform, note_episode_start, write_audio
-from lerobot_playbyear.datasets.attach import AttachAudioConfig, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets.clock_drift import ClockLine, MarksError, Steady, read_marks
 from lerobot_playbyear.datasets.episode_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.repair import check_dataset, repair_dataset

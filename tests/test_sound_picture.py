@@ -24,13 +24,13 @@ from robot_factory import joint_config, noise_file, robot_env
 from test_peers import needs
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.audio.attach import AttachError, DatasetPlace
+from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
+from lerobot_playbyear.audio.sound_picture import SoundPicture, pictures_of, read_pictures
 from lerobot_playbyear.datasets import picture_storage
-from lerobot_playbyear.datasets.attach import AttachError, DatasetPlace
-from lerobot_playbyear.datasets.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.repair import check_dataset
-from lerobot_playbyear.datasets.sound_picture import SoundPicture, pictures_of, read_pictures
 from lerobot_playbyear.episodes import frames
 from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
 from lerobot_playbyear.episodes.play import play

@@ -14,11 +14,11 @@ from typing import Any
 from draccus.argparsing import ArgumentParser
 from draccus.utils import is_choice_type
 
+from lerobot_playbyear.audio.attach import AttachAudioConfig
+from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig
+from lerobot_playbyear.audio.convert_audio import ConvertAudioConfig
 from lerobot_playbyear.calibration.calibrate import CalibrateLatencyConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.datasets.attach import AttachAudioConfig
-from lerobot_playbyear.datasets.attach_spectrogram import AttachSpectrogramConfig
-from lerobot_playbyear.datasets.convert_audio import ConvertAudioConfig
 from lerobot_playbyear.datasets.repair.command import RepairConfig
 from lerobot_playbyear.film.filming import VideoConfig
 from lerobot_playbyear.hub.uploads import PushConfig

@@ -24,7 +24,7 @@ from lerobot_env_playbyear.attempts import with_attempts_file
 from lerobot_env_playbyear.processors import PcmToFloatProcessorStep, SoundAsStateProcessorStep
 
 if TYPE_CHECKING:  # of the other distribution, which is needed for these pictures alone
-    from lerobot_playbyear.datasets.sound_picture import SoundPicture
+    from lerobot_playbyear.audio.sound_picture import SoundPicture
 
 SOUND_MODES = ("waveform", "contact_force", "none")
 RENDER_MODES = ("rgb_array", "human")

@@ -10,7 +10,7 @@ import numpy as np
 from lerobot.datasets import LeRobotDataset, modify_features
 from lerobot.utils.constants import OBS_ENV_STATE
 
-from lerobot_playbyear.datasets.attach import write_new_dataset
+from lerobot_playbyear.audio.attach import write_new_dataset
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_keys, check_audio_features
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.statistics import numeric_stats, write_stats

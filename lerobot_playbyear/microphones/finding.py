@@ -12,7 +12,6 @@ import numpy as np
 
 from lerobot_playbyear.datasets.audio_feature import write_wav
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.microphones.config import PortAudioMicrophoneConfig
 from lerobot_playbyear.microphones.microphone import MicrophoneError
 from lerobot_playbyear.microphones.portaudio import (
     PortAudioMicrophone,
@@ -24,7 +23,7 @@ from lerobot_playbyear.microphones.portaudio import (
 )
 
 _RATES = (8000, 16000, 32000, 44100, 48000, 96000)
-_LIKED_RATES = (48000, 16000, 44100)  # the first that a card takes is suggested
+_LIKED_RATES = (16000, 48000, 44100)  # the first that a card takes is suggested
 _QUIETEST_DB, _BAR = -60, 20
 _LOOK_S, _PATIENCE_S = 0.1, 3.0
 _CLIPPED = 32700
@@ -117,7 +116,7 @@ def described(card: SoundCard, rates: tuple[int, ...], cards: list[SoundCard]) -
     yield f"  sample rates: {', '.join(map(str, rates)) or 'none that is usual'} Hz; its own is {card.sample_rate} Hz"
     device, is_lasting = suggested_device(card, cards)
     quoted, rate = device.replace('"', '\\"'), suggested_rate(card, rates)
-    yield f"  --env.microphones='{{table: {{type: portaudio, device: \"{quoted}\", sample_rate: {rate}}}}}'"
+    yield f"  --robot.cameras='{{mic: {{type: microphone, device: \"{quoted}\", sample_rate: {rate}}}}}'"
     if not is_lasting:
         yield (
             "  Another card has the same name. They cannot be told apart, and may swap after a restart or another order of "
@@ -141,8 +140,7 @@ def level_text(samples: np.ndarray) -> str:
 def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
     """Listens to a card, shows its level meanwhile, writes a file, and says what was heard."""
     channels = channels_to_open(card, 1)
-    config = PortAudioMicrophoneConfig(device=card.number, sample_rate=rate)
-    microphone = PortAudioMicrophone(config, channels)
+    microphone = PortAudioMicrophone(card.number, rate, channels)
     samples = _heard(microphone, cfg.seconds)
     if len(samples) == 0 and not microphone.problem:
         samples = _heard(

@@ -1,19 +1,28 @@
-"""What every microphone is, whatever brings its sound."""
+"""What every microphone is, whatever brings its sound, and those of other packages."""
 
 import abc
+import importlib
+import logging
 import threading
 import time
 from collections.abc import Callable
+from importlib import metadata
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 
+if TYPE_CHECKING:
+    from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
+
+PLUGIN_PREFIX = "lerobot_microphone_"
+"""What the name of a distribution begins with that brings sources of sound; its module has the same name."""
+
 Listener = Callable[[np.ndarray, float], None]
 """Takes a chunk (n, channels), int16 PCM or floats in [-1, 1], and when its last sample came [s of time.perf_counter]."""
 
 _MOST_KEPT_S = 60.0
-_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
 
 
 class MicrophoneError(PlaybyearError, RuntimeError):
@@ -117,24 +126,39 @@ class Microphone(abc.ABC):
         self._ended = self._ended or reason
 
 
-def wait_for_first_sound(microphone: Microphone, listener: Listener, has_come: Callable[[float], bool]) -> None:
-    """Waits until something is heard. A card that brings nothing is opened once more: through a sound server a stream that was
-    opened now and then never begins.
+Source = Callable[["MicrophoneCameraConfig", int], Microphone]
+"""Makes a microphone, not connected yet, from a camera's options and how many channels it has at least."""
 
-    Args:
-        microphone: Connected with this listener.
-        listener: Gets its chunks.
-        has_come: Waits for the first one at most for as long [s], and says whether it came.
+SOURCES: dict[str, Source] = {}
+
+
+def register_source(name: str) -> Callable[[Source], Source]:
+    """Registers what `--robot.cameras.<name>.source=NAME` makes, from a package named `lerobot_microphone_...`."""
+
+    def register(source: Source) -> Source:
+        SOURCES[name] = source
+        return source
+
+    return register
+
+
+def find_source(name: str) -> Source:
+    """A registered source.
 
     Raises:
-        MicrophoneError: Nothing comes, or it cannot be opened again.
+        MicrophoneError: No installed package registers it.
     """
-    if has_come(_FIRST_SOUND_S):
-        return
-    microphone.disconnect()
-    microphone.connect(listener)
-    if not has_come(_FIRST_SOUND_S):
+    if name not in SOURCES:
+        for distribution in metadata.distributions():
+            module = distribution.metadata.get("Name") or ""
+            if module.startswith(PLUGIN_PREFIX):
+                try:
+                    importlib.import_module(module)
+                except Exception:  # whatever is wrong with it, the others work
+                    logging.exception("Could not import the microphones of %s", module)
+    if name not in SOURCES:
         raise MicrophoneError(
-            f"From {microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened again. Is it "
-            "plugged in, and used by no other program? `playbyear-find-microphones` shows whether it hears."
+            f"source={name!r} of a microphone is not registered; there is {', '.join(sorted(SOURCES)) or 'none'}. Install its "
+            f"package, whose name begins with {PLUGIN_PREFIX}, or give `device`, `file` or `tone_hz` instead."
         )
+    return SOURCES[name]

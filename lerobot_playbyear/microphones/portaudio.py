@@ -1,19 +1,16 @@
 """Sound cards through PortAudio."""
 
 import contextlib
-import gc
 import time
 from dataclasses import dataclass
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from lerobot_playbyear.compat import look_for_cards_again, stream_kind
+from lerobot_playbyear.compat import look_for_cards_again
+from lerobot_playbyear.microphones.card import CHUNK_S
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
-
-if TYPE_CHECKING:
-    from lerobot_playbyear.microphones.config import PortAudioMicrophoneConfig
 
 _FIND = "`playbyear-find-microphones` lists what there is."
 _MOST_OPENED = 8  # channels of a card that are opened without being asked for; a sound server offers 32, and has fewer
@@ -126,97 +123,78 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
     return card
 
 
-def channels_to_open(card: SoundCard, needed: int, wanted: int | None = None) -> int:
-    """How many channels of a card to open, so that each is its own.
+def channels_to_open(card: SoundCard, needed: int) -> int:
+    """How many channels of a card to open, at least `needed`, so that each is its own.
 
     A sound server that is asked for fewer than a card has mixes them: its mono is the mean of left and right. What it offers
     is no help, 32 whatever the card has. So two are opened there unless more are needed.
-
-    Args:
-        card: The card.
-        needed: At least so many.
-        wanted: What was asked for, if anything.
-
-    Raises:
-        MicrophoneError: Fewer are asked for than are needed.
     """
-    if wanted is not None:
-        if wanted < needed:
-            raise MicrophoneError(
-                f"card_channels={wanted} of a microphone: channel {needed - 1} is asked for, counted from 0."
-            )
-        return wanted
     return card.channels if card.channels <= _MOST_OPENED else max(needed, 2)
 
 
-def _has_open_stream() -> bool:
-    """Whether a stream of this process is open, anyone's; PortAudio would close it when it looks again."""
-    kind, is_frozen = stream_kind(load_sounddevice()), gc.get_freeze_count() > 0
-    gc.unfreeze()  # what is frozen, as before each attempt, is not among the objects
-    streams = [thing for thing in gc.get_objects() if issubclass(type(thing), kind)]
-    if is_frozen:
-        gc.freeze()
-    # One that could not be opened, and to which its error still refers, never got a rate.
-    return any(hasattr(stream, "samplerate") and not stream.closed for stream in streams)
+_open_streams: set[Any] = set()
 
 
 class PortAudioMicrophone(Microphone):
     """A sound card of this machine.
 
     Args:
-        config: Its options.
-        channels: How many to open.
+        device: Its name, a part of it that no other has, or its number.
+        sample_rate: [Hz].
+        channels: How many it gives, at least.
     """
 
-    def __init__(self, config: "PortAudioMicrophoneConfig", channels: int) -> None:
-        super().__init__(f"the microphone {config.device!r}", config.sample_rate, channels)
-        self._config = config
+    def __init__(self, device: str | int, sample_rate: int, channels: int) -> None:
+        super().__init__(f"the microphone {str(device)!r}", sample_rate, channels)
+        self._device = device
         self._stream: Any = None
 
     def _open(self) -> None:
         """PortAudio knows the cards that were there when it looked; where none of these can be opened, it looks again."""
         card: SoundCard | None = None
         try:
-            card = find_card(self._config.device, self.channels)
+            card = find_card(self._device, self.channels)
             self._open_card(card)
         except MicrophoneError as error:
-            if _has_open_stream():
+            if _open_streams:  # PortAudio would close them
                 raise
             sound_cards(fresh=True)
             try:
-                self._open_card(find_card(self._config.device, self.channels))
+                self._open_card(find_card(self._device, self.channels))
             except MicrophoneError:
                 if card is not None:  # it was there, and why it cannot be opened says more
                     raise error from None
                 raise
 
     def _open_card(self, card: SoundCard) -> None:
-        sounddevice, config = load_sounddevice(), self._config
-        channels = channels_to_open(card, self.channels, config.card_channels)
+        sounddevice = load_sounddevice()
+        channels = channels_to_open(card, self.channels)
         try:
-            self._stream = sounddevice.InputStream(
+            stream = sounddevice.InputStream(
                 samplerate=self.sample_rate,
-                blocksize=max(round(config.block_s * self.sample_rate), 1),
+                blocksize=max(round(CHUNK_S * self.sample_rate), 1),
                 device=card.number,
                 channels=channels,
                 dtype="int16",
-                latency="low" if config.wait_s is None else config.wait_s,
+                latency="low",
                 callback=self._take,
                 finished_callback=self._finished,
             )
-            self._stream.start()
+            stream.start()
         except Exception as error:  # PortAudio's errors, and those of its arguments
-            self._stream = None
             said = str(error).replace("\n", " ")
             raise MicrophoneError(
                 f"{card.name} cannot be opened with {channels} channels at {self.sample_rate} Hz: {said}. Is it plugged in, "
                 "and its sound server running? Close other programs that use it, or give another sample_rate: its own is "
                 f"{card.sample_rate} Hz."
             ) from error
+        self._stream = stream
+        _open_streams.add(stream)
 
     def _close(self) -> None:
         stream, self._stream = self._stream, None
         if stream is not None:
+            _open_streams.discard(stream)
             with contextlib.suppress(Exception):  # of a card that is gone
                 stream.abort(ignore_errors=True)
                 stream.close(ignore_errors=True)

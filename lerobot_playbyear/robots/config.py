@@ -15,9 +15,9 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.robots import RobotConfig
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
+from lerobot_playbyear.audio.sound_picture import SoundPicture
 from lerobot_playbyear.compat import import_devices
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.sound_picture import SoundPicture
 from lerobot_playbyear.episodes.sound_pictures import pictures_for
 from lerobot_playbyear.microphones.config import MicrophoneConfig, register_microphone_plugins
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep

@@ -40,7 +40,7 @@ def main() -> None:
 
 
 def _attach() -> None:
-    from lerobot_playbyear.datasets.attach import AttachError, attach_audio
+    from lerobot_playbyear.audio.attach import AttachError, attach_audio
 
     try:
         run_alone(attach_audio)

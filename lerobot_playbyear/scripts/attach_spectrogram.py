@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def _attach() -> None:
-    from lerobot_playbyear.datasets.attach_spectrogram import AttachSpectrogramError, attach_spectrogram
+    from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramError, attach_spectrogram
 
     try:
         run_alone(attach_spectrogram)

@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def _convert() -> None:
-    from lerobot_playbyear.datasets.convert_audio import ConvertError, convert_audio
+    from lerobot_playbyear.audio.convert_audio import ConvertError, convert_audio
 
     try:
         run_alone(convert_audio)

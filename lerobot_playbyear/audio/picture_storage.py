@@ -14,8 +14,8 @@ from lerobot.datasets.video_utils import encode_video_frames, get_video_info
 from PIL import Image
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.attached_copy import DatasetChange
-from lerobot_playbyear.datasets.attached_pictures import EpisodePictures
+from lerobot_playbyear.audio.attached_copy import DatasetChange
+from lerobot_playbyear.audio.attached_pictures import EpisodePictures
 from lerobot_playbyear.datasets.long_dataset import scratch_folder
 from lerobot_playbyear.datasets.statistics import Stats
 from lerobot_playbyear.datasets.video_seal import seal

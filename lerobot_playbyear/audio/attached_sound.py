@@ -12,7 +12,7 @@ import pyarrow as pa
 from lerobot.datasets import LeRobotDataset
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled, audio_pieces
 from lerobot_playbyear.datasets.columns import numpy_to_column
 from lerobot_playbyear.datasets.long_dataset import LongDataset

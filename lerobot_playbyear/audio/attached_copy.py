@@ -16,9 +16,9 @@ from lerobot.datasets.utils import INFO_PATH
 from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.attached_sound import EpisodesSound
+from lerobot_playbyear.audio.attached_sound import EpisodesSound
+from lerobot_playbyear.audio.audio_layout import AUDIO_FOLDER
 from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature, audio_keys
-from lerobot_playbyear.datasets.audio_layout import AUDIO_FOLDER
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,

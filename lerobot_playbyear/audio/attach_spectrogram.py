@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear.datasets.attach import DatasetPlace, new_folder, open_for_copy, write_new_dataset
+from lerobot_playbyear.audio.attach import DatasetPlace, new_folder, open_for_copy, write_new_dataset
+from lerobot_playbyear.audio.sound_picture import picture_feature
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, check_audio_features
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
-from lerobot_playbyear.datasets.sound_picture import picture_feature
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -95,10 +95,10 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
                 raise AttachSpectrogramError(f"--{name}={getattr(cfg, name)} is for --video=true. Leave it out.")
     dataset = open_for_copy(cfg.dataset)
     plans = _plan(cfg, dataset)
-    from lerobot_playbyear.datasets.attached_copy import write_changed
-    from lerobot_playbyear.datasets.attached_pictures import EpisodePictures, fit_levels
+    from lerobot_playbyear.audio.attached_copy import write_changed
+    from lerobot_playbyear.audio.attached_pictures import EpisodePictures, fit_levels
+    from lerobot_playbyear.audio.picture_storage import images_change, make_encoder, video_change
     from lerobot_playbyear.datasets.long_dataset import scratch_folder
-    from lerobot_playbyear.datasets.picture_storage import images_change, make_encoder, video_change
 
     with scratch_folder() as scratch, errors_of_input():
         encoder = make_encoder(cfg.vcodec, cfg.crf) if cfg.video else None

@@ -96,10 +96,10 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
     _check_source(cfg)
     target = new_folder(cfg.output)
     dataset = open_for_copy(cfg.dataset)
-    from lerobot_playbyear.datasets.attached_copy import write_with_sound
-    from lerobot_playbyear.datasets.attached_sound import read_sound
+    from lerobot_playbyear.audio.attached_copy import write_with_sound
+    from lerobot_playbyear.audio.attached_sound import read_sound
+    from lerobot_playbyear.audio.session_sound import read_session
     from lerobot_playbyear.datasets.long_dataset import scratch_folder
-    from lerobot_playbyear.datasets.session_sound import read_session
 
     keys = _keys(cfg, dataset)
     with scratch_folder() as scratch:
@@ -159,7 +159,7 @@ def open_for_copy(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
         raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
     try:
         dataset = open_dataset(place.repo_id, place.root, video_backend="pyav")
-        from lerobot_playbyear.datasets.attached_copy import read_named_table
+        from lerobot_playbyear.audio.attached_copy import read_named_table
 
         check_links(Path(dataset.root))  # the copy would hold what they lead to
         for path in list_files(Path(dataset.root), f"{EPISODES_DIR}/*/*.parquet"):

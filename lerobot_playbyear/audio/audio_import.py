@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.attached_sound import EpisodesSound, SpooledFile, raise_all
+from lerobot_playbyear.audio.attached_sound import EpisodesSound, SpooledFile, raise_all
+from lerobot_playbyear.audio.audio_layout import AudioTrack, column_names
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Channels, Cut, Resampled, audio_pieces
-from lerobot_playbyear.datasets.audio_layout import AudioTrack, column_names
 
 CHANNEL_OF, CHANNEL = "channel_of", "channel"
 """In a column's `info`: the microphone of which it is a channel, and which."""

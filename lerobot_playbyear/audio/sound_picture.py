@@ -130,14 +130,21 @@ class SoundPicture:
         Returns:
             (columns_per_frame, height) [dB], the lowest frequency first.
         """
-        wave = sound / _FULL_SCALE if sound.dtype.kind == "i" else sound.astype(np.float64)
-        segments = np.stack([wave[end - self.segment : end] for end in self._ends])  # (C, segment)
-        spectrum = np.fft.rfft(segments * self._window, self._fft_size)
-        power = spectrum.real**2 + spectrum.imag**2  # (C, bins)
-        bands = np.empty((self.columns_per_frame, self.height))
-        for band, (first, weights) in enumerate(self._bank):
-            bands[:, band] = (power[:, first : first + len(weights)] * weights).sum(axis=1)
+        return self.levels_of(np.stack([sound[end - self.segment : end] for end in self._ends]))
+
+    def levels_of(self, segments: np.ndarray) -> np.ndarray:
+        """The levels of columns, (n, height) [dB], from the samples behind each, (n, segment)."""
+        wave = segments / _FULL_SCALE if segments.dtype.kind == "i" else segments.astype(np.float64)
+        spectrum = np.fft.rfft(wave * self._window, self._fft_size)
+        power = spectrum.real**2 + spectrum.imag**2  # (n, bins)
+        bins, weights, firsts = self._flat_bank
+        bands = np.add.reduceat(power[:, bins] * weights, firsts, axis=1)
         return 10 * np.log10(bands + 10 ** (FLOOR_DB / 10))
+
+    def pixels_of(self, levels: np.ndarray) -> np.ndarray:
+        """Levels [dB] as grey, uint8."""
+        share = (levels - self.low_db) / (self.high_db - self.low_db)
+        return np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
 
     def columns(self, sound: np.ndarray, n_heard: int) -> np.ndarray:
         """A frame's columns as pixels.
@@ -150,8 +157,7 @@ class SoundPicture:
         Returns:
             (columns_per_frame, height) uint8, the lowest frequency first.
         """
-        share = (self.levels(sound) - self.low_db) / (self.high_db - self.low_db)
-        pixels = np.rint(255 * np.clip(share, 0, 1)).astype(np.uint8)
+        pixels = self.pixels_of(self.levels(sound))
         return np.where(self.begun(n_heard)[:, None], pixels, np.array(self.before_episode, np.uint8))
 
     def begun(self, n_heard: int) -> np.ndarray:
@@ -191,9 +197,13 @@ class SoundPicture:
     def _fft_size(self) -> int:
         return 2 * (self._bank_and_bins[1] - 1)
 
-    @property
-    def _bank(self) -> list[tuple[int, np.ndarray]]:
-        return self._bank_and_bins[0]
+    @cached_property
+    def _flat_bank(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The bins of all bands one after the other, their weights, and where each band begins among them."""
+        bank = self._bank_and_bins[0]
+        bins = np.concatenate([first + np.arange(len(weights)) for first, weights in bank])
+        lengths = [len(weights) for _, weights in bank]
+        return bins, np.concatenate([weights for _, weights in bank]), np.cumsum([0, *lengths[:-1]])
 
     @cached_property
     def _bank_and_bins(self) -> tuple[list[tuple[int, np.ndarray]], int]:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.attach import DatasetPlace, new_folder, open_for_copy, write_new_dataset
-from lerobot_playbyear.datasets.audio_layout import DEFAULT_AUDIO_PATH, AudioTrack, column_names, read_tracks
+from lerobot_playbyear.audio.attach import DatasetPlace, new_folder, open_for_copy, write_new_dataset
+from lerobot_playbyear.audio.audio_layout import DEFAULT_AUDIO_PATH, AudioTrack, column_names, read_tracks
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
@@ -89,8 +89,8 @@ def _to_columns(cfg: ConvertAudioConfig, target: Path) -> Path:
         _check_names(tracks, set(features))
         if cfg.sample_rate is not None and (cfg.sample_rate <= 0 or cfg.sample_rate % fps):
             raise ConvertError(f"--sample_rate={cfg.sample_rate}: wanted a multiple of {fps} frames per second.")
-    from lerobot_playbyear.datasets.attached_copy import write_with_sound
-    from lerobot_playbyear.datasets.audio_import import CutOptions, read_tracks_sound
+    from lerobot_playbyear.audio.attached_copy import write_with_sound
+    from lerobot_playbyear.audio.audio_import import CutOptions, read_tracks_sound
     from lerobot_playbyear.datasets.long_dataset import scratch_folder
 
     with scratch_folder() as scratch:
@@ -105,8 +105,8 @@ def _to_columns(cfg: ConvertAudioConfig, target: Path) -> Path:
 
 def _to_files(cfg: ConvertAudioConfig, target: Path) -> Path:
     dataset = open_for_copy(cfg.dataset)
-    from lerobot_playbyear.datasets.attached_copy import DatasetChange, write_changed
-    from lerobot_playbyear.datasets.audio_export import FILE_MEGABYTES, check_codec, microphones_of, write_track
+    from lerobot_playbyear.audio.attached_copy import DatasetChange, write_changed
+    from lerobot_playbyear.audio.audio_export import FILE_MEGABYTES, check_codec, microphones_of, write_track
     from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 
     microphones = microphones_of(dataset.meta.features, dataset.fps)

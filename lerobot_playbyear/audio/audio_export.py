@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import av
 import numpy as np
 
+from lerobot_playbyear.audio.audio_import import CHANNEL, CHANNEL_OF
+from lerobot_playbyear.audio.audio_layout import AUDIO_FOLDER, DEFAULT_AUDIO_PATH, PRE_ROLL_S
 from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, AUDIO_PREFIX, check_audio_features, to_pcm_s16
-from lerobot_playbyear.datasets.audio_import import CHANNEL, CHANNEL_OF
-from lerobot_playbyear.datasets.audio_layout import AUDIO_FOLDER, DEFAULT_AUDIO_PATH, PRE_ROLL_S
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.statistics import repeated_stats
 from lerobot_playbyear.datasets.tensors import read_rows

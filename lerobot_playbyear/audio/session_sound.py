@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.attach import AttachAudioConfig, AttachError
-from lerobot_playbyear.datasets.attached_sound import EpisodesSound, checked_rate, offsets_of, raise_all, spool
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
+from lerobot_playbyear.audio.attached_sound import EpisodesSound, checked_rate, offsets_of, raise_all, spool
+from lerobot_playbyear.audio.clock_drift import Steady, read_marks
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled
-from lerobot_playbyear.datasets.clock_drift import Steady, read_marks
 from lerobot_playbyear.datasets.episode_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts
 
 if TYPE_CHECKING:

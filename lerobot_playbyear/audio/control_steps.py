@@ -1,0 +1,91 @@
+"""The sound of each control step, from a microphone's newest samples at every step: the same in a dataset and while acting.
+
+A loop's steps are not exactly as long as they should be (803 samples where 800 were meant), so what was heard between two steps
+is resampled to one step's samples. Each sample of the result depends on `2 * HALF` samples around its moment, so that the sound
+comes `HALF` samples late (1 ms at 16 kHz).
+
+Here stands what a gap is. **Sound** is resampled where a step is between half and twice as long as it should be. A shorter one (the
+first after a takeover) is not stretched, a longer one (a late step) is not squeezed: both get the newest samples as they are.
+**Memory** ends at a pause, where more than half a second was not recorded, as LeRobot's rollout resets the policy then.
+"""
+
+import numpy as np
+
+from lerobot_playbyear.audio.sample_strip import KEPT_S, Strip
+
+HALF = 16
+"""Samples before and after a moment that its resampled value depends on, and by how many the sound comes late."""
+
+PAUSE_S = 0.5
+"""Steps further apart than this do not belong together: a pause or a takeover lies between them [s]."""
+
+_SHORTEST, _LONGEST = 0.5, 2.0  # of a step, in steps
+_PHASES = 256
+
+
+def _kernels() -> np.ndarray:
+    """(_PHASES + 1, 2 * HALF): a windowed sinc for every fraction of a sample."""
+    fraction = np.arange(_PHASES + 1)[:, None] / _PHASES
+    distance = np.arange(1 - HALF, HALF + 1) - fraction
+    kernels = np.sinc(distance) * np.cos(np.pi * distance / (2 * HALF)) ** 2
+    return kernels / kernels.sum(axis=1, keepdims=True)
+
+
+_KERNELS = _kernels()
+
+
+class ControlStepSound:
+    """Makes the sound of one control step after the other.
+
+    Args:
+        n_samples: Of a step, S.
+
+    Raises:
+        ValueError: A strip is shorter than such a step.
+    """
+
+    def __init__(self, n_samples: int) -> None:
+        self._size = n_samples
+        self._last: Strip | None = None
+
+    def reset(self) -> None:
+        """The next step is the first one."""
+        self._last = None
+
+    def next(self, strip: Strip) -> tuple[np.ndarray, bool]:
+        """The sound of the step that ends with a strip.
+
+        Returns:
+            (S,) int16, and whether the step is the first one of a recording, or after a pause.
+        """
+        last, self._last = self._last, strip
+        n, size, kept = _samples_between(last, strip), self._size, len(strip.samples)
+        if size + 2 * HALF > kept:
+            raise ValueError(
+                f"A control step of {size} samples is longer than what a microphone's picture holds ({KEPT_S} s): give more "
+                "frames per second, 5 or more."
+            )
+        is_first = n is None or n > PAUSE_S * strip.sample_rate
+        if n is None or not _SHORTEST * size <= n <= min(_LONGEST * size, kept - 2 * HALF):
+            return strip.samples[kept - size - HALF : kept - HALF], is_first
+        return _resampled(strip.samples, n, size), is_first
+
+
+def _samples_between(last: Strip | None, strip: Strip) -> int | None:
+    """From one step's end to the next; None where these are not of one recording."""
+    if last is None or last.session != strip.session or last.sample_rate != strip.sample_rate:
+        return None
+    n = strip.counter - last.counter
+    return n if n >= 0 else None
+
+
+def _resampled(samples: np.ndarray, n: int, size: int) -> np.ndarray:
+    """The last `n` of some samples, `HALF` late, as `size` samples."""
+    place = len(samples) - 1 - HALF - n + (np.arange(size) + 1) * (n / size)  # (S,), the last one ends with the step
+    whole = np.floor(place).astype(np.int64)
+    phase = (place - whole) * _PHASES
+    index = phase.astype(np.int64)
+    share = (phase - index)[:, None]
+    kernel = (1 - share) * _KERNELS[index] + share * _KERNELS[index + 1]  # (S, 2 * HALF)
+    around = samples[whole[:, None] + np.arange(1 - HALF, HALF + 1)]
+    return np.clip(np.rint((kernel * around).sum(axis=1)), -32768, 32767).astype(np.int16)

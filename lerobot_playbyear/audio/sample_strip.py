@@ -1,0 +1,128 @@
+"""What a microphone's picture carries besides the spectrogram: its newest samples, and their number.
+
+The **strip**, the lowest rows, holds the last quarter of a second as bytes and ends with a header. It is exact wherever pictures
+are not compressed. The **timecode**, 96 x 64 pixels at the top left, holds the session and the number of samples so far. It
+survives video encoders: each bit is a square of 8 pixels whose halves are black and white, in an order that is the bit.
+"""
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+KEPT_S = 0.25
+"""Seconds of sound in a strip."""
+
+TIMECODE_WIDTH, TIMECODE_HEIGHT = 96, 64
+"""Pixels of the timecode."""
+
+_CELL = 8  # pixels of a bit, a side
+_HEADER = np.dtype(
+    [
+        ("magic", "S4"),
+        ("session", "<u4"),
+        ("counter", "<u8"),
+        ("sample_rate", "<u4"),
+        ("low_db", "<f4"),
+        ("high_db", "<f4"),
+        ("checksum", "<u4"),
+    ]
+)
+_MAGIC = b"PBYS"
+_HIGHEST_RATE = 1_000_000  # Hz
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A microphone's newest samples.
+
+    Args:
+        session: Of the microphone, from its connection on; above 0.
+        counter: How many samples the session had when the last of these came.
+        sample_rate: [Hz].
+        samples: (kept,) int16, the newest last.
+        low_db, high_db: Levels that are black and white in the picture's spectrogram [dB].
+    """
+
+    session: int
+    counter: int
+    sample_rate: int
+    samples: np.ndarray
+    low_db: float = 0.0
+    high_db: float = 0.0
+
+
+def n_kept(sample_rate: int) -> int:
+    """Samples in a strip."""
+    return int(KEPT_S * sample_rate)
+
+
+def n_rows(sample_rate: int, width: int) -> int:
+    """Rows of pixels that a strip takes."""
+    return -(-(2 * n_kept(sample_rate) + _HEADER.itemsize) // (3 * width))
+
+
+def write_strip(picture: np.ndarray, strip: Strip) -> None:
+    """Draws a strip over the lowest rows of a picture (H, W, 3) uint8, contiguous."""
+    rows = picture[-n_rows(strip.sample_rate, picture.shape[1]) :].reshape(-1)
+    payload = np.ascontiguousarray(strip.samples, "<i2").view(np.uint8)
+    fields = (_MAGIC, strip.session, strip.counter, strip.sample_rate, strip.low_db, strip.high_db, 0)
+    header = np.array([fields], _HEADER)
+    header["checksum"] = _checksum(header, payload)
+    rows[: len(payload)] = payload
+    rows[len(payload) : -_HEADER.itemsize] = 0
+    rows[-_HEADER.itemsize :] = header.view(np.uint8)
+
+
+def read_strip(picture: np.ndarray) -> Strip | None:
+    """The strip of a picture (H, W, 3) uint8, of which the lowest rows are enough; None where there is no whole one."""
+    pixels = np.ascontiguousarray(picture, np.uint8)
+    if pixels.size < _HEADER.itemsize:
+        return None
+    header = pixels.reshape(-1)[-_HEADER.itemsize :].copy().view(_HEADER)
+    if header["magic"][0] != _MAGIC or not 0 < header["sample_rate"][0] <= _HIGHEST_RATE:
+        return None
+    sample_rate = int(header["sample_rate"][0])
+    rows = n_rows(sample_rate, pixels.shape[1])
+    if rows > len(pixels):
+        return None
+    payload = pixels[-rows:].reshape(-1)[: 2 * n_kept(sample_rate)].copy()
+    said = int(header["checksum"][0])
+    header["checksum"] = 0
+    if _checksum(header, payload) != said:
+        return None
+    session, counter, _, low_db, high_db = header[["session", "counter", "sample_rate", "low_db", "high_db"]][0]
+    return Strip(
+        int(session), int(counter), sample_rate, payload.view("<i2").astype(np.int16), float(low_db), float(high_db)
+    )
+
+
+def write_timecode(picture: np.ndarray, session: int, counter: int) -> None:
+    """Draws the timecode over the top left corner of a picture (H, W, 3) uint8."""
+    code = session.to_bytes(4, "little") + counter.to_bytes(5, "little")
+    code += _code_checksum(code)
+    bits = np.unpackbits(np.frombuffer(code, np.uint8)).reshape(TIMECODE_HEIGHT // _CELL, TIMECODE_WIDTH // _CELL)
+    halves = np.stack([1 - bits, bits], axis=-1).reshape(len(bits), -1).astype(np.uint8)  # (8, 24): black is 0
+    pixels = (255 * halves).repeat(_CELL, axis=0).repeat(_CELL // 2, axis=1)
+    picture[:TIMECODE_HEIGHT, :TIMECODE_WIDTH] = pixels[:, :, None]
+
+
+def read_timecode(picture: np.ndarray) -> tuple[int, int] | None:
+    """Session and counter of a picture (H, W, 3) uint8, also one that was encoded; None where there is no whole timecode."""
+    if picture.shape[0] < TIMECODE_HEIGHT or picture.shape[1] < TIMECODE_WIDTH:
+        return None
+    grey = picture[:TIMECODE_HEIGHT, :TIMECODE_WIDTH].sum(axis=-1, dtype=np.int64)
+    halves = grey.reshape(TIMECODE_HEIGHT // _CELL, _CELL, -1, _CELL // 2).sum(axis=(1, 3))  # (8, 24)
+    code = np.packbits(halves[:, 1::2] > halves[:, ::2]).tobytes()
+    session, counter = int.from_bytes(code[:4], "little"), int.from_bytes(code[4:9], "little")
+    if session == 0 or _code_checksum(code[:9]) != code[9:]:
+        return None
+    return session, counter
+
+
+def _checksum(header: np.ndarray, payload: np.ndarray) -> int:
+    return zlib.crc32(payload, zlib.crc32(header))
+
+
+def _code_checksum(code: bytes) -> bytes:
+    return zlib.crc32(code).to_bytes(4, "little")[:3]

@@ -1,0 +1,369 @@
+"""A microphone as a LeRobot camera: `--robot.cameras='{mic: {type: microphone, device: "USB Audio"}}'`.
+
+Its picture shows the spectrogram of the last two seconds, and carries the exact samples and their number (`audio.sample_strip`).
+"""
+
+import logging
+import math
+import secrets
+import threading
+import time
+import weakref
+from collections.abc import Hashable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from draccus.utils import DecodingError
+from lerobot.cameras import Camera, CameraConfig
+from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
+
+from lerobot_playbyear.audio.sample_strip import (
+    TIMECODE_HEIGHT,
+    TIMECODE_WIDTH,
+    Strip,
+    n_kept,
+    n_rows,
+    write_strip,
+    write_timecode,
+)
+from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
+from lerobot_playbyear.microphones.card import CardRecording
+from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
+from lerobot_playbyear.microphones.session_file import SessionFile, session_path
+
+SESSIONS = HF_LEROBOT_HOME / "playbyear_sessions"
+"""Where the sound of sessions is written, unless `save_to` says otherwise."""
+
+_NO_FILE = "none"
+_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
+_SAME_STEP_S = 0.1  # microphones of one card that are read one after the other within this have the same newest sample
+_ZEROS_S = 2.0  # of nothing but zeros: muted, or unplugged
+_FIND = "`playbyear-find-microphones` prints an entry to paste."
+
+
+class MicrophoneOptionError(PlaybyearError, DecodingError):
+    """An option of a microphone has no meaning. Being draccus' own as well, LeRobot's commands say it in one line."""
+
+    def __init__(self, message: str) -> None:
+        DecodingError.__init__(self, (), message)
+
+
+@CameraConfig.register_subclass("microphone")
+@dataclass(kw_only=True)
+class MicrophoneCameraConfig(CameraConfig):
+    """Options of a microphone. Give one of `device`, `file`, `tone_hz` and `source`.
+
+    Args:
+        device: A sound card: its name, a part of it that no other has, or its number (`playbyear-find-microphones`).
+        file: A sound file that is played in real time, again and again.
+        tone_hz: A tone instead of sound [Hz].
+        source: A source that another package registers, by its name; `device` is then for that source.
+        sample_rate: Samples per second [Hz].
+        channel: Of the card, counted from 0. Microphones of one card share its stream and its clock.
+        gain_db: Factor on the samples [dB]; what is too loud is clipped.
+        save_to: Folder for the session's sound. None: `playbyear_sessions` in LeRobot's home. "none": it is not saved.
+        low_db, high_db: Levels that are black and white in the spectrogram [dB; a sine at full scale has 0].
+        width, height: Of the picture [pixels].
+        fps: As other cameras have it; the picture is drawn whenever it is read.
+
+    Raises:
+        MicrophoneOptionError: An option is out of range.
+    """
+
+    device: str | int | None = None
+    file: str | None = None
+    tone_hz: float | None = None
+    source: str | None = None
+    sample_rate: int = 16000
+    channel: int = 0
+    gain_db: float = 0.0
+    save_to: str | None = None
+    low_db: float = -90.0
+    high_db: float = -20.0
+    width: int | None = 224
+    height: int | None = 224
+    fps: int | None = 30
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("device", "file", "tone_hz") if getattr(self, name) not in (None, "")]
+        if self.source is None and len(given) != 1:
+            seen = " and ".join(given) or "nothing"
+            raise MicrophoneOptionError(f"A microphone has {seen}: give one of device, file and tone_hz. {_FIND}")
+        for name, wanted, is_good in (
+            ("sample_rate", "Hz from 1000 to 384000", 1000 <= self.sample_rate <= 384_000),
+            ("channel", "the card's channel, counted from 0", 0 <= self.channel < 256),
+            ("gain_db", "dB from -60 to 60", -60 <= self.gain_db <= 60),
+            (
+                "tone_hz",
+                "Hz below half the sample_rate",
+                self.tone_hz is None or 0 < self.tone_hz < self.sample_rate / 2,
+            ),
+            ("low_db", f"at least -100, and below high_db={self.high_db}", -100 <= self.low_db < self.high_db),
+        ):
+            if not is_good:
+                raise MicrophoneOptionError(f"{name}={getattr(self, name)} of a microphone: give {wanted}.")
+        width, height = self.width or 0, self.height or 0
+        needed = TIMECODE_HEIGHT + n_rows(self.sample_rate, max(width, TIMECODE_WIDTH))
+        if width < TIMECODE_WIDTH or height < needed or width % 2 or height % 2 or max(width, height) > 4096:
+            raise MicrophoneOptionError(
+                f"width={width} and height={height} of a microphone: its samples and its timecode need at least "
+                f"width={TIMECODE_WIDTH} and at this width height={needed + needed % 2}, both even, at most 4096."
+            )
+
+    @property
+    def card(self) -> Hashable:
+        """What tells cards apart: microphones with the same one share a stream and a clock."""
+        return self.source, str(self.device), self.file, self.tone_hz
+
+    def make(self, channels: int) -> Microphone:
+        """The card, not connected yet, with at least as many channels.
+
+        Raises:
+            MicrophoneError: It is a file that cannot be read, or a source that nobody registers.
+        """
+        if self.source is not None:
+            return find_source(self.source)(self, channels)
+        if self.device is not None:
+            from lerobot_playbyear.microphones.portaudio import PortAudioMicrophone
+
+            return PortAudioMicrophone(self.device, self.sample_rate, channels)
+        from lerobot_playbyear.microphones.file import file_microphone, tone_microphone
+
+        if self.tone_hz is not None:
+            return tone_microphone(self.tone_hz, self.sample_rate, channels)
+        return file_microphone(Path(str(self.file)).expanduser(), self.sample_rate, channels)
+
+
+class _OpenCard:
+    """A card that listens, for all microphones that are its channels."""
+
+    def __init__(self, configs: list[MicrophoneCameraConfig]) -> None:
+        rates = sorted({config.sample_rate for config in configs})
+        if len(rates) > 1:
+            raise MicrophoneError(
+                f"Microphones of one card ({_name(configs[0])}) have sample_rate {rates[0]} and {rates[1]}: give them the same."
+            )
+        self.n_users = 0
+        self.microphone = configs[0].make(max(config.channel for config in configs) + 1)
+        self.recording = CardRecording(self.microphone.name, rates[0], self.microphone.channels)
+        self._step_s, self._step_counter = -math.inf, 0
+        self._readers: set[int] = set()  # in this control step
+        self._lock = threading.Lock()
+
+    def open(self) -> None:
+        """Listens, and waits until a strip's sound is there. A card that brings nothing is opened once more: through a sound
+        server a stream that was opened now and then never begins."""
+        enough = n_kept(self.microphone.sample_rate)
+        try:
+            self.microphone.connect(self.recording.write)
+            if not self.recording.wait_for(1, _FIRST_SOUND_S):
+                self.microphone.disconnect()
+                self.microphone.connect(self.recording.write)
+            if not self.recording.wait_for(enough, _FIRST_SOUND_S):
+                raise MicrophoneError(
+                    f"From {self.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened again. "
+                    "Is it plugged in, and used by no other program? `playbyear-find-microphones` shows whether it hears."
+                )
+        except BaseException:
+            self.microphone.disconnect()
+            raise
+
+    def newest(self, reader: int) -> int:
+        """How many samples have come; within a control step, which ends when one reads again, the same for all readers."""
+        with self._lock:
+            now = time.perf_counter()
+            if reader in self._readers or now - self._step_s > _SAME_STEP_S:
+                self._readers.clear()
+                self._step_s, self._step_counter = now, max(self.recording.heard_at(now), self._step_counter)
+            self._readers.add(reader)
+            return self._step_counter
+
+
+_cameras: "weakref.WeakSet[MicrophoneCamera]" = weakref.WeakSet()
+_open_cards: dict[Hashable, _OpenCard] = {}
+_lock = threading.Lock()
+
+
+def _name(config: MicrophoneCameraConfig) -> str:
+    options = {name: getattr(config, name) for name in ("source", "device", "file", "tone_hz")}
+    return ", ".join(f"{name}={value!r}" for name, value in options.items() if value is not None)
+
+
+class MicrophoneCamera(Camera):
+    """A microphone that LeRobot reads at every control step.
+
+    Args:
+        config: Its options.
+    """
+
+    def __init__(self, config: MicrophoneCameraConfig) -> None:
+        super().__init__(config)
+        self.config = config
+        self._card: _OpenCard | None = None
+        self._file: SessionFile | None = None
+        self._session = 0
+        self._gain = 10 ** (config.gain_db / 20)
+        self._reading = threading.Lock()
+        self._has_said_zeros = False
+        _cameras.add(self)
+
+    @property
+    def is_connected(self) -> bool:
+        return self._card is not None
+
+    @staticmethod
+    def find_cameras() -> list[dict[str, Any]]:
+        """None: `playbyear-find-microphones` looks for sound cards."""
+        return []
+
+    def connect(self, warmup: bool = True) -> None:
+        """Begins to listen, and to write the session's sound.
+
+        Raises:
+            DeviceAlreadyConnectedError: It listens already.
+            MicrophoneError: It cannot be opened, nothing comes from it, or its sound cannot be written.
+        """
+        from lerobot_playbyear.audio.rolling_spectrogram import RollingSpectrogram
+
+        if self._card is not None:
+            raise DeviceAlreadyConnectedError(f"The microphone ({_name(self.config)}) is connected already.")
+        config, width, height = self.config, self.width or 0, self.height or 0
+        rows = n_rows(config.sample_rate, width)
+        self._spectrogram = RollingSpectrogram(config.sample_rate, height - rows, width, config.low_db, config.high_db)
+        self._label = _drawn_label(f"{config.low_db:g} to {config.high_db:g} dB", width, height - rows)
+        self._session = 1 + secrets.randbelow(2**32 - 1)
+        with _lock:
+            card = _open_cards.get(config.card)
+            if card is None:
+                alike = [camera.config for camera in _cameras if camera.config.card == config.card]
+                card = _OpenCard([config, *alike])
+                card.open()
+                _open_cards[config.card] = card
+            if config.channel >= card.microphone.channels:
+                raise MicrophoneError(
+                    f"channel={config.channel} of a microphone ({_name(config)}): the card is open with "
+                    f"{card.microphone.channels} channels. Make all of its microphones before one is connected."
+                )
+            card.n_users += 1
+            self._card = card
+        try:
+            self._save(card)
+        except OSError as error:
+            self.disconnect()
+            raise MicrophoneError(
+                f"The session's sound cannot be written to {config.save_to or SESSIONS}: {error}. Give another save_to, or "
+                "save_to=none."
+            ) from error
+
+    def _save(self, card: _OpenCard) -> None:
+        config = self.config
+        if config.save_to == _NO_FILE:
+            logging.warning(
+                "The microphone (%s) saves no sound (save_to=none): a dataset with videos loses it, one with "
+                "--dataset.video=false keeps it in its pictures.",
+                _name(config),
+            )
+            return
+        folder = Path(config.save_to).expanduser() if config.save_to else SESSIONS
+        path = session_path(folder, self._session, time.strftime("%Y-%m-%d_%H-%M-%S"))
+        self._file = SessionFile(path, config.sample_rate, lambda: card.recording.written, self._samples)
+        logging.info(
+            "The microphone (%s) listens. All that it hears, voices too, is written to %s, %.1f MB a minute.",
+            _name(config),
+            path,
+            120 * config.sample_rate / 1e6,
+        )
+
+    def read(self) -> np.ndarray:
+        """The picture of now, (height, width, 3) uint8. Raises as `read_latest`."""
+        return self.read_latest()
+
+    def async_read(self, timeout_ms: float = 200) -> np.ndarray:
+        """The picture of now, (height, width, 3) uint8. Raises as `read_latest`."""
+        return self.read_latest()
+
+    def read_latest(self, max_age_ms: int = 500) -> np.ndarray:
+        """The picture of now, (height, width, 3) uint8.
+
+        Raises:
+            DeviceNotConnectedError: It was not connected, or it is gone.
+            TimeoutError: No sound has come for `max_age_ms` [ms].
+        """
+        card = self._card
+        if card is None:
+            raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is not connected.")
+        if card.microphone.problem:
+            raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is gone: {card.microphone.problem}.")
+        if card.microphone.silent_for_s * 1000 > max_age_ms:
+            raise TimeoutError(
+                f"The microphone ({_name(self.config)}) has brought nothing for {card.microphone.silent_for_s:.1f} s. Is it "
+                "still plugged in?"
+            )
+        self._look_for_zeros(card)
+        with self._reading:
+            return self._picture(card.newest(self._session))
+
+    def _picture(self, counter: int) -> np.ndarray:
+        config = self.config
+        grey = self._spectrogram.draw(counter, self._samples)
+        picture = np.zeros((self.height or 0, self.width or 0, 3), np.uint8)
+        picture[: len(grey)] = grey[:, :, None]
+        if self._label is not None:
+            picture[: len(self._label), TIMECODE_WIDTH : TIMECODE_WIDTH + self._label.shape[1]] = self._label[
+                :, :, None
+            ]
+        kept = self._samples(counter - n_kept(config.sample_rate), counter)
+        write_strip(picture, Strip(self._session, counter, config.sample_rate, kept, config.low_db, config.high_db))
+        write_timecode(picture, self._session, counter)
+        return picture
+
+    def _samples(self, start: int, stop: int) -> np.ndarray:
+        """Its samples from one number to before another, (n,) int16, with its gain."""
+        assert self._card is not None
+        samples = self._card.recording.samples(start, stop)[:, self.config.channel]
+        if self._gain == 1:
+            return samples
+        return np.clip(np.rint(samples * self._gain), -32768, 32767).astype(np.int16)
+
+    def _look_for_zeros(self, card: _OpenCard) -> None:
+        is_silent = card.recording.zeros_s(self.config.channel) > _ZEROS_S
+        if is_silent and not self._has_said_zeros:
+            logging.warning(
+                "The microphone (%s) gives nothing but zeros: it is muted, or unplugged.", _name(self.config)
+            )
+        self._has_said_zeros = is_silent
+
+    def disconnect(self) -> None:
+        """Stops listening, and says where the session's sound is.
+
+        Raises:
+            DeviceNotConnectedError: It was not connected.
+        """
+        if self._card is None:
+            raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is not connected.")
+        file, self._file = self._file, None
+        if file is not None:
+            file.close()
+            logging.info("The session's sound is in %s.", file.path)
+        card, self._card = self._card, None
+        with _lock:
+            card.n_users -= 1
+            if card.n_users == 0:
+                _open_cards.pop(self.config.card, None)
+                card.microphone.disconnect()
+
+
+def _drawn_label(text: str, width: int, height: int) -> np.ndarray | None:
+    """The range of levels as it stands beside the timecode, (h, w) uint8; None where there is no room for it."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    font = ImageFont.load_default()
+    _, _, right, bottom = (round(edge) for edge in font.getbbox(text))
+    if TIMECODE_WIDTH + right + 4 > width or bottom + 4 > height:
+        return None
+    label = Image.new("L", (right + 4, bottom + 4))
+    ImageDraw.Draw(label).text((2, 2), text, fill=255, font=font)
+    return np.asarray(label)
