@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "sim_robot"))
 
 from lerobot_operator import Corrections, Done, Episodes, Operator, run_command
 from lerobot_robot_playbyear_sim.process import simulation

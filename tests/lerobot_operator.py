@@ -16,11 +16,14 @@ import pty
 import select
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
+
+sys.path.insert(0, str(Path(__file__).parent / "sim_robot"))
 
 from lerobot_robot_playbyear_sim.link import Link
 from lerobot_robot_playbyear_sim.process import with_sim_robot
