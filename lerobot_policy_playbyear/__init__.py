@@ -11,6 +11,7 @@ from lerobot_playbyear import __version__, lazy_names
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
+from lerobot_playbyear.policy.microphone_step import MicrophonePicturesToAudioStep
 
 if TYPE_CHECKING:
     from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "MicrophoneCamera",
     "MicrophoneCameraConfig",
+    "MicrophonePicturesToAudioStep",
     "Pcm16ToFloatProcessorStep",
     "PlaybyearConfig",
     "PlaybyearPolicy",

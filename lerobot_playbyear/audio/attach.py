@@ -6,7 +6,7 @@ LeRobot is imported when the dataset's files have been looked at.
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -51,7 +51,8 @@ class AttachAudioConfig:
         output: The copy with sound.
         files: The sound of each episode, if each has a file: a path in which `{episode}` stands for the episode's number,
             for example `sound/{episode:06d}.wav`. WAV, FLAC, or a film whose sound track is taken.
-        session: One file with the sound of the whole session, in place of `files`.
+        session: One file with the sound of the whole session, in place of `files`; or, where a microphone was recorded as a
+            camera, a folder with the files of its sessions, if these are not where the microphone left them.
         clock: When each episode's first frame was taken [s]: a table (CSV) of episode and seconds, or JSON. None: the
             dataset says so itself, in `meta/playbyear_clock.json`.
         marks: Moments that are known in the session's file and on that clock, such as a clap at the start and one at the
@@ -80,7 +81,7 @@ class AttachAudioConfig:
 
 
 def attach_audio(cfg: AttachAudioConfig) -> Path:
-    """Copies a dataset and adds a microphone.
+    """Copies a dataset and adds its microphones: those that were recorded as cameras, or one from files.
 
     Args:
         cfg: The options.
@@ -98,15 +99,26 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
     dataset = open_for_copy(cfg.dataset)
     from lerobot_playbyear.audio.attached_copy import write_with_sound
     from lerobot_playbyear.audio.attached_sound import read_sound
+    from lerobot_playbyear.audio.camera_sound import read_camera_sound, write_with_cameras
     from lerobot_playbyear.audio.session_sound import read_session
     from lerobot_playbyear.datasets.long_dataset import scratch_folder
 
-    keys = _keys(cfg, dataset)
     with scratch_folder() as scratch:
-        sound = (read_sound if cfg.session is None else read_session)(cfg, dataset, keys, Path(scratch))
-        write_new_dataset(Path(dataset.root), target, partial(write_with_sound, sounds=[sound], fps=dataset.fps))
-    print(f"\nDataset: {target} ({dataset.num_episodes} episodes with {', '.join(keys)} at {sound.sample_rate} Hz)")
+        if _is_from_cameras(cfg):
+            found = read_camera_sound(cfg, dataset, Path(scratch))
+            sounds, write = found.sounds, partial(write_with_cameras, found=found, fps=dataset.fps)
+        else:
+            read = read_sound if cfg.session is None else read_session
+            sounds = [read(cfg, dataset, _keys(cfg, dataset), Path(scratch))]
+            write = partial(write_with_sound, sounds=sounds, fps=dataset.fps)
+        write_new_dataset(Path(dataset.root), target, write)
+    heard = ", ".join(f"{key} at {sound.sample_rate} Hz" for sound in sounds for key in sound.keys)
+    print(f"\nDataset: {target} ({dataset.num_episodes} episodes with {heard})")
     return target
+
+
+def _is_from_cameras(cfg: AttachAudioConfig) -> bool:
+    return cfg.files is None and (cfg.session is None or cfg.session.is_dir())
 
 
 def write_new_dataset(root: Path, target: Path, write: Callable[[Path, Path], None]) -> None:
@@ -173,9 +185,18 @@ def open_for_copy(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
 
 def _check_source(cfg: AttachAudioConfig) -> None:
     """Whether the options say where the sound is, and in one way."""
-    if (cfg.files is None) == (cfg.session is None):
-        both = "both are given" if cfg.files else "neither is given"
-        raise AttachError(f"--files has the sound of each episode, --session that of all; {both}. Give one of them.")
+    if cfg.files is not None and cfg.session is not None:
+        raise AttachError(
+            "--files has the sound of each episode, --session that of all; both are given. Give one of them."
+        )
+    if _is_from_cameras(cfg):
+        for field in fields(AttachAudioConfig):
+            value = getattr(cfg, field.name)
+            if field.name not in ("dataset", "output", "session") and value != field.default:
+                raise AttachError(
+                    f"--{field.name}={value} is for --files and for one --session=FILE, not for microphones that were recorded "
+                    "as cameras. Leave it out, or say where the files are."
+                )
     if cfg.files is not None and "{episode" not in cfg.files:
         raise AttachError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
     for name in ("clock", "marks"):

@@ -71,6 +71,7 @@ class DatasetChange:
         removed: The features that it lacks, with their columns, statistics and files of sound.
         episode_columns: Columns that `meta/episodes` has more, a value per episode.
         info: Fields of `meta/info.json` that differ; None: left out.
+        notes: What the `info` of features says more.
     """
 
     added: dict[str, dict[str, Any]]
@@ -79,6 +80,7 @@ class DatasetChange:
     removed: Collection[str] = ()
     episode_columns: Mapping[str, Sequence] = field(default_factory=dict)
     info: Mapping[str, Any] = field(default_factory=dict)
+    notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 def write_with_sound(
@@ -97,6 +99,11 @@ def write_with_sound(
         ParquetDamageError: A table is damaged, or names other frames than there is sound for.
         OSError: Something cannot be read or written.
     """
+    write_changed(root, target, sound_change(sounds, fps, removed))
+
+
+def sound_change(sounds: Sequence[EpisodesSound], fps: int, removed: Collection[str] = ()) -> DatasetChange:
+    """In what a dataset with microphones more differs; arguments as for `write_with_sound`."""
     added: dict[str, dict[str, Any]] = {}
     for sound in sounds:
         for key, notes in zip(sound.keys, sound.notes or [{}] * len(sound.keys), strict=True):
@@ -105,7 +112,7 @@ def write_with_sound(
     n_episodes = len(sounds[0].episodes)
     stats = [{key: own for sound in sounds for key, own in sound.stats(i).items()} for i in range(n_episodes)]
     info = {"audio_path": None, "audio_files_size_in_mb": None} if removed else {}
-    write_changed(root, target, DatasetChange(added, stats, sounds, removed, info=info))
+    return DatasetChange(added, stats, sounds, removed, info=info)
 
 
 def write_changed(root: Path, target: Path, change: DatasetChange) -> None:
@@ -146,6 +153,8 @@ def write_changed(root: Path, target: Path, change: DatasetChange) -> None:
 
 def _changed_features(features: Mapping[str, dict], change: DatasetChange) -> dict[str, dict[str, Any]]:
     kept = {key: feature for key, feature in features.items() if key not in change.removed}
+    for key, notes in change.notes.items():
+        kept[key] = {**kept[key], "info": {**(kept[key].get("info") or {}), **notes}}
     own = {key: feature for key, feature in kept.items() if key not in DEFAULT_FEATURES}
     return {**own, **change.added, **kept}
 

@@ -57,7 +57,7 @@ class EpisodesSound:
     sample_rate: int
     keys: list[str]
     samples_per_frame: int
-    episodes: list[Cut]
+    episodes: Sequence[Cut | SpooledFile]
     notes: list[dict[str, Any]] | None = None
 
     @property

@@ -4,10 +4,14 @@ A loop's steps are not exactly as long as they should be (803 samples where 800 
 is resampled to one step's samples. Each sample of the result depends on `2 * HALF` samples around its moment, so that the sound
 comes `HALF` samples late (1 ms at 16 kHz).
 
-Here stands what a gap is. **Sound** is resampled where a step is between half and twice as long as it should be. A shorter one (the
-first after a takeover) is not stretched, a longer one (a late step) is not squeezed: both get the newest samples as they are.
+Here stands what a gap is. **Sound** is resampled where a step is between half and twice as long as it should be. A shorter one
+(the first after a takeover) is not stretched, a longer one (a late step) is not squeezed: both get the newest samples as
+they are.
 **Memory** ends at a pause, where more than half a second was not recorded, as LeRobot's rollout resets the policy then.
 """
+
+import logging
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,6 +24,7 @@ PAUSE_S = 0.5
 """Steps further apart than this do not belong together: a pause or a takeover lies between them [s]."""
 
 _SHORTEST, _LONGEST = 0.5, 2.0  # of a step, in steps
+_FASTEST, _SLOWEST, _USUAL = 0.75, 1.5, 0.1  # steps that are shorter or longer than meant, in steps
 _PHASES = 256
 
 
@@ -89,3 +94,25 @@ def _resampled(samples: np.ndarray, n: int, size: int) -> np.ndarray:
     kernel = (1 - share) * _KERNELS[index] + share * _KERNELS[index + 1]  # (S, 2 * HALF)
     around = samples[whole[:, None] + np.arange(1 - HALF, HALF + 1)]
     return np.clip(np.rint((kernel * around).sum(axis=1)), -32768, 32767).astype(np.int16)
+
+
+def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str) -> None:
+    """Whether control steps are as long as a frame rate says: LeRobot compares `--fps` and `--dataset.fps` with nothing.
+
+    Args:
+        spacing: Samples between steps.
+        sample_rate: Of these samples [Hz].
+        fps: The frame rate [Hz].
+        what: Whose it is, for the message.
+
+    Raises:
+        ValueError: They are so much shorter or longer that another frame rate was meant.
+    """
+    if len(spacing) < 5:
+        return
+    seen = float(np.median(spacing)) * fps / sample_rate
+    told = f"{what} has fps={fps:g}, and the control steps are {1000 * seen / fps:.1f} ms apart ({fps / seen:.1f} per second)"
+    if not _FASTEST <= seen <= _SLOWEST:
+        raise ValueError(f"{told}: use one rate for --fps and --dataset.fps")
+    if abs(seen - 1) > _USUAL:
+        logging.warning("%s: the machine is too slow, or too busy.", told)

@@ -1,8 +1,8 @@
 """What a microphone's picture carries besides the spectrogram: its newest samples, and their number.
 
-The **strip**, the lowest rows, holds the last quarter of a second as bytes and ends with a header. It is exact wherever pictures
-are not compressed. The **timecode**, 96 x 64 pixels at the top left, holds the session and the number of samples so far. It
-survives video encoders: each bit is a square of 8 pixels whose halves are black and white, in an order that is the bit.
+The **strip**, the lowest rows, holds the last quarter of a second as bytes and ends with a header. It is exact wherever
+pictures are not compressed. The **timecode**, 96 x 64 pixels at the top left, holds the session and the number of samples so
+far. It survives video encoders: each bit is a square of 8 pixels whose halves are black and white, in an order that is the bit.
 """
 
 import zlib

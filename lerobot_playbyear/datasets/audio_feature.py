@@ -24,6 +24,15 @@ AUDIO_PREFIX = "observation.audio."
 AUDIO_DTYPE = "audio"
 """Of a feature whose sound lies in files beside the frames, which is not our layout: see `audio_layout`."""
 
+IS_FIRST = "is_first"
+"""A column of datasets with pauses: the frames before which something was not recorded, each episode's first one included.
+Memory and sound do not reach back beyond such a frame."""
+
+IS_FIRST_FEATURE = {"dtype": "bool", "shape": (1,), "names": None}
+
+MICROPHONE = "microphone"
+"""Where the `info` of a microphone's pictures names its sound, `observation.audio.<microphone>`."""
+
 PCM_S16 = "pcm_s16"
 _PCM_S16_FULL_SCALE = 32768
 _DTYPES = ("int16", "float32", "float64")

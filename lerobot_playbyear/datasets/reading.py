@@ -14,7 +14,7 @@ from lerobot.utils.import_utils import get_safe_default_video_backend
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.audio_feature import check_audio_features
+from lerobot_playbyear.datasets.audio_feature import IS_FIRST, check_audio_features
 from lerobot_playbyear.datasets.columns import episode_bounds
 from lerobot_playbyear.datasets.disk_columns import DEFAULT_CACHE, disk_columns
 from lerobot_playbyear.datasets.free_memory import available_memory
@@ -49,7 +49,8 @@ def read_dataset(
     """Read the episodes that a dataset was opened with; arguments and errors as for `EpisodeStore.from_dataset`.
 
     Returns:
-        Each feature as a tensor of N rows, the first frame of each episode, and the frame after its last.
+        Each feature as a tensor of N rows, the first frame of each episode, and the frame after its last. A part of an
+        episode after a pause (`is_first`) is an episode of its own.
     """
     if len(dataset) == 0:
         raise ValueError(f"The dataset '{dataset.repo_id}' is empty: it has no frames. Record at least one episode.")
@@ -155,7 +156,7 @@ def _select_features(dataset: LeRobotDataset | LongDataset, keys: Iterable[str] 
             for key, feature in features.items()
             if key not in LANGUAGE_COLUMNS and key not in dataset.meta.depth_keys and feature["dtype"] != "string"
         ]
-    keys = list(dict.fromkeys([*keys, *INDEX_KEYS]))
+    keys = list(dict.fromkeys([*keys, *INDEX_KEYS, *({IS_FIRST} & set(features))]))
     for key in keys:
         if key not in features:
             raise ValueError(f"The dataset '{dataset.repo_id}' has no '{key}'; it has {sorted(features)}.")
@@ -197,4 +198,7 @@ def _episodes(columns: Mapping[str, Tensor], repo_id: str) -> tuple[list[int], l
                 f"Episode {int(columns['episode_index'][start])} of '{repo_id}' is incomplete: its {end - start} rows "
                 f"are not frames 0 to {end - start - 1}. Remove it with lerobot-edit-dataset, or record it again."
             )
+    if IS_FIRST in columns:  # LeRobot's rollout resets the policy after a pause: no window reaches back beyond it
+        starts = sorted({*starts, *columns[IS_FIRST].reshape(-1).cpu().nonzero().reshape(-1).tolist()})
+        ends = [*starts[1:], *ends[-1:]]
     return starts, ends

@@ -1,6 +1,7 @@
 """A microphone as a LeRobot camera: `--robot.cameras='{mic: {type: microphone, device: "USB Audio"}}'`.
 
-Its picture shows the spectrogram of the last two seconds, and carries the exact samples and their number (`audio.sample_strip`).
+Its picture shows the spectrogram of the last two seconds, and carries the exact samples and their number (see
+`audio.sample_strip`).
 """
 
 import logging
@@ -28,14 +29,11 @@ from lerobot_playbyear.audio.sample_strip import (
     write_strip,
     write_timecode,
 )
+from lerobot_playbyear.audio.session_files import SESSIONS, session_path
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
-from lerobot_playbyear.microphones.session_file import SessionFile, session_path
-
-SESSIONS = HF_LEROBOT_HOME / "playbyear_sessions"
-"""Where the sound of sessions is written, unless `save_to` says otherwise."""
+from lerobot_playbyear.microphones.session_file import SessionFile
 
 _NO_FILE = "none"
 _FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
@@ -164,8 +162,8 @@ class _OpenCard:
                 self.microphone.connect(self.recording.write)
             if not self.recording.wait_for(enough, _FIRST_SOUND_S):
                 raise MicrophoneError(
-                    f"From {self.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened again. "
-                    "Is it plugged in, and used by no other program? `playbyear-find-microphones` shows whether it hears."
+                    f"From {self.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened "
+                    "again. Is it plugged in, and used by no other program? `playbyear-find-microphones` shows what it hears."
                 )
         except BaseException:
             self.microphone.disconnect()

@@ -35,7 +35,7 @@ class CardRecording:
         self._changed = threading.Condition()
         self._kept = np.zeros((round(KEPT_S * sample_rate), channels), np.int16)  # a ring, by number of sample
         self._written = 0
-        self._zeros = np.zeros(channels, np.int64)  # samples at the end of each channel that are exactly 0
+        self._zeros: np.ndarray = np.zeros(channels, np.int64)  # samples at the end of each channel that are exactly 0
 
     def write(self, chunk: np.ndarray, came_s: float) -> None:
         """Takes a chunk (n, channels), whose last sample came at `came_s` [s of time.perf_counter]."""

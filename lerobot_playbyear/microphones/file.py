@@ -62,8 +62,8 @@ def file_microphone(path: Path, sample_rate: int, channels: int) -> Microphone:
         raise MicrophoneError(f"file={path} of a microphone cannot be read: {error}") from error
     if samples.shape[1] < channels or len(samples) == 0:
         raise MicrophoneError(
-            f"file={path} of a microphone has {samples.shape[1]} channels and {len(samples)} samples; channel {channels - 1} is "
-            "asked for, counted from 0."
+            f"file={path} of a microphone has {samples.shape[1]} channels and {len(samples)} samples; channel {channels - 1} "
+            "is asked for, counted from 0."
         )
     return PlayedMicrophone(f"the sound file {path}", resample(samples, rate, sample_rate), sample_rate)
 

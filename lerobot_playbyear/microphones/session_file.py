@@ -9,21 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_playbyear.audio.session_files import HEADER_BYTES
+
 _FLUSH_S = 0.05
-_HEADER_BYTES = 44
 _LARGEST = 2**32 - 1
 _BLOCK = 65536  # samples
-
-
-def session_path(folder: Path, session: int, began: str) -> Path:
-    """The file of a session in a folder; `began` is a date and time, for people."""
-    return folder / f"{began}_{session:08x}.wav"
-
-
-def find_session(folder: Path, session: int) -> Path | None:
-    """A session's file in a folder, if it is there."""
-    found = sorted(folder.glob(f"*_{session:08x}.wav")) if folder.is_dir() else []
-    return next((path for path in found if path.is_file() and not path.is_symlink()), None)
 
 
 class SessionFile:
@@ -72,7 +62,7 @@ class SessionFile:
         end = self._written()
         while True:
             stop = min(end, self._n + _BLOCK)
-            self._write(self._samples(self._n, stop).astype("<i2").tobytes(), _HEADER_BYTES + 2 * self._n)
+            self._write(self._samples(self._n, stop).astype("<i2").tobytes(), HEADER_BYTES + 2 * self._n)
             self._n = stop
             if stop == end:
                 break
@@ -85,32 +75,3 @@ class SessionFile:
         self._file.seek(place)
         while data:
             data = data[self._file.write(data) :]
-
-
-class SessionSound:
-    """A session's samples from its file, by their numbers.
-
-    Args:
-        path: The file.
-
-    Raises:
-        ValueError: It is none.
-        OSError: It cannot be read.
-    """
-
-    def __init__(self, path: Path) -> None:
-        with path.open("rb") as file:
-            header = file.read(_HEADER_BYTES)
-        if len(header) < _HEADER_BYTES or header[:4] != b"RIFF" or header[36:40] != b"data":
-            raise ValueError(f"{path} is no file of a microphone's session")
-        self.sample_rate = int(struct.unpack_from("<I", header, 24)[0])
-        n = (path.stat().st_size - _HEADER_BYTES) // 2
-        self._samples = np.memmap(path, "<i2", "r", _HEADER_BYTES, (n,)) if n else np.zeros(0, "<i2")
-
-    def __len__(self) -> int:
-        return len(self._samples)
-
-    def samples(self, start: int, stop: int) -> np.ndarray:
-        """Samples from one number to before another, (n,) int16; 0 before the first. The last one must be there."""
-        before = np.zeros(max(min(-start, stop - start), 0), np.int16)
-        return np.concatenate([before, np.asarray(self._samples[max(start, 0) : max(stop, 0)], np.int16)])

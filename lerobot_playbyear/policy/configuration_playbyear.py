@@ -10,7 +10,7 @@ from lerobot.optim.optimizers import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_playbyear.compat import encode_choice
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, MICROPHONE
 from lerobot_playbyear.policy.feature_checks import check_features, sample_rate_of
 from lerobot_playbyear.policy.option_checks import check_options
 from lerobot_playbyear.policy.precision import training_dtype
@@ -208,12 +208,16 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
         return tuple((self.input_features or {})[key].shape)
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
-        """Takes the sample rate from the dataset's features; LeRobot calls it before it builds the policy.
+        """Takes the sample rate from the dataset's features, and leaves microphones' pictures out of the observations: a policy
+        that sees them hears, also one that should be deaf. LeRobot calls it before it builds the policy.
 
         Raises:
             ValueError: There is no sound, or a microphone's rate or frame length is missing or differs from the
                 configuration.
         """
+        for key, feature in features.items():
+            if MICROPHONE in (feature.get("info") or {}) and self.input_features:
+                self.input_features.pop(key, None)
         self.sample_rate = sample_rate_of(features, self)
 
     def validate_features(self) -> None:

@@ -3,9 +3,12 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 
 if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
     from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 
@@ -20,8 +23,9 @@ def sample_rate_of(features: Mapping[str, Any], config: "PlaybyearConfig") -> in
     microphones = {key: feature for key, feature in features.items() if key.startswith(AUDIO_PREFIX)}
     if not microphones:
         raise ValueError(
-            f"No '{AUDIO_PREFIX}<microphone>' among the dataset's features {sorted(features)}: record with sound, "
-            "or set --policy.use_audio=false to train a deaf policy."
+            f"No '{AUDIO_PREFIX}<microphone>' among the dataset's features {sorted(features)}: record with sound, attach it "
+            "(playbyear-attach-audio, also where a microphone was recorded as a camera), or set --policy.use_audio=false to "
+            "train a deaf policy."
         )
     wanted = config.sample_rate
     for key, feature in microphones.items():
@@ -78,6 +82,24 @@ def check_fps(fps: int, config: "PlaybyearConfig") -> None:
             f"The dataset has fps={fps}, but the policy is configured for fps={config.fps}: set --policy.fps={fps}, "
             "or train a new policy for this dataset."
         )
+
+
+def refuse_unheard_microphones(meta: "LeRobotDatasetMetadata", config: "PlaybyearConfig") -> None:
+    """Leaves microphones' pictures out of a configuration's observations.
+
+    Raises:
+        ValueError: The sound of one is not attached: a policy would see it instead of hearing it.
+    """
+    seen = [key for key in microphone_pictures(meta) if key in (config.input_features or {})]
+    for key in seen:
+        if audio_key_of(key) not in meta.features:
+            raise ValueError(
+                f"'{key}' is a microphone's picture, and its sound is not attached: playbyear-attach-audio "
+                f"--dataset.repo_id={meta.repo_id} --dataset.root={meta.root} --output.repo_id={meta.repo_id}_with_sound "
+                f"--output.root={meta.root}_with_sound. Then train on that dataset."
+            )
+        assert config.input_features is not None
+        del config.input_features[key]
 
 
 def _check_samples(key: str, samples: int, sample_rate: int, fps: int) -> None:

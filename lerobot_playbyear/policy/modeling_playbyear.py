@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lerobot_playbyear.policy.card import with_hearing, write_card
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.feature_checks import check_fps
+from lerobot_playbyear.policy.feature_checks import check_fps, refuse_unheard_microphones
 from lerobot_playbyear.policy.history import RecentFrames, newest
 from lerobot_playbyear.policy.moving_average import MovingAverage, with_average, without_average
 from lerobot_playbyear.policy.networks import PlaybyearNetwork
@@ -41,6 +41,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         super().__init__(config)
         if dataset_meta is not None:
             check_fps(dataset_meta.fps, config)
+            refuse_unheard_microphones(dataset_meta, config)
         config.validate_features()
         self.config: PlaybyearConfig = config
         self.model = PlaybyearNetwork(config)
@@ -209,8 +210,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
         if missing:
             raise ValueError(
                 f"This policy hears, and there is no sound in the observation: {', '.join(missing)} is missing. "
-                "lerobot-rollout, lerobot-record and lerobot.async_inference carry no sound (LeRobot 0.6). On a robot, use "
-                "lerobot-eval or playbyear-dagger with --env.type=playbyear_robot, --env.robot.type and --env.microphones."
+                "On a robot lerobot-rollout hears by --robot.cameras='{mic: {type: microphone, device: ...}}'. "
+                "lerobot.async_inference registers no packages, and carries no sound."
             )
 
     @torch.no_grad()

@@ -13,6 +13,7 @@ from lerobot.processor import (
 )
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.microphone_step import MicrophonePicturesToAudioStep
 
 
 def make_playbyear_pre_post_processors(
@@ -24,7 +25,8 @@ def make_playbyear_pre_post_processors(
     """Builds both pipelines.
 
     Only the low-dimensional observations and the action are normalised. Images and waveforms reach the network as they
-    are, which carries its own front ends; sound after the configured `audio_steps`.
+    are, which carries its own front ends; sound after the configured `audio_steps`. Where an observation has a microphone's
+    picture instead of its sound, as on a robot, the sound is taken from the picture.
 
     Args:
         config: The policy's configuration, with its features.
@@ -36,6 +38,8 @@ def make_playbyear_pre_post_processors(
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     steps.normalize.normalize_observation_keys = set(config.low_dimensional_keys)
     heard = [_microphone_step(name) for name in config.audio_steps]
+    if config.use_audio and config.sample_rate is not None:
+        heard.insert(0, MicrophonePicturesToAudioStep(config.audio_keys, config.sample_rate, config.fps))
     return make_policy_processor_pipelines(
         input_steps=[steps.rename_observations, steps.add_batch_dim, steps.to_device, *heard, steps.normalize],
         output_steps=[steps.unnormalize, steps.to_cpu],

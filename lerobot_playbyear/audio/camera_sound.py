@@ -1,0 +1,265 @@
+"""The sound of microphones that were recorded as cameras: from a dataset's pictures, and from the files of their sessions."""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pyarrow as pa
+from tqdm import tqdm
+
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
+from lerobot_playbyear.audio.attached_copy import sound_change, write_changed
+from lerobot_playbyear.audio.attached_sound import EpisodesSound, SpooledFile, raise_all
+from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
+from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
+from lerobot_playbyear.audio.sample_strip import Strip, n_kept, read_strip, read_timecode
+from lerobot_playbyear.audio.session_files import SESSIONS, SessionSound, find_session
+from lerobot_playbyear.datasets.audio_feature import IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
+from lerobot_playbyear.datasets.columns import numpy_to_column
+from lerobot_playbyear.datasets.statistics import Stats, numeric_stats
+from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDataset
+
+    from lerobot_playbyear.datasets.long_dataset import LongDataset
+
+
+@dataclass
+class _Frame:
+    session: int
+    counter: int
+    strip: Strip | None = None
+    was_read: bool = True
+
+
+@dataclass
+class CameraSound:
+    """The sound of a dataset's microphones.
+
+    Args:
+        sounds: One per microphone.
+        pictures: For each the feature of its pictures.
+        is_first: Of each episode (n,) bool: the first frame, and those after a pause.
+    """
+
+    sounds: list[EpisodesSound] = field(default_factory=list)
+    pictures: list[str] = field(default_factory=list)
+    is_first: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def has_pauses(self) -> bool:
+        """Whether anything was left out within an episode."""
+        return any(flags[1:].any() for flags in self.is_first)
+
+
+class IsFirstColumn:
+    """The column that says before which frames something was not recorded.
+
+    Args:
+        is_first: Of each episode (n,) bool.
+    """
+
+    rows_at_once = 2**20
+
+    def __init__(self, is_first: Sequence[np.ndarray]) -> None:
+        self.keys = [IS_FIRST]
+        self._is_first = is_first
+
+    def columns(self, runs: Sequence[tuple[int, int, int]], schema: pa.Schema) -> list[pa.Array]:
+        """Its values of some frames: of an episode, from one frame to before another."""
+        values = np.concatenate([self._is_first[episode][start:stop] for episode, start, stop in runs])
+        return [numpy_to_column(values, schema.field(IS_FIRST).type)]
+
+    def stats(self, episode: int) -> Stats:
+        """An episode's statistics."""
+        return numeric_stats({IS_FIRST: self._is_first[episode][:, None]}, {IS_FIRST: IS_FIRST_FEATURE})
+
+
+def read_camera_sound(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", scratch: Path) -> CameraSound:
+    """Reads the sound of all microphones, so that what is wrong is known before anything is written.
+
+    Args:
+        cfg: The options.
+        dataset: The dataset that gets its sound.
+        scratch: A folder for the sound, 2 bytes a sample.
+
+    Raises:
+        AttachError: There is no such microphone, or its samples are not there.
+    """
+    keys = [key for key in microphone_pictures(dataset.meta) if audio_key_of(key) not in dataset.meta.features]
+    if not keys:
+        raise AttachError(
+            "No camera of this dataset is a microphone whose sound is not attached yet. Sound that was recorded beside it is "
+            "attached with --files or --session."
+        )
+    found = CameraSound()
+    for key in keys:
+        reader = _Reader(cfg, dataset, key, scratch / key)
+        sound, is_first = reader.read()
+        found.sounds.append(sound)
+        found.pictures.append(key)
+        found.is_first = [own | other for own, other in zip(is_first, found.is_first or is_first, strict=True)]
+    return found
+
+
+def write_with_cameras(root: Path, target: Path, found: CameraSound, fps: int) -> None:
+    """Writes a dataset with the sound of its microphones; `root` and `target` as for `write_with_sound`."""
+    change = sound_change(found.sounds, fps)
+    notes = {picture: {MICROPHONE: audio_key_of(picture)} for picture in found.pictures}
+    change = replace(change, notes=notes)
+    if found.has_pauses:
+        column = IsFirstColumn(found.is_first)
+        change = replace(
+            change,
+            added={**change.added, IS_FIRST: IS_FIRST_FEATURE},
+            columns=[*change.columns, column],
+            stats=[{**own, **column.stats(i)} for i, own in enumerate(change.stats)],
+        )
+    write_changed(root, target, change)
+
+
+class _Reader:
+    """Reads one microphone."""
+
+    def __init__(
+        self, cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", key: str, scratch: Path
+    ) -> None:
+        self._dataset, self._key, self._scratch = dataset, key, scratch
+        self._folders = [*([cfg.session] if cfg.session is not None else []), SESSIONS]
+        self._files: dict[int, SessionSound | None] = {}
+        self._errors: dict[str, list[int]] = {}  # what is wrong, and in which episodes
+        self._rate = 0  # of the column [Hz]
+        self._steps: ControlStepSound | None = None
+
+    def read(self) -> tuple[EpisodesSound, list[np.ndarray]]:
+        """The sound of all episodes, and which of their frames are the first ones."""
+        self._scratch.mkdir(parents=True)
+        paths: list[Path] = []
+        is_first: list[np.ndarray] = []
+        pictures = itertools.chain.from_iterable(_pictures(self._dataset, self._key))
+        for length in tqdm(self._dataset.meta.episodes["length"], desc=f"Reading {self._key}", unit="episode"):
+            path = self._scratch / str(len(paths))
+            is_first.append(self._read_episode(len(paths), itertools.islice(pictures, length), path))
+            paths.append(path)
+        raise_all([f"{self._key}, {_listed(episodes)}: {error}" for error, episodes in self._errors.items()])
+        size = self._rate // self._dataset.fps
+        return EpisodesSound(
+            self._rate, [audio_key_of(self._key)], size, [SpooledFile(path, 1) for path in paths]
+        ), is_first
+
+    def _read_episode(self, episode: int, pictures: Iterator[np.ndarray], path: Path) -> np.ndarray:
+        """Writes an episode's sound to a file, and says what was exact. Returns which frames are the first ones, (n,) bool."""
+        is_first: list[bool] = []
+        spacing: list[int] = []
+        n_read = n_strips = 0
+        last: _Frame | None = None
+        if self._steps is not None:
+            self._steps.reset()
+        try:
+            with path.open("wb") as file:
+                for frame in _known(map(_read_frame, pictures), self._nominal):
+                    block, starts = self._sound_of(frame)
+                    file.write(block.astype("<i2").tobytes())
+                    is_first.append(starts)
+                    if last is not None and last.session == frame.session and not starts:
+                        spacing.append(frame.counter - last.counter)
+                    n_read, n_strips, last = n_read + frame.was_read, n_strips + (frame.strip is not None), frame
+            check_pace(spacing, self._source_rate, self._dataset.fps, "the dataset")
+        except (ValueError, OSError) as error:
+            self._errors.setdefault(str(error), []).append(episode)
+            return np.zeros(0, bool)
+        told = f"{n_strips} from the pictures, {len(is_first) - n_strips} from the session's file"
+        if n_read < len(is_first):
+            told += f"; {len(is_first) - n_read} timecodes could not be read and follow from their neighbours"
+        pauses = sum(is_first[1:])
+        told += f"; {pauses} pauses" if pauses else ""
+        tqdm.write(f"episode {episode}, {audio_key_of(self._key)}: {len(is_first)} frames, exact samples of {told}")
+        return np.array(is_first)
+
+    def _sound_of(self, frame: "_Frame") -> tuple[np.ndarray, bool]:
+        strip = frame.strip or self._from_file(frame)
+        rate = round(strip.sample_rate / self._dataset.fps) * self._dataset.fps
+        if self._steps is None:
+            self._rate, self._source_rate = rate, strip.sample_rate
+            self._steps = ControlStepSound(rate // self._dataset.fps)
+        if strip.sample_rate != self._source_rate:
+            raise ValueError(
+                f"it has {strip.sample_rate} samples per second, and those before {self._source_rate}: all "
+                "episodes of a dataset need one sample_rate"
+            )
+        return self._steps.next(strip)
+
+    def _from_file(self, frame: "_Frame") -> Strip:
+        """What the strip would hold, from the session's file.
+
+        Raises:
+            ValueError: The file is not there, or ends before.
+        """
+        if frame.session not in self._files:
+            path = next(filter(None, (find_session(folder, frame.session) for folder in self._folders)), None)
+            self._files[frame.session] = None if path is None else SessionSound(path)
+        file = self._files[frame.session]
+        if file is None:
+            raise ValueError(
+                f"its pictures were compressed, and the session's file *_{frame.session:08x}.wav is not in "
+                f"{' or '.join(map(str, self._folders))}. Copy it from the machine that recorded, and give --session=FOLDER"
+            )
+        if frame.counter > len(file):
+            raise ValueError(f"the session's file has {len(file)} samples, and a frame needs {frame.counter}")
+        kept = n_kept(file.sample_rate)
+        samples = file.samples(frame.counter - kept, frame.counter)
+        return Strip(frame.session, frame.counter, file.sample_rate, samples)
+
+    def _nominal(self) -> int:
+        """Samples from one frame to the next, as far as it is known."""
+        return self._rate // self._dataset.fps
+
+
+def _read_frame(picture: np.ndarray) -> "_Frame | None":
+    strip = read_strip(picture)
+    if strip is not None:
+        return _Frame(strip.session, strip.counter, strip)
+    code = read_timecode(picture)
+    return None if code is None else _Frame(*code)
+
+
+def _known(frames: Iterator["_Frame | None"], size: Callable[[], int]) -> Iterator["_Frame"]:
+    """All frames of an episode; those that could not be read lie evenly between their neighbours.
+
+    Raises:
+        ValueError: None could be read.
+    """
+    last: _Frame | None = None
+    n_unknown = 0
+    for frame in frames:
+        if frame is None:
+            n_unknown += 1
+            continue
+        for i in range(n_unknown):
+            if last is not None and last.session == frame.session:
+                counter = last.counter + (frame.counter - last.counter) * (i + 1) // (n_unknown + 1)
+            else:
+                counter = frame.counter - (n_unknown - i) * size()
+            yield _Frame(frame.session, max(counter, 0), was_read=False)
+        yield frame
+        last, n_unknown = frame, 0
+    if last is None:
+        raise ValueError("none of its timecodes can be read: are these a microphone's pictures, in their own size?")
+    for i in range(n_unknown):
+        yield _Frame(last.session, last.counter + (i + 1) * size(), was_read=False)
+
+
+def _pictures(dataset: "LeRobotDataset | LongDataset", key: str) -> Iterator[np.ndarray]:
+    """A feature's pictures in pieces, (n, H, W, C) uint8."""
+    is_video = dataset.meta.features[key]["dtype"] == "video"
+    for piece in video_pieces(dataset, key, video_backend="pyav") if is_video else image_pieces(dataset, key):
+        yield piece.transpose(0, 2, 3, 1)
+
+
+def _listed(episodes: list[int]) -> str:
+    named = ", ".join(map(str, episodes[:5])) + (", ..." if len(episodes) > 5 else "")
+    return f"episode{'s' if len(episodes) > 1 else ''} {named}"

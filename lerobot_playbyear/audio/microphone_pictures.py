@@ -1,0 +1,53 @@
+"""Which cameras of a dataset are microphones: those in whose pictures a timecode stands."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_playbyear.audio.sample_strip import read_timecode
+from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
+from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, MICROPHONE
+from lerobot_playbyear.datasets.confines import file_inside, open_picture
+from lerobot_playbyear.datasets.parquet_files import open_parquet, row_group_parts
+from lerobot_playbyear.datasets.video_pictures import video_pictures
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+_LOOKED_AT = 3  # pictures
+
+
+def audio_key_of(picture: str) -> str:
+    """The sound of a microphone whose pictures are `observation.images.<mic>`."""
+    return AUDIO_PREFIX + picture.removeprefix(PICTURE_PREFIX)
+
+
+def microphone_pictures(meta: "LeRobotDatasetMetadata") -> list[str]:
+    """The features of a dataset that are a microphone's pictures; those whose files are not here are not looked at."""
+    found = []
+    for key, feature in meta.features.items():
+        if feature["dtype"] in ("image", "video") and key not in meta.depth_keys:
+            is_noted = MICROPHONE in (feature.get("info") or {})
+            if is_noted or any(read_timecode(picture) for picture in _first_pictures(meta, key)):
+                found.append(key)
+    return found
+
+
+def _first_pictures(meta: "LeRobotDatasetMetadata", key: str) -> Iterator[np.ndarray]:
+    """The first episode's first pictures, (H, W, C) uint8; none where they cannot be read, which others say better."""
+    root, feature, n = Path(meta.root), meta.features[key], _LOOKED_AT
+    try:
+        if feature["dtype"] == "video":
+            first_s = float(meta.episodes[0][f"videos/{key}/from_timestamp"])
+            times = [first_s + i / meta.fps for i in range(min(n, int(meta.episodes[0]["length"])))]
+            yield from video_pictures(file_inside(root, meta.get_video_file_path(0, key)), times, 1e-4, "pyav")
+            return
+        with open_parquet(file_inside(root, meta.get_data_file_path(0))) as file:
+            rows = next(row_group_parts(file, 0, [key])).slice(0, n).column(key).to_pylist()
+        for row in rows:
+            with open_picture(row, root, key, feature) as image:
+                yield np.asarray(image.convert("RGB"))
+    except (OSError, ValueError, KeyError, IndexError, TypeError):
+        return

@@ -1,0 +1,124 @@
+"""What lets a hearing policy act in LeRobot's own commands: a microphone's picture becomes the sound of a control step."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import PipelineFeatureType, PolicyFeature
+from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
+from torch import Tensor
+
+from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
+from lerobot_playbyear.audio.sample_strip import Strip, n_rows, read_strip
+from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
+from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.errors import InputError
+
+_PACE_STEPS = slice(
+    2, 22
+)  # of an episode, whose lengths are looked at; the first ones wait for the policy's first thoughts
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="playbyear_microphone_pictures_to_audio")
+class MicrophonePicturesToAudioStep(ObservationProcessorStep):
+    """Makes `observation.audio.<mic>` of `observation.images.<mic>`, where the sound is not there yet.
+
+    In training and in simulation the sound is in the observation, and nothing is done. On a robot the microphone is a camera
+    (`microphones.camera`), whose picture carries its newest samples.
+
+    Args:
+        microphones: Keys of the sound that the policy hears, `observation.audio.<mic>`.
+        sample_rate: Of the sound that it was trained with [Hz].
+        fps: Control steps per second [Hz].
+    """
+
+    microphones: list[str] = field(default_factory=list)
+    sample_rate: int = 16000
+    fps: int = 20
+
+    def __post_init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """The next observation is an episode's first one."""
+        self._sounds: dict[tuple[str, int], ControlStepSound] = {}
+        self._last: dict[str, Strip] = {}
+        self._spacing: list[int] = []
+
+    def get_config(self) -> dict[str, Any]:
+        return {"microphones": list(self.microphones), "sample_rate": self.sample_rate, "fps": self.fps}
+
+    def observation(self, observation: dict) -> dict:
+        """Adds the sound that is missing, (B, S) float32 in [-1, 1].
+
+        Raises:
+            InputError: A microphone is missing, has another name or sample rate, or control steps have another length.
+        """
+        missing = [key for key in self.microphones if key not in observation]
+        if not missing:
+            return observation
+        return {**observation, **{key: self._sound(key, observation) for key in missing}}
+
+    def _sound(self, key: str, observation: dict) -> Tensor:
+        picture = observation.get(PICTURE_PREFIX + key.removeprefix(AUDIO_PREFIX))
+        if not isinstance(picture, Tensor) or picture.ndim < 3:
+            raise InputError(self._missing(key, observation))
+        pictures = picture if picture.ndim == 4 else picture[None]  # (B, 3, H, W)
+        blocks = [self._block(key, number, self._strip(key, one)) for number, one in enumerate(pictures)]
+        return torch.from_numpy(np.stack(blocks).astype(np.float32) / 32768).to(picture.device)
+
+    def _strip(self, key: str, picture: Tensor) -> Strip:
+        """The strip of a picture (3, H, W), floats in [0, 1] or uint8."""
+        rows = picture[:, -n_rows(self.sample_rate, picture.shape[-1]) :].cpu()
+        pixels = rows if rows.dtype == torch.uint8 else (rows * 255).round().to(torch.uint8)
+        strip = read_strip(pixels.permute(1, 2, 0).numpy())
+        if strip is not None and round(strip.sample_rate / self.fps) * self.fps == self.sample_rate:
+            return strip
+        name = key.removeprefix(AUDIO_PREFIX)
+        whole = picture.cpu() if picture.dtype == torch.uint8 else (picture.cpu() * 255).round().to(torch.uint8)
+        other = read_strip(whole.permute(1, 2, 0).numpy())
+        if other is None:
+            raise InputError(
+                f"This policy hears '{name}', and the picture '{PICTURE_PREFIX}{name}' carries no samples: it is another "
+                f"camera's, or was compressed or resized. Give --robot.cameras='{{{name}: {{type: microphone, device: ...}}}}'."
+            )
+        raise InputError(
+            f"The microphone '{name}' has sample_rate={other.sample_rate}, and this policy was trained with {self.sample_rate} Hz "
+            f"at {self.fps} frames per second: give sample_rate={self.sample_rate} in --robot.cameras."
+        )
+
+    def _block(self, key: str, number: int, strip: Strip) -> np.ndarray:
+        sound = self._sounds.get((key, number))
+        if sound is None:
+            sound = self._sounds[key, number] = ControlStepSound(self.sample_rate // self.fps)
+        if number == 0 and key == self.microphones[0]:
+            self._watch_pace(key, strip)
+        return sound.next(strip)[0]
+
+    def _watch_pace(self, key: str, strip: Strip) -> None:
+        last = self._last.get(key)
+        self._last[key] = strip
+        if last is None or last.session != strip.session or len(self._spacing) >= _PACE_STEPS.stop:
+            return
+        self._spacing.append(strip.counter - last.counter)
+        if len(self._spacing) == _PACE_STEPS.stop:
+            try:
+                check_pace(self._spacing[_PACE_STEPS], strip.sample_rate, self.fps, "the policy")
+            except ValueError as error:
+                raise InputError(f"The control loop does not fit the policy: {error}.") from error
+
+    def _missing(self, key: str, observation: dict) -> str:
+        name = key.removeprefix(AUDIO_PREFIX)
+        cameras = ", ".join(one.removeprefix(PICTURE_PREFIX) for one in observation if one.startswith(PICTURE_PREFIX))
+        return (
+            f"This policy hears '{name}', and there is neither '{key}' nor a camera '{name}' in the observation; the cameras "
+            f"are {cameras or 'none'}. On a robot give the microphone that name: "
+            f"--robot.cameras='{{{name}: {{type: microphone, device: ...}}}}' (playbyear-find-microphones prints it)."
+        )
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
