@@ -14,7 +14,6 @@ from lerobot_playbyear.datasets.audio_feature import (
 from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_clock import note_episode_start
-from lerobot_playbyear.datasets.microphone import MicrophoneBuffer, SoundCardBuffer
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.episode_store import EpisodeStore
@@ -23,9 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AUDIO_PREFIX",
     "EpisodeStore",
-    "MicrophoneBuffer",
     "RunSampler",
-    "SoundCardBuffer",
     "audio_feature",
     "audio_keys",
     "check_audio_features",

@@ -31,7 +31,7 @@ from lerobot_playbyear.audio.sample_strip import (
 )
 from lerobot_playbyear.audio.session_files import SESSIONS, session_path
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.microphones.card import CardRecording
+from lerobot_playbyear.microphones.card import CHUNK_S, CardRecording
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
 from lerobot_playbyear.microphones.session_file import SessionFile
 
@@ -154,7 +154,7 @@ class _OpenCard:
     def open(self) -> None:
         """Listens, and waits until a strip's sound is there. A card that brings nothing is opened once more: through a sound
         server a stream that was opened now and then never begins."""
-        enough = n_kept(self.microphone.sample_rate)
+        enough = n_kept(self.microphone.sample_rate) + round(2 * CHUNK_S * self.microphone.sample_rate)
         try:
             self.microphone.connect(self.recording.write)
             if not self.recording.wait_for(1, _FIRST_SOUND_S):

@@ -85,8 +85,8 @@ class MicrophonePicturesToAudioStep(ObservationProcessorStep):
                 f"camera's, or was compressed or resized. Give --robot.cameras='{{{name}: {{type: microphone, device: ...}}}}'."
             )
         raise InputError(
-            f"The microphone '{name}' has sample_rate={other.sample_rate}, and this policy was trained with {self.sample_rate} Hz "
-            f"at {self.fps} frames per second: give sample_rate={self.sample_rate} in --robot.cameras."
+            f"The microphone '{name}' has sample_rate={other.sample_rate}, and this policy was trained with {self.sample_rate} "
+            f"Hz at {self.fps} frames per second: give sample_rate={self.sample_rate} in --robot.cameras."
         )
 
     def _block(self, key: str, number: int, strip: Strip) -> np.ndarray:
