@@ -1,8 +1,6 @@
 """Sound from files and from a microphone's callback, and back into files."""
 
 import itertools
-import threading
-import time
 import wave
 from fractions import Fraction
 
@@ -12,9 +10,8 @@ import pytest
 
 from lerobot_playbyear.audio.audio_import import _spool
 from lerobot_playbyear.audio.audio_layout import AudioTrack
-from lerobot_playbyear.datasets import MicrophoneBuffer, cut_into_frames, read_audio, resample, write_audio
+from lerobot_playbyear.datasets import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.datasets.audio_files import AudioFileError, audio_pieces
-from lerobot_playbyear.datasets.microphone import DropOut
 
 RATE, FPS = 16000, 20
 SIZE = RATE // FPS
@@ -224,113 +221,3 @@ def test_a_file_that_is_too_short_is_refused_or_filled():
     assert padded.any(axis=1).tolist() == [False] * 3 + [True] * 5 + [False] * 2
     assert not cut_into_frames(waveform, RATE, FPS, 4, offset=9, pad=True).any()
     assert not cut_into_frames(waveform, RATE, FPS, 4, offset=-9, pad=True).any()
-
-
-# From a callback to frames
-
-
-def test_chunks_of_any_length_become_blocks_without_gaps():
-    """A sound card's thread against a loop of frames, in real time."""
-    buffer = MicrophoneBuffer(RATE, FPS)
-    waveform = noise(RATE * 2)
-    rng = np.random.default_rng(1)
-
-    def play() -> None:
-        position, begun = 0, time.monotonic()
-        while position < len(waveform):
-            chunk = waveform[position : position + int(rng.integers(1, 300))]
-            position += len(chunk)
-            time.sleep(max(0.0, begun + position / RATE - time.monotonic()))
-            buffer.write(chunk)
-
-    card = threading.Thread(target=play)
-    card.start()
-    time.sleep(0.2)
-    begun = time.monotonic()
-    blocks = []
-    for frame in range(25):
-        time.sleep(max(0.0, begun + frame / FPS - time.monotonic()))
-        blocks.append(buffer.read_frame())
-    card.join()
-
-    heard = np.concatenate(blocks)
-    assert not buffer.drop_outs
-    starts = np.flatnonzero(waveform == heard[0])
-    assert any(np.array_equal(waveform[start : start + len(heard)], heard) for start in starts)
-
-
-def fed(*, timestamps: bool, **options) -> tuple[MicrophoneBuffer, list[np.ndarray]]:
-    """A buffer that has got a second of noise in chunks of one frame."""
-    buffer = MicrophoneBuffer(RATE, FPS, timeout=0.01, **{"reserve": 0.0, **options})
-    chunks = list(noise(RATE * 2).reshape(-1, SIZE))
-    for i in range(FPS):
-        buffer.write(chunks[i], 100 + i / FPS if timestamps else None)
-    return buffer, chunks
-
-
-def test_the_first_block_is_the_newest_sound():
-    buffer, chunks = fed(timestamps=False)
-    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS - 1])
-    buffer.write(chunks[FPS])
-    buffer.write(chunks[FPS + 1])
-    buffer.reset()
-    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS + 1])
-
-
-def test_the_reserve_is_left_for_chunks_that_come_late():
-    buffer, chunks = fed(timestamps=False, reserve=SIZE / RATE)
-    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS - 2])
-    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS - 1])
-    assert not buffer.drop_outs
-
-
-def test_samples_that_the_sound_card_lost_become_silence_in_their_place():
-    buffer, chunks = fed(timestamps=True)
-    buffer.read_frame()
-    for i in (FPS, FPS + 2):  # one is lost
-        buffer.write(chunks[i], 100 + i / FPS)
-    blocks = [buffer.read_frame() for _ in range(3)]
-    np.testing.assert_array_equal(blocks, [chunks[FPS], np.zeros(SIZE, np.int16), chunks[FPS + 2]])
-    assert buffer.drop_outs == [DropOut(2, SIZE, "lost")]
-
-
-@pytest.mark.parametrize("come_after_all", [True, False])
-def test_samples_that_come_late_do_not_shift_what_follows(come_after_all):
-    buffer, chunks = fed(timestamps=True)
-    buffer.read_frame()
-    late = buffer.read_frame()
-    if come_after_all:
-        buffer.write(chunks[FPS], 100 + FPS / FPS)
-    buffer.write(chunks[FPS + 1], 100 + (FPS + 1) / FPS)
-    assert not late.any()
-    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS + 1])
-    assert buffer.drop_outs[0] == DropOut(1, SIZE, "late")
-    assert len(buffer.drop_outs) == (1 if come_after_all else 2)
-
-
-def test_sound_that_runs_ahead_is_cut():
-    buffer, chunks = fed(timestamps=False, max_lag=0.12)
-    buffer.read_frame()
-    for i in range(FPS, FPS + 6):
-        buffer.write(chunks[i])
-    np.testing.assert_array_equal(buffer.read_frame(), chunks[FPS + 5])
-    assert buffer.drop_outs == [DropOut(1, 5 * SIZE, "skipped")]
-
-
-def test_clocks_that_drift_apart_are_no_drop_out():
-    """200 parts in a million over ten minutes: 1,920 samples."""
-    buffer = MicrophoneBuffer(RATE, FPS, timeout=0.01)
-    for i in range(600 * FPS):
-        buffer.write(np.full(SIZE, 5, np.int16), i / FPS * 1.0002)
-        buffer.read_frame()
-    assert not [drop_out for drop_out in buffer.drop_outs if drop_out.reason == "lost"]
-
-
-def test_chunks_are_floats_or_columns_too():
-    buffer = MicrophoneBuffer(RATE, FPS, reserve=0.0)
-    buffer.write(np.full((SIZE, 1), 0.5, np.float32))
-    assert (buffer.read_frame() == 16384).all()
-    with pytest.raises(ValueError, match=r"shape \(800, 2\); wanted"):
-        buffer.write(np.zeros((SIZE, 2), np.int16))
-    with pytest.raises(ValueError, match="reserve"):
-        MicrophoneBuffer(RATE, FPS, reserve=0.5)

@@ -34,10 +34,10 @@ def test_each_card_is_listed_heard_and_written(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "0: bench, ALSA (default)" in said
     assert "sample rates: 8000, 16000, 32000, 44100, 48000, 96000 Hz" in said
-    assert "--env.microphones='{table: {type: portaudio, device: \"table, ALSA\", sample_rate: 48000}}'" in said
+    assert "--robot.cameras='{mic: {type: microphone, device: \"table, ALSA\", sample_rate: 16000}}'" in said
     assert said.count("nothing but zeros") == 1
     samples, rate = read_audio(tmp_path / "microphone_0.wav")
-    assert rate == 48000
+    assert rate == 16000
     assert len(samples) == 0.5 * rate
     assert np.median(samples, axis=0).tolist() == pytest.approx([8000, 1], abs=3)
 

@@ -84,10 +84,6 @@ def test_a_card_is_found_by_its_number_its_name_and_a_part_of_its_name_that_no_o
         ({"device": "piano"}, "is no sound card with an input"),
         ({"device": 7}, "is no sound card with an input"),
         ({"device": "bench_left", "channel": 40}, "channel 40 is asked for"),
-        (
-            {"device": "bench_left", "sample_rate": 384000, "height": 600},
-            "cannot be opened with 2 channels at 384000 Hz",
-        ),
     ],
 )
 def test_another_card_is_never_taken(changes, said):
@@ -385,7 +381,7 @@ def test_the_pictures_samples_are_those_of_the_sessions_file_bit_for_bit_with_ga
         samples = SessionSound(found).samples(strip.counter - len(strip.samples), strip.counter)
         np.testing.assert_array_equal(samples, strip.samples)
         assert caplog.text.count(str(found)) == 2  # told at the beginning and at the end
-    assert np.abs(strips[-1].samples.astype(int)).max() == 32767  # 3,000 and 12 dB more
+    assert strips[-1].samples.max() == 32767  # 3,000 and 12 dB more
 
 
 def test_without_a_file_it_says_that_a_video_loses_the_sound(caplog):
