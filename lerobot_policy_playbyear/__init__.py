@@ -1,5 +1,4 @@
-"""The module that LeRobot's plugin discovery imports: it registers the policy `playbyear` and the environment
-`playbyear_robot`, and changes nothing else.
+"""The module that LeRobot's plugin discovery imports: it registers the policy `playbyear`, and changes nothing else.
 
 Every command of LeRobot imports it, so that it brings no more than the registration takes: LeRobot finds the network and the
 processors by their modules' names. Import `lerobot_playbyear` in programs of your own.
@@ -10,7 +9,6 @@ from typing import TYPE_CHECKING
 from lerobot_playbyear import __version__, lazy_names
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
-from lerobot_playbyear.robots.config import RobotEnvConfig
 
 if TYPE_CHECKING:
     from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -20,7 +18,6 @@ __all__ = [
     "Pcm16ToFloatProcessorStep",
     "PlaybyearConfig",
     "PlaybyearPolicy",
-    "RobotEnvConfig",
     "__version__",
     "make_playbyear_pre_post_processors",
 ]

@@ -14,7 +14,6 @@ from typing import Any
 from draccus.argparsing import ArgumentParser
 from draccus.utils import is_choice_type
 
-from lerobot_playbyear.calibration.calibrate import CalibrateLatencyConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.attach import AttachAudioConfig
 from lerobot_playbyear.datasets.attach_spectrogram import AttachSpectrogramConfig
@@ -32,7 +31,6 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig
 CONFIGS: dict[str, type] = {
     "playbyear-attach-audio": AttachAudioConfig,
     "playbyear-attach-spectrogram": AttachSpectrogramConfig,
-    "playbyear-calibrate-latency": CalibrateLatencyConfig,
     "playbyear-convert-audio": ConvertAudioConfig,
     "playbyear-dagger": DaggerConfig,
     "playbyear-find-microphones": FindMicrophonesConfig,
