@@ -40,7 +40,6 @@ class Case(NamedTuple):
     name: str
     fps: int
     features: dict[str, dict[str, Any]]
-    streaming: bool = False
 
 
 _ROBOT = ((480, 640), 48000, 30, 2)  # pixels, Hz, Hz, microphones
@@ -50,7 +49,6 @@ PACED = (
     Case("20 Hz, 84x84 pictures, one microphone", 20, dataset_features((84, 84), 48000, 20)),
     Case("30 Hz, 640x480 pictures, two microphones", 30, dataset_features(*_ROBOT)),
     Case("30 Hz, 640x480 video, two microphones", 30, _FILMED),
-    Case("30 Hz, 640x480 video as it comes in, two microphones", 30, _FILMED, streaming=True),
 )
 
 
@@ -94,9 +92,7 @@ def measure_paced(case: Case, root: Path) -> None:
     waits, saves = [], []
     is_filmed = case.features[CAMERAS[0]]["dtype"] == "video"
     encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if is_filmed else None
-    with DurableWriter(
-        "benchmark/recording", root, case.fps, case.features, streaming_encoding=case.streaming, rgb_encoder=encoder
-    ) as writer:
+    with DurableWriter("benchmark/recording", root, case.fps, case.features, rgb_encoder=encoder) as writer:
         for episode in range(N_EPISODES):
             begun = time.perf_counter()
             for i, frame in enumerate(frames(case.features, SECONDS * case.fps, episode)):

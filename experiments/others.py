@@ -1,5 +1,5 @@
-"""What LeRobot's own policies make of the same demonstrations: ACT and Diffusion, each deaf, with the sound of the last seconds
-as a picture, and with the samples of the frame as a state.
+"""What LeRobot's own policies make of the same demonstrations: ACT and Diffusion, each deaf, and with the sound of the last
+seconds as a picture.
 
     python -m experiments.others --task=OccludedGrasp-v1 --minutes=20
 
@@ -47,10 +47,9 @@ from experiments.protocol import (
 from experiments.training import Job, clocked, evaluate
 from lerobot_playbyear.audio.sound_picture import read_pictures
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
-from lerobot_playbyear.datasets.sound_as_state import sound_as_state
 
 STUDY = "others"
-CONDITIONS = ("picture", "state", "deaf")
+CONDITIONS = ("picture", "deaf")
 SEEDS = (1, 2, 3)
 
 _ACT = (
@@ -68,12 +67,6 @@ SETTINGS = {
     "diffusion_long": f"{_DIFFUSION} n_action_steps=8",
 }
 """Options of each policy, without `--policy.`."""
-
-NORMALIZATION = {
-    "act": '{"VISUAL":"MEAN_STD","STATE":"MEAN_STD","ACTION":"MEAN_STD","ENV":"MEAN_STD"}',
-    "diffusion": '{"VISUAL":"MEAN_STD","STATE":"MIN_MAX","ACTION":"MIN_MAX","ENV":"MEAN_STD"}',
-}
-"""With sound as a state: LeRobot's own, and the sound's, which it would leave as quiet as it is."""
 
 PIXELS = 48
 """Of every picture, of the sound as of the cameras."""
@@ -128,8 +121,6 @@ def prepare(task: str) -> None:
         run(command, f"without-sound-{target.name}", threads=1)
         unfinished.rename(target)
     assert read_pictures(dataset_of(task, "picture")) == read_pictures(attached)
-    if not (target := dataset_of(task, "state")).exists():
-        sound_as_state(LeRobotDataset(f"experiments/{original.name}", root=original, video_backend="pyav"), target)
 
 
 def dataset_of(task: str, condition: str) -> Path:
@@ -138,8 +129,8 @@ def dataset_of(task: str, condition: str) -> Path:
 
 def environment_options(task: str, condition: str) -> list[str]:
     """What makes the environment give pictures and sound as the condition's dataset does."""
-    sound = {"picture": [f"--env.spectrogram={dataset_of(task, condition)}"], "state": ["--env.sound_as_state=true"]}
-    return [_IMAGE_SIZE, *sound.get(condition, [])]
+    sound = [f"--env.spectrogram={dataset_of(task, condition)}"] if condition == "picture" else []
+    return [_IMAGE_SIZE, *sound]
 
 
 def beginning(job: Job, settings: str, folder: Path) -> tuple[list[str], list[str]]:
@@ -149,10 +140,7 @@ def beginning(job: Job, settings: str, folder: Path) -> tuple[list[str], list[st
         Options of `lerobot-train`, and the commands that come first.
     """
     kind, *options = settings.split()
-    policy = kind.removeprefix("type=")
-    if job.condition == "state":
-        options.append(f"normalization_mapping={NORMALIZATION[policy]}")
-    if policy != "act":
+    if kind != "type=act":
         return [f"--policy.{option}" for option in (kind, *options)], []
     start = folder.with_name(f"{folder.name}.start")
     command = saved_start(options, dataset_of(job.task, job.condition), start, job.training_seed)

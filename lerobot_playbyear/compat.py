@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from types import ModuleType
 
     from lerobot.datasets import LeRobotDatasetMetadata
-    from lerobot.datasets.dataset_writer import DatasetWriter
     from lerobot.teleoperators.gamepad import GamepadTeleop
     from lerobot.teleoperators.keyboard import KeyboardTeleop
     from torch import Tensor
@@ -41,7 +40,6 @@ class CompatError(ImportError):
 
 _TRAINS = "playbyear-train and playbyear-dagger cannot"
 _ACTS = "no policy acts on a CPU"
-_LEADS = "nobody takes over with a leader arm"
 
 BORROWED = {
     "eval_policy_all": ("lerobot.scripts.lerobot_eval:eval_policy_all", f"{_TRAINS} evaluate"),
@@ -56,9 +54,6 @@ BORROWED = {
     "convolution_pointwise_binary": ("torch:ops.mkldnn._convolution_pointwise.binary", _ACTS),
     "BasicBlock": ("torchvision.models.resnet:BasicBlock", "the vision encoder cannot be built"),
     "encode_choice": ("draccus.parsers.encoding:encode_choice", "a policy's configuration cannot be saved"),
-    "follower_smooth_move_to": ("lerobot.common.control_utils:follower_smooth_move_to", "no arm goes to its rest"),
-    "teleop_smooth_move_to": ("lerobot.common.control_utils:teleop_smooth_move_to", _LEADS),
-    "teleop_supports_feedback": ("lerobot.common.control_utils:teleop_supports_feedback", _LEADS),
     "_GLOBAL_CLIENT_FACTORY": (
         "huggingface_hub.utils._http:_GLOBAL_CLIENT_FACTORY",
         "one lost request ends a download of hundreds",
@@ -95,7 +90,7 @@ def __getattr__(name: str) -> Any:
 
 
 def import_devices(package: "ModuleType") -> None:
-    """Imports a package's own packages, such as those of `lerobot.robots`, so that the types in them are registered.
+    """Imports a package's own packages, such as those of `lerobot.teleoperators`, so that the types in them are registered.
 
     One that cannot be imported, such as for want of its maker's software, is left out.
     """
@@ -108,21 +103,6 @@ def import_devices(package: "ModuleType") -> None:
 def forget_unsaved_rows(meta: "LeRobotDatasetMetadata") -> None:
     """Of episodes that LeRobot has not written yet; it would write them when it closes the dataset."""
     meta._metadata_buffer.clear()
-
-
-def streaming_encoder(writer: "DatasetWriter") -> Any:
-    """What makes the films while an episode comes in, or None."""
-    return writer._streaming_encoder
-
-
-def set_streaming_encoder(writer: "DatasetWriter", encoder: Any) -> None:
-    """Lets another take its place, which finishes, cancels and closes as LeRobot's does."""
-    writer._streaming_encoder = encoder
-
-
-def pictures_waiting(writer: "DatasetWriter") -> int:
-    """Pictures that no thread has begun to write yet; LeRobot takes any number of them."""
-    return 0 if writer.image_writer is None else writer.image_writer.queue.qsize()
 
 
 def held_keys(teleop: "KeyboardTeleop") -> dict[Any, bool]:

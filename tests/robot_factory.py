@@ -1,4 +1,4 @@
-"""A robot's environment for tests: the arm of joints, or the simulated one, with whatever microphones."""
+"""The simulated robots of `sim_robot` for tests, and sound for microphones that play files."""
 
 import os
 import subprocess
@@ -7,13 +7,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lerobot_playbyear.datasets.audio_feature import write_wav
-from lerobot_playbyear.teleoperation.keyboard import WindowKeys
-from lerobot_playbyear.teleoperation.status import Status
 
 SIM_ROBOT = Path(__file__).parent / "sim_robot"
 """What has to be on PYTHONPATH for LeRobot's discovery to find the robots that are not there."""
@@ -60,68 +57,6 @@ def noise_file(folder: Path, sample_rate: int, seconds: float = 5.0, channels: i
     rng = np.random.default_rng(0)
     samples = rng.normal(0, 3000, (round(seconds * sample_rate), channels)).astype(np.int16)
     return write_wav(folder / "noise.wav", samples, sample_rate)
-
-
-class ScriptedConsole:
-    """A person who does what a test says.
-
-    Args:
-        on_show: Gets every status; what it returns is pressed.
-    """
-
-    has_key_releases = False
-
-    def __init__(self, on_show: Callable[[Status], str | None] = lambda status: None) -> None:
-        self.keys, self.is_open = WindowKeys(), True
-        self.on_show = on_show
-        self.notes: list[str] = []
-
-    def show(self, status: Status, picture: np.ndarray | None = None) -> None:
-        if status.note and status.note not in self.notes[-1:]:
-            self.notes.append(status.note)
-        self.press(self.on_show(status))
-
-    def press(self, key: str | None) -> None:
-        if key:
-            self.keys.note(key, True)
-            self.keys.note(key, False)
-
-    def close(self) -> None:
-        self.is_open = False
-
-
-def joint_config(wav: Path | None = None, **changes: Any):
-    """The options of the arm of joints, with one microphone that plays a file."""
-    from lerobot_robot_playbyear_sim import JointArmConfig
-
-    from lerobot_playbyear.microphones.config import FileMicrophoneConfig
-    from lerobot_playbyear.robots.config import RobotEnvConfig
-
-    microphones = {} if wav is None else {"gripper": FileMicrophoneConfig(path=str(wav), sample_rate=16000)}
-    options: dict[str, Any] = {
-        "fps": 20,
-        "robot": JointArmConfig(),
-        "microphones": microphones,
-        "episode_s": 1.0,
-        "rest_s": 0.1,
-        "console": "none",
-        "task": "Reach out",
-    }
-    return RobotEnvConfig(**options | changes)
-
-
-@contextmanager
-def robot_env(config: Any, console: Any = None) -> Iterator[Any]:
-    """The environment itself, closed at the end."""
-    from lerobot_playbyear.robots.env import RobotEnv
-
-    env = RobotEnv(config)
-    if console is not None:
-        env._rig.console = console
-    try:
-        yield env
-    finally:
-        env.close()
 
 
 def wait_until(is_so: Callable[[], bool], timeout_s: float = 10.0) -> None:

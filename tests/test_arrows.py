@@ -19,11 +19,9 @@ hub             datasets policy film inspection
 training        datasets policy hub
 teleoperation   datasets episodes
 microphones     datasets
-calibration     datasets microphones
-robots          datasets policy episodes teleoperation microphones
 recording       datasets episodes hub teleoperation
 dagger          datasets episodes hub training
-scripts         datasets policy episodes film inspection hub training teleoperation recording dagger microphones calibration
+scripts         datasets policy episodes film inspection hub training teleoperation recording dagger microphones
 """
 _ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}
 _AT_THE_TOP = {"__init__.py", "compat.py"}

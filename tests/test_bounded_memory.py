@@ -4,7 +4,6 @@ import io
 import json
 import shutil
 import threading
-import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from dataset_factory import CAMERA, MICROPHONE, make_dataset
-from lerobot.datasets import LeRobotDataset, image_writer
+from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.video_utils import FrameTimestampError, decode_video_frames
 from PIL import Image
 from test_attach_audio import config as attach_config
@@ -34,8 +33,6 @@ from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.repair import carry_out, check_dataset, repair_dataset
 from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 from lerobot_playbyear.datasets.video_pictures import video_pictures
-from lerobot_playbyear.episodes import streaming
-from lerobot_playbyear.episodes.episode import Step
 from lerobot_playbyear.film.video import episode_sound
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
 from lerobot_playbyear.inspection.film import FilmSound, encode
@@ -329,84 +326,6 @@ def test_a_long_episode_is_written_in_row_groups_that_a_reader_can_hold(tmp_path
     rows = [file.row_group(i).num_rows for i in range(file.num_row_groups)]
     assert sum(rows) == 30
     assert max(rows) * 2 * BLOCK <= parquet_files.PIECE_BYTES
-
-
-SIZE = 64  # pixels of a recorded picture, high and wide
-RECORDED = {
-    CAMERA: {"dtype": "image", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channel"]},
-    "action": {"dtype": "float32", "shape": (2,), "names": None},
-    **{key: {"dtype": "bool", "shape": (1,), "names": None} for key in ("intervention", "next.success", "next.done")},
-    "next.reward": {"dtype": "float32", "shape": (1,), "names": None},
-    "seed": {"dtype": "int64", "shape": (1,), "names": None},
-}
-
-
-def recorded_step(number: int) -> Step:
-    picture = np.full((SIZE, SIZE, 3), number, np.uint8)
-    return Step({"pixels": {"front": picture}}, np.full(2, number, np.float32), 0.0, False, True, False)
-
-
-def held(stream: streaming.FrameStream, writer: DurableWriter) -> int:
-    """How many pictures of an episode that is recorded are in memory."""
-    return writer.n_waiting + stream._waiting.qsize()
-
-
-def test_pictures_that_a_slow_disk_does_not_take_are_not_piled_up(tmp_path, monkeypatch, caplog):
-    opened, real = threading.Event(), image_writer.write_image
-
-    def slow(*args, **kwargs):
-        opened.wait(10)
-        real(*args, **kwargs)
-
-    monkeypatch.setattr(image_writer, "write_image", slow)
-    most = 30
-    monkeypatch.setattr(streaming, "_MOST_BYTES", most * (3 * SIZE**2 + 30))
-    with DurableWriter("tests/long", tmp_path / "data", FPS, RECORDED) as writer:
-        stream, counts = streaming.FrameStream(writer, 0, "wave"), []
-
-        def play() -> None:
-            for number in range(100):
-                stream(recorded_step(number))
-                counts.append(held(stream, writer))
-
-        robot = threading.Thread(target=play)
-        robot.start()
-        robot.join(0.5)
-        n_taken = len(counts)
-        opened.set()
-        robot.join()
-        assert (
-            n_taken <= most + streaming._MOST_PICTURES + 6
-        )  # LeRobot's four threads, and the frame between the queues
-        stream.finish()
-        assert max(counts) <= most + streaming._MOST_PICTURES
-        writer.save_episode()
-    pictures = LeRobotDataset("tests/long", tmp_path / "data", video_backend="pyav")
-    assert [round(255 * float(pictures[n][CAMERA].max())) for n in (0, 47, 99)] == [0, 47, 99]
-    warnings = [record.getMessage() for record in caplog.records if "wait to be compressed" in record.getMessage()]
-    assert len(warnings) == 1
-    assert "--dataset.streaming_encoding=true" in warnings[0]
-
-
-def test_an_episode_that_is_thrown_away_is_not_compressed_before(tmp_path, monkeypatch):
-    written, real = [], image_writer.write_image
-
-    def slow(*args, **kwargs):
-        written.append(time.sleep(0.02))
-        real(*args, **kwargs)
-
-    monkeypatch.setattr(image_writer, "write_image", slow)
-    with DurableWriter("tests/long", tmp_path / "data", FPS, RECORDED) as writer:
-        stream = streaming.FrameStream(writer, 0, "wave")
-        for number in range(100):
-            stream(recorded_step(number))
-        stream.abandon()
-        assert len(written) < 60
-        stream = streaming.FrameStream(writer, 1, "wave")
-        stream(recorded_step(7))
-        stream.finish()
-        writer.save_episode()
-        assert writer.num_frames == 1
 
 
 @pytest.mark.parametrize("episodes", [None, [0, 2]])

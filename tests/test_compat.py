@@ -61,17 +61,6 @@ SAID = [
         "self._metadata_buffer.clear()",
         "an episode that could not be saved leaves a row in the dataset",
     ),
-    (
-        "datasets.dataset_writer:DatasetWriter",
-        "self._streaming_encoder.finish_episode()",
-        "an episode that was filmed while it came in is lost when its saving fails",
-    ),
-    (
-        "datasets.image_writer:AsyncImageWriter",
-        "self.queue = queue.Queue()",
-        "pictures that the disk does not take fast enough fill the memory while a robot is recorded",
-    ),
-    ("datasets.dataset_writer:DatasetWriter", "self.image_writer = AsyncImageWriter(", "the same"),
     ("teleoperators.keyboard:KeyboardTeleop", "self.current_pressed[", "held keys are forgotten at every step"),
     ("teleoperators.gamepad:GamepadTeleop", "self.gamepad = ", _PAD),
     ("teleoperators.gamepad.gamepad_utils:GamepadController", "self.running = False", _PAD),

@@ -15,7 +15,6 @@ from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig, DatasetSo
 from lerobot_playbyear.dagger.methods import gate_model, redo
 from lerobot_playbyear.dagger.methods.beside import Early, Labelling, Late, Redoing, Staying, shifted
 from lerobot_playbyear.dagger.methods.human_gated import NoHandbackConfig
-from lerobot_playbyear.dagger.methods.robot_gated import RobotGatedConfig
 from lerobot_playbyear.dagger.methods.weighted import WeightedConfig
 from lerobot_playbyear.dagger.same_run import differences
 from lerobot_playbyear.datasets.errors import PlaybyearError
@@ -370,21 +369,6 @@ def test_attempts_in_which_nobody_could_be_asked_do_not_end_a_run(tmp_path):
     assert attempts[-1]["outcome"] == "kept"
 
 
-@pytest.mark.parametrize(
-    ("options", "hands_back", "is_real_time", "redoes"),
-    [
-        ({}, False, False, True),
-        ({}, True, False, False),
-        ({}, False, True, False),
-        ({"redo_failed": False}, False, False, False),
-    ],
-)
-def test_what_fails_is_shown_by_a_script_that_acts_to_the_end_in_a_simulation(
-    options, hands_back, is_real_time, redoes
-):
-    assert RobotGatedConfig(**options).redoes(hands_back, is_real_time) is redoes
-
-
 @pytest.mark.slow
 def test_a_robot_that_does_not_go_on_by_itself_leaves_the_rest_to_the_expert(tmp_path):
     by_default = [option for option in GATED if "hands_back" not in option]
@@ -458,17 +442,6 @@ def test_a_person_is_not_held_back():
     ):
         shifted(person, 0.5, 20, env)
     assert isinstance(shifted(SimpleNamespace(decides=True, can_label=True, clock_fps=20), 0.5, 20, env), Late)
-
-
-def test_no_robot_is_asked_to_set_up_a_scene_twice():
-    source, robot = DatasetSource("a/b"), SimpleNamespace(is_real_time=True)
-    with pytest.raises(PlaybyearError, match="redo sets up the scene of every failure a second time"):
-        DaggerConfig(source, source, env=robot, method=redo.RedoConfig(), eval_every=0).check()
-    asking = RobotGatedConfig(redo_failed=True)
-    with pytest.raises(PlaybyearError, match="robot_gated sets up the scene of every failure a second time"):
-        DaggerConfig(source, source, env=robot, method=asking, eval_every=0).check()
-    DaggerConfig(source, source, env=robot, method=RobotGatedConfig(), eval_every=0).check()
-    DaggerConfig(source, source, env=robot, eval_every=0).check()
 
 
 def test_a_run_goes_on_with_its_own_method_alone(tmp_path):

@@ -4,7 +4,6 @@ import contextlib
 import errno
 import json
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -110,18 +109,13 @@ FAULTS = {
 
 
 @pytest.mark.parametrize(
-    ("call", "step", "fault", "streaming"),
-    [
-        ("replace", 1, "full disk", False),
-        ("replace", 1, "interrupt", False),
-        ("fsync", 4, "broken disk", False),
-        ("fsync", 5, "full disk", True),
-    ],
+    ("call", "step", "fault"),
+    [("replace", 1, "full disk"), ("replace", 1, "interrupt"), ("fsync", 4, "broken disk")],
 )
-def test_a_save_is_repeated_wherever_it_failed(tmp_path, monkeypatch, call, step, fault, streaming):
+def test_a_save_is_repeated_wherever_it_failed(tmp_path, monkeypatch, call, step, fault):
     """At the calls by which files reach their place, in turn; every try gets some calls further."""
     root = tmp_path / "dataset"
-    with writer(root, streaming_encoding=streaming) as target:
+    with writer(root) as target:
         write_episode(target, 0)
         add_episode(target, 1)
         failures, real = 0, getattr(os, call)
@@ -300,7 +294,6 @@ def test_a_person_at_the_terminal_is_asked_before_an_episode_is_given_up(tmp_pat
     os.write(ours, typed.encode() or b"\x04")  # end of input
     with writer(root, FEATURES) as target, os.fdopen(theirs) as terminal, monkeypatch.context() as patch:
         write_episode(target, 0)
-        add_episode(target, 1)
         failures, real = iter(range(100)), os.replace
 
         def replace(*args):
@@ -311,19 +304,18 @@ def test_a_person_at_the_terminal_is_asked_before_an_episode_is_given_up(tmp_pat
         patch.setattr(journal.os, "replace", replace)
         patch.setattr(sys, "stdin", terminal)
         with contextlib.nullcontext() if is_saved else pytest.raises(DatasetWriteError, match="Episode 1"):
-            assert save_or_ask(target) == 1
+            save_or_ask(target, episode_frames(1, FEATURES))
     os.close(ours)
     assert_recorded(root, 2 if is_saved else 1, FEATURES)
 
 
 def test_without_a_terminal_nobody_is_asked(tmp_path, monkeypatch):
     with writer(tmp_path / "dataset", FEATURES) as target:
-        add_episode(target, 0)
         monkeypatch.setattr(journal.os, "fsync", _no_room)
         with open(os.devnull) as nothing:
             monkeypatch.setattr(sys, "stdin", nothing)
             with pytest.raises(DatasetWriteError, match="call save_episode again"):
-                save_or_ask(target)
+                save_or_ask(target, episode_frames(0, FEATURES))
         monkeypatch.undo()
 
 
@@ -358,11 +350,11 @@ def test_an_episode_in_memory_is_written_anew_where_its_pictures_did_not_reach_t
         else:
             monkeypatch.setattr(Staging, "add_frame", no_room_for_the_third)
         with pytest.raises(DatasetWriteError) if is_given_up else contextlib.nullcontext():
-            assert save_or_ask(target, episode_frames(1, FEATURES)) == 1
+            save_or_ask(target, episode_frames(1, FEATURES))
         assert len(questions) == 1
         assert "still in memory" in questions[0]
         if is_given_up:
-            assert save_or_ask(target, episode_frames(1, FEATURES)) == 1
+            save_or_ask(target, episode_frames(1, FEATURES))
     os.close(ours)
     assert_recorded(root, 2, FEATURES)
 
@@ -392,36 +384,3 @@ def test_sound_of_a_repeated_save_is_there_once(tmp_path):
     samples = np.concatenate([frame["observation.audio.gripper"] for frame in frames])
     assert int(stats["observation.audio.gripper"]["count"][0]) == len(frames)
     np.testing.assert_allclose(stats["observation.audio.gripper"]["std"], samples.std(), rtol=1e-3)
-
-
-def test_a_streamed_episode_is_saved_again_while_its_films_are_whole(tmp_path, monkeypatch):
-    """LeRobot's table of frames could not be written; the films were complete."""
-    root = tmp_path / "dataset"
-    with writer(root, TWO_FILMS, streaming_encoding=True) as target:
-        write_episode(target, 0)
-        add_episode(target, 1)
-        with monkeypatch.context() as patch:
-            patch.setattr(lerobot.datasets.dataset_writer, "embed_images", _no_room)
-            for _ in range(2):
-                with pytest.raises(DatasetWriteError) as error:
-                    target.save_episode()
-                assert error.value.can_be_repeated
-        assert target.save_episode() == 1
-    assert_recorded(root, 2, TWO_FILMS)
-
-
-def test_a_film_that_its_encoder_could_not_write_is_said_to_be_lost(tmp_path):
-    root = tmp_path / "dataset"
-    with writer(root, streaming_encoding=True) as target:
-        write_episode(target, 0)
-        add_episode(target, 7)
-        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
-        try:
-            with pytest.raises(DatasetWriteError, match="cannot be saved any more: record it again") as error:
-                target.save_episode()
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        assert not error.value.can_be_repeated
-        assert write_episode(target, 1) == 1
-    assert_recorded(root, 2)

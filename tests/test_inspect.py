@@ -387,6 +387,47 @@ def test_sound_that_was_recorded_too_early_shows_as_a_lag(tmp_path, shift):
 # The detectors, on sound that is hard to judge
 
 
+def tapped(rng: np.random.Generator, delay_s: float) -> Arrays:
+    """Five taps of a hand that comes for 0.2 s and stops, seen at once and heard later; the row ends with its picture."""
+    length = 5 * 16 + 10
+    taps = 0.6 + 0.8 * np.arange(5) + rng.uniform(0, 0.1, 5)
+    places = np.clip((np.arange(length)[:, None] / FPS - taps) / 0.2 + 1, 0, 1).sum(axis=1)  # of the hand
+    sound = rng.normal(0, 10, length * BLOCK)
+    for tap in taps:
+        start = round((tap + delay_s + 1 / FPS) * SAMPLE_RATE)
+        sound[start : start + 800] += rng.normal(0, 6000, 800) * np.exp(-np.arange(800) / 200)
+    pictures = np.clip(SIZE * places[:, None] / 5 - np.arange(SIZE), 0, 1) * 200  # (length, SIZE)
+    return {
+        CAMERA: np.broadcast_to(pictures[:, None, :, None], (length, SIZE, SIZE, 3)).astype(np.uint8),
+        MICROPHONE: sound.clip(-32768, 32767).astype(np.int16).reshape(length, BLOCK),
+        "observation.state": rng.normal(size=(length, 3)).astype(np.float32),
+        "action": rng.uniform(-1, 1, (length, 2)).astype(np.float32),
+        "intervention": np.ones((length, 1), bool),
+        "next.success": np.ones((length, 1), bool),
+    }
+
+
+@pytest.mark.parametrize("delay_s", [0.038, -0.03])
+def test_how_much_later_sound_comes_than_the_picture_is_told_from_taps(tmp_path, capsys, delay_s):
+    rng = np.random.default_rng(0)
+    verdicts = look(write(tmp_path / "data", [tapped(rng, delay_s) for _ in range(3)]))
+    (told,) = [verdict for verdict in verdicts if verdict.check == "sound and picture"]
+    assert told.figures["delay_s"] == pytest.approx(delay_s, abs=0.006)
+    assert told.figures["contacts"] >= 14
+    side = "after" if delay_s > 0 else "before"
+    assert re.search(rf"sound comes \d+ ms {side} the picture of {CAMERA} \(spread \d+ ms", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("what", ["no taps", "other sounds"])
+def test_without_contacts_nothing_is_said_of_sound_and_picture(clean, tmp_path, what):
+    rng = np.random.default_rng(0)
+    episodes = [tapped(rng, 0.0) for _ in range(3)]
+    for episode, rows in zip(episodes, (3, 7, 11), strict=True):
+        episode[MICROPHONE] = np.roll(episode[MICROPHONE], rows, axis=0)
+    root = write(tmp_path / "data", episodes) if what == "other sounds" else clean
+    assert not [verdict for verdict in look(root) if verdict.check == "sound and picture"]
+
+
 def test_quiet_sound_of_few_steps_is_neither_cut_nor_lost():
     samples = np.round(np.random.default_rng(0).normal(0, 0.6, 5 * SAMPLE_RATE))  # half of the samples are 0
     assert gaps(samples, SAMPLE_RATE) == flat_tops(samples) == repeats(samples, BLOCK) == []

@@ -20,9 +20,10 @@ from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_edit_dataset, lerobot_eval, lerobot_train
-from robot_factory import joint_config, noise_file, robot_env
 from test_peers import needs
+from torchvision.ops import FrozenBatchNorm2d
 
+from experiments import act_start
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.audio.attach import AttachError, DatasetPlace
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
@@ -128,15 +129,6 @@ def test_other_rates_move_by_whole_columns_too(fps, rate, columns):
     sound = np.random.default_rng(0).normal(0, 2000, (15, how.samples_per_frame)).astype(np.int16)
     pictures = watch(sound, how)
     np.testing.assert_array_equal(pictures[-1][:, :-columns], pictures[-2][:, columns:])
-
-
-def test_another_frame_in_place_of_the_newest():
-    sound, other = noise(50), noise(1, seed=1)[0]
-    heard = HeardSound(HOW)
-    for block in sound:
-        heard.add(block)
-    heard.forget_newest()
-    np.testing.assert_array_equal(heard.add(other), watch(np.concatenate([sound[:-1], other[None]]))[-1])
 
 
 # Datasets
@@ -391,27 +383,6 @@ def test_an_environment_of_ones_own_is_wrapped():
         np.testing.assert_array_equal(pictures, watch(noise(9, seed)))
 
 
-def test_a_robot_shows_them_too_also_after_a_person_took_over(tmp_path):
-    info = tmp_path / "info.json"
-    info.write_text(json.dumps({"features": {PICTURE: {"info": HOW.as_info()}}}))
-    with robot_env(joint_config(noise_file(tmp_path, 16000), spectrogram=str(info))) as env:
-        for _ in range(2):
-            observation, _ = env.reset(seed=0)
-            blocks, seen = [observation["audio.gripper"]], [observation["pixels"]["gripper"]]
-            for tick in range(6):
-                if tick == 3:
-                    env.hold()
-                    env.go_on()  # what the last frame saw and heard is replaced
-                    blocks[-1], seen[-1] = observation["audio.gripper"], observation["pixels"]["gripper"]
-                observation, *_ = env.step(np.zeros(3, np.float32))
-                assert env.observation_space.contains(observation)
-                blocks.append(observation["audio.gripper"])
-                seen.append(observation["pixels"]["gripper"])
-            np.testing.assert_array_equal(seen, watch(np.stack(blocks)))
-    with pytest.raises(DecodingError, match="the environment has none"):
-        joint_config(spectrogram=str(info))
-
-
 # LeRobot's policies
 
 SMALL = {
@@ -481,3 +452,26 @@ def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path,
         batch = {key: value[None] for key, value in item.items() if key.startswith("observation.")}
         actions.append(policy.select_action({**batch, PICTURE: shown[None]}))
     assert not torch.equal(*actions), "what is heard has no part in what is done"
+
+
+def test_act_without_pretrained_weights_begins_with_norms_that_tell_pictures_apart(recorded, tmp_path):
+    options = ["pretrained_backbone_weights=null", *SMALL["act"].split()]
+    command = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
+    assert command.startswith("python -m experiments.act_start")
+    assert "dim_model=32" in command
+    written = (tmp_path / "start/model.safetensors").stat().st_mtime_ns
+    act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
+    assert (tmp_path / "start/model.safetensors").stat().st_mtime_ns == written
+    policy = get_policy_class("act").from_pretrained(tmp_path / "start")
+    dataset = load(recorded)
+    key = dataset.meta.camera_keys[0]
+    images = torch.stack([dataset[row][key] for row in range(0, len(dataset), 3)])
+    images = (images - images.mean(dim=(0, 2, 3), keepdim=True)) / images.std(dim=(0, 2, 3), keepdim=True)
+    calibrated = act_start.difference(policy.model.backbone, images)
+    for norm in policy.model.backbone.modules():
+        if isinstance(norm, FrozenBatchNorm2d):
+            norm.running_mean.zero_()
+            norm.running_var.fill_(1)
+    assert calibrated > 1.5 * act_start.difference(policy.model.backbone, images)
+    act_start.saved_start(options, recorded, tmp_path / "start", seed=1)
+    assert (tmp_path / "start/model.safetensors").stat().st_mtime_ns != written

@@ -387,10 +387,9 @@ def tapping(*names):
     return lambda window: press(window.keys, *names)
 
 
-def play(script, teleop=None, begins_paused=False, demonstrates=False, horizon=30, env=None):
+def play(script, teleop=None, begins_paused=False, demonstrates=False, horizon=30, toggles=False):
     """One attempt with a policy that does nothing. Returns the attempt and the window."""
-    own = env is None
-    env = env or make_env(horizon)
+    env = make_env(horizon)
     window = Screenless(script)
     if teleop is None:
         teleop = KeyboardWindowTeleop(KeyboardWindowTeleopConfig(), window.keys)
@@ -399,13 +398,13 @@ def play(script, teleop=None, begins_paused=False, demonstrates=False, horizon=3
     clock = Clock()
     speaker = Speaker(16000, 800, "a test")
     pace = Pace(20, clock, clock.sleep)
-    expert = TeleopExpert(window, teleop, mapping, Gripper(40), pace, speaker, [], begins_paused, demonstrates)
+    how = {"begins_paused": begins_paused, "demonstrates": demonstrates, "toggles": toggles}
+    expert = TeleopExpert(window, teleop, mapping, Gripper(40), pace, speaker, [], **how)
     try:
         return play_episode(env, Nobody(), seed=3, expert=expert), window
     finally:
         expert.close()
-        if own:
-            env.close()
+        env.close()
 
 
 def make_env(horizon):
@@ -422,6 +421,11 @@ def test_the_person_acts_on_exactly_the_steps_in_which_the_key_is_held():
     controls = [status.control for status, picture in window.shown if picture is not None]
     assert controls[6:13] == [Control.PERSON] * 7  # each step shows who acted in the one before
     assert controls[13:] == [Control.POLICY] * (len(controls) - 13)
+
+
+def test_a_press_takes_over_and_another_hands_back():
+    attempt, _ = play({5: tapping("space"), 12: tapping("space")}, toggles=True)
+    assert np.flatnonzero(attempt.interventions).tolist() == list(range(5, 12))
 
 
 def test_a_teleoperators_intervention_takes_over_with_its_own_action():
@@ -595,6 +599,7 @@ def test_the_keyboard_of_the_window_is_the_default():
         ({"takeover_key": " "}, "takeover_key=' ': give"),
         ({"takeover_key": "P"}, "takeover_key='P' means something else"),
         ({"takeover_key": "e"}, "takeover_key='e' means something else"),
+        ({"takeover": "press"}, "takeover='press': give hold or toggle"),
     ],
 )
 def test_bad_options_are_refused_before_a_window_opens(options, message):

@@ -181,7 +181,6 @@ def test_a_loaded_policy_acts_bit_for_bit_as_in_lerobot_eval(tmp_path, use_amp):
         ("film.gif", {}, r"--output=.*film.gif: films are mp4"),
         ("folder.mp4", {}, r"--output=.*folder.mp4: that is a folder"),
         ("file/film.mp4", {}, r"--output=.*film.mp4 cannot be written: Not a directory"),
-        ("film.mp4", {"env": SimpleNamespace(is_real_time=True)}, "No script can act on a robot: give --policy.path"),
         (
             "film.mp4",
             {"policy": ACTConfig(device="cpu"), "baseline": "search"},

@@ -4,8 +4,8 @@ LeRobot's scripts find this package by its name and import it; nothing needs to 
 """
 
 from lerobot_env_playbyear.config import PlaybyearEnvConfig
-from lerobot_env_playbyear.processors import PcmToFloatProcessorStep, SoundAsStateProcessorStep
+from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
 __version__ = "0.1.0"
 
-__all__ = ["PcmToFloatProcessorStep", "PlaybyearEnvConfig", "SoundAsStateProcessorStep"]
+__all__ = ["PcmToFloatProcessorStep", "PlaybyearEnvConfig"]

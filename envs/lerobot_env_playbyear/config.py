@@ -13,7 +13,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE, OBS_STR
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
 from gym_playbyear import register_tasks
 from gym_playbyear.options import OptionError, make_definition
@@ -21,7 +21,7 @@ from gym_playbyear.plugins import PluginError
 from gym_playbyear.room import RESPONSES
 from gym_playbyear.task import Task
 from lerobot_env_playbyear.attempts import with_attempts_file
-from lerobot_env_playbyear.processors import PcmToFloatProcessorStep, SoundAsStateProcessorStep
+from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
 if TYPE_CHECKING:  # of the other distribution, which is needed for these pictures alone
     from lerobot_playbyear.audio.sound_picture import SoundPicture
@@ -51,8 +51,6 @@ class PlaybyearEnvConfig(EnvConfig):
         microphone_response: `flat`, or the frequency response of another microphone: `phone`, `dull`, `boomy`.
         spectrogram: For policies that look at pictures of sound: the folder of the dataset that they learned from, made by
             `playbyear-attach-spectrogram`, or its `meta/info.json`. The same pictures then come as `pixels/<microphone>`.
-        sound_as_state: For policies that read sound as a state: `observation.environment_state` holds the samples of the
-            frame, in [-1, 1], of all microphones in the order of their names.
         cube_material: What the cube sounds like: `cube` (wood), `glass`, `tin`, `cardboard`, `rubber`; for tasks with a cube.
         variant: `default`, or `paper` for the paper's values where ours differ; for version 0 of the tasks.
         task_options: More options of the task, by name.
@@ -79,7 +77,6 @@ class PlaybyearEnvConfig(EnvConfig):
     room_noise_level: float = 1.0
     microphone_response: str = "flat"
     spectrogram: str | None = None
-    sound_as_state: bool = False
     # Task
     cube_material: str = "cube"
     variant: str = "default"
@@ -108,9 +105,6 @@ class PlaybyearEnvConfig(EnvConfig):
                 entries[f"audio.{mic}"] = (FeatureType.STATE, (self.samples_per_frame,), f"{OBS_STR}.audio.{mic}")
             for how in self._sound_pictures():
                 entries[f"pixels/{how.name}"] = (FeatureType.VISUAL, (how.height, how.width, 3), how.feature)
-            if self.sound_as_state:
-                n_samples = self.samples_per_frame * len(self.microphones or [])
-                entries["environment_state"] = (FeatureType.ENV, (n_samples,), OBS_ENV_STATE)
         elif self.sound == "contact_force":
             entries["contact_force"] = (FeatureType.STATE, (_FORCE_DIM,), f"{OBS_STR}.contact_force")
         self.features = {key: PolicyFeature(type=kind, shape=shape) for key, (kind, shape, _) in entries.items()}
@@ -178,8 +172,7 @@ class PlaybyearEnvConfig(EnvConfig):
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
         """What LeRobot runs on each observation before, and on each action after, the policy's own processors."""
-        steps = [PcmToFloatProcessorStep(), *([SoundAsStateProcessorStep()] if self.sound_as_state else [])]
-        return PolicyProcessorPipeline(steps=steps), PolicyProcessorPipeline(steps=[])
+        return PolicyProcessorPipeline(steps=[PcmToFloatProcessorStep()]), PolicyProcessorPipeline(steps=[])
 
     def _room(self) -> dict[str, Any] | None:
         """Options of `gym_playbyear.room.Room`, or None for the task's own room."""
@@ -253,8 +246,6 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("room_noise_level", "give 0 (silent) or more")
         if self.spectrogram is not None and self.sound != "waveform":
             raise self._error("spectrogram", f"--env.sound={self.sound} has no sound to show; leave one of them out")
-        if self.sound_as_state and self.sound != "waveform":
-            raise self._error("sound_as_state", f"--env.sound={self.sound} has no samples; leave one of them out")
         for name, least in (("image_size", 8), ("visualization_width", 1), ("episode_length", 1)):
             if getattr(self, name) is not None and getattr(self, name) < least:
                 raise self._error(name, f"give {least} or more")

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 
 import torch
-from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
+from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_PREFIX
+from lerobot.utils.constants import OBS_PREFIX
 
 OBS_AUDIO_PREFIX = OBS_PREFIX + "audio."
 PCM_FULL_SCALE = 32768.0  # int16: samples are in [-32768, 32767]
@@ -35,36 +35,3 @@ class PcmToFloatProcessorStep(ObservationProcessorStep):
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         return features
-
-
-@dataclass
-@ProcessorStepRegistry.register(name="playbyear_sound_as_state")
-class SoundAsStateProcessorStep(ObservationProcessorStep):
-    """Gives the sound of a frame as a state, for policies that read states: `--env.sound_as_state=true`.
-
-    `observation.environment_state`, (B, S of all microphones), holds the samples of every `observation.audio.<mic>`, (B, S), in
-    the order of their keys; all else stays. The numbers are those that `lerobot_playbyear.datasets.sound_as_state` writes
-    into a dataset, bit for bit, when `PcmToFloatProcessorStep` comes before.
-    """
-
-    def observation(self, observation: dict) -> dict:
-        """Joins the microphones.
-
-        Raises:
-            ValueError: There is none.
-        """
-        keys = sorted(key for key in observation if key.startswith(OBS_AUDIO_PREFIX))
-        if not keys:
-            raise ValueError(
-                f"'{OBS_ENV_STATE}' is to hold the sound, and the observation has {', '.join(observation)}; wanted a key "
-                f"'{OBS_AUDIO_PREFIX}<microphone>'. Give the environment a microphone, or leave out --env.sound_as_state."
-            )
-        return {**observation, OBS_ENV_STATE: torch.cat([observation[key] for key in keys], dim=-1)}  # (B, sum of S)
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        observed = features[PipelineFeatureType.OBSERVATION]
-        size = sum(feature.shape[0] for key, feature in observed.items() if key.startswith(OBS_AUDIO_PREFIX))
-        state = {OBS_ENV_STATE: PolicyFeature(type=FeatureType.ENV, shape=(size,))}
-        return {**features, PipelineFeatureType.OBSERVATION: {**observed, **state}}

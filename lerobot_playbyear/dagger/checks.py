@@ -15,7 +15,6 @@ from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.expert import Expert, ExpertError
 from lerobot_playbyear.episodes.frames import INTERVENTION
-from lerobot_playbyear.episodes.scripted_expert import NO_SCRIPT, ScriptedExpertConfig
 from lerobot_playbyear.training.parts import TrainingParts, check_dataset_suits
 from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
 
@@ -23,11 +22,10 @@ Features = Mapping[str, Mapping[str, Any]]
 
 
 def check_places(cfg: DaggerConfig) -> None:
-    """Refuse what would be found out only once a robot has moved, or once data were mixed.
+    """Refuse what would be found out only once data were mixed.
 
     Raises:
-        InputError: Attempts would be written among the demonstrations, a script would have to act on a robot, or takeovers are
-            to be late where there are none.
+        InputError: Attempts would be written among the demonstrations, or takeovers are to be late where there are none.
     """
     demos, interventions = (source.folder.resolve() for source in (cfg.demos, cfg.interventions))
     if cfg.is_online and demos == interventions:
@@ -48,8 +46,6 @@ def check_places(cfg: DaggerConfig) -> None:
         raise InputError(
             f"--takeover_delay_s={cfg.takeover_delay_s}: with --episodes=0 nobody takes over; leave it out, or give --skip_s."
         )
-    if cfg.is_online and getattr(cfg.env, "is_real_time", False) and isinstance(cfg.expert, ScriptedExpertConfig):
-        raise InputError(NO_SCRIPT.format("correct a policy on"))
 
 
 def check_dataset(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]) -> None:

@@ -22,7 +22,6 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 CONFIG_NAME = "dagger_config.json"
 """File in the output folder with the options of the run."""
 
-_MOST_WATCHED = 20  # episodes
 _LEAST = {"warmup_episodes": 1, "max_attempts": 1}  # of the other whole numbers: 0
 
 
@@ -167,12 +166,6 @@ class DaggerConfig:
         if not self.is_online and not self.updates:
             raise InputError("--episodes=0 collects nothing: give --updates, how many to make from what is there.")
         self._check_method()
-        takes_a_person = self.eval_every > 0 and getattr(self.env, "is_real_time", False)
-        if takes_a_person and self.eval.n_episodes > _MOST_WATCHED:
-            raise InputError(
-                f"--eval.n_episodes={self.eval.n_episodes} of every evaluation on a robot take a person's time, the first "
-                f"before any attempt: give --eval_every=0, or --eval.n_episodes of at most {_MOST_WATCHED}."
-            )
         if self.is_online and self.env is None:
             raise InputError(
                 "No environment: give --env.type and --env.task, or --episodes=0 --updates=N to learn from recorded "
@@ -197,11 +190,6 @@ class DaggerConfig:
         if self.skip_s and self.learn_from == "all":
             raise InputError(
                 f"--skip_s={self.skip_s} and --learn_from=all contradict each other: leave out one of them."
-            )
-        if self.method.needs_simulation and getattr(self.env, "is_real_time", False):
-            raise InputError(
-                f"--method.type={self.method.type} sets up the scene of every failure a second time, which only a simulation "
-                "does alike. On a robot leave it, or --method.redo_failed, out, or record demonstrations with playbyear-record."
             )
         if not math.isfinite(self.takeover_delay_s):
             raise InputError(f"--takeover_delay_s={self.takeover_delay_s}: give a number of seconds.")

@@ -164,7 +164,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         facts = env_facts(env)
         features = method.features(dataset_features(facts))
         check_alike(observed, demos.meta, features, facts.fps, f"--env.type={cfg.env.type}")
-        corrections.open_for_writing(facts.fps, features, getattr(cfg.env, "robot_type", cfg.env.type))
+        corrections.open_for_writing(facts.fps, features, cfg.env.type)
     else:
         check_alike(observed, demos.meta, corrections.meta.features, corrections.meta.fps, "the corrections")
     if state.first_episodes is None:
@@ -272,7 +272,6 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
     env = " --env.type=..."
     if cfg.env is not None:
         env = f" --env.type={cfg.env.type} --env.task={shlex.quote(str(cfg.env.task))}"
-        env += " ... (the robot's options)" if getattr(cfg.env, "is_real_time", False) else ""
     print(f"Policy:      {policy}")
     print(f"Evaluate:    lerobot-eval --policy.path={policy}{env}")
     print(go_on)

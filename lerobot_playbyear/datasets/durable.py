@@ -19,8 +19,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_playbyear.datasets.episode_checks import IncompleteEpisodeError, LostFramesError
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_compatible, check_root, check_undamaged, has_dataset
-from lerobot_playbyear.datasets.files import entries_below
-from lerobot_playbyear.datasets.journal import EPISODE, JOURNAL, finish_journal, publish
+from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, publish
 from lerobot_playbyear.datasets.locking import DatasetLock
 from lerobot_playbyear.datasets.repair.replacing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
@@ -55,8 +54,6 @@ class DurableWriter:
         resume: Append to the dataset in `root` if there is one. Otherwise an existing one is an error.
         robot_type: Noted in a new dataset's metadata; one that notes another is refused.
         image_writer_threads: Threads that compress pictures. 0: `add_frame` does it.
-        streaming_encoding: Encode video while frames come in, not in `save_episode`. The pictures are then nowhere but
-            in the video: an episode of which the encoder dropped a frame, or failed, is refused and cannot be saved.
         rgb_encoder: Codec and quality of video. None: LeRobot's default.
 
     Raises:
@@ -78,7 +75,6 @@ class DurableWriter:
         resume: bool = False,
         robot_type: str | None = None,
         image_writer_threads: int = 4,
-        streaming_encoding: bool = False,
         rgb_encoder: RGBEncoderConfig | None = None,
     ):
         check_features(features, fps)
@@ -94,7 +90,6 @@ class DurableWriter:
         self._write_options: dict[str, Any] = {
             "video_backend": "pyav",
             "image_writer_threads": image_writer_threads,
-            "streaming_encoding": streaming_encoding,
             "rgb_encoder": rgb_encoder,
         }
         self._n_episodes = self._n_frames = 0
@@ -131,15 +126,6 @@ class DurableWriter:
     def num_frames(self) -> int:
         """Frames on disk, without those of the episode in progress."""
         return self._n_frames
-
-    @property
-    def n_waiting(self) -> int:
-        """Pictures of the episode in progress that are in memory, and no thread compresses yet."""
-        return 0 if self._episode is None else self._episode.n_waiting
-
-    def episode_bytes(self) -> int:
-        """What the episode in progress takes on the disk now."""
-        return sum(path.lstat().st_size for path in entries_below(self.root / EPISODE))
 
     def add_frame(self, frame: dict[str, Any]) -> None:
         """Adds one frame to the episode in progress. After an error it is not part of it, and the episode goes on.

@@ -18,12 +18,11 @@ class LostFramesError(IncompleteEpisodeError):
     """They are nowhere else either: the episode cannot be saved, however often it is tried."""
 
 
-def check_pictures(dataset: LeRobotDataset, streaming: bool) -> None:
+def check_pictures(dataset: LeRobotDataset) -> None:
     """Whether every picture of the episode in progress is on the disk, whole.
 
     Args:
         dataset: The staging dataset.
-        streaming: Whether pictures for videos go to the encoder instead of the disk.
 
     Raises:
         LostFramesError: Naming the first one that is not.
@@ -32,8 +31,7 @@ def check_pictures(dataset: LeRobotDataset, streaming: bool) -> None:
     assert dataset.writer is not None
     if dataset.writer.image_writer is not None:
         dataset.writer.image_writer.wait_until_done()
-    keys = dataset.meta.image_keys if streaming else dataset.meta.camera_keys
-    for key in set(keys) - set(dataset.meta.depth_keys):
+    for key in set(dataset.meta.camera_keys) - set(dataset.meta.depth_keys):
         for index in range(dataset.writer.episode_buffer["size"]):
             name = DEFAULT_IMAGE_PATH.format(
                 image_key=key, episode_index=dataset.meta.total_episodes, frame_index=index
@@ -54,17 +52,16 @@ def check_videos(dataset: LeRobotDataset, length: int) -> None:
     """
     for key in dataset.meta.video_keys:
         for path in (dataset.root / "videos" / key).rglob("*.mp4"):
-            check_video(path, key, length)
+            _check_video(path, key, length)
 
 
-def check_video(path: Path, key: str, length: int) -> None:
-    """As `check_videos`, for one film."""
+def _check_video(path: Path, key: str, length: int) -> None:
     with av.open(str(path)) as container:
         frames = sum(1 for packet in container.demux(video=0) if packet.size)
     if frames != length:
         raise IncompleteEpisodeError(
-            f"the video of '{key}' has {frames} frames where {length} were recorded: the encoder did not "
-            "keep up, or the disk is full"
+            f"the video of '{key}' has {frames} frames where {length} were recorded: the encoder lost "
+            "some, or the disk is full"
         )
 
 

@@ -19,11 +19,10 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot.utils.utils import SuppressProgressBars
 from torch import Tensor
 
-from lerobot_playbyear.compat import forget_unsaved_rows, pictures_waiting, set_streaming_encoder, streaming_encoder
+from lerobot_playbyear.compat import forget_unsaved_rows
 from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.episode_checks import check_pictures, check_videos
 from lerobot_playbyear.datasets.files import take_over
-from lerobot_playbyear.datasets.films import Film, FinishedFilms, finish_films
 from lerobot_playbyear.datasets.journal import EPISODE, PICTURES, SCRATCH, STAGING
 from lerobot_playbyear.datasets.writable import check_frame
 
@@ -58,7 +57,6 @@ class Staging:
         self._repo_id, self._root, self._pictures = repo_id, root, root / PICTURES
         self._create_options, self._write_options = create_options, write_options
         self._frames: dict[str, Any] | None = None  # what LeRobot had of the episode before it was first saved
-        self._films: dict[str, Film] = {}
         self._is_saved = False
         remove_leftovers(root)
         self._open()
@@ -76,11 +74,6 @@ class Staging:
     def is_complete(self) -> bool:
         """Whether saving has begun, so that no frame can be added any more."""
         return self._frames is not None
-
-    @property
-    def n_waiting(self) -> int:
-        """Pictures that no thread has begun to write yet."""
-        return pictures_waiting(self._writer)
 
     @property
     def _writer(self) -> DatasetWriter:
@@ -140,15 +133,10 @@ class Staging:
             self.dataset.finalize()
 
     def _put_frames_aside(self) -> None:
-        is_streaming = streaming_encoder(self._writer) is not None
-        check_pictures(self.dataset, is_streaming)
+        check_pictures(self.dataset)
         shutil.rmtree(self._pictures / SCRATCH, ignore_errors=True)  # of a try that was interrupted
         if (self.folder / SCRATCH).is_dir():
             shutil.copytree(self.folder / SCRATCH, self._pictures / SCRATCH, copy_function=take_over)
-        if is_streaming:
-            if not self._films:
-                self._films = finish_films(streaming_encoder(self._writer), self._pictures / "films", self.length)
-            set_streaming_encoder(self._writer, FinishedFilms(self._films, self.folder))
         self._frames = dict(self._writer.episode_buffer)
 
     def _begin_again(self) -> None:
@@ -158,8 +146,6 @@ class Staging:
         self._open()
         if (self._pictures / SCRATCH).is_dir():
             shutil.copytree(self._pictures / SCRATCH, self.folder / SCRATCH, copy_function=take_over)
-        if self._films:
-            set_streaming_encoder(self._writer, FinishedFilms(self._films, self.folder))
         assert self._frames is not None
         self._writer.episode_buffer = dict(self._frames)
 

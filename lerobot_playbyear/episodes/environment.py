@@ -28,18 +28,14 @@ class EnvSpec:
     kwargs: dict[str, Any] = field(default_factory=dict)
 
     def make(self) -> gym.Env:
-        """Makes the environment and resets it once, so that whatever is missing shows now. One that has `connect`, such as a
-        robot that a reset would move, is only connected.
+        """Makes the environment and resets it once, so that whatever is missing shows now.
 
         Raises:
             RolloutError: It cannot be made: not installed, a wrong argument, no OpenGL library.
         """
         try:
             env = gym.make(self.id, disable_env_checker=True, **self.kwargs)
-            if env.has_wrapper_attr("connect"):
-                env.get_wrapper_attr("connect")()
-            else:
-                env.reset(seed=0)
+            env.reset(seed=0)
         except Exception as error:
             raise RolloutError(f"{self.id} does not start: {error}") from error
         return env
@@ -49,17 +45,12 @@ def env_spec(env: "EnvConfig") -> EnvSpec:
     """How Gymnasium makes the environment that a LeRobot configuration describes.
 
     Raises:
-        RolloutError: It asks for pictures of sound, or for sound as a state: datasets get both from the sound that is recorded.
+        RolloutError: It asks for pictures of sound: datasets get them from the sound that is recorded.
     """
     if getattr(env, "spectrogram", None) is not None:
         raise RolloutError(
             f"--env.spectrogram={env.spectrogram}: these pictures are for policies of LeRobot that act in lerobot-eval, "
             "lerobot-train or playbyear-video. Leave it out here: playbyear-attach-spectrogram makes them of what is recorded."
-        )
-    if getattr(env, "sound_as_state", False):
-        raise RolloutError(
-            "--env.sound_as_state=true: this state is for policies of LeRobot that act in lerobot-eval, lerobot-train or "
-            "playbyear-video. Leave it out here: lerobot_playbyear.datasets.sound_as_state makes it of what is recorded."
         )
     return EnvSpec(f"{env.package_name}:{env.gym_id}", dict(env.gym_kwargs))
 

@@ -21,7 +21,7 @@ from lerobot.utils.constants import (
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.environment import EnvFacts
-from lerobot_playbyear.episodes.episode import Episode, Observation, Step
+from lerobot_playbyear.episodes.episode import Episode, Observation
 
 INTERVENTION = "intervention"
 SEED = "seed"
@@ -66,30 +66,23 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
         features: From `dataset_features`.
     """
     by_expert = np.ones(len(episode), bool) if episode.interventions is None else episode.interventions
-    steps = zip(episode.observations, episode.actions, episode.rewards, episode.successes, by_expert, strict=False)
-    frames = [
-        make_frame(features, Step(*step, is_last=t == len(episode) - 1), episode.seed, episode.task)
-        for t, step in enumerate(steps)
-    ]
-    for frame, executed in zip(frames, () if episode.executed is None else episode.executed, strict=False):
-        frame[EXECUTED] = executed
+    frames: list[dict[str, Any]] = []
+    for t in range(len(episode)):
+        frame = _flat_observation(episode.observations[t])
+        for key, value in frame.items():
+            if features[key]["dtype"] == "float32":
+                frame[key] = np.asarray(value, np.float32)
+        frame[ACTION] = episode.actions[t]
+        if episode.executed is not None:
+            frame[EXECUTED] = episode.executed[t]
+        frame[INTERVENTION] = np.array([by_expert[t]], bool)
+        frame[REWARD] = np.array([episode.rewards[t]], np.float32)
+        frame[SUCCESS] = np.array([episode.successes[t]], bool)
+        frame[DONE] = np.array([t == len(episode) - 1])
+        frame[SEED] = np.array([episode.seed], np.int64)
+        frame["task"] = episode.task
+        frames.append(frame)
     return frames
-
-
-def make_frame(features: dict[str, dict[str, Any]], step: Step, seed: int, task: str) -> dict[str, Any]:
-    """A step as a frame of LeRobot's datasets; `seed` and `task` as of `Episode`."""
-    frame: dict[str, Any] = dict(_flat_observation(step.observation))
-    for key, value in frame.items():
-        if features[key]["dtype"] == "float32":
-            frame[key] = np.asarray(value, np.float32)
-    frame[ACTION] = step.action
-    frame[INTERVENTION] = np.array([step.by_expert], bool)
-    frame[REWARD] = np.array([step.reward], np.float32)
-    frame[SUCCESS] = np.array([step.success], bool)
-    frame[DONE] = np.array([step.is_last])
-    frame[SEED] = np.array([seed], np.int64)
-    frame["task"] = task
-    return frame
 
 
 def next_seed(root: Path, seed: int) -> int:

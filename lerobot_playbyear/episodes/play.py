@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from lerobot_playbyear.episodes.environment import task_description
-from lerobot_playbyear.episodes.episode import Episode, Observation, Step, Verdict
+from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
 
 if TYPE_CHECKING:
     from lerobot_playbyear.episodes.expert import Expert
@@ -60,7 +60,6 @@ def play(
     options: dict[str, Any] | None = None,
     watch: Callable[[], Any] | None = None,
     seconds: Seconds | None = None,
-    sink: Callable[[Step], None] | None = None,
 ) -> Episode:
     """Plays one episode until the environment or the expert ends it, or its steps are used up.
 
@@ -69,14 +68,11 @@ def play(
 
     Args:
         env: The environment; `info["is_success"]` is there after every step, and `_max_episode_steps`, if it has that,
-            limits their number. `info["verdict"]`, if it is there, ends the episode as a `Verdict`'s value says, and after
-            `info["was_stopped"]` the last action, which was not carried out, is the one before it, and so is who chose it;
-            an episode of which no action was carried out is void.
+            limits their number.
         actor: Who acts.
         seed, options: For `env.reset`.
         expert: Who may take over.
         watch: Called after the reset and after every step; what it returns is kept, such as `env.render` pictures.
-        sink: Takes every step when it was made; the episode then keeps no observations.
         seconds: Counts `simulation` (environment and expert) and `inference` (actor).
     """
     seconds = seconds or Seconds()
@@ -89,7 +85,7 @@ def play(
     space = env.action_space
     assert isinstance(space, gym.spaces.Box)
     limit = env.get_wrapper_attr("_max_episode_steps") if env.has_wrapper_attr("_max_episode_steps") else np.inf
-    observations = [observation] if sink is None else []
+    observations = [observation]
     actions: list[np.ndarray] = []
     rewards: list[float] = []
     successes: list[bool] = []
@@ -104,16 +100,9 @@ def play(
             if expert is not None and by_expert:
                 action = expert.act()
             action = np.asarray(action, np.float32).clip(space.low, space.high)
-            after, reward, terminated, truncated, info = env.step(action)
-            verdict = Verdict(info["verdict"]) if info.get("verdict") else None
-            if expert is not None:
-                verdict = verdict or expert.verdict()
-        if info.get("was_stopped") and actions:
-            action, by_expert = actions[-1], interventions[-1]  # this one was not carried out
-        elif info.get("was_stopped"):
-            action = np.nan_to_num(action, nan=0.0, posinf=0.0, neginf=0.0)
-            verdict = Verdict.DISCARD  # nothing was done
-        seen, observation = observation, after
+            observation, reward, terminated, truncated, info = env.step(action)
+            verdict = None if expert is None else expert.verdict()
+        observations.append(observation)
         actions.append(action)
         rewards.append(float(reward))
         successes.append(verdict is Verdict.SUCCESS or (verdict is None and bool(info["is_success"])))
@@ -121,10 +110,6 @@ def play(
         if watch:
             watched.append(watch())
         ended = terminated or truncated or verdict is not None or len(actions) >= limit
-        if sink is None:
-            observations.append(observation)
-        else:
-            sink(Step(seen, action, rewards[-1], successes[-1], by_expert, ended))
     return Episode(
         seed=seed,
         task=task_description(env),
@@ -135,5 +120,4 @@ def play(
         interventions=None if expert is None else np.asarray(interventions, bool),
         verdict=verdict,
         watched=watched,
-        facts=env.get_wrapper_attr("episode_facts")() if env.has_wrapper_attr("episode_facts") else None,
     )

@@ -14,9 +14,6 @@ from lerobot_playbyear.episodes.script import Script
 _SCRIPTS = ("intervention_gate", "scripted_expert")
 
 
-NO_SCRIPT = "--expert.type=scripted: no script can {} a robot; give --expert.type=teleop, a person."
-
-
 @ExpertConfig.register_subclass("scripted")
 @dataclass
 class ScriptedExpertConfig(ExpertConfig):

@@ -32,11 +32,8 @@ class HeardSound:
 
     def __init__(self, picture: SoundPicture) -> None:
         self._how = picture
-        self._frames: deque[np.ndarray] = deque(
-            maxlen=picture.n_frames + 1
-        )  # one more than is seen: see `forget_newest`
-        n_blocks = -(-picture.context // picture.samples_per_frame)
-        self._blocks: deque[np.ndarray] = deque(maxlen=n_blocks + 1)
+        self._frames: deque[np.ndarray] = deque(maxlen=picture.n_frames)
+        self._blocks: deque[np.ndarray] = deque(maxlen=-(-picture.context // picture.samples_per_frame))
 
     def clear(self) -> None:
         """An episode begins."""
@@ -52,49 +49,6 @@ class HeardSound:
         self._frames.append(how.columns(sound, len(heard)))
         return how.picture(np.concatenate(self._frames))
 
-    def forget_newest(self) -> None:
-        """Another frame comes in place of the newest."""
-        if self._frames:
-            self._frames.pop()
-            self._blocks.pop()
-
-
-class SoundPictures:
-    """The pictures of all microphones of one environment.
-
-    Args:
-        pictures: How they are made.
-    """
-
-    def __init__(self, pictures: Sequence[SoundPicture]) -> None:
-        self._heard = {(_raw_key(how), how.name): HeardSound(how) for how in pictures}
-        self._spaces = {how.name: spaces.Box(0, 255, (how.height, how.width, 3), np.uint8) for how in pictures}
-
-    def space(self, observations: spaces.Dict) -> spaces.Dict:
-        """The observations with the pictures."""
-        if not self._spaces:
-            return observations
-        pixels = observations.spaces.get(_PIXELS)
-        cameras = dict(pixels.spaces) if isinstance(pixels, spaces.Dict) else {}
-        return spaces.Dict({**observations.spaces, _PIXELS: spaces.Dict({**cameras, **self._spaces})})
-
-    def clear(self) -> None:
-        """An episode begins."""
-        for heard in self._heard.values():
-            heard.clear()
-
-    def add(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """The frame's observation with the pictures in `pixels`; the one given stays as it is."""
-        if not self._heard:
-            return dict(observation)
-        new = {name: heard.add(np.asarray(observation[key])) for (key, name), heard in self._heard.items()}
-        return {**observation, _PIXELS: {**observation.get(_PIXELS, {}), **new}}
-
-    def forget_newest(self) -> None:
-        """Another observation comes in place of the newest."""
-        for heard in self._heard.values():
-            heard.forget_newest()
-
 
 class WithSoundPictures(gym.ObservationWrapper):
     """An environment that shows what its microphones heard, `pixels[<name>]`, (height, width, 3) uint8.
@@ -106,16 +60,22 @@ class WithSoundPictures(gym.ObservationWrapper):
 
     def __init__(self, env: gym.Env, pictures: Sequence[SoundPicture]) -> None:
         super().__init__(env)
-        self._pictures = SoundPictures(pictures)
+        self._heard = {(_raw_key(how), how.name): HeardSound(how) for how in pictures}
         assert isinstance(env.observation_space, spaces.Dict)
-        self.observation_space = self._pictures.space(env.observation_space)
+        pixels = env.observation_space.spaces.get(_PIXELS)
+        cameras = dict(pixels.spaces) if isinstance(pixels, spaces.Dict) else {}
+        own = {how.name: spaces.Box(0, 255, (how.height, how.width, 3), np.uint8) for how in pictures}
+        self.observation_space = spaces.Dict({**env.observation_space.spaces, _PIXELS: spaces.Dict({**cameras, **own})})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        self._pictures.clear()
+        for heard in self._heard.values():
+            heard.clear()
         return super().reset(seed=seed, options=options)
 
     def observation(self, observation: Any) -> dict[str, Any]:
-        return self._pictures.add(observation)
+        """The frame's observation with the pictures; the one given stays as it is."""
+        own = {name: heard.add(np.asarray(observation[key])) for (key, name), heard in self._heard.items()}
+        return {**observation, _PIXELS: {**observation.get(_PIXELS, {}), **own}}
 
 
 def with_sound_pictures(make: Callable[[], gym.Env], pictures: Sequence[SoundPicture]) -> Callable[[], gym.Env]:

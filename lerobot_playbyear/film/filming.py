@@ -83,7 +83,7 @@ def film(cfg: VideoConfig) -> Path:
 
 
 def _check_options(cfg: VideoConfig) -> None:
-    """What would otherwise show only after the episode, which on a robot is a person's work."""
+    """What would otherwise show only after the episode."""
     if cfg.attempts < 1:
         raise InputError(f"attempts={cfg.attempts}: give at least 1.")
     if cfg.seed < 0:
@@ -93,8 +93,6 @@ def _check_options(cfg: VideoConfig) -> None:
     if cfg.output.is_dir():
         raise InputError(f"--output={cfg.output}: that is a folder; give the name of a file.")
     check_can_be_made(cfg.output.parent, f"--output={cfg.output}")
-    if cfg.policy is None and getattr(cfg.env, "is_real_time", False):
-        raise InputError("No script can act on a robot: give --policy.path.")
     if cfg.policy is not None and cfg.baseline is not None:
         raise InputError(f"--baseline={cfg.baseline}: it acts without a policy; leave it or --policy.path out.")
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from lerobot_playbyear.inspection.control_checks import check_actions, check_interventions, check_success
 from lerobot_playbyear.inspection.onsets import check_alignment
-from lerobot_playbyear.inspection.recording_checks import check_recording
 from lerobot_playbyear.inspection.sound_checks import check_sound
 from lerobot_playbyear.inspection.source import DatasetSource
 from lerobot_playbyear.inspection.structure_checks import (
@@ -36,7 +35,6 @@ def check_numbers(source: DatasetSource, action_range: Sequence[float] | None = 
     verdicts += _guarded("interventions", check_interventions, source)
     verdicts += _guarded("success", check_success, source)
     verdicts += _guarded("sample rate", check_sample_rates, source)
-    verdicts += _guarded("recording", check_recording, source)
     microphones = fit_microphones(source)
     verdicts += _guarded("sound", lambda s: check_sound(s, microphones), source)
     verdicts += _guarded("sound and motion", lambda s: check_alignment(s, microphones), source)

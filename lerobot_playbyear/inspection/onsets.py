@@ -19,7 +19,9 @@ from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.verdict import Verdict
 from lerobot_playbyear.inspection.waveform import Samples, block_levels
 
-_STEP_S = 0.005
+STEP_S = 0.005
+"""How finely sudden sounds are placed [s]."""
+
 _RISE_DB = 12.0
 _QUIET_BEFORE_S = 0.05
 _LARGEST = 0.1  # share of the frames that count as changes of motion
@@ -34,12 +36,12 @@ def sudden_sounds(samples: Samples, sample_rate: float) -> np.ndarray:
         samples: (n,) in steps of 16-bit PCM.
         sample_rate: [Hz].
     """
-    step = max(round(_STEP_S * sample_rate), 1)
+    step = max(round(STEP_S * sample_rate), 1)
     levels = block_levels(samples, step)
     if len(levels) == 0:
         return np.empty(0)
     loud = levels > np.median(levels) + _RISE_DB
-    quiet_steps = round(_QUIET_BEFORE_S / _STEP_S)
+    quiet_steps = round(_QUIET_BEFORE_S / STEP_S)
     recent = np.convolve(loud, np.ones(quiet_steps + 1))[: len(loud)] - loud  # loud steps just before
     return np.flatnonzero(loud & (recent == 0)) * step / sample_rate
 

@@ -1,12 +1,14 @@
 """Checks of what each camera recorded: pictures that repeat while the arm moves, blank ones, damaged ones."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from PIL import Image
 
+from lerobot_playbyear.inspection.delay import check_delay, difference
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
+from lerobot_playbyear.inspection.structure_checks import fit_microphones
 from lerobot_playbyear.inspection.verdict import Level, Verdict, name_episodes
 
 _BLANK_SPREAD = 2.0  # grey levels, standard deviation within a picture
@@ -29,6 +31,7 @@ class _Watched:
     n_repeated: int = 0  # of those
     longest_freeze: int = 0
     problem: str = ""
+    motion: list[float] = field(default_factory=list)  # of each picture, against the one before
 
 
 class PictureChecks:
@@ -53,6 +56,7 @@ class PictureChecks:
             for picture in pictures:
                 found.n_blank += _spread(picture) < _BLANK_SPREAD
                 repeated = before is not None and np.array_equal(picture, before)
+                found.motion.append(0.0 if before is None else difference(picture, before))
                 moving = bool(moves[found.n_pictures])
                 found.n_moving += moving
                 found.n_repeated += repeated and moving
@@ -81,6 +85,8 @@ class PictureChecks:
             if n_pictures:
                 yield self._judge_repeats(key, watched)
                 yield _judge_blank(key, watched)
+        motion = {key: [each.motion for each in watched] for key, watched in self._watched.items()}
+        yield from check_delay(self._source, fit_microphones(self._source), motion)
 
     def _judge_repeats(self, key: str, watched: list[_Watched]) -> Verdict:
         n_repeated = sum(each.n_repeated for each in watched)

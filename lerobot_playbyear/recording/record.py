@@ -19,7 +19,7 @@ from lerobot_playbyear.episodes.expert import ExpertConfig
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
-from lerobot_playbyear.episodes.scripted_expert import NO_SCRIPT, ScriptedExpertConfig
+from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
 from lerobot_playbyear.hub.datasets import push_dataset
 from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
 from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
@@ -38,7 +38,6 @@ class RecordDatasetConfig:
         root: Its folder. None: in LeRobot's own cache, under its name.
         num_episodes: How many successful episodes it shall have.
         video: Whether pictures are encoded as video; otherwise each is stored without loss.
-        streaming_encoding: Whether video is encoded while it is recorded, as by lerobot-record; otherwise after each episode.
         rgb_encoder: Codec and quality of video, such as `--dataset.rgb_encoder.vcodec=h264`.
         push_to_hub: Whether to upload it when it is complete.
         private: Whether the uploaded repository is private. True: nothing goes to one that is there and public. None: as the
@@ -50,7 +49,6 @@ class RecordDatasetConfig:
     root: str | None = None
     num_episodes: int = 50
     video: bool = False
-    streaming_encoding: bool = False
     rgb_encoder: RGBEncoderConfig = field(default_factory=RGBEncoderConfig)
     push_to_hub: bool = False
     private: bool | None = None
@@ -117,13 +115,10 @@ def record(cfg: RecordConfig) -> Path:
                     facts.fps,
                     features,
                     resume=cfg.resume,
-                    robot_type=getattr(cfg.env, "robot_type", cfg.env.type),
-                    streaming_encoding=cfg.dataset.streaming_encoding and cfg.dataset.video,
+                    robot_type=cfg.env.type,
                     rgb_encoder=cfg.dataset.rgb_encoder,
                 )
             with writer:
-                if isinstance(pool, PersonRollouts):
-                    pool.writer = writer
                 _record_episodes(cfg, pool, writer)
                 summary = f"{writer.num_episodes} episodes, {writer.num_frames} frames"
     except MemoryError as error:
@@ -184,17 +179,10 @@ def _check_options(cfg: RecordConfig) -> None:
         raise InputError(
             f"--expert.type={cfg.expert.type} corrects a policy and does not demonstrate: give scripted or teleop."
         )
-    if getattr(cfg.env, "is_real_time", False) and isinstance(cfg.expert, ScriptedExpertConfig):
-        raise InputError(NO_SCRIPT.format("demonstrate on"))
     if getattr(cfg.expert, "person", False):
         raise InputError("--expert.person=true: it corrects a policy, and does not demonstrate; leave it out.")
-    if not cfg.dataset.video:
-        needs_video = {
-            "streaming_encoding=true": cfg.dataset.streaming_encoding,
-            "rgb_encoder.*": cfg.dataset.rgb_encoder != RGBEncoderConfig(),
-        }
-        for option in (name for name, is_given in needs_video.items() if is_given):
-            raise InputError(f"--dataset.{option} encodes video: give --dataset.video=true, too, or leave it out.")
+    if not cfg.dataset.video and cfg.dataset.rgb_encoder != RGBEncoderConfig():
+        raise InputError("--dataset.rgb_encoder.* encodes video: give --dataset.video=true, too, or leave it out.")
     if cfg.dataset.push_to_hub:
         check_name("dataset.repo_id", cfg.dataset.repo_id, needs_user=True)
         warn_without_login()

@@ -13,7 +13,7 @@ What goes in
   --policy.path=...            the policy to improve, a checkpoint's folder or a name on the Hub
   --demos.repo_id=...          the demonstrations it was trained on; half of each batch; needed
   --demos.root=null            their folder; else LeRobot's cache
-  --env.type=...               where it acts: playbyear, or playbyear_robot for a real one
+  --env.type=...               where it acts, like playbyear
   --expert.type=...            who corrects: scripted (the environment's own, default), teleop
   --expert.teleop.type=...     what a person moves the arm with: keyboard_window, gamepad, ...
   --expert.person=...          with scripted: true for a script that reacts late, trembles and errs

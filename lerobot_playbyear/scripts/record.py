@@ -6,7 +6,7 @@ Only successful episodes are kept. Each is safe on the disk as soon as it is sav
         --dataset.repo_id=me/demos --dataset.root=outputs/demos --dataset.num_episodes=50
     playbyear-record ... --expert.type=teleop          # a person, in a window
 
-  --env.type=...               playbyear, or playbyear_robot for a real one; needed
+  --env.type=...               the environment, like playbyear; needed
   --env.task=...               its task, such as OccludedGrasp-v1 or TellApart-v1
   --expert.type=...            who demonstrates: scripted (the environment's own, default), teleop
   --expert.teleop.type=...     what a person moves the arm with: keyboard_window, gamepad, ...

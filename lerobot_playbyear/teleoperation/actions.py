@@ -1,6 +1,6 @@
 """From what a LeRobot teleoperator gives to an environment's action."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -16,9 +16,6 @@ CLOSE, STAY, OPEN = 0, 1, 2
 KNOWN_DIRECTIONS = {"keyboard_ee": "-x,-y,z", "gamepad": "-y,x,z"}
 """For the view of our tasks (right on the screen is x, away is y), per type of teleoperator; others have `x,y,z`."""
 
-BASE_DIRECTIONS = {"keyboard_window": "y,-x,z", "keyboard_ee": "-y,x,z", "gamepad": "x,y,z"}
-"""For a robot's base frame (x forward, y left, z up) as a person behind the robot sees it."""
-
 
 class ActionMapping:
     """Makes action vectors of a teleoperator's.
@@ -30,21 +27,13 @@ class ActionMapping:
         features: The teleoperator's `action_features`.
         space: The environment's actions.
         directions: What moves the hand along x, y and z: three of `x`, `y`, `z`, with `-` for the opposite direction.
-        names: Of the environment's actions in their order, if they are names of what the teleoperator gives.
         speed: What a full displacement of the teleoperator is for the environment, whose largest is 1.
 
     Raises:
         ExpertError: They do not fit, or `directions` is none.
     """
 
-    def __init__(
-        self,
-        features: Mapping[str, Any],
-        space: gym.Space,
-        directions: str,
-        speed: float,
-        names: Sequence[str] | None = None,
-    ) -> None:
+    def __init__(self, features: Mapping[str, Any], space: gym.Space, directions: str, speed: float) -> None:
         if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
             raise ExpertError(f"A person can act where actions are a Box of one dimension; here they are {space}.")
         self._names = action_names(features)
@@ -52,30 +41,13 @@ class ActionMapping:
         n = space.shape[0]
         self.moves_hand = set(DELTAS) <= set(self._names)
         self.has_gripper = self.moves_hand and n == len(DELTAS) + 1
-        self.names = list(names or ())
-        is_hand = bool(self.names) and set(self.names) <= {*DELTAS, GRIPPER}
-        if is_hand:
-            self.names = []  # they are taken by their meaning
-        if self.names and set(self.names) <= set(self._names):
-            self._names = self.names
-        elif self.names:
-            missing = sorted(set(self.names) - set(self._names))
-            raise ExpertError(
-                f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the robot also needs {', '.join(missing)}: "
-                "give a teleoperator of the same kind as the robot, such as so101_leader for so101_follower."
-            )
-        if (is_hand or n != len(self._names)) and not (self.moves_hand and n in (3, 4)):
+        if n != len(self._names) and not (self.moves_hand and n in (3, 4)):
             raise ExpertError(
                 f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the environment's action is {n} numbers. "
                 "Give a teleoperator of the end effector (--expert.teleop.type=keyboard_window, keyboard_ee, gamepad) for "
                 "actions dx, dy, dz and gripper, or one with as many numbers as the action has."
             )
         self._axes, self._signs = _parse(directions)
-
-    @property
-    def moves_joints(self) -> bool:
-        """Whether the teleoperator gives where each of the robot's joints shall be."""
-        return bool(self.names) and self._names == self.names and all(name.endswith(".pos") for name in self.names)
 
     def vector(self, action: Mapping[str, Any], gripper: float = 0.0) -> np.ndarray:
         """The action vector (action dim,), inside the environment's limits.

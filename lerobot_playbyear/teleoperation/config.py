@@ -1,6 +1,5 @@
 """`--expert.type=teleop`: its options, and how everything that a person needs is put together."""
 
-import logging
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -13,8 +12,7 @@ from lerobot.teleoperators.gamepad import GamepadTeleop
 
 from lerobot_playbyear.compat import has_gamepad, import_devices
 from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
-from lerobot_playbyear.teleoperation.actions import BASE_DIRECTIONS, DELTAS, KNOWN_DIRECTIONS, ActionMapping, Gripper
-from lerobot_playbyear.teleoperation.console import Console
+from lerobot_playbyear.teleoperation.actions import KNOWN_DIRECTIONS, ActionMapping, Gripper
 from lerobot_playbyear.teleoperation.controls import OVERRIDE, TAKEN
 from lerobot_playbyear.teleoperation.expert import TeleopExpert
 from lerobot_playbyear.teleoperation.keyboard import MOVES, KeyboardWindowTeleop, KeyboardWindowTeleopConfig
@@ -42,16 +40,14 @@ class TeleopExpertConfig(ExpertConfig):
         teleop: What they move the arm with: `keyboard_window` (the keys of the window, nothing to install), `keyboard_ee`,
             `gamepad`, or another registered one.
         speed: What a full displacement is, as a share of the largest that the environment takes.
-        directions: What moves the hand along x, y and z, such as `-y,x,z`. None: what fits the view of our tasks, or of a
-            person behind a robot whose base looks along x.
+        directions: What moves the hand along x, y and z, such as `-y,x,z`. None: what fits the view of our tasks.
         gripper_cooldown_s: For how long after a change the gripper cannot change again [s]; the paper's and our tasks' is 2.
         steps_per_second: Control steps per second; fewer than the environment's are slow motion. None: the environment's.
         begin_paused: Each attempt waits until the person presses P.
         takeover: How a person takes over from a policy: `hold` the key, or `toggle` it with one press, and hand back with
-            another. `auto`: hold it where the keyboard says when a key is let go, as a window does and a terminal does not.
+            another.
         takeover_key: The key, such as `space` or `b`; most pedals are keyboards with one key.
-        play_sound: Play the first microphone, if the package sounddevice is installed. None: only in simulation, for a
-            robot would hear it.
+        play_sound: Play the first microphone, if the package sounddevice is installed.
     """
 
     teleop: TeleoperatorConfig = field(default_factory=KeyboardWindowTeleopConfig)
@@ -60,59 +56,42 @@ class TeleopExpertConfig(ExpertConfig):
     gripper_cooldown_s: float = 2.0
     steps_per_second: float | None = None
     begin_paused: bool = True
-    takeover: str = "auto"
+    takeover: str = "hold"
     takeover_key: str = OVERRIDE
-    play_sound: bool | None = None
+    play_sound: bool = True
 
     def make(self, env: gym.Env, demonstrates: bool = False) -> Expert:
         """The person, beside a policy or with nobody else at the controls."""
         self._check(env)
         kind, env_fps = self.teleop.type, float(env.metadata["render_fps"])
         fps = self.steps_per_second or env_fps
-        robot: Any = env.unwrapped if getattr(env.unwrapped, "is_real_time", False) else None
         with ExitStack() as stack:  # closes what was opened if a later part fails
-            window: Window | Console
-            leader: Teleoperator | None = None
-            if robot is None:
-                window = Window(f"Play it by ear: {_title(env)}")
-                stack.callback(window.close)
-            else:  # a leader may ask for its calibration in the terminal, before keys are read from it
-                needs_window = isinstance(self.teleop, KeyboardWindowTeleopConfig)
-                leader = None if needs_window else connect_teleoperator(self.teleop)
-                window = robot.console
-            teleop = leader or connect_teleoperator(self.teleop, window)
+            window = Window(f"Play it by ear: {_title(env)}")
+            stack.callback(window.close)
+            teleop = connect_teleoperator(self.teleop, window)
             stack.callback(teleop.disconnect)
-            names = getattr(robot, "action_names", None)
-            known = BASE_DIRECTIONS if set(DELTAS) <= set(names or ()) else KNOWN_DIRECTIONS
-            directions = self.directions or known.get(kind, "x,y,z")
-            mapping = ActionMapping(_features(teleop), env.action_space, directions, self.speed, names)
-            if self.takeover == "hold" and not window.has_key_releases and not demonstrates:
-                logging.warning(
-                    "--expert.takeover=hold: without a window nothing says when a key is let go; it is pressed once more."
-                )
-            toggles = self.takeover == "toggle" or not window.has_key_releases
+            directions = self.directions or KNOWN_DIRECTIONS.get(kind, "x,y,z")
+            mapping = ActionMapping(_features(teleop), env.action_space, directions, self.speed)
+            toggles = self.takeover == "toggle"
             expert = TeleopExpert(
                 window=window,
                 teleop=teleop,
                 mapping=mapping,
                 gripper=Gripper(round(self.gripper_cooldown_s * env_fps)),
-                pace=Pace(fps, waits=robot is None),
+                pace=Pace(fps),
                 speaker=self._make_speaker(env, fps, env_fps),
                 keys=key_help(kind, mapping, demonstrates, toggles, self._key),
-                begins_paused=self.begin_paused and robot is None,  # a robot's attempt begins when the person is ready
+                begins_paused=self.begin_paused,
                 demonstrates=demonstrates,
                 toggles=toggles,
                 override=self._key,
-                robot=robot,
             )
             stack.pop_all()
-        if robot is not None:
-            robot.person.has_expert = True
         return expert
 
     @property
     def _key(self) -> str:
-        """As windows and terminals name it."""
+        """As the window names it."""
         return self.takeover_key.lower()
 
     def _check(self, env: gym.Env) -> None:
@@ -137,12 +116,8 @@ class TeleopExpertConfig(ExpertConfig):
                 f"--expert.takeover_key={self.takeover_key!r} means something else already: give another one than "
                 f"{', '.join(sorted({*TAKEN, *moves}))}, such as space or b."
             )
-        if self.takeover not in ("auto", "hold", "toggle"):
-            raise ExpertError(f"--expert.takeover={self.takeover!r}: give auto, hold or toggle.")
-        if getattr(env.unwrapped, "is_real_time", False) and self.steps_per_second is not None:
-            raise ExpertError(
-                f"--expert.steps_per_second={self.steps_per_second}: a robot has no slow motion; give --env.fps."
-            )
+        if self.takeover not in ("hold", "toggle"):
+            raise ExpertError(f"--expert.takeover={self.takeover!r}: give hold or toggle.")
         if not env.metadata.get("render_fps"):
             raise ExpertError("The environment does not say its steps per second, metadata['render_fps'].")
 
@@ -151,17 +126,14 @@ class TeleopExpertConfig(ExpertConfig):
         blocks = microphone_blocks(env.observation_space.sample())
         size = len(next(iter(blocks.values()), ()))
         reason = "" if blocks else "no microphone"
-        is_robot = getattr(env.unwrapped, "is_real_time", False)
-        if is_robot and self.play_sound is None:
-            reason = "the robot's microphones would hear it"
-        elif self.play_sound is False:
+        if not self.play_sound:
             reason = "--expert.play_sound=false"
         elif fps != env_fps:
             reason = "slow motion"
         return Speaker(round(size * env_fps), size, reason)
 
 
-def connect_teleoperator(config: TeleoperatorConfig, window: Window | Console | None = None) -> Teleoperator:
+def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoperator:
     """Make and connect a LeRobot teleoperator.
 
     Args:
@@ -174,7 +146,7 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window | Console | 
     option = f"--expert.teleop.type={config.type}"
     try:
         if isinstance(config, KeyboardWindowTeleopConfig):
-            teleop: Teleoperator = KeyboardWindowTeleop(config, window.keys if window is not None else None)
+            teleop: Teleoperator = KeyboardWindowTeleop(config, window.keys)
         else:
             teleop = make_teleoperator_from_config(config)
         teleop.connect()

@@ -2,21 +2,17 @@
 
 import time
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
 from lerobot.teleoperators import Teleoperator
 
-from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.episode import Observation, Verdict
-from lerobot_playbyear.episodes.expert import Expert, ExpertError
+from lerobot_playbyear.episodes.expert import Expert
 from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
-from lerobot_playbyear.teleoperation.console import Console
-from lerobot_playbyear.teleoperation.controls import LEAVE, OVERRIDE, Controls, PersonLeftError, Wish
-from lerobot_playbyear.teleoperation.handover import hand_over
-from lerobot_playbyear.teleoperation.leader import connected_anew, let_go, problem_of
+from lerobot_playbyear.teleoperation.controls import OVERRIDE, Controls, PersonLeftError, Wish
 from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.pace import Pace
 from lerobot_playbyear.teleoperation.speaker import Speaker
@@ -36,7 +32,7 @@ class TeleopExpert(Expert):
     """Shows a person each step in its turn, and lets them take over while they hold a key.
 
     Args:
-        window: Shows the scene and hears keys; on a robot, its console.
+        window: Shows the scene and hears keys.
         teleop: A connected LeRobot teleoperator.
         mapping: Makes actions of what it gives.
         gripper: What the gripper is told.
@@ -47,10 +43,9 @@ class TeleopExpert(Expert):
         demonstrates: Whether nobody but the person acts.
         toggles: Whether a press of the key takes over, or hands back, instead of holding it.
         override: The key.
-        robot: The robot's environment, if it is one; its console is not closed here.
     """
 
-    window: Window | Console
+    window: Window
     teleop: Teleoperator
     mapping: ActionMapping
     gripper: Gripper
@@ -61,7 +56,6 @@ class TeleopExpert(Expert):
     demonstrates: bool = False
     toggles: bool = False
     override: str = OVERRIDE
-    robot: Any = None
 
     decides: ClassVar[bool] = True
     can_label: ClassVar[bool] = False
@@ -87,9 +81,7 @@ class TeleopExpert(Expert):
         self._verdict, self._last_command, self._is_paused = None, None, self.begins_paused
         status.control = Control.PERSON if self.demonstrates else Control.POLICY
         self._controls.reset()
-        if self.robot is not None and self.window.is_open:
-            self._connect_leader()
-        if self._look()[0].leaves:  # all else that was pressed meanwhile was not meant for this attempt
+        if self._controls.read().leaves:  # all else that was pressed meanwhile was not meant for this attempt
             raise PersonLeftError
         self._controls.reset()
         self._acts = self._is_called = self._stays = False
@@ -98,17 +90,6 @@ class TeleopExpert(Expert):
         self.speaker.clear()
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
-        try:
-            return self._decide(observation, policy_action)
-        except PlaybyearError as error:
-            if self.robot is None:
-                raise
-            self._verdict = self.robot.stop_and_ask(str(error))
-            if self._verdict is None:
-                raise PersonLeftError from error
-            return False
-
-    def _decide(self, observation: Observation, policy_action: np.ndarray) -> bool:
         status = self._status
         status.step += 1
         if self._last_command is not None:
@@ -126,11 +107,6 @@ class TeleopExpert(Expert):
         if self._is_paused and self._verdict is None:
             self._pause()
         acts = self.demonstrates or self._wish.overrides or self._stays
-        if acts and not self._acts and self.robot is not None and self.mapping.moves_joints and self._verdict is None:
-            self._meet()
-        if self.robot is not None and self._verdict is not None:  # the arm holds at once; this step moves nothing
-            self.robot.stop(self._verdict)
-            return False
         self._acts = acts
         self._last_command = self._gripper_command() if acts else float(policy_action[-1])
         status.control = Control.PERSON if acts else Control.CALLED if self._is_called else Control.POLICY
@@ -157,75 +133,32 @@ class TeleopExpert(Expert):
 
     def close(self) -> None:
         self.speaker.close()
-        let_go(self.teleop)
-        if self.robot is None:
+        try:
+            if self.teleop.is_connected:
+                self.teleop.disconnect()
+        finally:
             self.window.close()
-        else:
-            self.robot.person.has_expert = False
-
-    def _connect_leader(self) -> None:
-        """Connects anew to a leader that was lost, as often as the person wants it."""
-        problem = problem_of(self.teleop)
-        if not problem:
-            return
-        self.robot.hold()
-        problem = connected_anew(self.teleop)
-        while problem:
-            problem, person = f"{problem} Look at its cable and its power.", self.robot.person
-            if not person.is_there or not person.wants_again(problem):
-                raise ExpertError(problem)
-            problem = connected_anew(self.teleop)
-        self.robot.go_on()
 
     def _read(self) -> None:
         """What the person wants now."""
         if not self.window.is_open:
             raise PersonLeftError
-        self._wish, problem = self._look()
-        if not problem and self._wish.leaves:
-            problem = "You pressed Escape." if self.teleop.is_connected else "The leader is no longer connected."
-        verdict = self._wish.verdict
-        if problem and self.robot is not None:
-            verdict = self.robot.stop_and_ask(problem)
-        if problem and verdict is None:
+        self._wish = self._controls.read()
+        if self._wish.leaves:
             raise PersonLeftError
         self._is_paused ^= self._wish.toggles_pause
-        self._verdict = verdict
-
-    def _look(self) -> tuple[Wish, str]:
-        """What the person wants; on a robot, a leader that does not answer wants nothing, and why it does not is said."""
-        try:
-            return self._controls.read(), ""
-        except Exception as error:  # a leader's cable
-            if self.robot is None:
-                raise
-            return Wish({}), f"The leader does not answer: {error}"
+        self._verdict = self._wish.verdict
 
     def _pause(self) -> None:
         """Nothing moves until the person goes on, or ends the attempt."""
         status = self._status
         note, status.note = status.note, _BEGIN if status.step == 0 else "Press P to go on"
-        if self.robot is not None:
-            self.robot.hold()
         while self._is_paused and self._verdict is None:
             status.control = Control.PAUSED
             self._show()
             time.sleep(1 / self.pace.fps)
             self._read()
         status.note = note
-        self.pace.start()
-        if self.robot is not None and self._verdict is None:
-            self.robot.go_on()
-            self._acts = False  # a leader that was put down is elsewhere now
-
-    def _meet(self) -> None:
-        """Leader and follower come together before the person acts."""
-        self._status.note = "The arms meet"
-        self._show()
-        target = self.robot.arm.by_name(self.mapping.vector(self._wish.action))
-        hand_over(self._env, self.teleop, target, lambda: self.window.keys.was_pressed(LEAVE))
-        self._status.note = ""
-        self._read()
         self.pace.start()
 
     def _gripper_command(self) -> float:
@@ -245,5 +178,4 @@ class TeleopExpert(Expert):
             status.gripper = "closed" if self.gripper.is_closed else "open"
             status.cooldown_s = round(self.gripper.blocked_steps / self.pace.fps, 2)
         status.sound = self.speaker.problem
-        status.drop_outs = self.robot.n_drop_outs if self.robot is not None else 0
         self.window.show(status, picture)

@@ -41,11 +41,6 @@ class WindowKeys:
             self.held = frozenset(self._held | set(self._pressed_since))
             self._pressed_since.clear()
 
-    def was_pressed(self, name: str) -> bool:
-        """Whether a key was pressed since the last look, which still will show it."""
-        with self._lock:
-            return name in self._pressed_since
-
     def note(self, name: str, is_pressed: bool) -> None:
         """A key went down or up."""
         with self._lock:

@@ -15,7 +15,6 @@ class Pace:
     Args:
         fps: Steps per second.
         clock, sleep: As in `time`.
-        waits: Whether it waits, and not only measures.
     """
 
     def __init__(
@@ -23,9 +22,8 @@ class Pace:
         fps: float,
         clock: Callable[[], float] = time.perf_counter,
         sleep: Callable[[float], None] = time.sleep,
-        waits: bool = True,
     ) -> None:
-        self.fps, self._waits = fps, waits
+        self.fps = fps
         self._clock, self._sleep = clock, sleep
         self._due: float | None = None
         self._times: deque[float] = deque()
@@ -38,7 +36,7 @@ class Pace:
     def wait(self) -> None:
         """Returns when the next step is due."""
         now = self._clock()
-        if self._due is None or now > self._due or not self._waits:
+        if self._due is None or now > self._due:
             self._due = now
         else:
             self._sleep(self._due - now)

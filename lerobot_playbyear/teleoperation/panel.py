@@ -104,8 +104,6 @@ def _draw_pace(draw: ImageDraw.ImageDraw, status: Status, y: int) -> None:
         _draw_fact(draw, y, "Pace", f"slow: {status.achieved_fps:.0f} of {status.fps:.0f} steps/s", _WARNING)
     elif status.fps:
         _draw_fact(draw, y, "Pace", f"{status.fps:.0f} steps/s")
-    if status.drop_outs:
-        _draw_fact(draw, y + 24, "Sound", f"{status.drop_outs} drop-outs", _WARNING)
 
 
 def _draw_fact(draw: ImageDraw.ImageDraw, y: int, name: str, value: str, colour: str = _DIM) -> None:

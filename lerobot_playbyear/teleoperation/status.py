@@ -35,7 +35,6 @@ class Status:
         keys: What to press, and what it does.
         note: What happened last.
         waiting: What goes on when no frame comes.
-        drop_outs: Places of this attempt at which sound is missing.
     """
 
     control: Control = Control.WAITING
@@ -52,7 +51,6 @@ class Status:
     keys: list[tuple[str, str]] = field(default_factory=list)
     note: str = ""
     waiting: str = ""
-    drop_outs: int = 0
 
     @property
     def is_slow(self) -> bool:

@@ -31,13 +31,10 @@ class Window:
     Attributes:
         keys: What a person presses in it.
         is_open: Whether nobody has closed it.
-        has_key_releases: It knows when a key is let go.
 
     Raises:
         ExpertError: There is no screen, or something is not installed.
     """
-
-    has_key_releases = True
 
     def __init__(self, title: str) -> None:
         self.keys = WindowKeys()

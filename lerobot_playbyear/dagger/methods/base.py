@@ -65,14 +65,12 @@ class MethodConfig(draccus.ChoiceRegistry, abc.ABC):
         expert_decides: The expert says when it takes over, so that `--takeover_delay_s` has a meaning.
         chooses_frames: The method says what is learned from, so that `--learn_from` has none, and `--skip_s` is 0 by default.
         is_watched: A person who corrects has to watch all of every attempt.
-        needs_simulation: A scene has to be set up twice alike.
         needs_judge: The expert has to say when it takes over.
     """
 
     expert_decides: ClassVar[bool] = True
     chooses_frames: ClassVar[bool] = False
     is_watched: ClassVar[bool] = True
-    needs_simulation: ClassVar[bool] = False
     needs_judge: ClassVar[bool] = True
 
     @property

@@ -181,14 +181,14 @@ class Early(Beside):
         is_rehearsal: Set it before the attempt.
 
     Raises:
-        InputError: The environment is a robot, or the expert a person: neither can be asked twice.
+        InputError: The expert is a person, who cannot be asked twice.
     """
 
     def __init__(self, expert: Expert, n_steps: int, env: gym.Env) -> None:
-        if getattr(env.unwrapped, "is_real_time", False) or expert.decides or not expert.can_label:
+        if expert.decides or not expert.can_label:
             raise InputError(
                 "--takeover_delay_s below 0 plays every attempt twice, to know when the expert would take over: only a "
-                "simulation and a script do the same again. Give 0 or more."
+                "script does the same again. Give 0 or more."
             )
         super().__init__(expert)
         self._n_steps, self.is_rehearsal = n_steps, False

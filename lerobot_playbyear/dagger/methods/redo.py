@@ -27,7 +27,6 @@ class RedoConfig(MethodConfig):
 
     expert_decides: ClassVar[bool] = False
     chooses_frames: ClassVar[bool] = True
-    needs_simulation: ClassVar[bool] = True
     needs_judge: ClassVar[bool] = False
 
     def make(self, cfg: "DaggerConfig") -> Method:

@@ -52,8 +52,7 @@ class Remembering:
         self._policy: Any = tools.parts.accelerator.unwrap_model(tools.parts.policy)
         source = DatasetSource(f"{tools.cfg.interventions.repo_id}_{ATTEMPTS}", str(tools.folder.path / ATTEMPTS))
         self._others = Corrections(source)
-        robot = getattr(tools.cfg.env, "robot_type", tools.cfg.env.type)
-        self._others.open_for_writing(tools.facts.fps, dataset_features(tools.facts), robot)
+        self._others.open_for_writing(tools.facts.fps, dataset_features(tools.facts), tools.cfg.env.type)
         self._others.read(tools.windows.keys, tools.demonstrations.device, tools.demonstrations.image_size)
 
     def close(self) -> None:

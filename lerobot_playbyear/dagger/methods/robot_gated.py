@@ -45,7 +45,7 @@ class RobotGatedConfig(MethodConfig):
         discount: Of a success, per step; ThriftyDAgger: 0.9999.
         memory: Last attempts from which thresholds are set.
         redo_failed: Where an attempt fails all the same, the scene is set up again, and the expert demonstrates the task in it
-            from the first step on, as with `--method.type=redo`. None: in a simulation, where a script acts to the end.
+            from the first step on, as with `--method.type=redo`. None: where the expert acts to the end.
     """
 
     expert_decides: ClassVar[bool] = False
@@ -61,14 +61,6 @@ class RobotGatedConfig(MethodConfig):
     discount: float = 0.9999
     memory: int = 20
     redo_failed: bool | None = None
-
-    @property
-    def needs_simulation(self) -> bool:  # type: ignore[override]
-        return bool(self.redo_failed)
-
-    def redoes(self, hands_back: bool, is_real_time: bool) -> bool:
-        """Whether what fails is shown from its first step."""
-        return not (hands_back or is_real_time) if self.redo_failed is None else self.redo_failed
 
     def check(self) -> None:
         if not 0 < self.intervention_share < 1:
@@ -123,7 +115,7 @@ class RobotGated(Method):
         self._tools = tools
         hands_back = self._expert.decides if self._config.hands_back is None else self._config.hands_back
         self._n_least = round(self._config.least_s * tools.facts.fps) if hands_back else FOR_GOOD
-        self._redoes = self._config.redoes(hands_back, getattr(self.cfg.env, "is_real_time", False))
+        self._redoes = not hands_back if self._config.redo_failed is None else self._config.redo_failed
 
     @property
     def _remembering(self) -> "Remembering":

@@ -23,7 +23,6 @@ from lerobot_playbyear.datasets.columns import column_to_numpy, with_values
 from lerobot_playbyear.datasets.episode_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.files import list_files, take_over
 from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES, ParquetDamageError, open_checked, write_tables
-from lerobot_playbyear.datasets.recording_notes import renumber_notes
 from lerobot_playbyear.datasets.repair.episodes import Row
 from lerobot_playbyear.datasets.repair.frames import DataFile
 from lerobot_playbyear.datasets.repair.plan import Kept, Plan
@@ -52,7 +51,8 @@ def write_copy(root: Path, target: Path, plan: Plan) -> list[str]:
     survey = plan.survey
     notes = [*take_over_rest(root, target, plan.info.features), *plan.notes]
     numbers = {kept.run.episode: kept.number for kept in plan.kept}
-    notes += [said for renumber in (renumber_episode_starts, renumber_notes) if (said := renumber(target, numbers))]
+    if said := renumber_episode_starts(target, numbers):
+        notes.append(said)
     by_file: dict[Path, list[Kept]] = defaultdict(list)
     for kept in plan.kept:
         by_file[kept.run.file.name].append(kept)
