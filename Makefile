@@ -13,12 +13,12 @@ export HF_HUB_DISABLE_TELEMETRY ?= 1
 unexport PYTHONDONTWRITEBYTECODE
 
 # In the order of their names: otherwise the longest, which are few in their files, come last and one by one.
-PYTEST := $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder
+PYTEST = $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: help install demo test test-slow lint bench checks adversaries lock clean
+.PHONY: help install demo test test-slow test-lerobot lint bench checks adversaries lock clean
 
 help:  ## Says what there is
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-11s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 install: .venv/.installed  ## Makes .venv with pinned versions (PYTHON=... to choose the Python)
 
@@ -41,6 +41,12 @@ test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, def
 test-slow: install  ## The tests that take minutes, side by side like the others
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST) -m slow --timeout 3600
 
+test-lerobot: BIN := .venv-lerobot/bin
+test-lerobot:  ## The tests with another LeRobot, in .venv-lerobot (LEROBOT=... a checkout or a wheel)
+	$(if $(LEROBOT),,$(error Which LeRobot? make test-lerobot LEROBOT=/path/to/checkout, or a wheel))
+	PYTHON="$(PYTHON)" LEROBOT="$(LEROBOT)" ./tools/setup.sh
+	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST)
+
 bench: install  ## Measures speed and memory, beside alternatives, in a quarter of an hour
 	$(BIN)/python benchmarks/run.py
 
@@ -60,5 +66,5 @@ lock: install  ## Writes the versions in .venv to constraints.txt
 	mv constraints.txt.new constraints.txt
 
 clean:  ## Removes .venv, caches and outputs
-	rm -rf .venv outputs .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv .venv-lerobot outputs .pytest_cache .mypy_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

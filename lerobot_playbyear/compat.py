@@ -10,17 +10,24 @@ What lives on other people's objects has a function of its own at the end; what 
 torch.
 """
 
+from collections.abc import Callable
 from contextlib import suppress
+from copy import copy
 from importlib import import_module, metadata
+from inspect import signature
 from pkgutil import iter_modules, resolve_name
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from types import ModuleType
 
+    from accelerate import Accelerator
+    from huggingface_hub import ModelCard
+    from lerobot.configs import PreTrainedConfig
     from lerobot.datasets import LeRobotDatasetMetadata
     from lerobot.teleoperators.gamepad import GamepadTeleop
     from lerobot.teleoperators.keyboard import KeyboardTeleop
+    from lerobot.utils.logging_utils import MetricsTracker
     from torch import Tensor
 
 
@@ -45,7 +52,6 @@ BORROWED = {
     "eval_policy_all": ("lerobot.scripts.lerobot_eval:eval_policy_all", f"{_TRAINS} evaluate"),
     "get_step_checkpoint_dir": ("lerobot.common.train_utils:get_step_checkpoint_dir", f"{_TRAINS} name a checkpoint"),
     "get_step_identifier": ("lerobot.common.train_utils:get_step_identifier", f"{_TRAINS} name a film"),
-    "load_training_state": ("lerobot.common.train_utils:load_training_state", f"{_TRAINS} resume"),
     "save_checkpoint": ("lerobot.common.train_utils:save_checkpoint", f"{_TRAINS} save"),
     "update_last_checkpoint": ("lerobot.common.train_utils:update_last_checkpoint", f"{_TRAINS} save"),
     "WandBLogger": ("lerobot.common.wandb_utils:WandBLogger", f"{_TRAINS} report to W&B"),
@@ -98,6 +104,63 @@ def import_devices(package: "ModuleType") -> None:
         if module.ispkg:
             with suppress(Exception):
                 import_module(f"{package.__name__}.{module.name}")
+
+
+def save_checkpoint(accelerator: "Accelerator", cfg: Any, **what: Any) -> None:
+    """LeRobot's. It notes how many processes learned, each from how many windows, which lerobot-train resumes from.
+
+    Args:
+        accelerator: Of the processes. LeRobot does not get it: it would wait for all of them, and one saves.
+        cfg: The options of the run.
+        what: Further arguments, which every version takes.
+    """
+    save = __getattr__("save_checkpoint")
+    if "num_processes" in signature(save).parameters:  # LeRobot 0.6.1
+        what |= {"num_processes": accelerator.num_processes, "batch_size": cfg.batch_size}
+    else:  # it reads them in the options
+        cfg.parallelism.dp_replicate = accelerator.num_processes
+    save(cfg=cfg, **what)
+
+
+def metrics_tracker(accelerator: "Accelerator | None", *figures: Any, initial_step: int) -> "MetricsTracker":
+    """LeRobot's `MetricsTracker`, of an accelerator's processes; None: of this one."""
+    from lerobot.utils.logging_utils import MetricsTracker
+
+    processes: dict[str, Any]
+    if "accelerator" in signature(MetricsTracker).parameters:  # LeRobot 0.6.1
+        processes = {"accelerator": accelerator}
+    else:
+        processes = {"dp_world_size": 1 if accelerator is None else accelerator.num_processes}
+    return MetricsTracker(*figures, initial_step=initial_step, **processes)
+
+
+def card_writer(policy: Any, config: "PreTrainedConfig") -> "Callable[..., ModelCard]":
+    """What writes LeRobot's card of a policy: its method, or where policies have none, a function that takes the same.
+
+    Args:
+        policy: The policy; `super()` in a method of its own of that name.
+        config: Its configuration.
+    """
+    method: Callable[..., ModelCard] | None = getattr(policy, "generate_model_card", None)  # LeRobot 0.6.1
+    if method is not None:
+        return method
+    generate = load("lerobot.common.train_utils:generate_model_card", "no policy gets a card")
+
+    def write(
+        dataset_repo_id: str | None,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: Any = None,
+        dataset_meta: Any = None,
+    ) -> "ModelCard":
+        described: Any = copy(config)
+        described.license, described.tags = license, tags
+        card: ModelCard = generate(described, cfg=cfg, dataset_meta=dataset_meta)
+        card.data["datasets"] = dataset_repo_id
+        return card
+
+    return write
 
 
 def forget_unsaved_rows(meta: "LeRobotDatasetMetadata") -> None:

@@ -9,6 +9,7 @@ from pkgutil import resolve_name
 
 import pytest
 import torch
+from lerobot.policies import PreTrainedPolicy
 
 from lerobot_playbyear import compat
 from lerobot_playbyear.compat import BORROWED, CompatError
@@ -77,6 +78,8 @@ def test_what_is_borrowed_is_there(name):
 
 @pytest.mark.parametrize(("where", "says", "breaks"), SAID)
 def test_lerobot_does_with_ours_what_we_hold_on_to(where, says, breaks):
+    if where.endswith("push_model_to_hub") and not hasattr(PreTrainedPolicy, "generate_model_card"):
+        pytest.skip("LeRobot after 0.6.1 asks no policy for its card: that of lerobot-train is LeRobot's own")
     assert says in inspect.getsource(resolve_name(f"lerobot.{where}")), f"{where} changed. Without it: {breaks}"
 
 
@@ -104,11 +107,11 @@ def test_a_package_that_cannot_be_imported_does_not_keep_the_others_out(tmp_path
 
 
 def test_functions_are_imported_by_their_name():
-    from lerobot.common.train_utils import save_checkpoint
+    from lerobot.common.train_utils import update_last_checkpoint
 
-    assert compat.save_checkpoint is save_checkpoint
-    with pytest.raises(ImportError, match="cannot import name 'save_checkpoin'"):
-        from lerobot_playbyear.compat import save_checkpoin  # noqa: F401
+    assert compat.update_last_checkpoint is update_last_checkpoint
+    with pytest.raises(ImportError, match="cannot import name 'update_last_checkpoin'"):
+        from lerobot_playbyear.compat import update_last_checkpoin  # noqa: F401
 
 
 def test_nothing_is_borrowed_elsewhere():

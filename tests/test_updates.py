@@ -167,13 +167,13 @@ def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(
     assert all(value.is_contiguous(memory_format=torch.channels_last) for value in moments)
     further = learn(parts, given, 2)
 
-    from lerobot_playbyear.compat import load_training_state
+    from lerobot_playbyear.training.checkpoints import load_training_state
 
     cfg, resumed = make()
     resumed.policy.load_state_dict(load_file(folder / "pretrained_model" / "model.safetensors"))
     prefer_channels_last(resumed.policy, resumed.optimizer.optimizer)
     fuse(resumed.optimizer.optimizer)
-    resumed.step, _, _ = load_training_state(folder, resumed.optimizer.optimizer, resumed.scheduler)
+    resumed.step = load_training_state(folder, resumed.optimizer.optimizer, resumed.scheduler)
     again = batches(resumed)
     for _ in range(3):
         next(again)

@@ -11,6 +11,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies import get_policy_class
 from lerobot.utils.constants import CHECKPOINTS_DIR, HF_LEROBOT_HOME
 
+from lerobot_playbyear.compat import card_writer
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.hub.datasets import CARD, FILM
 from lerobot_playbyear.hub.pushing import HubError, PushOptions, check_name, push_patiently, reason
@@ -93,7 +94,7 @@ def _make_card(policy: Any, folder: Path) -> ModelCard:
         if (root / "meta" / "info.json").is_file():
             meta = LeRobotDatasetMetadata(dataset.repo_id, root=root)
     card = write_card(
-        policy.generate_model_card,
+        card_writer(policy, config),
         config,
         dataset.repo_id if dataset is not None else None,
         config.type,

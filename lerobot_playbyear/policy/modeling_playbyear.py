@@ -4,12 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.device_utils import resolve_safetensors_device
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from lerobot_playbyear.compat import card_writer
 from lerobot_playbyear.policy.card import with_hearing, write_card
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.feature_checks import check_fps, refuse_unheard_microphones
@@ -17,7 +19,7 @@ from lerobot_playbyear.policy.history import RecentFrames, newest
 from lerobot_playbyear.policy.moving_average import MovingAverage, with_average, without_average
 from lerobot_playbyear.policy.networks import PlaybyearNetwork
 from lerobot_playbyear.policy.packed_encoder import act_by_folded_copies, prepare_to_act
-from lerobot_playbyear.policy.shared_statistics import mean_over_processes, share_batch_norm
+from lerobot_playbyear.policy.shared_statistics import is_first_process, mean_over_processes, share_batch_norm
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram
 
 
@@ -65,11 +67,20 @@ class PlaybyearPolicy(PreTrainedPolicy):
             self.averaged.update_parameters(self.model)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        """Writes a checkpoint, of copies: on a GPU an LSTM's weights are views of one buffer, which safetensors refuses."""
-        if state_dict is None:
-            as_saved = {"device": "cpu", "copy": True, "memory_format": torch.contiguous_format}
-            state_dict = {name: value.to(**as_saved) for name, value in self.state_dict().items()}
-        super()._save_pretrained(save_directory, state_dict=state_dict)
+        """Writes a checkpoint, of copies: on a GPU an LSTM's weights are views of one buffer, which LeRobot's own refuses.
+
+        Args:
+            save_directory: Where to.
+            state_dict: The weights, where LeRobot 0.6.1 has gathered them; None: the policy's. Later versions call this in
+                every process of a training, and the first writes.
+        """
+        if not is_first_process():
+            return
+        as_saved: dict[str, Any] = {"device": "cpu", "copy": True, "memory_format": torch.contiguous_format}
+        weights = self.state_dict() if state_dict is None else state_dict
+        copies = {name: value.to(**as_saved) for name, value in weights.items()}
+        self.config.save_pretrained(save_directory)
+        save_file(copies, save_directory / SAFETENSORS_SINGLE_FILE, metadata={"format": "pt"})
 
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
@@ -90,7 +101,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> Any:
         """LeRobot's card, with what the policy hears."""
-        return with_hearing(write_card(super().generate_model_card, self.config, *args, **kwargs), self.config)
+        writer = card_writer(super(), self.config)
+        return with_hearing(write_card(writer, self.config, *args, **kwargs), self.config)
 
     def keep_normalization(self) -> None:
         """From now on sound is normalised by the statistics that the spectrograms have, in training too."""

@@ -13,6 +13,11 @@ def n_processes() -> int:
     return distributed.get_world_size() if distributed.is_available() and distributed.is_initialized() else 1
 
 
+def is_first_process() -> bool:
+    """Whether this is the process that writes files, of those that train together."""
+    return n_processes() == 1 or distributed.get_rank() == 0
+
+
 def mean_over_processes(values: Tensor) -> Tensor:
     """The mean of every process's values, of the same shape; gradients flow back to all of them."""
     if n_processes() == 1:

@@ -1,15 +1,20 @@
-"""Which of a run's checkpoints acts: the one with the lowest held-out loss, or an average of the last ones."""
+"""The checkpoints of a run: which acts, the one with the lowest held-out loss or an average; how a run goes on from one."""
 
 import math
 import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
-from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+from lerobot.optim import load_optimizer_state, load_scheduler_state
+from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR, TRAINING_STATE_DIR, TRAINING_STEP
+from lerobot.utils.io_utils import load_json
+from lerobot.utils.random_utils import load_rng_state
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+from torch.optim import Optimizer
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
@@ -51,6 +56,32 @@ class BestCheckpoint:
         new.unlink(missing_ok=True)
         new.symlink_to(checkpoint.name)
         os.replace(new, checkpoint.with_name(BEST_LINK))
+
+
+def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: Any) -> int:
+    """Reads what LeRobot wrote beside the policy, before the optimizer is prepared: random numbers, optimizer, schedule.
+
+    LeRobot's own function for this is another one in every version; the parts that it calls stay.
+
+    Args:
+        checkpoint: `<run>/checkpoints/<step>`.
+        optimizer: Gets its state.
+        scheduler: Gets its state; None: there is none.
+
+    Returns:
+        Updates done.
+
+    Raises:
+        NotADirectoryError: The checkpoint has no training state.
+    """
+    folder = checkpoint / TRAINING_STATE_DIR
+    if not folder.is_dir():
+        raise NotADirectoryError(folder)
+    load_rng_state(folder)
+    load_optimizer_state(optimizer, folder)
+    if scheduler is not None:
+        load_scheduler_state(scheduler, folder)
+    return int(load_json(folder / TRAINING_STEP)["step"])
 
 
 def last_checkpoints(output_dir: Path, n: int) -> list[Path]:

@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
-from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
+from lerobot.utils.logging_utils import AverageMeter
 from torch import Tensor
 
+from lerobot_playbyear.compat import metrics_tracker
 from lerobot_playbyear.datasets.mixture import Windowed
 
 if TYPE_CHECKING:
@@ -37,8 +38,9 @@ class Figures:
         }
         if torch.cuda.is_available():
             meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
-        self._tracker = MetricsTracker(
-            batch_size, len(store), store.n_episodes, meters, initial_step=step, accelerator=accelerator
+        self._accelerator = accelerator
+        self._tracker = metrics_tracker(
+            accelerator, batch_size, len(store), store.n_episodes, meters, initial_step=step
         )
         self._waiting: list[Mapping[str, Any]] = []
 
@@ -52,7 +54,8 @@ class Figures:
     def read(self) -> tuple[dict[str, float], str]:
         """The averages since the last time, by name and as a line. Every process has to call it."""
         self._take_in()
-        self._tracker.reduce_across_ranks()
+        if self._accelerator is not None:
+            self._tracker.reduce_across_ranks()
         figures, line = self._tracker.to_dict(), str(self._tracker)
         self._tracker.reset_averages()
         return figures, line

@@ -21,7 +21,6 @@ from lerobot_playbyear.compat import (
     eval_policy_all,
     get_step_checkpoint_dir,
     get_step_identifier,
-    load_training_state,
     save_checkpoint,
     update_last_checkpoint,
 )
@@ -29,6 +28,7 @@ from lerobot_playbyear.hub.policies import push_checkpoint
 from lerobot_playbyear.hub.pushing import push_meanwhile
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
+from lerobot_playbyear.training.checkpoints import load_training_state
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.windows import dataset_names
 
@@ -115,16 +115,15 @@ class TrainingParts:
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:
         """Write LeRobot's checkpoint into a folder."""
         save_checkpoint(
+            self.accelerator,
+            cfg,
             checkpoint_dir=folder,
             step=self.step,
-            cfg=cfg,
             policy=self._unwrapped(),
             optimizer=self.optimizer,
             scheduler=self.scheduler,
             preprocessor=self.preprocessor,
             postprocessor=self.postprocessor,
-            num_processes=self.accelerator.num_processes,
-            batch_size=cfg.batch_size,
         )
 
     def evaluate(self, cfg: PlaybyearTrainConfig, n_videos: int = 4) -> dict[str, Any]:
@@ -200,7 +199,7 @@ def make_training_parts(
     optimizer, scheduler = make_optimizer_and_scheduler(cfg, policy)
     step = 0
     if cfg.resume and cfg.checkpoint_path is not None:
-        step, optimizer, scheduler = load_training_state(cfg.checkpoint_path, optimizer, scheduler)
+        step = load_training_state(cfg.checkpoint_path, optimizer, scheduler)
     if accelerator.device.type == "cuda":
         policy.to(accelerator.device)  # before its weights and the optimizer's state are laid out anew
         prefer_channels_last(policy, optimizer)
