@@ -11,24 +11,25 @@ _ROOT = Path(__file__).parents[1] / "lerobot_playbyear"
 # Each package, and what it may import besides itself and `compat`. A package names only those above it: no circles.
 _ARROWS = """
 datasets
-policy          datasets
-episodes        datasets
-film            datasets episodes
-inspection      datasets film
-hub             datasets policy film inspection
-training        datasets policy hub
+audio           datasets
+microphones     datasets audio
+policy          datasets audio
+episodes        datasets audio
+film            datasets audio episodes
+inspection      datasets audio film
+hub             datasets audio policy film inspection
+training        datasets audio policy hub
 teleoperation   datasets episodes
-microphones     datasets
 recording       datasets episodes hub teleoperation
 dagger          datasets episodes hub training
-scripts         datasets policy episodes film inspection hub training teleoperation recording dagger microphones
+scripts         datasets audio microphones policy episodes film inspection hub training teleoperation recording dagger
 """
 _ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}
 _AT_THE_TOP = {"__init__.py", "compat.py"}
 _TOP_NAMES = {"compat", "lazy_names", "__version__"}
 """What every package may import from the top."""
 
-_MOST_LINES, _FEWEST_LINES = 300, 25
+_MOST_LINES, _FEWEST_LINES = 400, 25
 _SHORT = {
     "datasets/errors.py": "the error that all of the package raise; whoever catches it needs none of the rest",
 }

@@ -28,7 +28,7 @@ def microphone_pictures(meta: "LeRobotDatasetMetadata") -> list[str]:
     """The features of a dataset that are a microphone's pictures; those whose files are not here are not looked at."""
     found = []
     for key, feature in meta.features.items():
-        if feature["dtype"] in ("image", "video") and key not in meta.depth_keys:
+        if feature["dtype"] in ("image", "video") and tuple(feature["shape"])[-1] == 3:
             is_noted = MICROPHONE in (feature.get("info") or {})
             if is_noted or any(read_timecode(picture) for picture in _first_pictures(meta, key)):
                 found.append(key)
@@ -37,8 +37,9 @@ def microphone_pictures(meta: "LeRobotDatasetMetadata") -> list[str]:
 
 def _first_pictures(meta: "LeRobotDatasetMetadata", key: str) -> Iterator[np.ndarray]:
     """The first episode's first pictures, (H, W, C) uint8; none where they cannot be read, which others say better."""
-    root, feature, n = Path(meta.root), meta.features[key], _LOOKED_AT
+    feature, n = meta.features[key], _LOOKED_AT
     try:
+        root = Path(meta.root)
         if feature["dtype"] == "video":
             first_s = float(meta.episodes[0][f"videos/{key}/from_timestamp"])
             times = [first_s + i / meta.fps for i in range(min(n, int(meta.episodes[0]["length"])))]
@@ -49,5 +50,5 @@ def _first_pictures(meta: "LeRobotDatasetMetadata", key: str) -> Iterator[np.nda
         for row in rows:
             with open_picture(row, root, key, feature) as image:
                 yield np.asarray(image.convert("RGB"))
-    except (OSError, ValueError, KeyError, IndexError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return

@@ -10,8 +10,8 @@ docs/microphones.md says which microphones to buy and where to put them.
   --seconds=3.0                for how long to listen to each [s]
   --output_dir=outputs/microphones  where the WAV files are written
 
-Each card is printed with the entry of --robot.cameras that chooses it, for lerobot-record, lerobot-teleoperate and
-lerobot-rollout.
+Each card is printed with the entry of --robot.cameras that chooses it, for lerobot-record,
+lerobot-teleoperate and lerobot-rollout.
 """
 
 from lerobot_playbyear.scripts.command import run_alone, run_command

@@ -23,14 +23,14 @@ import numpy as np
 from sound_server import Player
 
 STEP_S, GRACE_S = 0.05, 0.03
-LAG_S, JITTER_S = 0.01, 0.008
+LAG_S, JITTER_S, CHUNK_S = 0.01, 0.008, 0.004
 
 
 class Loudspeaker:
     """Plays blocks one after the other in real time, and a quiet room between them."""
 
     def __init__(self, fifo: str, sample_rate: int) -> None:
-        self._player = Player(Path(fifo), channels=1, sample_rate=sample_rate, noise=2.0)
+        self._player = Player(Path(fifo), channels=1, sample_rate=sample_rate, noise=2.0, chunk_s=CHUNK_S)
         self._player.start()
         self._rate, self._end = sample_rate, 0.0
 
@@ -83,12 +83,11 @@ class Simulation:
         self.is_waiting = False
         return {}
 
-    def act(self, action: list[float]) -> dict[str, Any]:
+    def act(self, action: list[float]) -> None:
         if self.is_waiting:
-            return {}
+            return
         self._step(np.array(action, np.float32))
         self.wants_control = bool(self.gate.wants_control(np.array(action, np.float32)))
-        return {}
 
     def observe(self) -> dict[str, Any]:
         if self.is_blind:
@@ -138,8 +137,13 @@ class Simulation:
                     self.n_holds += 1
                     self._step(np.array([0, 0, 0, self.last_grip], np.float32))
                 continue
+            what = request.pop("what")
+            if what == "act":  # as motors do: they take it, and move
+                answer.put({})
+                self.act(**request)
+                continue
             try:
-                answer.put(getattr(self, request.pop("what"))(**request))
+                answer.put(getattr(self, what)(**request))
             except Exception as error:
                 answer.put({"error": repr(error)})
 
