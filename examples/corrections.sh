@@ -1,0 +1,22 @@
+#!/usr/bin/env bash
+# One round of corrections on a robot with a microphone: correct, attach the sound, learn, act. Not tried on hardware.
+# ROBOT names a file with your robot's options, POLICY and DEMOS what was trained, and with what.
+#   POLICY=outputs/train/checkpoints/last/pretrained_model DEMOS=outputs/heard examples/corrections.sh outputs/round
+set -euo pipefail
+folder=${1:-outputs/round}
+fps=${FPS:-20} task=${TASK:-Find the cube}
+source "${ROBOT:-$(dirname "$0")/so101.sh}"
+
+# Space pauses, Tab begins and ends a correction, Space goes on, Esc ends.
+lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true --policy.path="$POLICY" "${ROBOT[@]}" "${TELEOP[@]}" \
+  --fps="$fps" --task="$task" --dataset.repo_id=me/rollout_corrections --dataset.no_stamp=true \
+  --dataset.root="$folder/corrections" --dataset.push_to_hub=false --dataset.video=false --dataset.fps="$fps"
+
+playbyear-attach-audio --dataset.repo_id=me/rollout_corrections --dataset.root="$folder/corrections" \
+  --output.repo_id=me/corrections --output.root="$folder/corrections_heard"
+
+playbyear-dagger --episodes=0 --updates="${UPDATES:-1000}" --policy.path="$POLICY" --output_dir="$folder/dagger" \
+  --demos.repo_id=me/heard --demos.root="$DEMOS" \
+  --interventions.repo_id=me/corrections --interventions.root="$folder/corrections_heard"
+
+lerobot-rollout --policy.path="$folder/dagger/checkpoints/last/pretrained_model" "${ROBOT[@]}" --fps="$fps" --duration="${ACT_S:-60}"
