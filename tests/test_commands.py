@@ -6,6 +6,7 @@ import json
 import re
 import sys
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 
 import draccus
@@ -23,6 +24,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 from list_options import CONFIGS, as_text, list_options
 
 LISTED = json.loads(OPTIONS_FILE.read_text())
+listed_lerobot = pytest.mark.skipif(
+    metadata.version("lerobot") != LISTED["lerobot"], reason="options are listed for another LeRobot"
+)
 HEAVY = {
     "torch",
     "torchvision",
@@ -61,6 +65,7 @@ def mistake(command: str, *arguments: str) -> str | None:
     return find_mistake(list(arguments), LISTED[command], LISTED["policies"])
 
 
+@listed_lerobot
 @pytest.mark.parametrize("command", CONFIGS)
 def test_help_and_a_misspelt_option_need_neither_lerobot_nor_torch(command):
     said = answer(command, "--help")
@@ -137,6 +142,7 @@ def _defaults(config: type) -> dict[str, str]:
     }
 
 
+@listed_lerobot
 def test_the_list_of_options_is_that_of_the_parsers():
     assert OPTIONS_FILE.read_text() == as_text(list_options()), "run `python tools/list_options.py`"
 
@@ -218,6 +224,7 @@ def test_no_value_that_the_full_parser_takes_is_refused(name, option):
     assert not [value for value in taken if mistake("playbyear-train", DATA, f"--{option}={value}")]
 
 
+@listed_lerobot
 def test_another_version_of_lerobot_may_have_other_options(monkeypatch, capsys):
     from lerobot_playbyear.scripts import command
 

@@ -49,6 +49,9 @@ TINY = (
     "--num_workers=0",
     "--batch_size=4",
 )
+AFTER_0_6_1 = pytest.mark.skipif(
+    "ema" not in TrainPipelineConfig.__dataclass_fields__, reason="LeRobot 0.6.1 has no such option"
+)
 
 
 @pytest.fixture(scope="module")
@@ -326,6 +329,8 @@ def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
         ({}, ("--policy.sample_rate=48001",), "sample_rate / fps = 48001 / 20"),
         ({"microphones": ()}, (), "sound.*--policy.use_audio=false"),
         ({}, ("--dataset.image_transforms.enable=true",), "image_transforms.enable does not work in playbyear-train"),
+        pytest.param({}, ("--ema.enable=true",), "ema.enable does not work in playbyear-train", marks=AFTER_0_6_1),
+        pytest.param({}, ("--accelerator.mixed_precision=bf16",), "--accelerator does not work", marks=AFTER_0_6_1),
         ({}, ("--sampling.start_weight=0",), "sampling.start_weight must be above 0"),
         (
             {},
@@ -338,7 +343,7 @@ def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
             "files=nowhere: there is no such folder",
         ),
     ],
-    ids=["fps", "sample rate", "no microphone", "image transforms", "weight", "name", "noise"],
+    ids=["fps", "sample rate", "no microphone", "image transforms", "ema", "accelerator", "weight", "name", "noise"],
 )
 def test_bad_input_is_refused_before_any_work(features, options, message, command, tmp_path):
     fps = features.get("fps", FPS)

@@ -120,7 +120,12 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         Raises:
             ValueError: Naming the option and what to do instead.
         """
+        newer = ("accelerator", "ema", "parallelism")  # options of LeRobot after 0.6.1
+        accelerator, ema, parallelism = (vars(self).get(name) for name in newer)
         refused = {
+            "--accelerator": accelerator is not None and accelerator != type(accelerator)(),
+            "--ema.enable": ema is not None and ema.enable,
+            "--parallelism.dp_shard": parallelism is not None and parallelism.is_sharded,
             "--job.target": self.job.is_remote,
             "--dataset.image_transforms.enable": self.dataset.image_transforms.enable,
             "--reward_model": self.is_reward_model_training,
