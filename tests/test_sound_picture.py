@@ -25,10 +25,10 @@ from torchvision.ops import FrozenBatchNorm2d
 
 from experiments import act_start
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.audio import picture_storage
 from lerobot_playbyear.audio.attach import AttachError, DatasetPlace
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
 from lerobot_playbyear.audio.sound_picture import SoundPicture, pictures_of, read_pictures
-from lerobot_playbyear.audio import picture_storage
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.repair import check_dataset
