@@ -1,7 +1,9 @@
-"""playbyear-attach-audio: a copy of a LeRobotDataset with sound from files recorded beside it.
+"""playbyear-attach-audio: a copy of a LeRobotDataset with its sound in columns.
 
-Every video is copied as it is; everything is checked before anything is written. What the columns
-mean is in docs/dataset.md.
+The sound is in files recorded beside it (--files or --session). Without these it is in the
+dataset's own files (dtype "audio", LeRobot's pull request 2824), or in the pictures of microphones
+that were recorded as cameras. Every video is copied as it is; everything is checked before
+anything is written. What the columns mean is in docs/dataset.md.
 
     playbyear-attach-audio --dataset.repo_id=me/grasp --dataset.root=outputs/grasp \\
         --output.repo_id=me/grasp_with_sound --output.root=outputs/grasp_with_sound \\
@@ -17,7 +19,8 @@ mean is in docs/dataset.md.
   --session=null               or one file with the sound of all; see below
   --microphone=microphone      its name; for files of several channels, one for each: left,right
   --channel=null               take only this channel of the files, counted from 0
-  --offset=0.0                 where in its file each episode's first frame was taken [s]
+  --offset=null                where in its file each episode's first frame was taken [s]; else 0,
+                               or as the dataset says of its own files
   --offsets=null               a JSON file with a list of offsets [s], one per episode, in addition
   --sample_rate=null           resample to this rate [Hz]; else the files' own
   --pad=false                  fill what a file lacks with silence; otherwise that is an error
