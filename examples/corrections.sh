@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # One round of corrections on a robot with a microphone: correct, attach the sound, learn, act. Not tried on hardware.
 # ROBOT names a file with your robot's options, POLICY and DEMOS what was trained, and with what.
-#   POLICY=outputs/train/checkpoints/last/pretrained_model DEMOS=outputs/heard examples/corrections.sh outputs/round
+#   POLICY=outputs/train/checkpoints/last/pretrained_model DEMOS=outputs/demos_with_sound examples/corrections.sh outputs/round
 set -euo pipefail
 folder=${1:-outputs/round}
 fps=${FPS:-20} task=${TASK:-Find the cube}
@@ -12,11 +12,10 @@ lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true --polic
   --fps="$fps" --task="$task" --dataset.repo_id=me/rollout_corrections --dataset.no_stamp=true \
   --dataset.root="$folder/corrections" --dataset.push_to_hub=false --dataset.video=false --dataset.fps="$fps"
 
-playbyear-attach-audio --dataset.repo_id=me/rollout_corrections --dataset.root="$folder/corrections" \
-  --output.repo_id=me/corrections --output.root="$folder/corrections_heard"
+playbyear-attach-audio --dataset.repo_id=me/rollout_corrections --dataset.root="$folder/corrections"
 
 playbyear-dagger --episodes=0 --updates="${UPDATES:-1000}" --policy.path="$POLICY" --output_dir="$folder/dagger" \
-  --demos.repo_id=me/heard --demos.root="$DEMOS" \
-  --interventions.repo_id=me/corrections --interventions.root="$folder/corrections_heard"
+  --demos.repo_id=me/demos_with_sound --demos.root="$DEMOS" \
+  --interventions.repo_id=me/rollout_corrections_with_sound --interventions.root="$folder/corrections_with_sound"
 
 lerobot-rollout --policy.path="$folder/dagger/checkpoints/last/pretrained_model" "${ROBOT[@]}" --fps="$fps" --duration="${ACT_S:-60}"

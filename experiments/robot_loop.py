@@ -7,8 +7,9 @@
     python -m experiments.robot_loop correct dagger --name=hearing -- --method.type=weighted
 
 The arm runs in a process of its own; its sound is played into a PulseAudio server and comes back through PortAudio as from any
-sound card. Each step prints its command, keeps what the command says, and adds a line to results.jsonl; what is there already
-is not made again. What stands after `--` goes to the command as typed. Debian: pulseaudio, libportaudio2, libasound2-plugins.
+sound card. Each step prints its command, keeps what the command says, and adds a line to results.jsonl. Recorded, attached and
+trained once, these are not made again. What stands after `--` goes to the steps' commands as typed. Debian: pulseaudio,
+libportaudio2, libasound2-plugins.
 """
 
 import argparse
@@ -92,7 +93,7 @@ class Loop:
 
     def attach(self) -> None:
         """Sound in columns, from what the microphones' pictures carry."""
-        self._attach("attach", "demos", self.demos, self.attached)
+        self._attach("attach", "demos", self.demos, "heard", self.attached)
 
     def train(self) -> None:
         train = self.own / "train"
@@ -102,7 +103,7 @@ class Loop:
         preset = [f"--preset={self.args.preset}"] if self.args.preset else []
         command = [
             *("playbyear-train", *preset, "--policy.type=playbyear", "--policy.push_to_hub=false"),
-            *("--dataset.repo_id=me/demos", f"--dataset.root={self.attached}", f"--output_dir={train}"),
+            *("--dataset.repo_id=me/heard", f"--dataset.root={self.attached}", f"--output_dir={train}"),
             "--wandb.enable=false",
         ]
         self.run("train", command)
@@ -110,7 +111,8 @@ class Loop:
     def rollout(self) -> None:
         """The policy on the robot, in held-out scenes."""
         name, n, first = self.args.rollout, self.args.episodes, self.args.seed
-        data = self.fresh(self.own / name)
+        data, outcomes = self.fresh(self.own / name), self.own / f"{name}.jsonl"
+        outcomes.unlink(missing_ok=True)
         with self.robot() as robot:
             command = [
                 *("lerobot-rollout", "--strategy.type=episodic", f"--policy.path={self.checkpoint}"),
@@ -118,7 +120,7 @@ class Loop:
                 *(f"--dataset.num_episodes={n}", f"--task={DESCRIPTION}"),
             ]
             operator = Episodes(robot.socket, range(first, first + n))
-            self.operate(name, command, operator, robot, self.own / f"{name}.jsonl")
+            self.operate(name, command, operator, robot, outcomes)
 
     def eval(self) -> None:
         """The same policy in the same scenes, in the simulator without clock and sound card."""
@@ -133,7 +135,9 @@ class Loop:
     def correct(self) -> None:
         """The policy acts, and the script takes over where it goes wrong."""
         n, first = self.args.corrected, self.args.correction_seed
-        data = self.fresh(self.corrections)
+        data, outcomes = self.fresh(self.corrections), self.own / "corrections.jsonl"
+        self.fresh(self.attached_corrections)
+        outcomes.unlink(missing_ok=True)
         with self.robot() as robot:
             command = [
                 *("lerobot-rollout", "--strategy.type=dagger", "--strategy.record_autonomous=true"),
@@ -142,27 +146,29 @@ class Loop:
                 f"--task={DESCRIPTION}",
             ]
             operator = Corrections(robot.socket, range(first, first + n))
-            self.operate("correct", command, operator, robot, self.own / "corrections.jsonl")
+            self.operate("correct", command, operator, robot, outcomes)
 
     def dagger(self) -> None:
         """What is learned from the corrections."""
-        self._attach("attach", "rollout_corrections", self.corrections, self.attached_corrections)
+        self._attach(
+            "attach-corrections", "rollout_corrections", self.corrections, "corrections", self.attached_corrections
+        )
         output = self.fresh(self.own / "dagger")
         command = [
             *("playbyear-dagger", "--episodes=0", f"--updates={self.args.updates}"),
-            *(f"--policy.path={self.checkpoint}", "--demos.repo_id=me/demos", f"--demos.root={self.attached}"),
-            *("--interventions.repo_id=me/rollout_corrections", f"--interventions.root={self.attached_corrections}"),
+            *(f"--policy.path={self.checkpoint}", "--demos.repo_id=me/heard", f"--demos.root={self.attached}"),
+            *("--interventions.repo_id=me/corrections", f"--interventions.root={self.attached_corrections}"),
             f"--output_dir={output}",
         ]
         self.run("dagger", command)
 
-    def _attach(self, name: str, repo: str, source: Path, target: Path) -> None:
+    def _attach(self, name: str, repo: str, source: Path, heard: str, target: Path) -> None:
         if n_episodes(target):
             return print(f"{target} is there.")
         shutil.rmtree(target, ignore_errors=True)
         command = [
             *("playbyear-attach-audio", f"--dataset.repo_id=me/{repo}", f"--dataset.root={source}"),
-            f"--output.root={target}",
+            *(f"--output.repo_id=me/{heard}", f"--output.root={target}"),
         ]
         self.run(name, command)
 
@@ -215,7 +221,7 @@ class Loop:
 
     def run(self, name: str, command: list[str], read: Any = dict) -> None:
         """Runs a command that needs nobody; `read` gives its figures."""
-        command = [*command, *self.args.more]
+        command = [*command, *(self.args.more if name in STEPS else [])]
         print(f"$ {shlex.join(command)}", flush=True)
         start = time.perf_counter()
         with self.log(name).open("w") as log:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_policy
 from lerobot.utils.feature_utils import hw_to_dataset_features
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
@@ -28,6 +29,7 @@ from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.audio_feature import write_wav
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.microphone_step import MicrophonePicturesToAudioStep
 
 RATE, FPS, SIZE = 16000, 20, 800
@@ -257,6 +259,24 @@ def test_what_is_missing_is_named_and_nothing_is_written(tmp_path):
     with pytest.raises(AttachError, match=r"fps=20, and the control steps are 33\.3 ms apart"):
         attached(recorded(tmp_path / "fast", session, [[8000 + 533 * i for i in range(10)]]))
     assert not list(tmp_path.glob("*_with_sound"))
+
+
+def test_a_policy_never_sees_a_microphone_and_is_not_trained_without_its_sound(tmp_path):
+    """A policy that was trained deaf would read the spectrogram, and hear."""
+    session = Session(tmp_path / "sessions", sound(4))
+    root = recorded(tmp_path / "heard", session, [counters_of(8)])
+    dataset = attached(root)
+    for options in ({"use_audio": False}, {}):
+        config = PlaybyearConfig(device="cpu", fps=FPS, use_vision=False, vision_width=8, image_size=48, **options)
+        policy = make_policy(config, ds_meta=dataset.meta)
+        assert PICTURE not in policy.config.input_features
+    unheard = LeRobotDataset("me/heard", root=root)
+    for options in ({"use_audio": False}, {"use_audio": False, "use_vision": False}):
+        config = PlaybyearConfig(device="cpu", fps=FPS, vision_width=8, image_size=48, **options)
+        with pytest.raises(
+            ValueError, match=r"sound is not attached: playbyear-attach-audio --dataset\.repo_id=me/heard"
+        ):
+            make_policy(config, ds_meta=unheard.meta)
 
 
 # While acting

@@ -132,7 +132,7 @@ def test_without_marks_the_seconds_are_those_of_the_file(silent, tmp_path):
         ({"marks": "10=1,20=5"}, "2.5000 seconds of sound in a second of the clock"),
         ({"session": "missing.wav"}, "There is no sound file"),
         ({"files": "{episode}.wav"}, "both are given. Give one"),
-        ({"session": None}, "neither is given"),
+        ({"session": None}, "is for --files and one --session"),
         ({"session": None, "files": "{episode}.wav"}, "--clock=.* is for --session"),
         ({"microphone": "left,right"}, "1 channels, and --microphone names 2"),
     ],

@@ -6,7 +6,7 @@ LeRobot is imported when the dataset's files have been looked at.
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,7 +50,7 @@ class AttachAudioConfig:
 
     Args:
         dataset: The dataset that gets sound; it is not changed. Without a root it may come from the Hub.
-        output: The copy with sound.
+        output: The copy with sound. Without a name: the dataset's name and folder with `_with_sound` behind them.
         files: The sound of each episode, if each has a file: a path in which `{episode}` stands for the episode's number,
             for example `sound/{episode:06d}.wav`. WAV, FLAC, or a film whose sound track is taken.
         session: One file with the sound of the whole session, in place of `files`; or, where a microphone was recorded as a
@@ -70,7 +70,7 @@ class AttachAudioConfig:
     """
 
     dataset: DatasetPlace
-    output: DatasetPlace
+    output: DatasetPlace = field(default_factory=lambda: DatasetPlace(""))
     files: str | None = None
     session: Path | None = None
     clock: Path | None = None
@@ -81,6 +81,11 @@ class AttachAudioConfig:
     offsets: Path | None = None
     sample_rate: int | None = None
     pad: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.output.repo_id:
+            root = self.output.root or (self.dataset.root and f"{Path(self.dataset.root)}_with_sound")
+            self.output = DatasetPlace(f"{self.dataset.repo_id}_with_sound", root)
 
 
 def attach_audio(cfg: AttachAudioConfig) -> Path:
@@ -216,12 +221,12 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
     if _is_from_cameras(cfg):
         own = ("the dataset's own files", "offset", "sample_rate", "pad")
         source, *taken = own if has_own_files else ("microphones that were recorded as cameras", "session")
-        for field in fields(AttachAudioConfig):
-            value = getattr(cfg, field.name)
-            if field.name not in ("dataset", "output", *taken) and value != field.default:
+        for option in fields(AttachAudioConfig):
+            value = getattr(cfg, option.name)
+            if option.name not in ("dataset", "output", *taken) and value != option.default:
                 raise AttachError(
-                    f"--{field.name}={value} is for --files and for one --session=FILE, not for {source}. Leave it out, or "
-                    "say where the files are."
+                    f"--{option.name}={value} is for --files and one --session=FILE, not for {source}. Leave it out, or say "
+                    "where the files are."
                 )
     if cfg.files is not None and "{episode" not in cfg.files:
         raise AttachError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")

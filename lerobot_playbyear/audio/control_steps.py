@@ -96,7 +96,7 @@ def _resampled(samples: np.ndarray, n: int, size: int) -> np.ndarray:
     return np.clip(np.rint((kernel * around).sum(axis=1)), -32768, 32767).astype(np.int16)
 
 
-def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str) -> None:
+def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str, is_live: bool = False) -> None:
     """Whether control steps are as long as a frame rate says: LeRobot compares `--fps` and `--dataset.fps` with nothing.
 
     Args:
@@ -104,6 +104,7 @@ def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str) 
         sample_rate: Of these samples [Hz].
         fps: The frame rate [Hz].
         what: Whose it is, for the message.
+        is_live: A robot moves: that it is slow is only told.
 
     Raises:
         ValueError: They are so much shorter or longer that another frame rate was meant.
@@ -112,7 +113,7 @@ def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str) 
         return
     seen = float(np.median(spacing)) * fps / sample_rate
     told = f"{what} has fps={fps:g}, and the control steps are {1000 * seen / fps:.1f} ms apart ({fps / seen:.1f} per second)"
-    if not _FASTEST <= seen <= _SLOWEST:
+    if seen < _FASTEST or (seen > _SLOWEST and not is_live):
         raise ValueError(f"{told}: use one rate for --fps and --dataset.fps")
     if abs(seen - 1) > _USUAL:
         logging.warning("%s: the machine is too slow, or too busy.", told)

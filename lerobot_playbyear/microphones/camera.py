@@ -38,6 +38,7 @@ from lerobot_playbyear.microphones.session_file import SessionFile
 _NO_FILE = "none"
 _FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
 _SAME_STEP_S = 0.1  # microphones of one card that are read one after the other within this have the same newest sample
+_STALLED_S = 1.0  # without sound: gone, and not only late on a busy machine
 _ZEROS_S = 2.0  # of nothing but zeros: muted, or unplugged
 _FIND = "`playbyear-find-microphones` prints an entry to paste."
 
@@ -288,14 +289,14 @@ class MicrophoneCamera(Camera):
 
         Raises:
             DeviceNotConnectedError: It was not connected, or it is gone.
-            TimeoutError: No sound has come for `max_age_ms` [ms].
+            TimeoutError: No sound has come for a second, or for `max_age_ms` [ms] if that is longer.
         """
         card = self._card
         if card is None:
             raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is not connected.")
         if card.microphone.problem:
             raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is gone: {card.microphone.problem}.")
-        if card.microphone.silent_for_s * 1000 > max_age_ms:
+        if card.microphone.silent_for_s > max(max_age_ms / 1000, _STALLED_S):
             raise TimeoutError(
                 f"The microphone ({_name(self.config)}) has brought nothing for {card.microphone.silent_for_s:.1f} s. Is it "
                 "still plugged in?"

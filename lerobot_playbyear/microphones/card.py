@@ -11,7 +11,7 @@ from lerobot_playbyear.microphones.clock import CardClock
 KEPT_S = 10.0
 """How much of a card's sound is kept [s]."""
 
-CHUNK_S = 0.005
+CHUNK_S = 0.003
 """How often sound is fetched from a card [s]; shorter costs more processor time."""
 
 _LATE_S = 0.01  # samples that come later than this, for a quarter of a second, come after others that were lost

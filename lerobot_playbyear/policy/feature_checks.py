@@ -95,8 +95,8 @@ def refuse_unheard_microphones(meta: "LeRobotDatasetMetadata", config: "Playbyea
         if audio_key_of(key) not in meta.features:
             raise ValueError(
                 f"'{key}' is a microphone's picture, and its sound is not attached: playbyear-attach-audio "
-                f"--dataset.repo_id={meta.repo_id} --dataset.root={meta.root} --output.repo_id={meta.repo_id}_with_sound "
-                f"--output.root={meta.root}_with_sound. Then train on that dataset."
+                f"--dataset.repo_id={meta.repo_id} --dataset.root={meta.root}. Then train on {meta.repo_id}_with_sound, in "
+                f"{meta.root}_with_sound."
             )
         assert config.input_features is not None
         del config.input_features[key]

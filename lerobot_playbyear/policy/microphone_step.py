@@ -57,7 +57,7 @@ class MicrophonePicturesToAudioStep(ObservationProcessorStep):
             InputError: A microphone is missing, has another name or sample rate, or control steps have another length.
         """
         missing = [key for key in self.microphones if key not in observation]
-        if not missing:
+        if not missing or not observation:  # an action alone, as when one is only normalised
             return observation
         return {**observation, **{key: self._sound(key, observation) for key in missing}}
 
@@ -105,7 +105,7 @@ class MicrophonePicturesToAudioStep(ObservationProcessorStep):
         self._spacing.append(strip.counter - last.counter)
         if len(self._spacing) == _PACE_STEPS.stop:
             try:
-                check_pace(self._spacing[_PACE_STEPS], strip.sample_rate, self.fps, "the policy")
+                check_pace(self._spacing[_PACE_STEPS], strip.sample_rate, self.fps, "the policy", is_live=True)
             except ValueError as error:
                 raise InputError(f"The control loop does not fit the policy: {error}.") from error
 

@@ -1,10 +1,11 @@
-"""playbyear-attach-audio: a copy of a LeRobotDataset with its sound in columns.
+"""playbyear-attach-audio: a copy of a LeRobotDataset with the sound of its microphones.
 
-The sound is in files recorded beside it (--files or --session). Without these it is in the
-dataset's own files (dtype "audio", LeRobot's pull request 2824), or in the pictures of microphones
-that were recorded as cameras. Every video is copied as it is; everything is checked before
-anything is written. What the columns mean is in docs/dataset.md.
+Where a microphone was recorded as a camera, or the dataset has its sound in files of its own (dtype
+"audio", LeRobot's pull request 2824), nothing more has to be said. Sound that was recorded beside
+the dataset is named by --files or --session. Everything is checked before anything is written. What
+the columns mean is in docs/dataset.md, microphones on robots in docs/robots.md.
 
+    playbyear-attach-audio --dataset.repo_id=me/demos --dataset.root=outputs/demos
     playbyear-attach-audio --dataset.repo_id=me/grasp --dataset.root=outputs/grasp \\
         --output.repo_id=me/grasp_with_sound --output.root=outputs/grasp_with_sound \\
         --files='sound/{episode:06d}.wav' --microphone=gripper --offset=0.25
@@ -13,10 +14,11 @@ anything is written. What the columns mean is in docs/dataset.md.
 
   --dataset.repo_id=...        name of the dataset, user/name; it is not changed; needed
   --dataset.root=null          its folder; else LeRobot's cache, or the Hub
-  --output.repo_id=...         the copy's name; needed
-  --output.root=null           its folder, which must not be there yet; else in LeRobot's cache
+  --output.repo_id=null        the copy's name; else the dataset's with _with_sound behind it
+  --output.root=null           its folder, which must not be there yet; else beside the dataset
   --files=...                  each episode's sound (WAV, FLAC, film), {episode} its number
-  --session=null               or one file with the sound of all; see below
+  --session=null               or one file with the sound of all, see below; or, of microphones that
+                               were recorded as cameras, a folder with the files of their sessions
   --microphone=microphone      its name; for files of several channels, one for each: left,right
   --channel=null               take only this channel of the files, counted from 0
   --offset=null                where in its file each episode's first frame was taken [s]; else 0,
@@ -25,7 +27,7 @@ anything is written. What the columns mean is in docs/dataset.md.
   --sample_rate=null           resample to this rate [Hz]; else the files' own
   --pad=false                  fill what a file lacks with silence; otherwise that is an error
 
-With --session, one recorder ran through all episodes:
+With one --session=FILE, one recorder ran through all episodes:
   --clock=null                 when each episode's first frame was taken: lines of episode,seconds
                                (CSV), or JSON; else meta/playbyear_clock.json of the dataset
   --marks=null                 moments known in the file and on that clock, such as two claps:
