@@ -28,17 +28,6 @@ def encode(path: Path, samples: np.ndarray, rate: int, codec: str) -> None:
         container.mux(stream.encode(None))
 
 
-def decode(path: Path) -> np.ndarray:
-    """(n, channels) int16 of a file of 16 bits, planar or not, or of floats."""
-    parts = []
-    with av.open(str(path)) as container:
-        for frame in container.decode(audio=0):
-            values = frame.to_ndarray()
-            values = values.T if frame.format.is_planar else values.reshape(-1, frame.layout.nb_channels)
-            parts.append(values if values.dtype == np.int16 else np.round(values * 32768).clip(-32768, 32767))
-    return np.concatenate(parts).astype(np.int16)
-
-
 def add_files_of_sound(
     root: Path, key: str, sounds: list[np.ndarray], rate: int, codec: str = "alac", per_file: int = 2, ends: bool = True
 ) -> None:

@@ -22,8 +22,9 @@ from PIL import Image
 from test_attach_audio import config as attach_config
 from test_attach_audio import silent_dataset, write_sounds
 
+from lerobot_playbyear.audio import attached_sound
 from lerobot_playbyear.audio.attach import attach_audio
-from lerobot_playbyear.datasets import EpisodeStore, attached_sound, audio_feature, opening, parquet_files, resample
+from lerobot_playbyear.datasets import EpisodeStore, audio_feature, opening, parquet_files, resample
 from lerobot_playbyear.datasets.audio_files import Resampled
 from lerobot_playbyear.datasets.columns import with_values
 from lerobot_playbyear.datasets.durable import DurableWriter

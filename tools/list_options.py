@@ -16,7 +16,6 @@ from draccus.utils import is_choice_type
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig
-from lerobot_playbyear.audio.convert_audio import ConvertAudioConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.repair.command import RepairConfig
 from lerobot_playbyear.film.filming import VideoConfig
@@ -31,7 +30,6 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig
 CONFIGS: dict[str, type] = {
     "playbyear-attach-audio": AttachAudioConfig,
     "playbyear-attach-spectrogram": AttachSpectrogramConfig,
-    "playbyear-convert-audio": ConvertAudioConfig,
     "playbyear-dagger": DaggerConfig,
     "playbyear-find-microphones": FindMicrophonesConfig,
     "playbyear-inspect": InspectConfig,

@@ -1,4 +1,4 @@
-"""`playbyear-attach-audio`: a copy of a LeRobotDataset with sound from files that were recorded beside it.
+"""`playbyear-attach-audio`: a copy of a LeRobotDataset with its sound in columns: from files, or from its own pictures.
 
 LeRobot is imported when the dataset's files have been looked at.
 """
@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lerobot_playbyear.audio.audio_layout import has_audio_files, read_layout
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.errors import InputError
@@ -22,6 +23,7 @@ from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
+    from lerobot_playbyear.audio.attached_sound import EpisodesSound
     from lerobot_playbyear.datasets.long_dataset import LongDataset
 
 
@@ -60,7 +62,8 @@ class AttachAudioConfig:
         microphone: What the microphone is called: the column is `observation.audio.<microphone>`. For files of
             several channels, a name for each, separated by commas.
         channel: Take only this channel of the files, counted from 0.
-        offset: Where in its file each episode's first frame was taken [s]; negative where the file begins after it.
+        offset: Where in its file each episode's first frame was taken [s]; negative where the file begins after it. None:
+            0, or as the dataset says of its own files.
         offsets: A JSON file with a list of offsets [s], one per episode, in addition to `offset`.
         sample_rate: Resample to this rate [Hz]. None keeps the files' own.
         pad: Fill what a file lacks at its beginning or its end with silence; otherwise that is an error.
@@ -74,7 +77,7 @@ class AttachAudioConfig:
     marks: str | None = None
     microphone: str = "microphone"
     channel: int | None = None
-    offset: float = 0.0
+    offset: float | None = None
     offsets: Path | None = None
     sample_rate: int | None = None
     pad: bool = False
@@ -86,7 +89,7 @@ class AttachAudioConfig:
 
 
 def attach_audio(cfg: AttachAudioConfig) -> Path:
-    """Copies a dataset and adds its microphones: those that were recorded as cameras, or one from files.
+    """Copies a dataset and adds its microphones: from files, from its own files, or those that were recorded as cameras.
 
     Args:
         cfg: The options.
@@ -99,8 +102,12 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         InputError: The copy's folder cannot be made, before any sound is read.
         OSError: The copy cannot be written.
     """
-    _check_source(cfg)
+    root = Path(cfg.dataset.root) if cfg.dataset.root else HF_LEROBOT_HOME / cfg.dataset.repo_id
+    has_own_files = cfg.files is None and cfg.session is None and has_audio_files(root)
+    _check_source(cfg, has_own_files)
     target = new_folder(cfg.output)
+    if has_own_files:
+        return _attach_own_files(cfg, root, target)
     dataset = open_for_copy(cfg.dataset)
     from lerobot_playbyear.audio.attached_copy import write_with_sound
     from lerobot_playbyear.audio.attached_sound import read_sound
@@ -117,8 +124,25 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
             sounds = [read(cfg, dataset, _keys(cfg, dataset), Path(scratch))]
             write = partial(write_with_sound, sounds=sounds, fps=dataset.fps)
         write_new_dataset(Path(dataset.root), target, write)
+    return _told(target, sounds)
+
+
+def _attach_own_files(cfg: AttachAudioConfig, root: Path, target: Path) -> Path:
+    layout = read_layout(cfg.dataset.repo_id, root, cfg.offset)
+    from lerobot_playbyear.audio.attached_copy import write_with_sound
+    from lerobot_playbyear.audio.audio_import import read_tracks_sound
+    from lerobot_playbyear.datasets.long_dataset import scratch_folder
+
+    with scratch_folder() as scratch:
+        sounds = read_tracks_sound(layout, cfg, Path(scratch))
+        removed = [track.key for track in layout.tracks]
+        write_new_dataset(root, target, partial(write_with_sound, sounds=sounds, fps=layout.fps, removed=removed))
+    return _told(target, sounds)
+
+
+def _told(target: Path, sounds: "list[EpisodesSound]") -> Path:
     heard = ", ".join(f"{key} at {sound.sample_rate} Hz" for sound in sounds for key in sound.keys)
-    print(f"\nDataset: {target} ({dataset.num_episodes} episodes with {heard})")
+    print(f"\nDataset: {target} ({len(sounds[0].episodes)} episodes with {heard})")
     return target
 
 
@@ -188,19 +212,21 @@ def open_for_copy(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
         raise AttachError(f"The dataset '{place.repo_id}' cannot be opened: {error}") from error
 
 
-def _check_source(cfg: AttachAudioConfig) -> None:
+def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
     """Whether the options say where the sound is, and in one way."""
     if cfg.files is not None and cfg.session is not None:
         raise AttachError(
             "--files has the sound of each episode, --session that of all; both are given. Give one of them."
         )
     if _is_from_cameras(cfg):
+        own = ("the dataset's own files", "offset", "sample_rate", "pad")
+        source, *taken = own if has_own_files else ("microphones that were recorded as cameras", "session")
         for option in fields(AttachAudioConfig):
             value = getattr(cfg, option.name)
-            if option.name not in ("dataset", "output", "session") and value != option.default:
+            if option.name not in ("dataset", "output", *taken) and value != option.default:
                 raise AttachError(
-                    f"--{option.name}={value} is for --files and one --session=FILE, not for microphones that were recorded "
-                    "as cameras. Leave it out, or say where the files are."
+                    f"--{option.name}={value} is for --files and one --session=FILE, not for {source}. Leave it out, or say "
+                    "where the files are."
                 )
     if cfg.files is not None and "{episode" not in cfg.files:
         raise AttachError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")

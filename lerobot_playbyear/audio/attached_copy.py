@@ -1,4 +1,4 @@
-"""The copy of a dataset whose sound is stored otherwise, or that gets sound or pictures of it: every other file as it is."""
+"""The copy of a dataset that gets sound, or pictures of it: every other file as it is."""
 
 import itertools
 import json
@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attached_sound import EpisodesSound
 from lerobot_playbyear.audio.audio_layout import AUDIO_FOLDER
-from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, audio_feature, audio_keys
+from lerobot_playbyear.datasets.audio_feature import audio_feature, audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
@@ -104,11 +104,7 @@ def write_with_sound(
 
 def sound_change(sounds: Sequence[EpisodesSound], fps: int, removed: Collection[str] = ()) -> DatasetChange:
     """In what a dataset with microphones more differs; arguments as for `write_with_sound`."""
-    added: dict[str, dict[str, Any]] = {}
-    for sound in sounds:
-        for key, notes in zip(sound.keys, sound.notes or [{}] * len(sound.keys), strict=True):
-            feature = audio_feature(sound.sample_rate, fps)
-            added[key] = {**feature, "info": {**feature["info"], **notes}}
+    added = {key: audio_feature(sound.sample_rate, fps) for sound in sounds for key in sound.keys}
     n_episodes = len(sounds[0].episodes)
     stats = [{key: own for sound in sounds for key, own in sound.stats(i).items()} for i in range(n_episodes)]
     info = {"audio_path": None, "audio_files_size_in_mb": None} if removed else {}
@@ -123,19 +119,14 @@ def write_changed(root: Path, target: Path, change: DatasetChange) -> None:
     """
     info = json.loads((root / INFO_PATH).read_text())
     features = _changed_features(info["features"], change)
-    in_columns = {
-        key: {**feature, "shape": tuple(feature["shape"])}
-        for key, feature in features.items()
-        if feature["dtype"] != AUDIO_DTYPE
-    }
+    in_columns = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in features.items()}
     schema = get_hf_features_from_features(in_columns).arrow_schema
-    folders = [(AUDIO_FOLDER, key) for key in change.removed]
     paths = sorted(
         path for path in root.rglob("*") if path.is_file() and path.relative_to(root).parts[0] not in _SCRATCH
     )
     for path in tqdm(paths, desc="Writing", unit="file"):
         name = path.relative_to(root)
-        if name.parts[:2] in folders:
+        if name.parts[0] == AUDIO_FOLDER and any(key in name.parts for key in change.removed):
             continue
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         if name.parts[0] == "data":

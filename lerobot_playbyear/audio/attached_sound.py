@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -51,14 +50,12 @@ class EpisodesSound:
         keys: The columns.
         samples_per_frame: S.
         episodes: For each episode (n_frames * S, columns) int16, read where it is indexed.
-        notes: For each column what its feature's `info` says besides the rate; None: nothing.
     """
 
     sample_rate: int
     keys: list[str]
     samples_per_frame: int
     episodes: Sequence[Cut | SpooledFile]
-    notes: list[dict[str, Any]] | None = None
 
     @property
     def rows_at_once(self) -> int:
@@ -180,15 +177,16 @@ def offsets_of(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     Raises:
         AttachError: `offsets` is no list of as many numbers.
     """
+    offset = cfg.offset or 0.0
     if cfg.offsets is None:
-        return [cfg.offset] * n_episodes
+        return [offset] * n_episodes
     try:
         values = [float(value) for value in json.loads(cfg.offsets.read_text())]
     except (OSError, ValueError, TypeError) as error:
         raise AttachError(f"--offsets={cfg.offsets} is no list of numbers in JSON: {error}") from error
     if len(values) != n_episodes:
         raise AttachError(f"--offsets={cfg.offsets} has {len(values)} values; the dataset has {n_episodes} episodes.")
-    return [cfg.offset + value for value in values]
+    return [offset + value for value in values]
 
 
 def _choose_channels(cfg: AttachAudioConfig, samples: np.ndarray, n_microphones: int) -> np.ndarray:

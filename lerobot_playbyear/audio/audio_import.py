@@ -1,17 +1,14 @@
 """Sound in files beside the frames becomes columns: decoded once, cut at the episodes, and read where it is indexed."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
 from lerobot_playbyear.audio.attached_sound import EpisodesSound, SpooledFile, raise_all
-from lerobot_playbyear.audio.audio_layout import AudioTrack, column_names
+from lerobot_playbyear.audio.audio_layout import AudioLayout, AudioTrack, column_names
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Channels, Cut, Resampled, audio_pieces
-
-CHANNEL_OF, CHANNEL = "channel_of", "channel"
-"""In a column's `info`: the microphone of which it is a channel, and which."""
 
 _SPARE_S = 1.0
 _FORMATS = "mov,mp4,m4a,wav,flac,ogg,matroska,webm,mp3,aac"  # none of which names other files
@@ -33,36 +30,12 @@ class Part:
         return self._sound[self._start + start : self._start + max(start, stop)]
 
 
-@dataclass(frozen=True)
-class CutOptions:
-    """How sound becomes blocks.
-
-    Args:
-        fps: Frames per second [Hz].
-        sample_rate: Resample to this rate [Hz]. None: the files' own, or the nearest that is a multiple of `fps`.
-        pad: Fill what a file lacks with silence; otherwise that is an error.
-    """
-
-    fps: int
-    sample_rate: int | None = None
-    pad: bool = False
-
-    def rate(self, own: int) -> int:
-        """The rate of the columns [Hz], where the files have the rate `own`."""
-        if self.sample_rate is not None:
-            return self.sample_rate
-        return own if own % self.fps == 0 else max(1, round(own / self.fps)) * self.fps
-
-
-def read_tracks_sound(
-    tracks: list[AudioTrack], lengths: list[int], options: CutOptions, scratch: Path
-) -> list[EpisodesSound]:
+def read_tracks_sound(layout: AudioLayout, cfg: AttachAudioConfig, scratch: Path) -> list[EpisodesSound]:
     """Decodes all files, so that what is wrong with them is known before anything is written.
 
     Args:
-        tracks: The microphones.
-        lengths: Frames of each episode.
-        options: How sound becomes blocks.
+        layout: Where the files are.
+        cfg: The options.
         scratch: A folder for the decoded sound, 2 bytes a sample.
 
     Returns:
@@ -71,23 +44,25 @@ def read_tracks_sound(
     Raises:
         AttachError: Naming every microphone, episode and file whose sound is missing, too short or of another kind.
     """
+    if cfg.sample_rate is not None and (cfg.sample_rate <= 0 or cfg.sample_rate % layout.fps):
+        raise AttachError(f"--sample_rate={cfg.sample_rate}: wanted a multiple of {layout.fps} frames per second.")
     errors: list[str] = []
-    sounds = [_read(track, lengths, options, scratch / str(i), errors) for i, track in enumerate(tracks)]
+    sounds = [_read(track, layout, cfg, scratch / str(i), errors) for i, track in enumerate(layout.tracks)]
     raise_all(errors)
     return [sound for sound in sounds if sound is not None]
 
 
 def _read(
-    track: AudioTrack, lengths: list[int], options: CutOptions, scratch: Path, errors: list[str]
+    track: AudioTrack, layout: AudioLayout, cfg: AttachAudioConfig, scratch: Path, errors: list[str]
 ) -> EpisodesSound | None:
     scratch.mkdir()
     files: dict[Path, tuple[SpooledFile, int] | None] = {}
     episodes: list[Cut] = []
     rates: set[int] = set()
-    order = list(zip(track.spans, lengths, strict=True))
+    order = list(zip(track.spans, layout.lengths, strict=True))
     needed_s: dict[Path, float] = {}  # to where in each file; one may decode to more than a disk holds
     for span, length in order:
-        end_s = span.start_s + track.start_time_s + length / options.fps + _SPARE_S
+        end_s = span.start_s + track.start_time_s + length / layout.fps + _SPARE_S
         needed_s[span.path] = max(end_s, needed_s.get(span.path, 0.0))
     for episode, (span, length) in enumerate(tqdm(order, desc=f"Reading {track.key}", unit="episode")):
         try:
@@ -101,21 +76,24 @@ def _read(
             rates.add(rate)
             start = round(span.start_s * rate)
             stop = len(samples) if span.end_s is None else round(span.end_s * rate)
-            new_rate = options.rate(rate)
+            new_rate = cfg.sample_rate or _nearest_rate(rate, layout.fps)
             sound = Resampled(Part(samples, start, stop), rate, new_rate)
-            episodes.append(Cut(sound, new_rate, options.fps, length, track.start_time_s, options.pad))
+            episodes.append(Cut(sound, new_rate, layout.fps, length, track.start_time_s, cfg.pad))
         except (AudioFileError, ValueError) as error:
             errors.append(f"'{track.key}', episode {episode}, {span.path}: {error}")
     if len(rates) > 1:
         errors.append(
             f"'{track.key}': its files have the sample rates {sorted(rates)} Hz; wanted one. Encode them again."
         )
-    if len(episodes) < len(lengths) or len(rates) != 1:
+    if len(episodes) < len(layout.lengths) or len(rates) != 1:
         return None
-    rate = options.rate(rates.pop())
-    names = column_names(track)
-    notes = [{CHANNEL_OF: track.key, CHANNEL: channel} for channel in range(track.n_channels)]
-    return EpisodesSound(rate, names, rate // options.fps, episodes, notes if track.n_channels > 1 else None)
+    rate = cfg.sample_rate or _nearest_rate(rates.pop(), layout.fps)
+    return EpisodesSound(rate, column_names(track), rate // layout.fps, episodes)
+
+
+def _nearest_rate(own: int, fps: int) -> int:
+    """The rate that is a multiple of the frame rate [Hz]."""
+    return own if own % fps == 0 else max(1, round(own / fps)) * fps
 
 
 def _spool(track: AudioTrack, path: Path, last_s: float, target: Path) -> tuple[SpooledFile, int]:

@@ -1,8 +1,9 @@
 """Sound in files beside the frames, as LeRobot's pull request 2824 stores it, and where in these files an episode's lies.
 
 A feature `observation.audio.<microphone>` of dtype "audio" and shape (channels,) has no column. Its sound lies in
-`audio/<key>/chunk-000/file-000.m4a`, several episodes one after the other; `meta/episodes` says where each begins. The sound
-of an episode begins `info.start_time_s` before its first frame. All this may be a stranger's, and is checked here.
+`audio/<key>/chunk-000/file-000.m4a`, or where `audio_path` in `meta/info.json` says, several episodes one after the other;
+`meta/episodes` says where each begins. The sound of an episode begins `info.start_time_s` before its first frame. All this may
+be a stranger's, and is checked here.
 """
 
 import bisect
@@ -17,14 +18,14 @@ from typing import Any
 import pyarrow as pa
 
 from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, AUDIO_PREFIX
-from lerobot_playbyear.datasets.confines import file_inside
-from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import INFO_PATH
+from lerobot_playbyear.datasets.columns import check_dataset_files
+from lerobot_playbyear.datasets.confines import check_links, file_inside
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, list_files
+from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, read_table
 
 AUDIO_FOLDER = "audio"
 DEFAULT_AUDIO_PATH = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
-PRE_ROLL_S = 1.0
-"""How long before an episode's first frame its sound begins [s]."""
 
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:audio_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _MOST_CHANNELS, _MOST_START_S, _MOST_INDEX = 64, 60.0, 10**6
@@ -69,31 +70,95 @@ class AudioTrack:
     spans: list[AudioSpan]
 
 
-def read_tracks(root: Path, rows: pa.Table, seconds: float, start_time_s: float | None = None) -> list[AudioTrack]:
-    """The microphones of a dataset in this layout.
+@dataclass(frozen=True)
+class AudioLayout:
+    """What a dataset says of its files of sound.
 
     Args:
         root: Its folder.
-        rows: Its `meta/episodes`, in the order of the episodes.
-        seconds: How long all episodes last together [s].
+        fps: Its frames per second [Hz].
+        lengths: Frames of each episode.
+        tracks: Its microphones.
+    """
+
+    root: Path
+    fps: int
+    lengths: list[int]
+    tracks: list[AudioTrack]
+
+
+def has_audio_files(root: Path) -> bool:
+    """Whether a dataset has sound in files beside the frames; also False where its features cannot be read."""
+    try:
+        features = json.loads((root / INFO_PATH).read_text())["features"]
+        return any(feature.get("dtype") == AUDIO_DTYPE for feature in features.values())
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        return False
+
+
+def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> AudioLayout:
+    """Where the sound of a dataset lies that has it in files.
+
+    Args:
+        repo_id: Its name.
+        root: Its folder.
         start_time_s: What is taken for `info.start_time_s` [s]; None: what the dataset says.
 
     Raises:
-        AudioLayoutError: There is none; or a name, a number or a time is missing or cannot be right.
-        OutsideError: A file lies outside the folder.
+        InputError: A file is damaged or lies outside the folder; or a name, a number or a time is missing or cannot be right.
     """
-    info = json.loads((root / INFO_PATH).read_text())
-    features = {key: one for key, one in info["features"].items() if one.get("dtype") == AUDIO_DTYPE}
-    if not features:
+    with errors_of_input():
+        footers = check_dataset_files(repo_id, root)
+        check_links(root)
+        info = json.loads((root / INFO_PATH).read_text())
+        fps, features = info.get("fps"), info["features"]
+        if isinstance(fps, bool) or not isinstance(fps, int | float) or fps % 1 or fps < 1:
+            raise AudioLayoutError(
+                f"{root / INFO_PATH}: fps is {fps!r}; wanted a whole number of frames per second. Correct it."
+            )
+        template = info.get("audio_path") or DEFAULT_AUDIO_PATH
+        if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
+            raise AudioLayoutError(
+                f"{root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
+            )
+        rows, lengths = _episodes(root, sum(footer.num_rows for footer in footers))
+        tracks = [
+            _track(root, key, feature, template, rows, sum(lengths) / fps, start_time_s)
+            for key, feature in features.items()
+            if feature.get("dtype") == AUDIO_DTYPE
+        ]
+        _check_names(tracks, set(features))
+    return AudioLayout(root, int(fps), lengths, tracks)
+
+
+def _episodes(root: Path, n_frames: int) -> tuple[pa.Table, list[int]]:
+    """The rows of `meta/episodes` in the order of the episodes, and the frames of each."""
+    remedy = f"Repair it first: playbyear-repair --root={root}"
+    try:
+        tables = [read_table(path) for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet")]
+        rows = pa.concat_tables(tables, promote_options="default").sort_by("episode_index")
+        lengths = rows.column("length").to_pylist()
+        numbers = rows.column("episode_index").to_pylist()
+    except (ParquetDamageError, pa.ArrowException, KeyError) as error:
+        raise AudioLayoutError(f"{root / EPISODES_DIR} is damaged: {error}. {remedy}") from error
+    if numbers != list(range(len(rows))) or not all(isinstance(length, int) and length > 0 for length in lengths):
         raise AudioLayoutError(
-            f"{root / INFO_PATH} has no feature of dtype 'audio'. Sound in columns becomes files with --to=files."
+            f"{root / EPISODES_DIR} does not name episodes 0 to {len(rows) - 1} and their lengths. {remedy}"
         )
-    template = info.get("audio_path") or DEFAULT_AUDIO_PATH
-    if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
+    if sum(lengths) != n_frames:
         raise AudioLayoutError(
-            f"{root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
+            f"{root / EPISODES_DIR} counts {sum(lengths)} frames; the data files hold {n_frames}. {remedy}"
         )
-    return [_track(root, key, feature, template, rows, seconds, start_time_s) for key, feature in features.items()]
+    return rows, lengths
+
+
+def _check_names(tracks: list[AudioTrack], features: set[str]) -> None:
+    taken = features - {track.key for track in tracks}
+    for track in tracks:
+        for name in column_names(track):
+            if name in taken:
+                raise AudioLayoutError(f"'{track.key}' becomes '{name}', which is there already. Rename one of them.")
+            taken.add(name)
 
 
 def column_names(track: AudioTrack) -> list[str]:
@@ -128,7 +193,7 @@ def _track(
     if start is None or not is_time:
         raise AudioLayoutError(
             f"'{key}': info.start_time_s is {start!r}; wanted how long before an episode's first frame its sound begins, "
-            f"0 to {_MOST_START_S:g} s. Say it with --start_time_s={PRE_ROLL_S:g}."
+            f"0 to {_MOST_START_S:g} s. Say it with --offset=1."
         )
     latest_s = _TOLERANCE * (seconds + len(rows) * start) + _SPARE_S
     spans = _spans(root, key, template, rows, latest_s)

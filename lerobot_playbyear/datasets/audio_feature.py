@@ -102,7 +102,8 @@ def check_audio_features(features: Mapping[str, Mapping[str, Any]], fps: int) ->
 def _check_one(key: str, feature: Mapping[str, Any], fps: int) -> int:
     if feature["dtype"] == AUDIO_DTYPE:
         raise ValueError(
-            f"'{key}' has its sound in files (dtype 'audio'); wanted a column. Make one: playbyear-convert-audio --to=columns."
+            f"'{key}' has its sound in files (dtype 'audio'); wanted a column. Make one: playbyear-attach-audio, "
+            "without --files and --session."
         )
     if feature["dtype"] not in _DTYPES:
         raise ValueError(

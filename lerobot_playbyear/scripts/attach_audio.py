@@ -1,8 +1,9 @@
 """playbyear-attach-audio: a copy of a LeRobotDataset with the sound of its microphones.
 
-Where a microphone was recorded as a camera, nothing more has to be said. Sound that was recorded
-beside the dataset is named by --files or --session. Everything is checked before anything is
-written. What the columns mean is in docs/dataset.md, microphones on robots in docs/robots.md.
+Where a microphone was recorded as a camera, or the dataset has its sound in files of its own (dtype
+"audio", LeRobot's pull request 2824), nothing more has to be said. Sound that was recorded beside
+the dataset is named by --files or --session. Everything is checked before anything is written. What
+the columns mean is in docs/dataset.md, microphones on robots in docs/robots.md.
 
     playbyear-attach-audio --dataset.repo_id=me/demos --dataset.root=outputs/demos
     playbyear-attach-audio --dataset.repo_id=me/grasp --dataset.root=outputs/grasp \\
@@ -20,7 +21,8 @@ written. What the columns mean is in docs/dataset.md, microphones on robots in d
                                were recorded as cameras, a folder with the files of their sessions
   --microphone=microphone      its name; for files of several channels, one for each: left,right
   --channel=null               take only this channel of the files, counted from 0
-  --offset=0.0                 where in its file each episode's first frame was taken [s]
+  --offset=null                where in its file each episode's first frame was taken [s]; else 0,
+                               or as the dataset says of its own files
   --offsets=null               a JSON file with a list of offsets [s], one per episode, in addition
   --sample_rate=null           resample to this rate [Hz]; else the files' own
   --pad=false                  fill what a file lacks with silence; otherwise that is an error
