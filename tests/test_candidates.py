@@ -1,4 +1,4 @@
-"""What may learn better than the paper's policy: features, fusion, losses beside the action's; off by default."""
+"""What learns better than the paper's policy: displacements, envelopes, losses beside the action's; off by default."""
 
 import math
 
@@ -6,42 +6,30 @@ import pytest
 import torch
 from test_fake_cuda import Waits, move_to_card, on_card, without_cudnn
 from test_policy_contract import make_config, make_episode, run_ending_at, step_through
-from torch import nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from training_digest import probe, trained
 
 from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads
-from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.mel_features import LogMel, make_ear
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.precision import computes_512_bits
-from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-RATE, MICROPHONE, N_FRAMES = 16000, "observation.audio.gripper", 16
+MICROPHONE, N_FRAMES = "observation.audio.gripper", 16
 TRAINED = {"d1a39e5a6f87a521": "9d03b8ddf2f5e894"}
 """By the probe of a machine: what the usual options trained there, since pictures are shrunk before they are recoloured."""
 
 SMALL = {"audio_window_s": 0.9, "n_memory_steps": 3, "n_supervised_steps": 5, "n_frame_stack": 2}
 CANDIDATES = {
-    "attention": {"fusion": "attention"},
-    "dropout": {"fusion_dropout": 0.4},
-    "log_mel": {"audio_features": "log_mel"},
-    "pcen": {"audio_features": "pcen"},
     "onset": {"auxiliary_onset": 0.1},
     "balance": {"auxiliary_balance": 0.1},
-    "past_onsets": {"auxiliary_onset": 0.1, "auxiliary_onset_s": 0.2},
     "envelope": {"audio_envelope_gain": 0.3},
     "way": {"auxiliary_way": 0.1},
-    "next_sound": {"auxiliary_next_sound": 0.1},
-    "inverse_dynamics": {"auxiliary_inverse_dynamics": 0.3},
-    "chunk": {"auxiliary_chunk": 0.5},
     "displacement": {"memory_displacement_gain": 10.0, "low_dimensional_offset": 0.1},
     "readers": {"memory_displacement_gain": 10.0, "memory_readers": 2},
 }
 EVERYTHING = {name: value for options in CANDIDATES.values() for name, value in options.items()}
-HEADS = ("onset", "way", "next_sound", "inverse_dynamics", "chunk")
+HEADS = ("onset", "way")
 
 
 def make_policy(**options) -> PlaybyearPolicy:
@@ -66,9 +54,7 @@ def test_with_the_usual_options_training_is_what_it_was_bit_for_bit():
 def test_the_usual_options_make_no_new_module_and_say_nothing_new():
     policy = make_policy()
     assert policy.model.auxiliary is None
-    assert not any(isinstance(module, nn.Dropout) for module in policy.modules())
     assert policy.forward(batch_of(policy))[1] == {}
-    assert make_ear(policy.config).state_dict().keys() == {"mean", "variance", "n_batches"}
 
 
 @pytest.mark.parametrize("options", CANDIDATES.values(), ids=CANDIDATES)
@@ -123,7 +109,7 @@ def test_in_bfloat16_it_learns_the_same():
     """The preset `cpu` learns in it where the processor can; energies and targets stay exact."""
     losses = []
     for enabled in (False, True):
-        policy = make_policy(**{**EVERYTHING, "fusion_dropout": 0.0}, use_vision=False)
+        policy = make_policy(**EVERYTHING, use_vision=False)
         with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
             losses.append(policy.forward(batch_of(policy))[1])
     for name, value in losses[0].items():
@@ -215,7 +201,7 @@ def test_a_head_changes_the_loss_by_its_weight_and_its_gradient_reaches_the_sens
     weight = (batch["action"] * 0 + 1)[..., 0]
     encodings = network.encode_run(batch, policy.config.n_run_frames)
     outputs = network.memory_head.recall(encodings)
-    (other,) = network.auxiliary(batch, encodings[:, -weight.shape[1] :], outputs, batch["action"], weight)
+    (other,) = network.auxiliary(batch, encodings[:, -weight.shape[1] :], outputs, weight)
     policy.zero_grad()
     other.error.sum().backward()
     ear = next(iter(network.hearing.parameters())).grad
@@ -306,32 +292,8 @@ def test_the_way_is_from_the_last_onset_that_the_memory_holds():
     assert is_known.tolist() == [[1, 1, 1, 0, 0]]
     # The head is asked for nothing where nothing is known.
     outputs = torch.zeros(1, 5, policy.config.embedding_size)
-    (loss,) = heads(quiet, outputs, outputs, batch["action"], torch.tensor([[1.0, 1.0, 0.0, 1.0, 1.0]]))
+    (loss,) = heads(quiet, outputs, outputs, torch.tensor([[1.0, 1.0, 0.0, 1.0, 1.0]]))
     assert loss.weight.tolist() == [[1, 1, 0, 0, 0]]
-
-
-def test_onsets_of_the_past_are_told_newest_first():
-    policy = make_policy(auxiliary_onset=1.0, auxiliary_onset_s=0.15)  # four frames
-    batch = run_ending_at(clicks(policy, (12, 15)), N_FRAMES - 1, policy.config)
-    heads, weight = policy.model.auxiliary, torch.ones(1, 5)
-    head = heads.heads["onset"]
-    for parameter in head.parameters():
-        torch.nn.init.zeros_(parameter)
-    encodings, errors = torch.zeros(1, 5, policy.config.embedding_size), []
-    for k in range(4):  # sure that a sound began k frames ago, and that none did in the others
-        head[-1].bias.data = torch.full((4,), -20.0).index_fill(0, torch.tensor(k), 20.0)
-        (loss,) = heads(batch, encodings, encodings, batch["action"], weight)
-        errors.append(loss.error[0] < 0.1)
-    told = torch.stack(errors, dim=1).int().tolist()  # of frames 11 to 15
-    assert told == [[0, 0, 0, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 0]]  # at the last: now, and 3 ago
-    with pytest.raises(
-        ValueError, match=r"auxiliary_onset_s=0.9 must be .* at most 0.8 s of .*audio_window_s=0.9 at 20 Hz"
-    ):
-        make_config(**SMALL, auxiliary_onset=1.0, auxiliary_onset_s=0.9)
-
-
-def test_a_window_of_a_single_frame_is_allowed_where_no_past_onsets_are_asked_for():
-    assert make_config(**(SMALL | {"audio_window_s": 0.05, "audio_channels": ()})).onset_frames == 1
 
 
 def test_an_envelope_keeps_how_loud_it_was():
@@ -386,7 +348,7 @@ def test_the_balance_is_who_hears_an_onset_louder():
 
     def errors(logits):
         head[-1].bias.data = torch.tensor(logits)
-        (loss,) = heads(batch, encodings, encodings, batch["action"], weight)
+        (loss,) = heads(batch, encodings, encodings, weight)
         assert loss.weight.tolist() == [[0, 1, 0, 0, 1]]  # of frames 11 to 15
         return loss.error[0, [1, 4]].tolist()
 
@@ -412,197 +374,26 @@ def test_the_balance_is_learned_from_the_ears_and_needs_two_of_them():
     assert two_ears(auxiliary_balance=1.0, use_audio=False).model.auxiliary is None
 
 
-def test_the_next_sound_is_the_end_of_the_next_frame():
-    policy = make_policy(auxiliary_next_sound=1.0).eval()
-    heads = policy.model.auxiliary
-    weight = torch.ones(1, 4)
-    before = heads._next_columns(run_ending_at(clicks(policy, ()), 15, policy.config), weight)
-    episode = clicks(policy, ())
-    episode[MICROPHONE][13, 500:540] += 8000  # the last 640 samples of 800 are looked at
-    moved = heads._next_columns(run_ending_at(episode, 15, policy.config), weight)
-    assert (moved - before).abs().amax(dim=2)[0].gt(0.1).tolist() == [False, True, False, False]  # of frames 12 to 15
-    for frame, column in zip(range(12, 16), moved[0], strict=True):
-        wave = episode[MICROPHONE][frame, -640:].float()[None] / 32768
-        torch.testing.assert_close(column[:, None], heads.ears[0](wave, wave < 2)[0])
-
-
-def test_a_chunk_is_the_actions_after_the_one_that_is_executed():
-    policy = make_policy(auxiliary_chunk=1.0, auxiliary_chunk_size=3)
-    network, batch = policy.model, batch_of(policy)
-    encodings, outputs = torch.rand(1, 5, 50), torch.rand(1, 5, 50)
-    actions, weight = batch["action"], torch.tensor([[0.0, 1, 1, 1, 1]])
-    with torch.no_grad():
-        (loss,) = network.auxiliary(batch, encodings, outputs, actions, weight)
-        predicted = network.auxiliary.heads["chunk"](outputs).unflatten(2, (4, 2))  # (1, K, A, later)
-    assert loss.weight.tolist() == [[0, 1, 1]]
-    for start in range(3):
-        for later in range(2):
-            predicted[:, start, :, later] -= actions[:, start + 1 + later]
-    torch.testing.assert_close(loss.error, predicted[:, :3].square().mean(dim=(2, 3)))
-
-
-# Dropout and attention
-
-
-def test_dropout_is_for_training_alone_and_takes_its_share():
-    policy = make_policy(fusion_dropout=0.4)
-    encodings = [torch.rand(400, size) for size in (32, 8, 7)]
-    sizes = [encoding.shape[1] for encoding in encodings]
-    fusion = type(policy.model.fusion)(sizes, policy.config).train()
-    dropped = (fusion(encodings) == 0).float().mean()
-    assert 0.37 < dropped < 0.43
-    assert torch.equal(fusion.eval()(encodings), fusion(encodings))
-    assert (fusion(encodings) == 0).float().mean() < 0.01
-
-
-def test_attention_weighs_a_sense_by_what_the_others_say():
-    """In the mean of tokens alone the effect of one sense would not depend on another."""
-    policy = make_policy(fusion="attention")
-    fusion = policy.model.fusion.eval()
-    fusion.layers = nn.Identity()
-    torch.manual_seed(0)
-    seen, heard, felt = (3 * torch.randn(2, linear.in_features) for linear in fusion.tokens)
-    with torch.no_grad():
-        effects = [fusion([s, heard, felt]) - fusion([s, 0 * heard, felt]) for s in (seen, 0 * seen)]
-    assert (effects[0] - effects[1]).abs().max() > 1e-2
-
-
-# Features
-
-
-def ear_of(kind: str, **options) -> LogSpectrogram:
-    return make_ear(make_config(audio_features=kind, **options))
-
-
-def raw(ear: LogSpectrogram, wave: torch.Tensor) -> torch.Tensor:
-    """Columns before they are normalised by statistics."""
-    n_segments = (wave.shape[1] - ear.segment) // ear.hop + 1
-    return ear.levels(wave, torch.ones(len(wave), 1, n_segments, dtype=torch.bool), None)
-
-
-def noise(n_items: int = 8, seconds: float = 2.0, seed: int = 0) -> torch.Tensor:
-    return 1e-3 * torch.randn(n_items, round(seconds * RATE), generator=torch.Generator().manual_seed(seed))
-
-
-def test_forty_bands_cover_the_kept_bins_and_a_tone_is_in_its_band():
-    ear = ear_of("log_mel")
-    assert ear.mel.shape == (160, 40)
-    torch.testing.assert_close(ear.mel.sum(dim=0), torch.ones(40))
-    assert ear.mel[1:-1].sum(dim=1).min() > 0
-    time = torch.arange(2 * RATE) / RATE
-    loudest = [int(raw(ear, torch.sin(2 * math.pi * hz * time)[None]).mean(dim=2).argmax()) for hz in (200, 1000, 3500)]
-    assert loudest == [int(ear.mel[round(hz * 0.04)].argmax()) for hz in (200, 1000, 3500)]
-
-
-def test_steady_noise_eight_times_as_loud_moves_log_mel_and_hardly_pcen():
-    mel, pcen = ear_of("log_mel"), ear_of("pcen")
-    moved = [(raw(ear, 8 * noise()) - raw(ear, noise())).mean() for ear in (mel, pcen)]
-    torch.testing.assert_close(moved[0], torch.tensor(2 * math.log10(8)), rtol=0.02, atol=0)  # 18 dB
-    spread = [raw(ear, noise()).std() for ear in (mel, pcen)]
-    assert moved[0] / spread[0] > 5
-    assert moved[1] / spread[1] < 0.2
-
-
-@pytest.mark.parametrize("factor", [1.0, 8.0])
-def test_what_begins_stands_out_of_pcen_in_any_noise(factor):
-    pcen, wave = ear_of("pcen"), factor * noise()
-    burst = factor * 0.02 * torch.randn(8, 800, generator=torch.Generator().manual_seed(1))
-    wave[:, 20000:20800] += burst
-    levels = raw(pcen, wave).mean(dim=1)  # (B, n_segments)
-    column = 20000 // 560
-    assert levels.mean(dim=0)[column - 1 : column + 3].amax() > 4 * levels.mean(dim=0)[10:30].mean()
-
-
-def test_pcens_average_becomes_the_published_smoother():
-    """M(t) = (1 - s) M(t - 1) + s E(t), once what came before the window has faded."""
-    pcen = ear_of("pcen")
-    energies = torch.rand(1, 3, 400, generator=torch.Generator().manual_seed(0))
-    keep = math.exp(-pcen.hop / RATE / 0.4)
-    smooth = energies[..., 0]
-    for t in range(1, 400):
-        smooth = keep * smooth + (1 - keep) * energies[..., t]
-    ours = pcen._average(energies, torch.ones(1, 1, 400))
-    torch.testing.assert_close(ours[..., -1], smooth, rtol=1e-4, atol=0)
-    torch.testing.assert_close(ours[..., 0], energies[..., 0])
-
-
-def test_what_precedes_the_episode_does_not_matter_to_pcen():
-    pcen, wave = ear_of("pcen").eval(), noise(2)
-    begun = torch.arange(wave.shape[1]).expand(2, -1) >= 16000
-    louder = torch.where(begun, wave, 100 * wave)
-    first = math.ceil(16000 / 560)
-    torch.testing.assert_close(pcen(wave, begun)[..., first:], pcen(louder, begun)[..., first:])
-    assert (pcen(louder, begun)[..., :first] == 0).all()
-
-
-def test_windows_that_begin_elsewhere_share_no_column_in_pcen():
-    """The adversary: with stretches shared as for the spectrogram a window would hear more past in training than acting."""
-    pcen, wave = ear_of("pcen").eval(), noise(1, 3.0)
-    wave[:, :14000] *= 30
-    begun = torch.ones_like(wave, dtype=torch.bool)
-    for is_apart, agrees in ((True, True), (False, False)):
-        shared = SharedStretches(16, 800, 32000, pcen.hop, is_apart)
-        together = shared.windows(pcen(shared.stretches(wave), shared.stretches(begun)), 57)
-        alone = wave[:, -32000 - 15 * 800 :].unfold(1, 32000, 800).flatten(0, 1)
-        alone = pcen(alone, torch.ones_like(alone, dtype=torch.bool))
-        assert torch.allclose(together, alone, atol=1e-4) == agrees
-    assert pcen.is_per_window
-    assert not LogMel.is_per_window
-
-
-@pytest.mark.parametrize("kind", ["log_mel", "pcen"])
-def test_another_microphones_gain_is_one_of_the_bins_below_the_bands(kind):
-    ear, wave = ear_of(kind), noise(2)
-    colour = torch.full((2, 160), 1.2)  # 12 dB
-    real = torch.ones(2, 1, 57, dtype=torch.bool)
-    torch.testing.assert_close(ear.levels(wave, real, colour), raw(ear, wave * 10**0.6), rtol=1e-3, atol=1e-3)
+# Refusals
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"audio_features": "mfcc"}, r"audio_features must be one of spectrogram, log_mel, pcen, got 'mfcc'"),
-        ({"fusion": "sum"}, r"fusion must be one of concatenation, attention, got 'sum'"),
-        ({"fusion_dropout": 1.0}, r"fusion_dropout must be at least 0 \(none\) and below 1, got 1.0"),
-        (
-            {"audio_features": "pcen", "n_mels": 161},
-            r"n_mels must be from 1 to --policy.n_frequency_bins \(160\), got 161",
-        ),
         ({"auxiliary_onset": -1.0}, r"auxiliary_onset must be at least 0 \(off\) and finite, got -1.0"),
-        ({"auxiliary_chunk": math.inf}, r"auxiliary_chunk must be at least 0"),
-        ({"auxiliary_next_sound": 1.0, "n_supervised_steps": 1}, r"needs runs of at least 2.*n_supervised_steps is 1"),
-        ({"auxiliary_chunk": 1.0, "n_supervised_steps": 3}, r"needs runs of at least 4 windows"),
+        ({"auxiliary_way": math.inf}, r"auxiliary_way must be at least 0"),
         ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
         ({"memory_displacement_gain": 10.0, "low_dimensional_gain": 0.0}, r"low_dimensional_gain is 0: give 4"),
         ({"memory_readers": -1}, r"memory_readers must be at least 0 \(none\), got -1"),
         ({"memory_readers": 2}, r"memory_readers=2 read displacements, .*memory_displacement_gain is 0: give 10"),
-        ({"auxiliary_chunk_size": 1}, r"auxiliary_chunk_size must be at least 2"),
     ],
 )
 def test_what_cannot_be_is_refused_with_the_option(options, message):
-    with pytest.raises(ValueError, match=rf"--policy\.{message}" if "needs" not in message else message):
+    with pytest.raises(ValueError, match=rf"--policy\.{message}"):
         make_config(**options)
 
 
-@pytest.mark.filterwarnings("ignore:At least one mel filterbank")
-def test_bands_narrower_than_bins_are_refused():
-    with pytest.raises(ValueError, match=r"--policy.n_mels=160: some bands are narrower than the 25 Hz of a bin"):
-        ear_of("log_mel", n_mels=160)
-
-
 def test_a_deaf_policy_learns_as_if_nobody_had_asked_for_what_needs_sound():
-    deaf, asked = (
-        make_policy(use_audio=False),
-        make_policy(use_audio=False, auxiliary_onset=0.3, auxiliary_next_sound=1),
-    )
+    deaf, asked = make_policy(use_audio=False), make_policy(use_audio=False, auxiliary_onset=0.3, auxiliary_way=0.3)
     assert asked.model.auxiliary is None
     torch.testing.assert_close(asked.state_dict(), deaf.state_dict(), rtol=0, atol=0)
-    kept = make_policy(use_audio=False, auxiliary_onset=0.3, auxiliary_chunk=0.5).model.auxiliary
-    assert list(kept.heads) == ["chunk"]
-
-
-def test_an_old_checkpoints_options_are_todays_defaults():
-    assert PlaybyearConfig(device="cpu").n_audio_channels == 160
-    assert (
-        PlaybyearConfig(device="cpu", n_frequency_bins=16).n_audio_channels == 16
-    )  # fewer than a default that is unused

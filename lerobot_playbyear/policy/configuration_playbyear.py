@@ -36,9 +36,6 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
         audio_window_s: Seconds of sound behind one encoding.
         segment_s, hop_s: Length and step of the spectrogram's segments [s].
         n_frequency_bins: Lowest bins of the spectrogram that are kept; a bin is 1 / segment_s wide.
-        audio_features: What the audio encoder gets of them: "spectrogram", their log power (the paper); "log_mel", that of
-            `n_mels` bands; "pcen", the bands' power relative to its own recent past, which steady noise hardly moves.
-        n_mels: Bands of equal width on the mel scale, over the kept bins; for "log_mel" and "pcen".
         image_size: Pixels, height and width, that the vision encoder sees. 84 trains about five times faster than 224.
         audio_steps: Names in LeRobot's ProcessorStepRegistry: steps that sound passes through before the network, in training
             as in a rollout. A trained policy keeps those it was trained with (`extension.MicrophoneStep`).
@@ -47,8 +44,6 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
         vision_encoder, audio_encoder: Names of registered encoders (`extension.register_vision_encoder`, `_audio_encoder`).
         vision_width: Channels of the ResNet-18's first stage; 64 is ResNet-18, and its embedding has 8 times as many.
         audio_channels: Channels of the audio encoder's convolutions, all with kernel 7.
-        fusion: "concatenation" of all encodings (the paper), or "attention" among them, each a token, before the same MLP.
-        fusion_dropout: Share of a joint encoding's numbers that training sets to 0; acting uses all.
         hidden_size: Of the two hidden layers in the fusion and in the head.
         embedding_size: Of the fused encoding and of the LSTM, D.
         normalize_encodings: Bring every camera's and microphone's encoding to the same size before the fusion (a layer norm
@@ -83,18 +78,12 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
         low_dimensional_offset: Standard deviation of an error besides that all frames of an item share: it hides where a
             demonstration was recorded, and leaves ways as they are. 0: none (the paper).
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
-        ema_decay: Weight of the past in an exponential moving average of the network's weights, which acts in rollouts in place
-            of the last update's; both are in a checkpoint. It rises to this in the first updates: (1 + n) / (10 + n) after n.
-            0: none (the paper).
         auxiliary_*: Weights, beside the action's loss, of what training predicts besides (`auxiliary.py`); 0: not at all (the
-            paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame, and in
-            each of those of the `auxiliary_onset_s` before it [cross entropy, nats]; balance: at an onset in the newest frame,
-            each microphone's share of the power that they hear, which tells where it was [Kullback-Leibler divergence, nats];
-            way: from the memory, how far the low-dimensional observations were at its last onset from what they are now, 1 at
-            most [Huber loss, normalised units]; next_sound: the last spectrogram column of the next frame [squared standard
-            deviations]; inverse_dynamics: the action between two neighbouring encodings; chunk: the actions after the one that
-            is executed, so that they are `auxiliary_chunk_size` together [both as the action's own loss]. A deaf policy leaves
-            out the first four, and one with a single microphone the second.
+            paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame [cross
+            entropy, nats]; balance: at such an onset, each microphone's share of the power that they hear, which tells where it
+            was [Kullback-Leibler divergence, nats]; way: from the memory, how far the low-dimensional observations were at its
+            last onset from what they are now, 1 at most [Huber loss, normalised units]. A deaf policy leaves them out, and one
+            with a single microphone the second.
         dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
             the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
             GPU means "auto". Acting always computes in float32.
@@ -115,8 +104,6 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     segment_s: float = 0.040
     hop_s: float = 0.035
     n_frequency_bins: int = 160
-    audio_features: str = "spectrogram"
-    n_mels: int = 40
     image_size: int = 224
     audio_steps: tuple[str, ...] = ()
     normalization_mapping: dict[str, NormalizationMode] = field(
@@ -133,8 +120,6 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     audio_encoder: str = "spectrogram_cnn"
     vision_width: int = 64
     audio_channels: tuple[int, ...] = (64, 32, 16, 8)
-    fusion: str = "concatenation"
-    fusion_dropout: float = 0.0
     hidden_size: int = 1024
     embedding_size: int = 50
     normalize_encodings: bool = True
@@ -158,15 +143,9 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
     low_dimensional_noise: float = 0.0
     low_dimensional_offset: float = 0.0
     spectrogram_momentum: float = 0.01
-    ema_decay: float = 0.0
     auxiliary_onset: float = 0.0
-    auxiliary_onset_s: float = 0.0
     auxiliary_balance: float = 0.0
     auxiliary_way: float = 0.0
-    auxiliary_next_sound: float = 0.0
-    auxiliary_inverse_dynamics: float = 0.0
-    auxiliary_chunk: float = 0.0
-    auxiliary_chunk_size: int = 4
     dtype: str | None = None
     optimizer_lr: float = 1e-3
     optimizer_weight_decay: float = 0.0

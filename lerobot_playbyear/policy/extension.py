@@ -41,11 +41,11 @@ def register_audio_encoder[Factory: EncoderFactory](name: str) -> Callable[[Fact
     It gets the policy's configuration and returns a module with
 
     - `embedding_size`, an int, E;
-    - `forward`: (N, config.n_audio_channels, config.n_segments) -> (N, E), for any N: log power, or what `audio_features`
-      names, about 0 +- 1 in every bin or band, and 0 where the episode had not begun.
+    - `forward`: (N, config.n_frequency_bins, config.n_segments) -> (N, E), for any N: log power, about 0 +- 1 in
+      every bin, and 0 where the episode had not begun.
 
     In training neighbouring windows share segments. An encoder that is convolutional along time, without padding, may share its
-    work too, and says so by an attribute `window_columns`: it then gets (N, n_audio_channels, n_segments + extra) and returns
+    work too, and says so by an attribute `window_columns`: it then gets (N, n_frequency_bins, n_segments + extra) and returns
     (N, C, window_columns + extra), where every window's embedding is a slice of `window_columns` columns, so that E is C *
     window_columns.
 

@@ -16,7 +16,6 @@ from lerobot_playbyear.policy.card import with_hearing, write_card
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.feature_checks import check_fps, refuse_unheard_microphones
 from lerobot_playbyear.policy.history import RecentFrames, newest
-from lerobot_playbyear.policy.moving_average import MovingAverage, with_average, without_average
 from lerobot_playbyear.policy.networks import PlaybyearNetwork
 from lerobot_playbyear.policy.packed_encoder import act_by_folded_copies, prepare_to_act
 from lerobot_playbyear.policy.shared_statistics import is_first_process, mean_over_processes, share_batch_norm
@@ -49,22 +48,10 @@ class PlaybyearPolicy(PreTrainedPolicy):
         self.model = PlaybyearNetwork(config)
         share_batch_norm(self.model)
         act_by_folded_copies(self.model)
-        self.averaged = MovingAverage(self.model, config.ema_decay) if config.ema_decay else None
         self.reset()
-
-    @property
-    def acting_network(self) -> PlaybyearNetwork:
-        """What acts: the moving average of the weights, or the weights of the last update."""
-        network: Any = self.model if self.averaged is None else self.averaged.module
-        return network
 
     def get_optim_params(self) -> Any:
         return self.model.parameters()
-
-    def update(self) -> None:
-        """After an update of the weights: LeRobot calls it."""
-        if self.averaged is not None:
-            self.averaged.update_parameters(self.model)
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
         """Writes a checkpoint, of copies: on a GPU an LSTM's weights are views of one buffer, which LeRobot's own refuses.
@@ -88,7 +75,6 @@ class PlaybyearPolicy(PreTrainedPolicy):
         hint = "Use the configuration, with the sizes and the inputs, that the checkpoint was trained with."
         try:
             weights = load_file(model_file, device=resolve_safetensors_device(map_location))
-            weights = without_average(weights) if model.averaged is None else with_average(weights)
             missing, unexpected = model.load_state_dict(weights, strict=False)
         except RuntimeError as error:
             raise ValueError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
@@ -112,7 +98,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """Forgets the episode."""
-        prepare_to_act(self.acting_network)
+        prepare_to_act(self.model)
         self._recent = RecentFrames(self.config)
         self._encodings: Tensor | None = None
 
@@ -132,7 +118,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         Raises:
             ValueError: A key is missing or sound is not finite.
         """
-        network, n_frames = self._network(), self.config.n_run_frames
+        network, n_frames = self.model, self.config.n_run_frames
         encodings = network.encode_run(batch, n_frames)  # (B, R, D)
         outputs = network.memory_head.recall(encodings)  # (B, K, D)
         predicted = network.memory_head.act(outputs)  # (B, K, n_actions)
@@ -147,7 +133,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
             return loss, {}
         figures = {"loss_action": loss.detach().mean()}
         fused = encodings[:, -n_windows:, : self.config.embedding_size]
-        for other in network.auxiliary(batch, fused, outputs, target, weight):
+        for other in network.auxiliary(batch, fused, outputs, weight):
             average = self._average(other.error, other.weight, reduction)
             figures[f"loss_{other.kind}"] = average.detach().mean()
             loss = loss + other.factor * average
@@ -161,34 +147,28 @@ class PlaybyearPolicy(PreTrainedPolicy):
         total = mean_over_processes(weight.sum()) if self.training else weight.sum()
         return (error * weight).sum() / total.clamp(min=1e-8)
 
-    def _network(self) -> PlaybyearNetwork:
-        """What learns in training, and what acts otherwise."""
-        return self.model if self.training else self.acting_network
-
     def predict_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
         """Actions of the last `n_steps` (default K) frames of every item, (B, n_steps, n_actions), normalised."""
-        network = self._network()
-        return network.memory_head(self._encode(network, batch, n_steps))
+        return self.model.memory_head(self._encode(batch, n_steps))
 
     def memory_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
         """What the policy remembers at the last `n_steps` (default K) frames of every item, (B, n_steps, D)."""
-        network = self._network()
-        return network.memory_head.recall(self._encode(network, batch, n_steps))
+        return self.model.memory_head.recall(self._encode(batch, n_steps))
 
     @property
     def memory(self) -> Tensor:
         """What it remembers since the last `select_action`, (B, D)."""
         assert self._encodings is not None, "select_action comes first"
         with torch.no_grad():
-            return self.acting_network.memory_head.recall(self._encodings)[:, -1]
+            return self.model.memory_head.recall(self._encodings)[:, -1]
 
     def act_from(self, memories: Tensor) -> Tensor:
         """The actions (..., n_actions), normalised, that follow from memories (..., D)."""
-        return self.acting_network.memory_head.act(memories)
+        return self.model.memory_head.act(memories)
 
-    def _encode(self, network: PlaybyearNetwork, batch: dict[str, Tensor], n_steps: int | None) -> Tensor:
+    def _encode(self, batch: dict[str, Tensor], n_steps: int | None) -> Tensor:
         """Joint encodings of every item's last frames, (B, R, D)."""
-        return network.encode_run(batch, (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1)
+        return self.model.encode_run(batch, (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -206,7 +186,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         self._check_sound(batch)
         if self.training:
             self.eval()
-        network = self.acting_network
+        network = self.model
         run = self._recent.add(batch, network.prepare_images)
         device = next(iter(run.values())).device
         with torch.autocast(device.type, enabled=False):  # bfloat16 would round positions to half a millimetre

@@ -17,13 +17,12 @@ from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.auxiliary import make_auxiliary
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
-from lerobot_playbyear.policy.fusion import FUSIONS
+from lerobot_playbyear.policy.fusion import Fusion
 from lerobot_playbyear.policy.history import before_episode, newest
-from lerobot_playbyear.policy.mel_features import make_ear
 from lerobot_playbyear.policy.memory import MemoryHead
 from lerobot_playbyear.policy.precision import computes_512_bits
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
-from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, make_ear, to_float_wave
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
@@ -61,10 +60,10 @@ class PlaybyearNetwork(nn.Module):
             n_columns = config.n_segments if config.audio_envelope_gain else 0
             sizes += [encoder.embedding_size + n_columns for encoder in self.hearing.values()]  # type: ignore[misc, operator]
         felt = [math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys]
-        self.fusion = FUSIONS[config.fusion]([*sizes, *felt], config)
+        self.fusion = Fusion(sum([*sizes, *felt]), config)
         self.memory_head = MemoryHead(config, config.action_feature.shape[0], sum(felt))
         # Last, so that all else begins with the weights that it has without.
-        self.auxiliary = make_auxiliary(config, config.action_feature.shape[0])
+        self.auxiliary = make_auxiliary(config)
 
     def encode_run(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
         """Joint encodings of the last `n_frames` frames of every item, each encoded once: (B, n_frames, D).
@@ -116,9 +115,7 @@ class PlaybyearNetwork(nn.Module):
         spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
         assert isinstance(spectrogram, LogSpectrogram)
         # Neighbouring windows overlap: their segments are computed once.
-        shared = SharedStretches(
-            n_frames, sound.shape[2], config.window_samples, spectrogram.hop, spectrogram.is_per_window
-        )
+        shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
         if colour is not None:
             colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
         levels = spectrogram(
@@ -267,7 +264,7 @@ def _vision_encoder(config: PlaybyearConfig) -> VisionEncoder:
 
 @register_audio_encoder("spectrogram_cnn")
 def _audio_encoder(config: PlaybyearConfig) -> AudioEncoder:
-    return AudioEncoder(config.n_audio_channels, config.n_segments, tuple(config.audio_channels))
+    return AudioEncoder(config.n_frequency_bins, config.n_segments, tuple(config.audio_channels))
 
 
 def _module_name(key: str) -> str:

@@ -5,9 +5,6 @@ from typing import TYPE_CHECKING
 
 from lerobot_playbyear.policy.precision import DTYPES
 
-AUDIO_FEATURES = ("spectrogram", "log_mel", "pcen")
-FUSIONS = ("concatenation", "attention")
-
 if TYPE_CHECKING:
     from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
@@ -38,8 +35,6 @@ def check_options(config: "PlaybyearConfig") -> None:
             f"--policy.memory_readers={config.memory_readers} read displacements, and --policy.memory_displacement_gain is 0: "
             "give 10, its usual value."
         )
-    if not 0 <= config.ema_decay < 1:
-        raise ValueError(f"--policy.ema_decay must be at least 0 (none) and below 1, got {config.ema_decay}.")
     if config.audio_noise_files is not None and config.audio_noise_db is None:
         raise ValueError(
             f"--policy.audio_noise_files={config.audio_noise_files} says nothing of how loud the noise may be: add "
@@ -47,7 +42,10 @@ def check_options(config: "PlaybyearConfig") -> None:
         )
     if config.audio_colour_db < 0:
         raise ValueError(f"--policy.audio_colour_db must be at least 0 dB, got {config.audio_colour_db}.")
-    _check_candidates(config)
+    for kind in ("onset", "balance", "way"):
+        weight = getattr(config, f"auxiliary_{kind}")
+        if not 0 <= weight < math.inf:
+            raise ValueError(f"--policy.auxiliary_{kind} must be at least 0 (off) and finite, got {weight}.")
     if config.audio_window_s < config.segment_s or config.hop_s <= 0:
         raise ValueError(
             f"--policy.audio_window_s ({config.audio_window_s}) must hold at least one segment of "
@@ -59,46 +57,3 @@ def check_options(config: "PlaybyearConfig") -> None:
         )
     if config.dtype not in (None, *DTYPES):
         raise ValueError(f"--policy.dtype must be one of {', '.join(DTYPES)}, got {config.dtype!r}.")
-
-
-def _check_candidates(config: "PlaybyearConfig") -> None:
-    """What the paper's policy has not: features, fusion, and what training predicts besides."""
-    for name, wanted in (("audio_features", AUDIO_FEATURES), ("fusion", FUSIONS)):
-        if getattr(config, name) not in wanted:
-            raise ValueError(f"--policy.{name} must be one of {', '.join(wanted)}, got {getattr(config, name)!r}.")
-    if config.audio_features != "spectrogram" and not 1 <= config.n_mels <= config.n_frequency_bins:
-        raise ValueError(
-            f"--policy.n_mels must be from 1 to --policy.n_frequency_bins ({config.n_frequency_bins}), "
-            f"got {config.n_mels}."
-        )
-    if not 0 <= config.fusion_dropout < 1:
-        raise ValueError(f"--policy.fusion_dropout must be at least 0 (none) and below 1, got {config.fusion_dropout}.")
-    # By kind: how many windows of a run it needs.
-    needs = {
-        "onset": 1,
-        "balance": 1,
-        "way": 1,
-        "next_sound": 2,
-        "inverse_dynamics": 2,
-        "chunk": config.auxiliary_chunk_size,
-    }
-    for kind, n_windows in needs.items():
-        option, weight = f"--policy.auxiliary_{kind}", getattr(config, f"auxiliary_{kind}")
-        if not 0 <= weight < math.inf:
-            raise ValueError(f"{option} must be at least 0 (off) and finite, got {weight}.")
-        if weight and config.n_supervised_steps < n_windows:
-            raise ValueError(
-                f"{option}={weight} needs runs of at least {n_windows} windows: --policy.n_supervised_steps is "
-                f"{config.n_supervised_steps}, give {n_windows} or more."
-            )
-    if not 0 <= config.auxiliary_onset_s <= max(0, config.audio_frames - 2) / config.fps:
-        raise ValueError(
-            f"--policy.auxiliary_onset_s={config.auxiliary_onset_s} must be at least 0, the newest frame alone, and leave two "
-            f"frames of what is heard: at most {max(0, config.audio_frames - 2) / config.fps:g} s of "
-            f"--policy.audio_window_s={config.audio_window_s} at {config.fps} Hz."
-        )
-    if config.auxiliary_chunk_size < 2:
-        raise ValueError(
-            f"--policy.auxiliary_chunk_size must be at least 2, the action that is executed and one more, got "
-            f"{config.auxiliary_chunk_size}."
-        )

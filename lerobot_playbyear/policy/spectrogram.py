@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 from lerobot_playbyear.policy.window_lengths import segment_and_hop
 
@@ -47,20 +48,16 @@ class SharedStretches:
         step: Between the windows' ends [samples].
         length: Of a window [samples].
         hop: Between the segments' starts [samples].
-        is_apart: Every window is a stretch of its own, for what depends on where a window begins.
     """
 
     n_windows: int
     step: int
     length: int
     hop: int
-    is_apart: bool = False
 
     @property
     def period(self) -> int:
         """Frames after which windows have segments in common."""
-        if self.is_apart:
-            return self.n_windows
         return self.hop // math.gcd(self.step, self.hop)
 
     @property
@@ -106,29 +103,17 @@ class LogSpectrogram(nn.Module):
         segment_s, hop_s: Length and step of the segments [s].
         n_bins: Lowest frequency bins kept; bin b is at b / segment_s Hz.
         momentum: Weight of the newest batch in the running statistics.
-        n_channels: Numbers that a column has in the end, where they are not the bins.
 
     Attributes:
-        is_per_window: A column depends on where its window begins, so that windows cannot share it.
         keeps_statistics: Whether the running statistics stay as they are in training too.
     """
-
-    is_per_window = False
 
     window: Tensor
     mean: Tensor
     variance: Tensor
     n_batches: Tensor
 
-    def __init__(
-        self,
-        sample_rate: int,
-        segment_s: float,
-        hop_s: float,
-        n_bins: int,
-        momentum: float = 0.01,
-        n_channels: int | None = None,
-    ):
+    def __init__(self, sample_rate: int, segment_s: float, hop_s: float, n_bins: int, momentum: float = 0.01):
         super().__init__()
         self.sample_rate = sample_rate
         self.segment, self.hop = segment_and_hop(sample_rate, segment_s, hop_s)
@@ -142,8 +127,8 @@ class LogSpectrogram(nn.Module):
         self.register_buffer("window", torch.hann_window(self.segment).clone(), persistent=False)
         # A full-scale sine has power 1 in its bin, whatever the segment's length.
         self.scale = 4.0 / float(self.window.sum()) ** 2
-        self.register_buffer("mean", torch.zeros(n_channels or n_bins))
-        self.register_buffer("variance", torch.ones(n_channels or n_bins))
+        self.register_buffer("mean", torch.zeros(n_bins))
+        self.register_buffer("variance", torch.ones(n_bins))
         self.register_buffer("n_batches", torch.zeros((), dtype=torch.long))
 
     def log_power(self, wave: Tensor) -> Tensor:
@@ -164,20 +149,6 @@ class LogSpectrogram(nn.Module):
         spectrum = spectrum[:, : self.n_bins]  # of the bins kept alone, and without a root
         return spectrum.real.square().addcmul_(spectrum.imag, spectrum.imag)
 
-    def levels(self, wave: Tensor, real: Tensor, colour: Tensor | None) -> Tensor:
-        """What a column is before it is normalised.
-
-        Args:
-            wave: (B, samples) or (B, n, samples), in [-1, 1].
-            real: (B * n, 1, n_segments) bool, False for segments before the episode.
-            colour: (B * n, n_bins), gains of another microphone [10 dB].
-
-        Returns:
-            (B * n, channels of a column, n_segments).
-        """
-        levels = self.log_power(wave)
-        return levels if colour is None else levels + colour.unsqueeze(2)
-
     def forward(self, wave: Tensor, begun: Tensor, colour: Tensor | None = None) -> Tensor:
         """Spectrograms in which what precedes the episode is the average sound: zero.
 
@@ -187,12 +158,14 @@ class LogSpectrogram(nn.Module):
             colour: (B * n, n_bins), gains of another microphone [10 dB].
 
         Returns:
-            (B * n, channels of a column, n_segments).
+            (B * n, n_bins, n_segments).
         """
         # A segment counts if its first sample does: the episode, once begun, goes on.
         real = begun[..., : wave.shape[-1] - self.segment + 1 : self.hop]
         real = real.flatten(0, -2).unsqueeze(1)  # (B * n, 1, n_segments)
-        levels = self.levels(wave, real, colour)
+        levels = self.log_power(wave)
+        if colour is not None:
+            levels = levels + colour.unsqueeze(2)
         if self.training and not self.keeps_statistics:
             self._update(levels.detach(), real)
         levels = (levels - self.mean[:, None]) * torch.rsqrt(self.variance + 1e-5)[:, None]
@@ -209,3 +182,11 @@ class LogSpectrogram(nn.Module):
         self.mean.lerp_(mean, momentum)
         self.variance.lerp_(variance, momentum)
         self.n_batches += counts
+
+
+def make_ear(config: PlaybyearConfig) -> LogSpectrogram:
+    """One microphone's spectrogram, as a policy's options say."""
+    assert config.sample_rate is not None
+    return LogSpectrogram(
+        config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins, config.spectrogram_momentum
+    )

@@ -24,10 +24,7 @@ class WindowLengths:
     segment_s: float
     hop_s: float
     n_frequency_bins: int
-    audio_features: str
-    n_mels: int
     n_supervised_steps: int
-    auxiliary_onset_s: float
 
     @property
     def memory_steps(self) -> int:
@@ -43,11 +40,6 @@ class WindowLengths:
     def audio_frames(self) -> int:
         """Frames whose sound one encoding hears."""
         return math.ceil(round(self.audio_window_s * self.fps, 6))
-
-    @property
-    def onset_frames(self) -> int:
-        """Frames of which training tells, from one encoding, whether a sudden sound begins in them; the newest is one."""
-        return 1 + round(self.auxiliary_onset_s * self.fps)
 
     @property
     def n_run_frames(self) -> int:
@@ -89,8 +81,3 @@ class WindowLengths:
         assert self.sample_rate is not None
         segment, hop = segment_and_hop(self.sample_rate, self.segment_s, self.hop_s)
         return (self.window_samples - segment) // hop + 1
-
-    @property
-    def n_audio_channels(self) -> int:
-        """Numbers in one column of what the audio encoder gets: frequency bins, or mel bands."""
-        return self.n_frequency_bins if self.audio_features == "spectrogram" else self.n_mels

@@ -37,7 +37,6 @@ _NETWORK = (
     "memory_displacement_gain",
     "memory_readers",
     "auxiliary_onset",
-    "auxiliary_onset_s",
     "auxiliary_balance",
     "auxiliary_way",
 )

@@ -13,9 +13,9 @@ class SpectrogramGRU(nn.Module):
     def __init__(self, config: PlaybyearConfig):
         super().__init__()
         self.embedding_size = 64
-        self.gru = nn.GRU(config.n_audio_channels, self.embedding_size, batch_first=True)
+        self.gru = nn.GRU(config.n_frequency_bins, self.embedding_size, batch_first=True)
 
     def forward(self, spectrogram: Tensor) -> Tensor:
-        """(N, n_audio_channels, n_segments) -> (N, embedding_size)."""
+        """(N, n_frequency_bins, n_segments) -> (N, embedding_size)."""
         _, last = self.gru(spectrogram.transpose(1, 2))  # (1, N, embedding_size)
         return last[0]
