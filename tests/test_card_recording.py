@@ -65,6 +65,14 @@ def test_the_newest_sample_is_a_chunk_old_for_a_minute_beside_a_clock_that_is_fa
     assert np.ptp(errors) < 0.007  # and steps have the same length, whatever the chunks do
 
 
+@pytest.mark.parametrize("period_s", [0.01, 0.0213, 0.0427, 0.1])
+def test_steps_have_the_length_that_they_have_in_time_where_a_sound_server_sends_bursts(period_s):
+    simulation = Simulation(20, came=lambda at: float(np.ceil(at / period_s) * period_s))
+    lengths = np.diff(simulation.counters)[3 * FPS :]
+    assert np.abs(lengths / RATE * FPS - 1).max() < 0.1  # the made-up chunks come up to 4 ms late
+    assert simulation.errors_from(4).max() < period_s + 0.012
+
+
 @pytest.mark.parametrize("held_s", [0.06, 0.3, 0.9])
 def test_chunks_that_were_held_up_are_late_and_not_lost_and_shift_nothing(held_s, caplog):
     simulation = Simulation(9, came=lambda at: max(at, 5 + held_s) if at >= 5 else at)

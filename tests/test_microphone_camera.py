@@ -13,6 +13,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy
 from lerobot.utils.feature_utils import hw_to_dataset_features
 
+from lerobot_playbyear.audio import camera_sound
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.audio.control_steps import HALF, ControlStepSound
 from lerobot_playbyear.audio.sample_strip import (
@@ -75,15 +76,21 @@ def counters_of(n: int, first: int = 8000, seed: int = 0) -> list[int]:
     return [first, *(first + np.cumsum(np.random.default_rng(seed).integers(801, 815, n - 1))).tolist()]
 
 
-def recorded(root: Path, session: Session, episodes: list[list[int]], video: bool = False, **others) -> Path:
+def recorded(
+    root: Path, session: Session, episodes: list[list[int]], video: bool = False, by_person=None, **others
+) -> Path:
     """A dataset of these steps, with LeRobot's own functions."""
     features = hw_to_dataset_features({"a.pos": float, "b.pos": float, "mic": (224, 224, 3)}, "observation", video)
     features |= hw_to_dataset_features({"a.pos": float, "b.pos": float}, "action", video)
+    if by_person:
+        features["intervention"] = {"dtype": "bool", "shape": (1,), "names": None}
     dataset = LeRobotDataset.create("me/heard", FPS, features, root=root, use_videos=video, **others)
     for counters in episodes:
         for i, counter in enumerate(counters):
             low = np.array([i, counter % 7], np.float32)
             frame = {"observation.state": low, "action": low, PICTURE: session.picture(counter), "task": "listen"}
+            if by_person:
+                frame["intervention"] = np.array([bool(by_person[i])])
             dataset.add_frame(frame)
         dataset.save_episode()
     dataset.finalize()
@@ -245,7 +252,41 @@ def test_a_timecode_that_cannot_be_read_follows_from_its_neighbours(tmp_path, ca
     torn = Torn(tmp_path / "sessions", sound(8))
     broken = attached(recorded(tmp_path / "broken", torn, [counters]), tmp_path / "sessions")
     assert "4 timecodes could not be read" in capsys.readouterr().out
-    np.testing.assert_array_equal(column(broken)[1:], column(good)[1:])
+    np.testing.assert_array_equal(column(broken), column(good))
+    np.testing.assert_array_equal(column(broken, "is_first"), column(good, "is_first"))
+
+
+def test_only_the_episodes_are_named_whose_sound_is_missing(tmp_path):
+    first, second = (Session(tmp_path / "sessions", sound(8), session) for session in (0x11, 0x22))
+
+    class Both(Session):
+        def picture(self, counter: int) -> np.ndarray:
+            return (first if counter < 20000 else second).picture(counter)
+
+    both = Both(tmp_path / "unused", sound(8))
+    root = recorded(tmp_path / "heard", both, [counters_of(8), counters_of(8, 30000)], video=True)
+    session_path(tmp_path / "sessions", 0x11, "2026-01-01_00-00-00").unlink()
+    with pytest.raises(AttachError, match=r"images\.mic, episode 0: its pictures were compressed.*_00000011\.wav"):
+        attached(root, tmp_path / "sessions")
+
+
+def test_a_dataset_of_the_hub_gets_no_sound_of_this_machines_sessions_by_itself(tmp_path, monkeypatch, capsys):
+    """Whoever saw a session's pictures could name it in their own, and have its voices copied."""
+    monkeypatch.setattr(camera_sound, "SESSIONS", tmp_path / "own")
+    session = Session(tmp_path / "own", sound(8))
+    root = recorded(tmp_path / "strange", session, [counters_of(8)], video=True)
+    (root / ".cache/huggingface").mkdir(parents=True)
+    with pytest.raises(AttachError, match="came from the Hub and may be a stranger's"):
+        attached(root)
+    shutil.rmtree(root / ".cache")
+    attached(root)
+    assert "0.2 to 0.9 s of" in capsys.readouterr().out
+
+
+def test_a_hand_back_begins_anew_however_short_the_pause(tmp_path):
+    session = Session(tmp_path / "sessions", sound(8))
+    root = recorded(tmp_path / "heard", session, [counters_of(9)], by_person=[0, 0, 0, 1, 1, 1, 0, 0, 0])
+    assert np.flatnonzero(column(attached(root), "is_first")).tolist() == [0, 6]
 
 
 def test_what_is_missing_is_named_and_nothing_is_written(tmp_path):

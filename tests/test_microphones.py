@@ -1,6 +1,7 @@
 """Microphones through PortAudio and a real sound server, and from files: which card, which samples, what goes wrong."""
 
 import contextlib
+import gc
 import logging
 import sys
 import threading
@@ -24,6 +25,7 @@ from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCam
 from lerobot_playbyear.microphones.file import PlayedMicrophone
 from lerobot_playbyear.microphones.microphone import MicrophoneError, register_source
 from lerobot_playbyear.microphones.portaudio import SoundCard, channels_to_open, find_card
+from lerobot_playbyear.microphones.session_file import SessionFile
 
 TICK_S = 1 / 20
 TAP = np.full(48, 20000, np.int16)  # a millisecond
@@ -373,6 +375,7 @@ def test_an_installed_distribution_brings_its_own_source_and_a_broken_one_harms_
         ({"channel": -1}, "channel=-1"),
         ({"gain_db": float("nan")}, "gain_db=nan"),
         ({"low_db": -10.0}, "low_db=-10.0"),
+        ({"high_db": float("inf")}, "high_db=inf"),
         ({"width": 90}, "width=96"),
         ({"width": 225}, "both even"),
         ({"height": 98}, "at this width height=100"),
@@ -411,6 +414,30 @@ def test_the_pictures_samples_are_those_of_the_sessions_file_bit_for_bit_with_ga
         np.testing.assert_array_equal(samples, strip.samples)
         assert caplog.text.count(str(found)) == 2  # told at the beginning and at the end
     assert strips[-1].samples.max() == 32767  # 3,000 and 12 dB more
+
+
+def test_a_full_disk_ends_the_recording_with_its_reason(tmp_path, monkeypatch):
+    write = SessionFile._write
+
+    def full(self, data, place):
+        if place > 20000:
+            raise OSError(28, "No space left on device")
+        write(self, data, place)
+
+    monkeypatch.setattr(SessionFile, "_write", full)
+    with listening(mic=options(tone_hz=440.0, save_to=str(tmp_path))) as cameras:
+        assert "No space left on device" in str(until_error(cameras["mic"], 5))
+
+
+def test_a_microphone_that_is_forgotten_listens_no_longer(tmp_path):
+    camera = MicrophoneCamera(options(tone_hz=440.0, save_to=str(tmp_path)))
+    camera.connect()
+    del camera
+    gc.collect()
+    (path,) = tmp_path.glob("*.wav")
+    size = path.stat().st_size
+    time.sleep(0.3)
+    assert path.stat().st_size == size
 
 
 def test_without_a_file_it_says_that_a_video_loses_the_sound(caplog):

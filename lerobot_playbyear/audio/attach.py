@@ -60,7 +60,8 @@ class AttachAudioConfig:
         marks: Moments that are known in the session's file and on that clock, such as a clap at the start and one at the
             end: `2.31=1754400000.12, 1802.74=1754401800.55`. None: the clock's seconds are the file's.
         microphone: What the microphone is called: the column is `observation.audio.<microphone>`. For files of
-            several channels, a name for each, separated by commas.
+            several channels, a name for each, separated by commas. None: "microphone"; of those that were recorded as cameras,
+            all.
         channel: Take only this channel of the files, counted from 0.
         offset: Where in its file each episode's first frame was taken [s]; negative where the file begins after it. None:
             0, or as the dataset says of its own files.
@@ -75,7 +76,7 @@ class AttachAudioConfig:
     session: Path | None = None
     clock: Path | None = None
     marks: str | None = None
-    microphone: str = "microphone"
+    microphone: str | None = None
     channel: int | None = None
     offset: float | None = None
     offsets: Path | None = None
@@ -220,7 +221,9 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
         )
     if _is_from_cameras(cfg):
         own = ("the dataset's own files", "offset", "sample_rate", "pad")
-        source, *taken = own if has_own_files else ("microphones that were recorded as cameras", "session")
+        source, *taken = (
+            own if has_own_files else ("microphones that were recorded as cameras", "session", "microphone")
+        )
         for option in fields(AttachAudioConfig):
             value = getattr(cfg, option.name)
             if option.name not in ("dataset", "output", *taken) and value != option.default:
@@ -236,7 +239,7 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
 
 
 def _keys(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset") -> list[str]:
-    names = [name.strip() for name in cfg.microphone.split(",")]
+    names = [name.strip() for name in (cfg.microphone or "microphone").split(",")]
     keys = [name if name.startswith(AUDIO_PREFIX) else AUDIO_PREFIX + name for name in names]
     for key in keys:
         if "/" in key or key == AUDIO_PREFIX or keys.count(key) > 1:

@@ -1,6 +1,8 @@
 """The sound of microphones that were recorded as cameras: from a dataset's pictures, and from the files of their sessions."""
 
 import itertools
+import logging
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
+from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
@@ -17,8 +20,10 @@ from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
 from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
 from lerobot_playbyear.audio.sample_strip import Strip, n_kept, read_strip, read_timecode
 from lerobot_playbyear.audio.session_files import SESSIONS, SessionSound, find_session
+from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.audio_feature import IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
-from lerobot_playbyear.datasets.columns import numpy_to_column
+from lerobot_playbyear.datasets.columns import column_to_numpy, numpy_to_column
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.datasets.statistics import Stats, numeric_stats
 from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 
@@ -26,6 +31,9 @@ if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
     from lerobot_playbyear.datasets.long_dataset import LongDataset
+
+
+INTERVENTION = "intervention"
 
 
 @dataclass
@@ -37,7 +45,7 @@ class _Frame:
 
 
 @dataclass
-class CameraSound:
+class MicrophoneSound:
     """The sound of a dataset's microphones.
 
     Args:
@@ -49,11 +57,6 @@ class CameraSound:
     sounds: list[EpisodesSound] = field(default_factory=list)
     pictures: list[str] = field(default_factory=list)
     is_first: list[np.ndarray] = field(default_factory=list)
-
-    @property
-    def has_pauses(self) -> bool:
-        """Whether anything was left out within an episode."""
-        return any(flags[1:].any() for flags in self.is_first)
 
 
 class IsFirstColumn:
@@ -79,7 +82,9 @@ class IsFirstColumn:
         return numeric_stats({IS_FIRST: self._is_first[episode][:, None]}, {IS_FIRST: IS_FIRST_FEATURE})
 
 
-def read_camera_sound(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", scratch: Path) -> CameraSound:
+def read_camera_sound(
+    cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", scratch: Path
+) -> MicrophoneSound:
     """Reads the sound of all microphones, so that what is wrong is known before anything is written.
 
     Args:
@@ -91,46 +96,59 @@ def read_camera_sound(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDat
         AttachError: There is no such microphone, or its samples are not there.
     """
     keys = [key for key in microphone_pictures(dataset.meta) if audio_key_of(key) not in dataset.meta.features]
-    if not keys:
+    chosen = keys if cfg.microphone is None else [PICTURE_PREFIX + name.strip() for name in cfg.microphone.split(",")]
+    if not keys or not set(chosen) <= set(keys):
         raise AttachError(
-            "No camera of this dataset is a microphone whose sound is not attached yet. Sound that was recorded beside it is "
-            "attached with --files or --session."
+            f"The cameras of this dataset that are microphones without attached sound: {', '.join(keys) or 'none'}; wanted "
+            f"{', '.join(chosen) or 'one'}. Sound that was recorded beside it is attached with --files or --session."
         )
-    found = CameraSound()
-    for key in keys:
-        reader = _Reader(cfg, dataset, key, scratch / key)
+    found = MicrophoneSound()
+    for key in chosen:
+        reader = _MicrophoneReader(cfg, dataset, key, scratch / key)
         sound, is_first = reader.read()
         found.sounds.append(sound)
         found.pictures.append(key)
         found.is_first = [own | other for own, other in zip(is_first, found.is_first or is_first, strict=True)]
+    if (
+        INTERVENTION in dataset.meta.features
+    ):  # LeRobot's rollout resets the policy at every hand-back, however short the pause
+        by_person = column_to_numpy(dataset.hf_dataset.data.column(INTERVENTION)).reshape(-1).astype(bool)
+        for flags, own in zip(
+            found.is_first, np.split(by_person, np.cumsum([*map(len, found.is_first)])[:-1]), strict=True
+        ):
+            flags[1:] |= own[:-1] & ~own[1:]
     return found
 
 
-def write_with_cameras(root: Path, target: Path, found: CameraSound, fps: int) -> None:
+def write_with_cameras(root: Path, target: Path, found: MicrophoneSound, fps: int) -> None:
     """Writes a dataset with the sound of its microphones; `root` and `target` as for `write_with_sound`."""
     change = sound_change(found.sounds, fps)
     notes = {picture: {MICROPHONE: audio_key_of(picture)} for picture in found.pictures}
-    change = replace(change, notes=notes)
-    if found.has_pauses:
-        column = IsFirstColumn(found.is_first)
-        change = replace(
-            change,
-            added={**change.added, IS_FIRST: IS_FIRST_FEATURE},
-            columns=[*change.columns, column],
-            stats=[{**own, **column.stats(i)} for i, own in enumerate(change.stats)],
-        )
+    column = IsFirstColumn(found.is_first)
+    change = replace(
+        change,
+        notes=notes,
+        added={**change.added, IS_FIRST: IS_FIRST_FEATURE},
+        columns=[*change.columns, column],
+        stats=[{**own, **column.stats(i)} for i, own in enumerate(change.stats)],
+    )
     write_changed(root, target, change)
 
 
-class _Reader:
+class _MicrophoneReader:
     """Reads one microphone."""
 
     def __init__(
         self, cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", key: str, scratch: Path
     ) -> None:
         self._dataset, self._key, self._scratch = dataset, key, scratch
-        self._folders = [*([cfg.session] if cfg.session is not None else []), SESSIONS]
+        # A stranger's pictures may name a session of this machine's own, and so its voices: they get those that are named.
+        self._is_foreign = _came_from_the_hub(Path(dataset.root))
+        own = [] if self._is_foreign else [SESSIONS]
+        self._folders = own if cfg.session is None else [cfg.session, *own]
         self._files: dict[int, SessionSound | None] = {}
+        self._taken: dict[int, tuple[int, int]] = {}  # of each session's file, from which sample to which
+        self._spacing: list[list[int]] = []  # of each episode, samples from frame to frame
         self._errors: dict[str, list[int]] = {}  # what is wrong, and in which episodes
         self._rate = 0  # of the column [Hz]
         self._steps: ControlStepSound | None = None
@@ -142,10 +160,16 @@ class _Reader:
         is_first: list[np.ndarray] = []
         pictures = itertools.chain.from_iterable(_pictures(self._dataset, self._key))
         for length in tqdm(self._dataset.meta.episodes["length"], desc=f"Reading {self._key}", unit="episode"):
-            path = self._scratch / str(len(paths))
-            is_first.append(self._read_episode(len(paths), itertools.islice(pictures, length), path))
+            path, own = self._scratch / str(len(paths)), itertools.islice(pictures, length)
+            is_first.append(self._read_episode(len(paths), own, path))
+            deque(own, maxlen=0)  # of an episode that could not be read
             paths.append(path)
         raise_all([f"{self._key}, {_listed(episodes)}: {error}" for error, episodes in self._errors.items()])
+        self._check_pace()
+        for session, (start, stop) in self._taken.items():
+            file = self._files[session]
+            assert file is not None
+            print(f"{self._key}: {start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s of {file.path}")
         size = self._rate // self._dataset.fps
         return EpisodesSound(
             self._rate, [audio_key_of(self._key)], size, [SpooledFile(path, 1) for path in paths]
@@ -154,21 +178,19 @@ class _Reader:
     def _read_episode(self, episode: int, pictures: Iterator[np.ndarray], path: Path) -> np.ndarray:
         """Writes an episode's sound to a file, and says what was exact. Returns which frames are the first ones, (n,) bool."""
         is_first: list[bool] = []
-        spacing: list[int] = []
+        self._spacing.append([])
         n_read = n_strips = 0
-        last: _Frame | None = None
         if self._steps is not None:
             self._steps.reset()
         try:
             with path.open("wb") as file:
-                for frame in _known(map(_read_frame, pictures), self._nominal):
+                for frame in _known(map(_read_frame, pictures), self._samples_per_frame):
                     block, starts = self._sound_of(frame)
                     file.write(block.astype("<i2").tobytes())
                     is_first.append(starts)
-                    if last is not None and last.session == frame.session and not starts:
-                        spacing.append(frame.counter - last.counter)
-                    n_read, n_strips, last = n_read + frame.was_read, n_strips + (frame.strip is not None), frame
-            check_pace(spacing, self._source_rate, self._dataset.fps, "the dataset")
+                    if self._steps is not None and self._steps.n_heard is not None and not starts:
+                        self._spacing[-1].append(self._steps.n_heard)
+                    n_read, n_strips = n_read + frame.was_read, n_strips + (frame.strip is not None)
         except (ValueError, OSError) as error:
             self._errors.setdefault(str(error), []).append(episode)
             return np.zeros(0, bool)
@@ -199,24 +221,56 @@ class _Reader:
         Raises:
             ValueError: The file is not there, or ends before.
         """
-        if frame.session not in self._files:
-            path = next(filter(None, (find_session(folder, frame.session) for folder in self._folders)), None)
-            self._files[frame.session] = None if path is None else SessionSound(path)
-        file = self._files[frame.session]
-        if file is None:
-            raise ValueError(
-                f"its pictures were compressed, and the session's file *_{frame.session:08x}.wav is not in "
-                f"{' or '.join(map(str, self._folders))}. Copy it from the machine that recorded, and give --session=FOLDER"
-            )
+        file = self._file(frame.session)
         if frame.counter > len(file):
             raise ValueError(f"the session's file has {len(file)} samples, and a frame needs {frame.counter}")
         kept = n_kept(file.sample_rate)
         samples = file.samples(frame.counter - kept, frame.counter)
+        start, stop = self._taken.get(frame.session, (frame.counter, frame.counter))
+        self._taken[frame.session] = (min(start, max(frame.counter - kept, 0)), max(stop, frame.counter))
         return Strip(frame.session, frame.counter, file.sample_rate, samples)
 
-    def _nominal(self) -> int:
-        """Samples from one frame to the next, as far as it is known."""
-        return self._rate // self._dataset.fps
+    def _file(self, session: int) -> SessionSound:
+        """A session's file.
+
+        Raises:
+            ValueError: It is not there.
+        """
+        if session not in self._files:
+            path = next(filter(None, (find_session(folder, session) for folder in self._folders)), None)
+            self._files[session] = None if path is None else SessionSound(path)
+        file = self._files[session]
+        if file is None:
+            where = f"is not in {' or '.join(map(str, self._folders))}" if self._folders else "has to be named"
+            if self._is_foreign:
+                where += f", for this dataset came from the Hub and may be a stranger's (your own are in {SESSIONS})"
+            raise ValueError(
+                f"its pictures were compressed, and the session's file *_{session:08x}.wav {where}. Copy it from the machine "
+                "that recorded, and give --session=FOLDER"
+            )
+        return file
+
+    def _samples_per_frame(self, frame: "_Frame") -> int:
+        """From one frame to the next, as it should be."""
+        rate = frame.strip.sample_rate if frame.strip else self._file(frame.session).sample_rate
+        return round(rate / self._dataset.fps)
+
+    def _check_pace(self) -> None:
+        """Whether the recording's steps are as long as its frame rate says.
+
+        Raises:
+            AttachError: They are not.
+        """
+        fps, rate = self._dataset.fps, self._source_rate
+        try:
+            check_pace([n for own in self._spacing for n in own], rate, fps, "the dataset")
+        except ValueError as error:
+            raise AttachError(f"Nothing was written. {self._key}: {error}.") from error
+        for episode, own in enumerate(self._spacing):
+            try:
+                check_pace(own, rate, fps, f"episode {episode}", is_live=True)
+            except ValueError as error:
+                logging.warning("%s: %s. Remove that episode with lerobot-edit-dataset.", self._key, error)
 
 
 def _read_frame(picture: np.ndarray) -> "_Frame | None":
@@ -227,7 +281,7 @@ def _read_frame(picture: np.ndarray) -> "_Frame | None":
     return None if code is None else _Frame(*code)
 
 
-def _known(frames: Iterator["_Frame | None"], size: Callable[[], int]) -> Iterator["_Frame"]:
+def _known(frames: Iterator["_Frame | None"], size: Callable[["_Frame"], int]) -> Iterator["_Frame"]:
     """All frames of an episode; those that could not be read lie evenly between their neighbours.
 
     Raises:
@@ -243,14 +297,14 @@ def _known(frames: Iterator["_Frame | None"], size: Callable[[], int]) -> Iterat
             if last is not None and last.session == frame.session:
                 counter = last.counter + (frame.counter - last.counter) * (i + 1) // (n_unknown + 1)
             else:
-                counter = frame.counter - (n_unknown - i) * size()
+                counter = frame.counter - (n_unknown - i) * size(frame)
             yield _Frame(frame.session, max(counter, 0), was_read=False)
         yield frame
         last, n_unknown = frame, 0
     if last is None:
         raise ValueError("none of its timecodes can be read: are these a microphone's pictures, in their own size?")
     for i in range(n_unknown):
-        yield _Frame(last.session, last.counter + (i + 1) * size(), was_read=False)
+        yield _Frame(last.session, last.counter + (i + 1) * size(last), was_read=False)
 
 
 def _pictures(dataset: "LeRobotDataset | LongDataset", key: str) -> Iterator[np.ndarray]:
@@ -258,6 +312,13 @@ def _pictures(dataset: "LeRobotDataset | LongDataset", key: str) -> Iterator[np.
     is_video = dataset.meta.features[key]["dtype"] == "video"
     for piece in video_pieces(dataset, key, video_backend="pyav") if is_video else image_pieces(dataset, key):
         yield piece.transpose(0, 2, 3, 1)
+
+
+def _came_from_the_hub(root: Path) -> bool:
+    """Whether a dataset's folder is one that LeRobot or the Hub's client downloaded."""
+    caches = [Path(HF_HUB_CACHE).resolve(), (HF_LEROBOT_HOME / "hub").resolve()]
+    is_in_cache = any(root.resolve().is_relative_to(cache) for cache in caches)
+    return is_in_cache or (root / ".cache" / "huggingface").exists()
 
 
 def _listed(episodes: list[int]) -> str:

@@ -45,6 +45,9 @@ class ControlStepSound:
     Args:
         n_samples: Of a step, S.
 
+    Attributes:
+        n_heard: How many samples came during the last step; None where it is the first one of a recording.
+
     Raises:
         ValueError: A strip is shorter than such a step.
     """
@@ -52,6 +55,7 @@ class ControlStepSound:
     def __init__(self, n_samples: int) -> None:
         self._size = n_samples
         self._last: Strip | None = None
+        self.n_heard: int | None = None
 
     def reset(self) -> None:
         """The next step is the first one."""
@@ -65,6 +69,7 @@ class ControlStepSound:
         """
         last, self._last = self._last, strip
         n, size, kept = _samples_between(last, strip), self._size, len(strip.samples)
+        self.n_heard = n
         if size + 2 * HALF > kept:
             raise ValueError(
                 f"A control step of {size} samples is longer than what a microphone's picture holds ({KEPT_S} s): give more "

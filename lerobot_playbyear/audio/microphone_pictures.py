@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 from lerobot_playbyear.audio.sample_strip import read_timecode
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
@@ -43,12 +44,13 @@ def _first_pictures(meta: "LeRobotDatasetMetadata", key: str) -> Iterator[np.nda
         if feature["dtype"] == "video":
             first_s = float(meta.episodes[0][f"videos/{key}/from_timestamp"])
             times = [first_s + i / meta.fps for i in range(min(n, int(meta.episodes[0]["length"])))]
-            yield from video_pictures(file_inside(root, meta.get_video_file_path(0, key)), times, 1e-4, "pyav")
+            path = file_inside(root, meta.get_video_file_path(0, key))
+            yield from video_pictures(path, times, 1e-4, "pyav", key, feature["shape"])
             return
         with open_parquet(file_inside(root, meta.get_data_file_path(0))) as file:
             rows = next(row_group_parts(file, 0, [key])).slice(0, n).column(key).to_pylist()
         for row in rows:
             with open_picture(row, root, key, feature) as image:
                 yield np.asarray(image.convert("RGB"))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, Image.DecompressionBombError):
         return

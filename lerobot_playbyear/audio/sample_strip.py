@@ -29,7 +29,7 @@ _HEADER = np.dtype(
     ]
 )
 _MAGIC = b"PBYS"
-_HIGHEST_RATE = 1_000_000  # Hz
+HIGHEST_RATE = 1_000_000  # Hz
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def read_strip(picture: np.ndarray) -> Strip | None:
     if pixels.size < _HEADER.itemsize:
         return None
     header = pixels.reshape(-1)[-_HEADER.itemsize :].copy().view(_HEADER)
-    if header["magic"][0] != _MAGIC or not 0 < header["sample_rate"][0] <= _HIGHEST_RATE:
+    if header["magic"][0] != _MAGIC or not 0 < header["sample_rate"][0] <= HIGHEST_RATE:
         return None
     sample_rate = int(header["sample_rate"][0])
     rows = n_rows(sample_rate, pixels.shape[1])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_playbyear.audio.sample_strip import HIGHEST_RATE
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 
 SESSIONS = HF_LEROBOT_HOME / "playbyear_sessions"
@@ -36,11 +37,14 @@ class SessionSound:
     """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         with path.open("rb") as file:
             header = file.read(HEADER_BYTES)
         if len(header) < HEADER_BYTES or header[:4] != b"RIFF" or header[36:40] != b"data":
             raise ValueError(f"{path} is no file of a microphone's session")
-        self.sample_rate = int(struct.unpack_from("<I", header, 24)[0])
+        form, channels, self.sample_rate = struct.unpack_from("<HHI", header, 20)
+        if (form, channels, header[34]) != (1, 1, 16) or not 0 < self.sample_rate <= HIGHEST_RATE:
+            raise ValueError(f"{path} is no file of a microphone's session: wanted one channel of 16 bits")
         n = (path.stat().st_size - HEADER_BYTES) // 2
         self._samples = np.memmap(path, "<i2", "r", HEADER_BYTES, (n,)) if n else np.zeros(0, "<i2")
 

@@ -156,13 +156,19 @@ def _select_features(dataset: LeRobotDataset | LongDataset, keys: Iterable[str] 
             for key, feature in features.items()
             if key not in LANGUAGE_COLUMNS and key not in dataset.meta.depth_keys and feature["dtype"] != "string"
         ]
-    keys = list(dict.fromkeys([*keys, *INDEX_KEYS, *({IS_FIRST} & set(features))]))
+    keys = list(dict.fromkeys([*keys, *INDEX_KEYS, *([IS_FIRST] if _has_is_first(features) else [])]))
     for key in keys:
         if key not in features:
             raise ValueError(f"The dataset '{dataset.repo_id}' has no '{key}'; it has {sorted(features)}.")
         if key in dataset.meta.depth_keys or features[key]["dtype"] == "string" or key in LANGUAGE_COLUMNS:
             raise ValueError(f"'{key}' ({features[key]['dtype']}) cannot be kept in memory: use lerobot-train for it.")
     return {key: features[key] for key in keys}
+
+
+def _has_is_first(features: Mapping[str, Any]) -> bool:
+    """Whether the dataset has that column, and no other one of that name."""
+    feature = features.get(IS_FIRST)
+    return feature is not None and feature["dtype"] == "bool" and math.prod(feature["shape"]) == 1
 
 
 def _row_bytes(feature: Mapping[str, Any], image_size: int | None = None) -> int:
@@ -198,7 +204,9 @@ def _episodes(columns: Mapping[str, Tensor], repo_id: str) -> tuple[list[int], l
                 f"Episode {int(columns['episode_index'][start])} of '{repo_id}' is incomplete: its {end - start} rows "
                 f"are not frames 0 to {end - start - 1}. Remove it with lerobot-edit-dataset, or record it again."
             )
-    if IS_FIRST in columns:  # LeRobot's rollout resets the policy after a pause: no window reaches back beyond it
+    if (
+        IS_FIRST in columns and columns[IS_FIRST].dtype == torch.bool
+    ):  # LeRobot's rollout resets the policy after a pause: no window reaches back beyond it
         starts = sorted({*starts, *columns[IS_FIRST].reshape(-1).cpu().nonzero().reshape(-1).tolist()})
         ends = [*starts[1:], *ends[-1:]]
     return starts, ends

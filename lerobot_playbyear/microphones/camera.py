@@ -10,7 +10,7 @@ import secrets
 import threading
 import time
 import weakref
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,11 +31,12 @@ from lerobot_playbyear.audio.sample_strip import (
 )
 from lerobot_playbyear.audio.session_files import SESSIONS, session_path
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.microphones.card import CHUNK_S, CardRecording
+from lerobot_playbyear.microphones.card import CHUNK_S, KEPT_S, CardRecording
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
 from lerobot_playbyear.microphones.session_file import SessionFile
 
 _NO_FILE = "none"
+_LARGEST = 1024  # pixels, a side; a larger picture takes longer than a control step has
 _FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
 _SAME_STEP_S = 0.1  # microphones of one card that are read one after the other within this have the same newest sample
 _STALLED_S = 1.0  # without sound: gone, and not only late on a busy machine
@@ -100,16 +101,16 @@ class MicrophoneCameraConfig(CameraConfig):
                 "Hz below half the sample_rate",
                 self.tone_hz is None or 0 < self.tone_hz < self.sample_rate / 2,
             ),
-            ("low_db", f"at least -100, and below high_db={self.high_db}", -100 <= self.low_db < self.high_db),
+            ("low_db", f"at least -100, and below high_db={self.high_db}", -100 <= self.low_db < self.high_db <= 20),
         ):
             if not is_good:
                 raise MicrophoneOptionError(f"{name}={getattr(self, name)} of a microphone: give {wanted}.")
         width, height = self.width or 0, self.height or 0
         needed = TIMECODE_HEIGHT + n_rows(self.sample_rate, max(width, TIMECODE_WIDTH))
-        if width < TIMECODE_WIDTH or height < needed or width % 2 or height % 2 or max(width, height) > 4096:
+        if width < TIMECODE_WIDTH or height < needed or width % 2 or height % 2 or max(width, height) > _LARGEST:
             raise MicrophoneOptionError(
                 f"width={width} and height={height} of a microphone: its samples and its timecode need at least "
-                f"width={TIMECODE_WIDTH} and at this width height={needed + needed % 2}, both even, at most 4096."
+                f"width={TIMECODE_WIDTH} and at this width height={needed + needed % 2}, both even, at most {_LARGEST}."
             )
 
     @property
@@ -137,17 +138,24 @@ class MicrophoneCameraConfig(CameraConfig):
 
 
 class _OpenCard:
-    """A card that listens, for all microphones that are its channels."""
+    """A card that listens, for all microphones that are its channels.
 
-    def __init__(self, configs: list[MicrophoneCameraConfig]) -> None:
-        rates = sorted({config.sample_rate for config in configs})
-        if len(rates) > 1:
-            raise MicrophoneError(
-                f"Microphones of one card ({_name(configs[0])}) have sample_rate {rates[0]} and {rates[1]}: give them the same."
-            )
+    Args:
+        config: Of one of them.
+        channels: How many to open, at least.
+
+    Raises:
+        MicrophoneError: It has fewer.
+    """
+
+    def __init__(self, config: MicrophoneCameraConfig, channels: int) -> None:
         self.n_users = 0
-        self.microphone = configs[0].make(max(config.channel for config in configs) + 1)
-        self.recording = CardRecording(self.microphone.name, rates[0], self.microphone.channels)
+        self.microphone = config.make(channels)
+        if self.microphone.channels < channels:
+            raise MicrophoneError(
+                f"{self.microphone.name} gives {self.microphone.channels} channels, wanted {channels}."
+            )
+        self.recording = CardRecording(self.microphone.name, config.sample_rate, self.microphone.channels)
         self._step_s, self._step_counter = -math.inf, 0
         self._readers: set[int] = set()  # in this control step
         self._lock = threading.Lock()
@@ -186,6 +194,38 @@ _open_cards: dict[Hashable, _OpenCard] = {}
 _lock = threading.Lock()
 
 
+def _opened(config: MicrophoneCameraConfig) -> _OpenCard:
+    """A card that listens from now on, with the channels that all microphones of it want that were made.
+
+    Raises:
+        MicrophoneError: It cannot be opened, or nothing comes from it.
+    """
+    alike = [camera.config for camera in _cameras if camera.config.card == config.card]
+    wanted = {max(each.channel for each in [config, *alike]) + 1, config.channel + 1}
+    for channels in sorted(wanted, reverse=True):  # one that is not used any more may have wanted too many
+        try:
+            card = _OpenCard(config, channels)
+            card.open()
+        except MicrophoneError:
+            if channels == config.channel + 1:
+                raise
+        else:
+            break
+    _open_cards[config.card] = card
+    return card
+
+
+def _samples_of(recording: CardRecording, config: MicrophoneCameraConfig) -> Callable[[int, int], np.ndarray]:
+    """Gives a microphone's samples from one number to before another, (n,) int16, with its gain."""
+    channel, gain = config.channel, 10 ** (config.gain_db / 20)
+
+    def samples(start: int, stop: int) -> np.ndarray:
+        heard = recording.samples(start, stop)[:, channel]
+        return heard if gain == 1 else np.clip(np.rint(heard * gain), -32768, 32767).astype(np.int16)
+
+    return samples
+
+
 def _name(config: MicrophoneCameraConfig) -> str:
     options = {name: getattr(config, name) for name in ("source", "device", "file", "tone_hz")}
     return ", ".join(f"{name}={value!r}" for name, value in options.items() if value is not None)
@@ -204,7 +244,6 @@ class MicrophoneCamera(Camera):
         self._card: _OpenCard | None = None
         self._file: SessionFile | None = None
         self._session = 0
-        self._gain = 10 ** (config.gain_db / 20)
         self._reading = threading.Lock()
         self._has_said_zeros = False
         _cameras.add(self)
@@ -235,30 +274,45 @@ class MicrophoneCamera(Camera):
         self._label = _drawn_label(f"{config.low_db:g} to {config.high_db:g} dB", width, height - rows)
         self._session = 1 + secrets.randbelow(2**32 - 1)
         with _lock:
-            card = _open_cards.get(config.card)
-            if card is None:
-                alike = [camera.config for camera in _cameras if camera.config.card == config.card]
-                card = _OpenCard([config, *alike])
-                card.open()
-                _open_cards[config.card] = card
-            if config.channel >= card.microphone.channels:
-                raise MicrophoneError(
-                    f"channel={config.channel} of a microphone ({_name(config)}): the card is open with "
-                    f"{card.microphone.channels} channels. Make all of its microphones before one is connected."
-                )
+            card = _open_cards.get(config.card) or _opened(config)
+            self._check(card)
             card.n_users += 1
             self._card = card
         try:
             self._save(card)
-        except OSError as error:
+        except BaseException as error:
             self.disconnect()
+            if isinstance(error, OSError | ValueError):
+                raise MicrophoneError(
+                    f"The session's sound cannot be written to {config.save_to or SESSIONS}: {error}. Give another save_to, or "
+                    "save_to=none."
+                ) from error
+            raise
+
+    def _check(self, card: _OpenCard) -> None:
+        """Whether an open card has what this microphone wants.
+
+        Raises:
+            MicrophoneError: It has not, or it is gone.
+        """
+        config, open_card = self.config, card.microphone
+        if open_card.problem:
             raise MicrophoneError(
-                f"The session's sound cannot be written to {config.save_to or SESSIONS}: {error}. Give another save_to, or "
-                "save_to=none."
-            ) from error
+                f"{open_card.name} is gone: {open_card.problem}. Disconnect its other microphones first."
+            )
+        if open_card.sample_rate != config.sample_rate:
+            raise MicrophoneError(
+                f"Microphones of one card ({_name(config)}) have sample_rate {open_card.sample_rate} and {config.sample_rate}: "
+                "give them the same."
+            )
+        if config.channel >= open_card.channels:
+            raise MicrophoneError(
+                f"channel={config.channel} of a microphone ({_name(config)}): the card is open with {open_card.channels} "
+                "channels. Make all of its microphones before one is connected."
+            )
 
     def _save(self, card: _OpenCard) -> None:
-        config = self.config
+        config, self._samples = self.config, _samples_of(card.recording, self.config)
         if config.save_to == _NO_FILE:
             logging.warning(
                 "The microphone (%s) saves no sound (save_to=none): a dataset with videos loses it, one with "
@@ -268,9 +322,12 @@ class MicrophoneCamera(Camera):
             return
         folder = Path(config.save_to).expanduser() if config.save_to else SESSIONS
         path = session_path(folder, self._session, time.strftime("%Y-%m-%d_%H-%M-%S"))
-        self._file = SessionFile(path, config.sample_rate, lambda: card.recording.written, self._samples)
+        recording = card.recording
+        n_kept = round(KEPT_S * config.sample_rate)
+        self._file = SessionFile(path, config.sample_rate, lambda: recording.written, self._samples, n_kept)
         logging.info(
-            "The microphone (%s) listens. All that it hears, voices too, is written to %s, %.1f MB a minute.",
+            "The microphone (%s) listens. All that it hears, voices too, is written to %s, %.1f MB a minute, and what stands "
+            "in its pictures is sound as well.",
             _name(config),
             path,
             120 * config.sample_rate / 1e6,
@@ -288,7 +345,7 @@ class MicrophoneCamera(Camera):
         """The picture of now, (height, width, 3) uint8.
 
         Raises:
-            DeviceNotConnectedError: It was not connected, or it is gone.
+            DeviceNotConnectedError: It was not connected, it is gone, or its sound can no longer be saved.
             TimeoutError: No sound has come for a second, or for `max_age_ms` [ms] if that is longer.
         """
         card = self._card
@@ -300,6 +357,10 @@ class MicrophoneCamera(Camera):
             raise TimeoutError(
                 f"The microphone ({_name(self.config)}) has brought nothing for {card.microphone.silent_for_s:.1f} s. Is it "
                 "still plugged in?"
+            )
+        if self._file is not None and self._file.error:
+            raise DeviceNotConnectedError(
+                f"The microphone ({_name(self.config)}): {self._file.error}. Make room, and begin again."
             )
         self._look_for_zeros(card)
         with self._reading:
@@ -318,14 +379,6 @@ class MicrophoneCamera(Camera):
         write_strip(picture, Strip(self._session, counter, config.sample_rate, kept, config.low_db, config.high_db))
         write_timecode(picture, self._session, counter)
         return picture
-
-    def _samples(self, start: int, stop: int) -> np.ndarray:
-        """Its samples from one number to before another, (n,) int16, with its gain."""
-        assert self._card is not None
-        samples = self._card.recording.samples(start, stop)[:, self.config.channel]
-        if self._gain == 1:
-            return samples
-        return np.clip(np.rint(samples * self._gain), -32768, 32767).astype(np.int16)
 
     def _look_for_zeros(self, card: _OpenCard) -> None:
         is_silent = card.recording.zeros_s(self.config.channel) > _ZEROS_S
@@ -346,7 +399,7 @@ class MicrophoneCamera(Camera):
         file, self._file = self._file, None
         if file is not None:
             file.close()
-            logging.info("The session's sound is in %s.", file.path)
+            logging.info("The session's sound is in %s%s.", file.path, ", not to its end" if file.error else "")
         card, self._card = self._card, None
         with _lock:
             card.n_users -= 1

@@ -1,7 +1,9 @@
 """The last seconds of one sound card, by number of sample, and when each was heard."""
 
 import logging
+import math
 import threading
+from collections import deque
 
 import numpy as np
 
@@ -14,6 +16,8 @@ KEPT_S = 10.0
 CHUNK_S = 0.003
 """How often sound is fetched from a card [s]; shorter costs more processor time."""
 
+_USUAL = 0.9  # share of the bursts that come no later than it is reckoned with
+_LONGEST_WAIT_S = 0.15
 _LATE_S = 0.01  # samples that come later than this, for a quarter of a second, come after others that were lost
 
 
@@ -35,12 +39,17 @@ class CardRecording:
         self._changed = threading.Condition()
         self._kept = np.zeros((round(KEPT_S * sample_rate), channels), np.int16)  # a ring, by number of sample
         self._written = 0
+        self._bursts: deque[tuple[float, float]] = (
+            deque()
+        )  # of the last second: when one came, and how late its first sample
+        self._came_s = -math.inf
         self._zeros: np.ndarray = np.zeros(channels, np.int64)  # samples at the end of each channel that are exactly 0
 
     def write(self, chunk: np.ndarray, came_s: float) -> None:
         """Takes a chunk (n, channels), whose last sample came at `came_s` [s of time.perf_counter]."""
         samples = to_pcm_s16(chunk)
         with self._changed:
+            self._note_burst(came_s)
             self._put(samples, len(samples))
             is_sound = samples[::-1] != 0
             self._zeros = np.where(is_sound.any(axis=0), is_sound.argmax(axis=0), self._zeros + len(samples))
@@ -63,12 +72,24 @@ class CardRecording:
     def heard_at(self, now_s: float) -> int:
         """How many samples had come at a time [s of time.perf_counter], by the card's clock and not by its chunks.
 
-        A chunk's length behind, so that its samples are there; fewer only where chunks are late.
+        As far behind as samples usually wait for their chunk, or for the bursts in which a sound server sends chunks; so steps
+        have the length that they have in time. Fewer only where chunks are later than that.
         """
         with self._changed:
             if not self._clock.is_set:
                 return 0
-            return max(min(round(self._clock.written_at(now_s - CHUNK_S)), self._written), 0)
+            waits = sorted(wait for _, wait in self._bursts)
+            usual = waits[int(_USUAL * len(waits))] if waits else 0.0
+            behind = min(max(usual, CHUNK_S), _LONGEST_WAIT_S)
+            return max(min(round(self._clock.written_at(now_s - behind)), self._written), 0)
+
+    def _note_burst(self, came_s: float) -> None:
+        """A chunk came; the first one of a burst tells how long samples wait."""
+        is_first, self._came_s = came_s - self._came_s > CHUNK_S / 2, came_s
+        if is_first and self._clock.is_set:
+            self._bursts.append((came_s, (self._clock.written_at(came_s) - self._written) / self._rate))
+        while self._bursts and self._bursts[0][0] < came_s - 1:
+            self._bursts.popleft()
 
     def samples(self, start: int, stop: int) -> np.ndarray:
         """Samples from one number to before another, (n, channels) int16; 0 where they are not kept, or not there yet."""

@@ -61,11 +61,6 @@ class CardClock:
             self._offsets.pop()
         self._offsets.append((n_written, offset))
 
-    def restart(self) -> None:
-        """Forgets what was: the card begins anew."""
-        self._offsets.clear()
-        self._late = []
-
     @property
     def is_set(self) -> bool:
         """Whether a chunk has come."""

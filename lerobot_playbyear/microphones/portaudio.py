@@ -168,7 +168,7 @@ class PortAudioMicrophone(Microphone):
 
     def _open_card(self, card: SoundCard) -> None:
         sounddevice = load_sounddevice()
-        channels = channels_to_open(card, self.channels)
+        channels, stream = channels_to_open(card, self.channels), None
         try:
             stream = sounddevice.InputStream(
                 samplerate=self.sample_rate,
@@ -182,6 +182,8 @@ class PortAudioMicrophone(Microphone):
             )
             stream.start()
         except Exception as error:  # PortAudio's errors, and those of its arguments
+            if stream is not None:
+                stream.close(ignore_errors=True)
             said = str(error).replace("\n", " ")
             raise MicrophoneError(
                 f"{card.name} cannot be opened with {channels} channels at {self.sample_rate} Hz: {said}. Is it plugged in, "

@@ -24,21 +24,36 @@ class SessionFile:
         sample_rate: [Hz].
         written: Says how many samples there are.
         samples: Gives those from one number to before another, (n,) int16.
+        n_kept: How many of the newest ones it gives.
+
+    Attributes:
+        error: Why no more is written; empty while all is well.
 
     Raises:
         OSError: It cannot be made.
     """
 
     def __init__(
-        self, path: Path, sample_rate: int, written: Callable[[], int], samples: Callable[[int, int], np.ndarray]
+        self,
+        path: Path,
+        sample_rate: int,
+        written: Callable[[], int],
+        samples: Callable[[int, int], np.ndarray],
+        n_kept: int,
     ) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.path = path
+        self.path, self.error = path, ""
         self._rate, self._written, self._samples = sample_rate, written, samples
         new = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
         self._file = os.fdopen(os.open(path, new, 0o600), "wb", buffering=0)
-        self._n, self._stop = 0, threading.Event()
-        self._write_new()
+        self._n = max(written() - n_kept, 0)  # what is older is a hole in the file, and silence
+        self._stop = threading.Event()
+        try:
+            self._write_new()
+        except BaseException:
+            self._file.close()
+            path.unlink()
+            raise
         self._thread = threading.Thread(target=self._run, name=f"session {path.name}", daemon=True)
         self._thread.start()
 
@@ -53,10 +68,9 @@ class SessionFile:
             while not self._stop.wait(_FLUSH_S):
                 self._write_new()
             self._write_new()
-        except OSError as error:
-            logging.error(
-                "The session's sound is no longer written to %s: %s. Make room and begin again.", self.path, error
-            )
+        except Exception as error:  # whatever it is, the sound is not saved
+            self.error = f"the session's sound is no longer written to {self.path}: {error}"
+            logging.error("From %.1f s on %s.", self._n / self._rate, self.error)
 
     def _write_new(self) -> None:
         end = self._written()

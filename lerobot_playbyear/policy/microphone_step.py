@@ -10,11 +10,12 @@ from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
-from lerobot_playbyear.audio.sample_strip import Strip, n_rows, read_strip
+from lerobot_playbyear.audio.sample_strip import Strip, read_strip
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.errors import InputError
 
+_USUAL_RATES = (16000, 48000, 44100, 32000, 22050, 8000, 96000)  # Hz
 _PACE_STEPS = slice(
     2, 22
 )  # of an episode, whose lengths are looked at; the first ones wait for the policy's first thoughts
@@ -44,7 +45,6 @@ class MicrophonePicturesToAudioStep(ObservationProcessorStep):
     def reset(self) -> None:
         """The next observation is an episode's first one."""
         self._sounds: dict[tuple[str, int], ControlStepSound] = {}
-        self._last: dict[str, Strip] = {}
         self._spacing: list[int] = []
 
     def get_config(self) -> dict[str, Any]:
@@ -71,41 +71,43 @@ class MicrophonePicturesToAudioStep(ObservationProcessorStep):
 
     def _strip(self, key: str, picture: Tensor) -> Strip:
         """The strip of a picture (3, H, W), floats in [0, 1] or uint8."""
-        rows = picture[:, -n_rows(self.sample_rate, picture.shape[-1]) :].cpu()
-        pixels = rows if rows.dtype == torch.uint8 else (rows * 255).round().to(torch.uint8)
-        strip = read_strip(pixels.permute(1, 2, 0).numpy())
-        if strip is not None and round(strip.sample_rate / self.fps) * self.fps == self.sample_rate:
-            return strip
+        pixels = picture if picture.dtype == torch.uint8 else (picture * 255).round().to(torch.uint8)
+        strip = read_strip(pixels.permute(1, 2, 0).cpu().numpy())
         name = key.removeprefix(AUDIO_PREFIX)
-        whole = picture.cpu() if picture.dtype == torch.uint8 else (picture.cpu() * 255).round().to(torch.uint8)
-        other = read_strip(whole.permute(1, 2, 0).numpy())
-        if other is None:
+        if strip is None:
             raise InputError(
                 f"This policy hears '{name}', and the picture '{PICTURE_PREFIX}{name}' carries no samples: it is another "
                 f"camera's, or was compressed or resized. Give --robot.cameras='{{{name}: {{type: microphone, device: ...}}}}'."
             )
-        raise InputError(
-            f"The microphone '{name}' has sample_rate={other.sample_rate}, and this policy was trained with {self.sample_rate} "
-            f"Hz at {self.fps} frames per second: give sample_rate={self.sample_rate} in --robot.cameras."
-        )
+        if self._column_rate(strip.sample_rate) != self.sample_rate:
+            fitting = [rate for rate in _USUAL_RATES if self._column_rate(rate) == self.sample_rate]
+            raise InputError(
+                f"The microphone '{name}' has sample_rate={strip.sample_rate}, and this policy was trained with "
+                f"{self.sample_rate} Hz at {self.fps} frames per second: give sample_rate={(*fitting, self.sample_rate)[0]} in "
+                "--robot.cameras."
+            )
+        return strip
+
+    def _column_rate(self, sample_rate: int) -> int:
+        """The rate that a microphone's sound has in a dataset [Hz]."""
+        return round(sample_rate / self.fps) * self.fps
 
     def _block(self, key: str, number: int, strip: Strip) -> np.ndarray:
         sound = self._sounds.get((key, number))
         if sound is None:
             sound = self._sounds[key, number] = ControlStepSound(self.sample_rate // self.fps)
-        if number == 0 and key == self.microphones[0]:
-            self._watch_pace(key, strip)
-        return sound.next(strip)[0]
+        block, _ = sound.next(strip)
+        if number == 0 and key == self.microphones[0] and sound.n_heard is not None:
+            self._watch_pace(sound.n_heard, strip.sample_rate)
+        return block
 
-    def _watch_pace(self, key: str, strip: Strip) -> None:
-        last = self._last.get(key)
-        self._last[key] = strip
-        if last is None or last.session != strip.session or len(self._spacing) >= _PACE_STEPS.stop:
+    def _watch_pace(self, n_heard: int, sample_rate: int) -> None:
+        if len(self._spacing) >= _PACE_STEPS.stop:
             return
-        self._spacing.append(strip.counter - last.counter)
+        self._spacing.append(n_heard)
         if len(self._spacing) == _PACE_STEPS.stop:
             try:
-                check_pace(self._spacing[_PACE_STEPS], strip.sample_rate, self.fps, "the policy", is_live=True)
+                check_pace(self._spacing[_PACE_STEPS], sample_rate, self.fps, "the policy", is_live=True)
             except ValueError as error:
                 raise InputError(f"The control loop does not fit the policy: {error}.") from error
 

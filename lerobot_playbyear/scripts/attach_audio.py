@@ -19,7 +19,8 @@ the columns mean is in docs/dataset.md, microphones on robots in docs/robots.md.
   --files=...                  each episode's sound (WAV, FLAC, film), {episode} its number
   --session=null               or one file with the sound of all, see below; or, of microphones that
                                were recorded as cameras, a folder with the files of their sessions
-  --microphone=microphone      its name; for files of several channels, one for each: left,right
+  --microphone=null            its name, else "microphone"; for files of several channels, one for
+                               each: left,right; of recorded cameras those that are named, else all
   --channel=null               take only this channel of the files, counted from 0
   --offset=null                where in its file each episode's first frame was taken [s]; else 0,
                                or as the dataset says of its own files
