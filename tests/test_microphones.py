@@ -212,7 +212,7 @@ def test_a_pictures_sound_is_of_its_moment_to_5_ms():
 def test_microphones_of_one_card_have_one_sample_rate(tmp_path):
     path = str(write_wav(tmp_path / "sound.wav", np.ones((RATE, 2), np.int16), RATE))
     with (
-        pytest.raises(MicrophoneError, match=r"have sample_rate 16000 and 48000: give them the same"),
+        pytest.raises(MicrophoneError, match=r"have sample_rate 48000 and 16000: give them the same"),
         listening(left=options(file=path), right=options(file=path, channel=1, sample_rate=16000)),
     ):
         pass

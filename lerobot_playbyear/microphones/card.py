@@ -56,6 +56,7 @@ class CardRecording:
             lost = self._clock.note(self._written, came_s)
             if lost:  # known a quarter of a second later: then silence stands where sound goes on
                 self._put(np.zeros((0, samples.shape[1]), np.int16), lost)
+                self._bursts.clear()  # which seemed late
             self._changed.notify_all()
         if lost:
             logging.warning(
