@@ -239,7 +239,7 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
 
 
 def _keys(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset") -> list[str]:
-    names = [name.strip() for name in (cfg.microphone or "microphone").split(",")]
+    names = [name.strip() for name in ("microphone" if cfg.microphone is None else cfg.microphone).split(",")]
     keys = [name if name.startswith(AUDIO_PREFIX) else AUDIO_PREFIX + name for name in names]
     for key in keys:
         if "/" in key or key == AUDIO_PREFIX or keys.count(key) > 1:

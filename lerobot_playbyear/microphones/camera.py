@@ -5,7 +5,6 @@ Its picture shows the spectrogram of the last two seconds, and carries the exact
 """
 
 import logging
-import math
 import secrets
 import threading
 import time
@@ -31,14 +30,13 @@ from lerobot_playbyear.audio.sample_strip import (
 )
 from lerobot_playbyear.audio.session_files import SESSIONS, session_path
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.microphones.card import CHUNK_S, KEPT_S, CardRecording
+from lerobot_playbyear.microphones.card import KEPT_S, CardRecording
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
+from lerobot_playbyear.microphones.open_cards import OpenCard, join_card, leave_card
 from lerobot_playbyear.microphones.session_file import SessionFile
 
 _NO_FILE = "none"
 _LARGEST = 1024  # pixels, a side; a larger picture takes longer than a control step has
-_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
-_SAME_STEP_S = 0.1  # microphones of one card that are read one after the other within this have the same newest sample
 _STALLED_S = 1.0  # without sound: gone, and not only late on a busy machine
 _ZEROS_S = 2.0  # of nothing but zeros: muted, or unplugged
 _FIND = "`playbyear-find-microphones` prints an entry to paste."
@@ -137,82 +135,7 @@ class MicrophoneCameraConfig(CameraConfig):
         return file_microphone(Path(str(self.file)).expanduser(), self.sample_rate, channels)
 
 
-class _OpenCard:
-    """A card that listens, for all microphones that are its channels.
-
-    Args:
-        config: Of one of them.
-        channels: How many to open, at least.
-
-    Raises:
-        MicrophoneError: It has fewer.
-    """
-
-    def __init__(self, config: MicrophoneCameraConfig, channels: int) -> None:
-        self.n_users = 0
-        self.microphone = config.make(channels)
-        if self.microphone.channels < channels:
-            raise MicrophoneError(
-                f"{self.microphone.name} gives {self.microphone.channels} channels, wanted {channels}."
-            )
-        self.recording = CardRecording(self.microphone.name, config.sample_rate, self.microphone.channels)
-        self._step_s, self._step_counter = -math.inf, 0
-        self._readers: set[int] = set()  # in this control step
-        self._lock = threading.Lock()
-
-    def open(self) -> None:
-        """Listens, and waits until a strip's sound is there. A card that brings nothing is opened once more: through a sound
-        server a stream that was opened now and then never begins."""
-        enough = n_kept(self.microphone.sample_rate) + round(2 * CHUNK_S * self.microphone.sample_rate)
-        try:
-            self.microphone.connect(self.recording.write)
-            if not self.recording.wait_for(1, _FIRST_SOUND_S):
-                self.microphone.disconnect()
-                self.microphone.connect(self.recording.write)
-            if not self.recording.wait_for(enough, _FIRST_SOUND_S):
-                raise MicrophoneError(
-                    f"From {self.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened "
-                    "again. Is it plugged in, and used by no other program? `playbyear-find-microphones` shows what it hears."
-                )
-        except BaseException:
-            self.microphone.disconnect()
-            raise
-
-    def newest(self, reader: int) -> int:
-        """How many samples have come; within a control step, which ends when one reads again, the same for all readers."""
-        with self._lock:
-            now = time.perf_counter()
-            if reader in self._readers or now - self._step_s > _SAME_STEP_S:
-                self._readers.clear()
-                self._step_s, self._step_counter = now, max(self.recording.heard_at(now), self._step_counter)
-            self._readers.add(reader)
-            return self._step_counter
-
-
 _cameras: "weakref.WeakSet[MicrophoneCamera]" = weakref.WeakSet()
-_open_cards: dict[Hashable, _OpenCard] = {}
-_lock = threading.Lock()
-
-
-def _opened(config: MicrophoneCameraConfig) -> _OpenCard:
-    """A card that listens from now on, with the channels that all microphones of it want that were made.
-
-    Raises:
-        MicrophoneError: It cannot be opened, or nothing comes from it.
-    """
-    alike = [camera.config for camera in _cameras if camera.config.card == config.card]
-    wanted = {max(each.channel for each in [config, *alike]) + 1, config.channel + 1}
-    for channels in sorted(wanted, reverse=True):  # one that is not used any more may have wanted too many
-        try:
-            card = _OpenCard(config, channels)
-            card.open()
-        except MicrophoneError:
-            if channels == config.channel + 1:
-                raise
-        else:
-            break
-    _open_cards[config.card] = card
-    return card
 
 
 def _samples_of(recording: CardRecording, config: MicrophoneCameraConfig) -> Callable[[int, int], np.ndarray]:
@@ -241,7 +164,7 @@ class MicrophoneCamera(Camera):
     def __init__(self, config: MicrophoneCameraConfig) -> None:
         super().__init__(config)
         self.config = config
-        self._card: _OpenCard | None = None
+        self._card: OpenCard | None = None
         self._file: SessionFile | None = None
         self._session = 0
         self._reading = threading.Lock()
@@ -273,11 +196,8 @@ class MicrophoneCamera(Camera):
         self._spectrogram = RollingSpectrogram(config.sample_rate, height - rows, width, config.low_db, config.high_db)
         self._label = _drawn_label(f"{config.low_db:g} to {config.high_db:g} dB", width, height - rows)
         self._session = 1 + secrets.randbelow(2**32 - 1)
-        with _lock:
-            card = _open_cards.get(config.card) or _opened(config)
-            self._check(card)
-            card.n_users += 1
-            self._card = card
+        alike = [camera.config.channel for camera in _cameras if camera.config.card == config.card]
+        card = self._card = join_card(config, [config.channel, *alike], _name(config))
         try:
             self._save(card)
         except BaseException as error:
@@ -289,29 +209,7 @@ class MicrophoneCamera(Camera):
                 ) from error
             raise
 
-    def _check(self, card: _OpenCard) -> None:
-        """Whether an open card has what this microphone wants.
-
-        Raises:
-            MicrophoneError: It has not, or it is gone.
-        """
-        config, open_card = self.config, card.microphone
-        if open_card.problem:
-            raise MicrophoneError(
-                f"{open_card.name} is gone: {open_card.problem}. Disconnect its other microphones first."
-            )
-        if open_card.sample_rate != config.sample_rate:
-            raise MicrophoneError(
-                f"Microphones of one card ({_name(config)}) have sample_rate {open_card.sample_rate} and {config.sample_rate}: "
-                "give them the same."
-            )
-        if config.channel >= open_card.channels:
-            raise MicrophoneError(
-                f"channel={config.channel} of a microphone ({_name(config)}): the card is open with {open_card.channels} "
-                "channels. Make all of its microphones before one is connected."
-            )
-
-    def _save(self, card: _OpenCard) -> None:
+    def _save(self, card: OpenCard) -> None:
         config, self._samples = self.config, _samples_of(card.recording, self.config)
         if config.save_to == _NO_FILE:
             logging.warning(
@@ -380,7 +278,7 @@ class MicrophoneCamera(Camera):
         write_timecode(picture, self._session, counter)
         return picture
 
-    def _look_for_zeros(self, card: _OpenCard) -> None:
+    def _look_for_zeros(self, card: OpenCard) -> None:
         is_silent = card.recording.zeros_s(self.config.channel) > _ZEROS_S
         if is_silent and not self._has_said_zeros:
             logging.warning(
@@ -401,11 +299,7 @@ class MicrophoneCamera(Camera):
             file.close()
             logging.info("The session's sound is in %s%s.", file.path, ", not to its end" if file.error else "")
         card, self._card = self._card, None
-        with _lock:
-            card.n_users -= 1
-            if card.n_users == 0:
-                _open_cards.pop(self.config.card, None)
-                card.microphone.disconnect()
+        leave_card(self.config.card, card)
 
 
 def _drawn_label(text: str, width: int, height: int) -> np.ndarray | None:
