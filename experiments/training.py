@@ -49,7 +49,6 @@ class Job:
         options: Further ones.
         variant: What the options do, for the names of files; empty without any.
         dataset: Folder of a dataset that holds the demonstrations and no more. None: the first ones of the task's own.
-        chosen: Name of the checkpoint that is evaluated: "last", or "best" with `--save_best=true`.
     """
 
     study: str
@@ -64,7 +63,6 @@ class Job:
     options: tuple[str, ...] = ()
     variant: str = ""
     dataset: Path | None = None
-    chosen: str = "last"
 
     @property
     def learned(self) -> dict[str, Any]:
@@ -79,7 +77,7 @@ class Job:
 
     @property
     def checkpoint(self) -> Path:
-        return RUNS / "train" / self.name / "checkpoints" / self.chosen / "pretrained_model"
+        return RUNS / "train" / self.name / "checkpoints" / "last" / "pretrained_model"
 
     @property
     def result_path(self) -> Path:

@@ -161,7 +161,7 @@ DATA = "--dataset.repo_id=a/b"
             "did you mean --policy.image_size?",
         ),
         ("playbyear-train", (DATA, "--steps=many"), "--steps=many: wanted a whole number."),
-        ("playbyear-train", (DATA, "--sampling.start_s=long"), "wanted a number."),
+        ("playbyear-train", (DATA, "--dataset.eval_split=long"), "wanted a number."),
         ("playbyear-train", (DATA, "--resume=perhaps"), "wanted true or false."),
         ("playbyear-train", (DATA, "--steps"), "--steps needs a value"),
         ("playbyear-train", (DATA, "cpu"), "'cpu' is no option"),
@@ -201,7 +201,7 @@ class Values:
 
     resume: bool = False
     steps: int = 0
-    start_s: float = 0.0
+    eval_split: float = 0.0
 
 
 _ODD_VALUES = [
@@ -212,7 +212,7 @@ _ODD_VALUES = [
 
 
 @pytest.mark.parametrize(
-    ("name", "option"), [("resume", "resume"), ("steps", "steps"), ("start_s", "sampling.start_s")]
+    ("name", "option"), [("resume", "resume"), ("steps", "steps"), ("eval_split", "dataset.eval_split")]
 )
 def test_no_value_that_the_full_parser_takes_is_refused(name, option):
     taken = []

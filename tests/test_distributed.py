@@ -152,9 +152,7 @@ def test_lerobots_training_in_two_processes_learns_what_one_with_twice_the_batch
 @pytest.mark.slow
 def test_training_in_two_processes_learns_what_one_with_twice_the_batch_learns(tmp_path, dataset):
     """Over 20 updates, from stores on the disk that one of the two makes, with one checkpoint and one line per update."""
-    make_dataset(tmp_path / "other", (20,), seed=1, image_size=40, sample_rate=48000)
-    mix = f"--mix=[{{repo_id: tests/noise, root: {tmp_path / 'other'}, weight: 0.5}}]"
-    options = ("--dataset.repo_id=tests/noise", "--dataset.eval_split=0.5", "--eval_steps=10", mix)
+    options = ("--dataset.repo_id=tests/noise", "--dataset.eval_split=0.5", "--eval_steps=10")
     data = (f"--dataset.root={dataset}", *options)
     losses = {}
     for n_processes in (2, 1):
@@ -166,7 +164,7 @@ def test_training_in_two_processes_learns_what_one_with_twice_the_batch_learns(t
         assert [line["step"] for line in figures(folder, "train")] == list(range(1, 21))
         assert [line["step"] for line in figures(folder, "validation")] == [10, 20]
         assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == ["000010", "000020", "last"]
-        assert len([path for path in cache.iterdir() if path.is_dir()]) == 3
+        assert len([path for path in cache.iterdir() if path.is_dir()]) == 2
     assert losses[2] == pytest.approx(losses[1], rel=2e-3)
     last = tmp_path / "2" / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
     launch(2, "playbyear-train", "--resume=true", f"--config_path={last}", "--steps=22")

@@ -26,8 +26,7 @@ from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts import train as train_script
 from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.command_line import with_long_store
-from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
-from lerobot_playbyear.training.loop import frame_weights
+from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 from lerobot_playbyear.training.presets import PRESETS, RECIPES, apply_preset, preset_options
 from lerobot_playbyear.training.validation import first_of_each_task, validation_runs
 from lerobot_playbyear.training.windows import PolicyWindows
@@ -92,7 +91,7 @@ def weights_of(checkpoint):
 def trained(root, tmp_path_factory):
     """The output folder of a run of six updates with checkpoints every three."""
     output = tmp_path_factory.mktemp("run") / "out"
-    options = ("--steps=6", "--save_freq=3", "--log_freq=2", "--sampling.start_weight=2", "--sampling.start_s=0.1")
+    options = ("--steps=6", "--save_freq=3", "--log_freq=2", "--store.place=memory")
     validation = ("--dataset.eval_split=0.25", "--eval_steps=3", "--policy.n_supervised_steps=4")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["train", *TINY, *data(root), *options, *validation, f"--output_dir={output}"])
@@ -121,10 +120,29 @@ def test_its_options_are_kept_where_lerobot_does_not_stumble_over_them(trained):
     path = config_of(trained / "checkpoints" / "last")
 
     stock = TrainPipelineConfig.from_pretrained(path)
-    ours = PlaybyearTrainConfig.from_pretrained(path, cli_args=["--sampling.start_s=0.3"])
+    ours = PlaybyearTrainConfig.from_pretrained(path, cli_args=["--store.device=cpu"])
 
     assert (stock.steps, stock.policy.type) == (6, "playbyear")
-    assert ours.sampling == SamplingConfig(start_weight=2, start_s=0.3)
+    assert ours.store == StoreConfig(place="memory", device="cpu")
+
+
+def test_measuring_held_out_episodes_changes_nothing_that_is_learned(root, command, tmp_path):
+    options = (*TINY, *data(root), "--steps=2", "--dataset.eval_split=0.25")
+    command(train, *options, f"--output_dir={tmp_path / 'without'}")
+    command(train, *options, "--eval_steps=1", f"--output_dir={tmp_path / 'with'}")
+    ours, theirs = (weights_of(tmp_path / name / "checkpoints" / "last") for name in ("without", "with"))
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+
+
+def test_a_policy_is_tuned_with_sound_of_another_rate(trained, command, tmp_path):
+    policy = trained / "checkpoints" / "last" / "pretrained_model"
+    sample_rate = json.loads((policy / "config.json").read_text())["sample_rate"]
+    make_dataset(tmp_path / "faster", (12, 9), image_size=16, sample_rate=3 * sample_rate)
+    options = ("--policy.push_to_hub=false", "--num_workers=0", "--steps=1", "--batch_size=2")
+    output = tmp_path / "out"
+    command(train, f"--policy.path={policy}", *data(tmp_path / "faster"), *options, f"--output_dir={output}")
+    tuned = json.loads((output / "checkpoints/last/pretrained_model/config.json").read_text())
+    assert tuned["sample_rate"] == sample_rate
 
 
 def test_a_resumed_run_ends_where_an_uninterrupted_one_does(trained, command, tmp_path):
@@ -331,7 +349,6 @@ def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
         ({}, ("--dataset.image_transforms.enable=true",), "image_transforms.enable does not work in playbyear-train"),
         pytest.param({}, ("--ema.enable=true",), "ema.enable does not work in playbyear-train", marks=AFTER_0_6_1),
         pytest.param({}, ("--accelerator.mixed_precision=bf16",), "--accelerator does not work", marks=AFTER_0_6_1),
-        ({}, ("--sampling.start_weight=0",), "sampling.start_weight must be above 0"),
         (
             {},
             ("--policy.push_to_hub=true", "--policy.repo_id=me/no name"),
@@ -343,7 +360,7 @@ def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
             "files=nowhere: there is no such folder",
         ),
     ],
-    ids=["fps", "sample rate", "no microphone", "image transforms", "ema", "accelerator", "weight", "name", "noise"],
+    ids=["fps", "sample rate", "no microphone", "image transforms", "ema", "accelerator", "name", "noise"],
 )
 def test_bad_input_is_refused_before_any_work(features, options, message, command, tmp_path):
     fps = features.get("fps", FPS)
@@ -389,16 +406,6 @@ def test_an_output_that_cannot_be_made_is_told_before_the_dataset_is_read(name, 
 def test_the_command_says_in_one_line_what_is_wrong(command):
     with pytest.raises(SystemExit, match=r"^error: --preset=tpu is not known. The presets are: cpu .*; paper "):
         command(train_script.main, "--preset=tpu", "--dataset.repo_id=tests/noise")
-
-
-def test_moments_that_matter_weigh_more():
-    sound = torch.ones(40, 100, dtype=torch.int16)
-    sound[20] = 3000
-    store = EpisodeStore({"action": torch.zeros(40, 1), MICROPHONE: sound}, [0], [40], FPS)
-
-    weights = frame_weights(store, SamplingConfig(start_weight=3, start_s=0.2, loud_weight=2, loud_s=0.1))
-
-    assert weights.tolist() == [3] * 4 + [1] * 16 + [2] * 2 + [1] * 18
 
 
 def test_a_preset_gives_way_to_the_command_line():

@@ -117,7 +117,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
     from lerobot_playbyear.datasets.long_dataset import scratch_folder
 
     with scratch_folder() as scratch:
-        if _is_from_cameras(cfg):
+        if _is_in_dataset(cfg):
             found = read_camera_sound(cfg, dataset, Path(scratch))
             sounds, write = found.sounds, partial(write_with_cameras, found=found, fps=dataset.fps)
         else:
@@ -147,7 +147,7 @@ def _told(target: Path, sounds: "list[EpisodesSound]") -> Path:
     return target
 
 
-def _is_from_cameras(cfg: AttachAudioConfig) -> bool:
+def _is_in_dataset(cfg: AttachAudioConfig) -> bool:
     return cfg.files is None and (cfg.session is None or cfg.session.is_dir())
 
 
@@ -219,7 +219,7 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
         raise AttachError(
             "--files has the sound of each episode, --session that of all; both are given. Give one of them."
         )
-    if _is_from_cameras(cfg):
+    if _is_in_dataset(cfg):
         own = ("the dataset's own files", "offset", "sample_rate", "pad")
         source, *taken = (
             own if has_own_files else ("microphones that were recorded as cameras", "session", "microphone")

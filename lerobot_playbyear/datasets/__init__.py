@@ -17,7 +17,7 @@ from lerobot_playbyear.datasets.episode_clock import note_episode_start
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.episode_store import EpisodeStore
-    from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
+    from lerobot_playbyear.datasets.samplers import RunSampler, run_weights
 
 __all__ = [
     "AUDIO_PREFIX",
@@ -29,18 +29,16 @@ __all__ = [
     "check_dataset_files",
     "cut_into_frames",
     "episode_waveform",
-    "loud_frames",
     "note_episode_start",
     "read_audio",
     "resample",
     "run_weights",
-    "start_frames",
     "write_audio",
     "write_wav",
 ]
 
 _WITH_TORCH = {
     "episode_store": ("EpisodeStore",),
-    "samplers": ("RunSampler", "loud_frames", "run_weights", "start_frames"),
+    "samplers": ("RunSampler", "run_weights"),
 }
 __getattr__ = lazy_names(__name__, _WITH_TORCH)

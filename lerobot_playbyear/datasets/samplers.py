@@ -4,17 +4,13 @@ A training item is a run of K windows, named by its last frame: its windows end 
 before. Weights are given per frame ("this moment matters three times as much") and turned into weights of runs.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
-
-_SILENCE = 1e-10  # power of a frame without any sound, -100 dB of full scale
 
 
 class RunSampler:
@@ -97,48 +93,3 @@ def run_weights(
         weights[start + k - 1] += (k - 1) / 2 * means[0]
         weights[end - 1] += (k - 1) / 2 * means[-1]
     return weights
-
-
-def start_frames(store: EpisodeStore, n_frames: int) -> Tensor:
-    """Which frames are among the first `n_frames` of their episode, (N,) bool."""
-    mask = torch.zeros(len(store), dtype=torch.bool)
-    for start, end in zip(store.starts, store.ends, strict=True):
-        mask[start : min(start + n_frames, end)] = True
-    return mask
-
-
-def loud_frames(
-    store: EpisodeStore, threshold_db: float = 12.0, n_frames: int = 1, keys: Sequence[str] | None = None
-) -> Tensor:
-    """Which frames follow a sudden sound: something was touched, dropped or switched.
-
-    A frame is loud when its power is more than `threshold_db` above the median of all frames of that microphone;
-    a sound begins at a loud frame that is as much louder than the one before, and that was not: what swells is not sudden.
-
-    Args:
-        store: The episodes.
-        threshold_db: How far above the median a sound has to be [dB].
-        n_frames: How many frames count, from the one in which the sound begins.
-        keys: The microphones; None takes all.
-
-    Returns:
-        (N,) bool.
-    """
-    mask = torch.zeros(len(store), dtype=torch.bool)
-    for key in audio_keys(store.keys) if keys is None else keys:
-        level = _level_db(store, key)
-        loud = level > level.median() + threshold_db
-        for start, end in zip(store.starts, store.ends, strict=True):
-            begins = loud[start:end].clone()
-            begins[1:] &= ~loud[start : end - 1] & (level[start:end].diff() > threshold_db)
-            for frame in begins.nonzero().squeeze(1).tolist():
-                mask[start + frame : min(start + frame + n_frames, end)] = True
-    return mask
-
-
-def _level_db(store: EpisodeStore, key: str) -> Tensor:
-    """Power of each frame of one microphone, (N,) [dB of full scale]."""
-    sound = store.column(key)
-    scale = 1.0 if sound.dtype.is_floating_point else 1.0 / 32768
-    parts = [(part.float() * scale).square().mean(dim=1) for part in sound.split(4096)]
-    return 10 * torch.log10(torch.cat(parts) + _SILENCE).cpu()

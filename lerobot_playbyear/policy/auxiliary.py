@@ -17,7 +17,7 @@ from lerobot_playbyear.policy.spectrogram import POWER_FLOOR, to_float_wave
 
 KINDS = ("onset", "balance", "way")
 _HIDDEN = 128
-_ONSET = 1.2  # [10 dB] above the item's median frame, as in `datasets.samplers.loud_frames`, and above the frame before
+_ONSET = 1.2  # [10 dB] above the item's median frame, and above the frame before
 _NEAR = 0.1  # [normalised units] errors of a way count squared up to here, and then as they are
 _FAR = 1.0  # [normalised units] what is farther away is told as that far: carrying takes it to several, and nothing hangs on it
 

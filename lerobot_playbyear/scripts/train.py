@@ -14,8 +14,6 @@ What is trained on
   --dataset.root=null          its folder; else LeRobot's cache, or the Hub
   --dataset.episodes=null      only these, like [0,1,2]
   --dataset.eval_split=0.0     share of the episodes that are held out
-  --mix=[]                     further datasets at once, like [{repo_id: me/other, weight: 0.5}]:
-                               0.5 runs of it for every one of --dataset
   --store=auto                 where frames are kept: memory, disk (files, found again by the
                                next run), or auto: memory where they fill half of it at most
   --store.device=null          cpu or cuda; else cuda where there is room
@@ -33,8 +31,6 @@ How
   --steps=100000               updates
   --batch_size=8               runs of windows per update
   --seed=1000                  of all random numbers
-  --sampling.start_weight=1.0  how often the first frames of episodes are drawn, as a factor
-  --sampling.loud_weight=1.0   the same for frames after a sudden sound
   --policy.use_amp=false       bfloat16 or float16 where the machine computes in it
   --compile=false              compile the network first; meant for a GPU, not measured yet
 
@@ -43,7 +39,6 @@ What comes of it
   --log_freq=200               updates between two lines of figures
   --save_freq=20000            updates between two checkpoints
   --eval_steps=0               updates between two losses of the held-out episodes; 0: none
-  --save_best=false            checkpoints/best is the one with the lowest of these losses
   --env.type=...               environment to try the policy in, like playbyear
   --env_eval_freq=20000        updates between two such trials; 0: none
   --eval.n_episodes=50         episodes of a trial

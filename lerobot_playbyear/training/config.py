@@ -1,7 +1,7 @@
 """What `playbyear-train` can be told: all of `lerobot-train`'s options, and a few of its own."""
 
 import json
-import math
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,36 +14,7 @@ from lerobot.utils.utils import flatten_dict
 OWN_CONFIG_NAME = "playbyear_train_config.json"
 """File beside `train_config.json` that holds the options which lerobot-train does not know."""
 
-_OWN_FIELDS = ("preset", "sampling", "store", "mix", "compile", "save_best")
-
-
-@dataclass
-class SamplingConfig:
-    """Which moments are learned from more often than others. Weights of 1 draw all frames alike.
-
-    Attributes:
-        start_weight: How many times as often the first frames of an episode are drawn; only they may show what
-            has to be remembered.
-        start_s: How long the first frames last [s].
-        loud_weight: How many times as often frames after a sudden sound are drawn.
-        loud_s: How long such a moment lasts [s].
-        loud_db: How far above the median a frame's power is when something sounds [dB].
-    """
-
-    start_weight: float = 1.0
-    start_s: float = 0.5
-    loud_weight: float = 1.0
-    loud_s: float = 0.5
-    loud_db: float = 12.0
-
-    def check(self) -> None:
-        """Raise a ValueError if a number is out of its range."""
-        for name in ("start_weight", "loud_weight"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"--sampling.{name} must be above 0, got {getattr(self, name)}.")
-        for name in ("start_s", "loud_s"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"--sampling.{name} must be at least 0 seconds, got {getattr(self, name)}.")
+_OWN_FIELDS = ("preset", "store", "compile")
 
 
 @dataclass
@@ -63,56 +34,22 @@ class StoreConfig:
 
 
 @dataclass
-class MixConfig:
-    """One more dataset to learn from.
-
-    Attributes:
-        repo_id: Its name.
-        root: Its folder; None: LeRobot's cache, or the Hub.
-        revision: Of the dataset on the Hub.
-        episodes: Only these; None: all.
-        weight: How many runs are drawn from it for every one of `--dataset`, whatever the sizes of both.
-    """
-
-    repo_id: str
-    root: str | None = None
-    revision: str | None = None
-    episodes: list[int] | None = None
-    weight: float = 1.0
-
-    def check(self) -> None:
-        """Raise a ValueError if the weight is out of its range."""
-        if not 0 < self.weight < math.inf:
-            raise ValueError(
-                f"--mix: the weight of '{self.repo_id}' must be above 0 and finite, got {self.weight}. It is how many runs are "
-                "drawn from it for every one of --dataset."
-            )
-
-
-@dataclass
 class PlaybyearTrainConfig(TrainPipelineConfig):
-    """All options of lerobot-train and, beside them, `--preset`, `--sampling.*`, `--store.*`, `--mix` and so on.
+    """All options of lerobot-train and, beside them, `--preset`, `--store.*` and `--compile`.
 
     A checkpoint keeps lerobot-train's options in its `train_config.json` and the others in a file of their own, so
     that lerobot-train can resume what playbyear-train began, and the other way round.
 
     Attributes:
         preset: A named set of defaults, see `lerobot_playbyear.training.presets`.
-        sampling: Which moments are learned from more often.
         store: Where the dataset is kept.
-        mix: Further datasets that are learned from at the same time.
         compile: Whether torch compiles the encoders and the head, which takes a minute or more before the first update. Meant
             for GPUs; what it is worth there was not measured.
-        save_best: Whether every checkpoint's loss on the held-out episodes is measured, and `checkpoints/best` is the one where
-            it is lowest.
     """
 
     preset: str | None = None
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
-    mix: list[MixConfig] = field(default_factory=list)
     compile: bool = False
-    save_best: bool = False
 
     def validate(self) -> None:
         """As for lerobot-train; options that need its data loader are refused.
@@ -140,14 +77,6 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
                 "--dataset.streaming does not work in playbyear-train: give --store=disk, which keeps decoded frames in files "
                 "instead of in memory, or use lerobot-train."
             )
-        if self.save_best and not (self.dataset.eval_split > 0 and self.save_checkpoint):
-            raise ValueError(
-                f"--save_best=true compares checkpoints on held-out episodes: give --dataset.eval_split=0.1 (got "
-                f"{self.dataset.eval_split}) and --save_checkpoint=true (got {str(self.save_checkpoint).lower()})."
-            )
-        self.sampling.check()
-        for other in self.mix:
-            other.check()
         super().validate()
 
     def _save_pretrained(self, save_directory: Path) -> None:
@@ -171,7 +100,10 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         path = Path(pretrained_name_or_path)
         own = (path if path.is_dir() else path.parent) / OWN_CONFIG_NAME
         if own.is_file():
-            saved = flatten_dict(json.loads(own.read_text()), sep=".").items()
+            content = json.loads(own.read_text())
+            if unknown := {name: content.pop(name) for name in sorted(content.keys() - {*_OWN_FIELDS})}:
+                logging.warning(f"{own} has options that there are no longer; they are left out: {unknown}")
+            saved = flatten_dict(content, sep=".").items()
             missing = {k: v for k, v in saved if v is not None and parser.parse_arg(k, cli_args) is None}
             given = [f"--{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in missing.items()]
             cli_args = given + cli_args

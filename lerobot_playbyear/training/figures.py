@@ -8,7 +8,7 @@ from lerobot.utils.logging_utils import AverageMeter
 from torch import Tensor
 
 from lerobot_playbyear.compat import metrics_tracker
-from lerobot_playbyear.datasets.mixture import Windowed
+from lerobot_playbyear.datasets.episode_store import EpisodeStore
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -27,7 +27,7 @@ class Figures:
     """
 
     def __init__(
-        self, batch_size: int, store: Windowed, step: int = 0, accelerator: "Accelerator | None" = None
+        self, batch_size: int, store: EpisodeStore, step: int = 0, accelerator: "Accelerator | None" = None
     ) -> None:
         meters = {
             "loss": AverageMeter("loss", ":.3f", reduction="mean"),

@@ -2,7 +2,7 @@
 
 Takes lerobot-train's options, keeps its output folder and its checkpoints (each resumes the other's), and makes the same
 updates. What is added: the dataset is read once, runs of windows are cut out of memory or of files that are mapped into
-it, some moments can be drawn more often than others, and a GPU never waits for the host.
+it, and a GPU never waits for the host.
 """
 
 import logging
@@ -22,21 +22,18 @@ from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.datasets.errors import errors_of_input
 from lerobot_playbyear.datasets.files import check_can_be_made
-from lerobot_playbyear.datasets.mixture import StoreMixture, Windowed
 from lerobot_playbyear.datasets.reading import choose_place
-from lerobot_playbyear.datasets.samplers import RunSampler, loud_frames, run_weights, start_frames
+from lerobot_playbyear.datasets.samplers import RunSampler, run_weights
 from lerobot_playbyear.hub.policies import push_policy
 from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
-from lerobot_playbyear.training.checkpoints import BestCheckpoint
-from lerobot_playbyear.training.config import PlaybyearTrainConfig, SamplingConfig
-from lerobot_playbyear.training.mixing import learned_meta, mixed_weights, open_mix
+from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.parts import TrainingParts, make_training_parts, read_recorded_noise
 from lerobot_playbyear.training.prefetch import pinned, prefetched
 from lerobot_playbyear.training.processes import make_accelerator, noise_seed, share_of
 from lerobot_playbyear.training.reach import Reach, action_names
 from lerobot_playbyear.training.report import Report, is_due, print_results
 from lerobot_playbyear.training.validation import first_of_each_task, validation_loss
-from lerobot_playbyear.training.windows import PolicyWindows
+from lerobot_playbyear.training.windows import PolicyWindows, learned_meta
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -62,8 +59,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         output = cfg.output_dir or _OUTPUTS
         check_can_be_made(Path(str(output)), f"--output_dir={output}")
         cfg.validate()
-        for each in (cfg.dataset, *cfg.mix):
-            check_dataset_files(each.repo_id, each.root, each.revision)
+        check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
         if cfg.policy is not None and cfg.policy.push_to_hub:
             check_name("policy.repo_id", str(cfg.policy.repo_id))
             warn_without_login()
@@ -77,8 +73,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         _configure_backends(cfg)
         with accelerator.main_process_first():  # it downloads, and the others find what is there
             dataset, held_out = make_train_eval_datasets(cfg)
-            datasets = [dataset, *open_mix(cfg)]
-        meta = learned_meta(cfg, *(each.meta for each in datasets))
+        meta = learned_meta(cfg.policy, dataset.meta)
         parts = make_training_parts(cfg, meta, accelerator=accelerator)
         if cfg.seed is not None and accelerator.num_processes > 1:
             set_seed(noise_seed(cfg.seed, accelerator.process_index, parts.step))  # each its own
@@ -87,23 +82,17 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         config = policy.config
         windows = PolicyWindows(config, meta, cfg.rename_map)
         is_shared = accelerator.num_processes > 1
-        for each in datasets:
-            windows.check_lengths(each)
-        stores = [read_store(each, windows, cfg, is_shared) for each in datasets]
-        is_validated = held_out is not None and (cfg.eval_steps > 0 or cfg.save_best)
+        windows.check_lengths(dataset)
+        store = read_store(dataset, windows, cfg, is_shared)
         validation = None
-        if held_out is not None and is_validated:
+        if held_out is not None and cfg.eval_steps > 0:
             chosen = first_of_each_task(held_out, cfg.max_eval_samples)
             validation = (read_store(held_out, windows, cfg, is_shared), chosen)
 
     reach = Reach(config, parts.preprocessor, action_names(dataset.meta.features[ACTION]))
-    for each, part in zip(datasets, stores, strict=True):
-        reach.warn(part.column(ACTION), f"the dataset '{each.repo_id}'")
-    store = stores[0] if len(stores) == 1 else StoreMixture(stores)
-    weights = [
-        run_weights(part, windows.n_windows, frame_weights(part, cfg.sampling), windows.n_dropped) for part in stores
-    ]
-    sampler = RunSampler(mixed_weights(weights, cfg), cfg.seed or 0)
+    reach.warn(store.column(ACTION), f"the dataset '{dataset.repo_id}'")
+    weights = run_weights(store, windows.n_windows, n_dropped=windows.n_dropped)
+    sampler = RunSampler(weights, cfg.seed or 0)
     sampler.load_state_dict({**sampler.state_dict(), "n_batches": parts.step})
     _log_start(cfg, parts)
     with Report(cfg, store, parts) as report:
@@ -117,23 +106,11 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     return Path(str(cfg.output_dir))
 
 
-def frame_weights(store: EpisodeStore, sampling: SamplingConfig) -> Tensor:
-    """How much each frame of a store matters, (N,): the weights of all the moments it belongs to, multiplied."""
-    weights = torch.ones(len(store))
-    if sampling.start_weight != 1:
-        weights[start_frames(store, round(sampling.start_s * store.fps))] *= sampling.start_weight
-    if sampling.loud_weight != 1:
-        loud = loud_frames(store, sampling.loud_db, max(1, round(sampling.loud_s * store.fps)))
-        weights[loud] *= sampling.loud_weight
-        logging.info(f"{int(loud.sum())} of {len(store)} frames follow a sudden sound")
-    return weights
-
-
 def _loop(
     cfg: PlaybyearTrainConfig,
     parts: TrainingParts,
     windows: PolicyWindows,
-    store: Windowed,
+    store: EpisodeStore,
     sampler: RunSampler,
     validation: tuple[EpisodeStore, Tensor | None] | None,
     report: Report,
@@ -142,7 +119,6 @@ def _loop(
     accelerator = parts.accelerator
     is_first = accelerator.is_main_process
     batches = _batches(cfg, accelerator, windows, store, sampler)
-    best = BestCheckpoint(Path(str(cfg.output_dir)), parts.step) if cfg.save_best and is_first else None
     while parts.step < cfg.steps:
         start = time.perf_counter()
         batch = next(batches)
@@ -152,17 +128,12 @@ def _loop(
         if is_due(parts.step, cfg.log_freq):
             report.write_training()
         is_saved = cfg.save_checkpoint and (is_due(parts.step, cfg.save_freq) or is_last)
-        is_measured = is_due(parts.step, cfg.eval_steps) or is_last or (is_saved and cfg.save_best)
-        loss = None
+        is_measured = is_due(parts.step, cfg.eval_steps) or is_last
         if validation is not None and is_first and is_measured:
             held_out, chosen = validation
-            loss = validation_loss(parts, windows, held_out, cfg.batch_size, chosen)
-            report.write("validation", {"loss": loss})
+            report.write("validation", {"loss": validation_loss(parts, windows, held_out, cfg.batch_size, chosen)})
         if is_saved and is_first:
-            checkpoint = parts.save(cfg)
-            report.saved(checkpoint)
-            if best is not None and loss is not None:
-                best.offer(checkpoint, loss)
+            report.saved(parts.save(cfg))
         is_tried = cfg.env is not None and cfg.env_eval_freq > 0 and is_first
         if is_tried and (is_due(parts.step, cfg.env_eval_freq) or is_last):
             report.write_evaluation(parts.evaluate(cfg))
@@ -172,7 +143,7 @@ def _batches(
     cfg: PlaybyearTrainConfig,
     accelerator: "Accelerator",
     windows: PolicyWindows,
-    store: Windowed,
+    store: EpisodeStore,
     sampler: RunSampler,
 ) -> Iterator[dict[str, Any]]:
     """This process's share of every batch. All draw the same runs, so that together they have those of one process."""

@@ -14,9 +14,8 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_playbyear.compat import WandBLogger
-from lerobot_playbyear.datasets.mixture import Windowed
+from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.hub.training_run import METRICS_NAME
-from lerobot_playbyear.training.checkpoints import BEST_LINK
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.figures import Figures
 from lerobot_playbyear.training.parts import TrainingParts
@@ -93,7 +92,7 @@ class Progress(abc.ABC):
 class Report(Progress):
     """Tells a person, a file and W&B how training goes."""
 
-    def __init__(self, cfg: PlaybyearTrainConfig, store: Windowed, parts: TrainingParts) -> None:
+    def __init__(self, cfg: PlaybyearTrainConfig, store: EpisodeStore, parts: TrainingParts) -> None:
         super().__init__(cfg, parts, cfg.steps, parts.step, "step", "Training")
         self._path = Path(str(cfg.output_dir)) / METRICS_NAME
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -145,7 +144,5 @@ def print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
         policy = folder / "checkpoints" / "last" / "pretrained_model"
         env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."
         print(f"Policy:     {policy}")
-        if cfg.save_best:
-            print(f"Best:       {policy.parent.with_name(BEST_LINK) / policy.name}, by its loss on held-out episodes")
         print(f"Evaluate:   lerobot-eval --policy.path={policy}{env}")
         print(f"Go on:      playbyear-train --resume=true --config_path={policy / 'train_config.json'} --steps=...")

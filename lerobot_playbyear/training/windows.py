@@ -1,5 +1,7 @@
 """The batches that a policy trains on, cut out of stores."""
 
+import copy
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,9 +10,9 @@ from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata, resolve_del
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_playbyear.datasets import audio_keys
-from lerobot_playbyear.datasets.mixture import Windowed
-from lerobot_playbyear.datasets.resampling import sample_rate_in
+from lerobot_playbyear.datasets import audio_keys, check_audio_features
+from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.resampling import features_at, sample_rate_in
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 
@@ -76,7 +78,7 @@ class PolicyWindows:
                 f"episode has {longest}; wanted fewer than that. Give less, or a dataset with longer episodes."
             )
 
-    def batch(self, store: Windowed, last_frames: Tensor) -> dict[str, Any]:
+    def batch(self, store: EpisodeStore, last_frames: Tensor) -> dict[str, Any]:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""
         return store.windows(last_frames, self._deltas, as_lerobot=self._as_lerobot)
 
@@ -94,3 +96,26 @@ def _history(policy: PlaybyearConfig) -> dict[str, int]:
         **dict.fromkeys(audio_keys(policy.input_features or {}) if policy.use_audio else [], policy.n_audio_frames),
         **dict.fromkeys(policy.low_dimensional_keys, policy.n_run_frames),
     }
+
+
+def learned_meta(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata) -> LeRobotDatasetMetadata:
+    """The metadata that a policy is made for: sound at the rate at which it is learned from.
+
+    Returns:
+        `meta` itself where nothing of it changes.
+
+    Raises:
+        ValueError: The frame rate does not divide the policy's sample rate.
+    """
+    if not (isinstance(policy, PlaybyearConfig) and policy.use_audio and policy.sample_rate is not None):
+        return meta
+    features = features_at(meta.features, dict.fromkeys(audio_keys(meta.features), policy.sample_rate), meta.fps)
+    changed = [key for key in features if features[key] is not meta.features[key]]
+    if not changed:
+        return meta
+    check_audio_features({key: meta.features[key] for key in changed}, meta.fps)
+    logging.info(f"'{meta.repo_id}': {', '.join(changed)} resampled to {policy.sample_rate} Hz")
+    meta = copy.copy(meta)
+    meta.info = copy.copy(meta.info)
+    meta.info.features = features
+    return meta
