@@ -111,7 +111,7 @@ def test_the_pages_programs_run(tmp_path, monkeypatch):
     make_dataset(tmp_path / "outputs/demo/dataset", (12,), image_size=16, repo_id="demo/occluded")
     page = (EXAMPLES.parent / "docs" / "dataset.md").read_text()
     blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
-    assert len(blocks) == 6
+    assert len(blocks) == 4
     for block in blocks:
         exec(compile(block, "docs/dataset.md", "exec"), {})
     assert read_audio("episode_0.flac")[0].shape == (12 * 800, 1)

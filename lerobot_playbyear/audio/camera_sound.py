@@ -32,12 +32,14 @@ if TYPE_CHECKING:
 
     from lerobot_playbyear.datasets.long_dataset import LongDataset
 
-
 INTERVENTION = "intervention"
+"""LeRobot's column of the frames that a person corrected."""
 
 
 @dataclass
 class _Frame:
+    """Of one picture what it says of its microphone; `was_read`: and not reckoned from its neighbours."""
+
     session: int
     counter: int
     strip: Strip | None = None
@@ -109,15 +111,19 @@ def read_camera_sound(
         found.sounds.append(sound)
         found.pictures.append(key)
         found.is_first = [own | other for own, other in zip(is_first, found.is_first or is_first, strict=True)]
-    if (
-        INTERVENTION in dataset.meta.features
-    ):  # LeRobot's rollout resets the policy at every hand-back, however short the pause
-        by_person = column_to_numpy(dataset.hf_dataset.data.column(INTERVENTION)).reshape(-1).astype(bool)
-        for flags, own in zip(
-            found.is_first, np.split(by_person, np.cumsum([*map(len, found.is_first)])[:-1]), strict=True
-        ):
-            flags[1:] |= own[:-1] & ~own[1:]
+    for flags, by_person in zip(found.is_first, _by_person(dataset, [*map(len, found.is_first)]), strict=True):
+        flags[1:] |= by_person[:-1] & ~by_person[1:]
     return found
+
+
+def _by_person(dataset: "LeRobotDataset | LongDataset", lengths: Sequence[int]) -> list[np.ndarray]:
+    """Which frames of each episode are corrections, (n,) bool: LeRobot's rollout resets the policy at every hand-back, however
+    short the pause."""
+    feature = dataset.meta.features.get(INTERVENTION)
+    if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
+        return [np.zeros(length, bool) for length in lengths]
+    flags = column_to_numpy(dataset.hf_dataset.data.column(INTERVENTION)).reshape(-1).astype(bool)
+    return np.split(flags, np.cumsum(lengths)[:-1])
 
 
 def write_with_cameras(root: Path, target: Path, found: MicrophoneSound, fps: int) -> None:

@@ -39,9 +39,8 @@ class CardRecording:
         self._changed = threading.Condition()
         self._kept = np.zeros((round(KEPT_S * sample_rate), channels), np.int16)  # a ring, by number of sample
         self._written = 0
-        self._bursts: deque[tuple[float, float]] = (
-            deque()
-        )  # of the last second: when one came, and how late its first sample
+        # Of the last second: when a burst of chunks came, and how long its first sample had waited [s].
+        self._bursts: deque[tuple[float, float]] = deque()
         self._came_s = -math.inf
         self._zeros: np.ndarray = np.zeros(channels, np.int64)  # samples at the end of each channel that are exactly 0
 
