@@ -30,7 +30,7 @@ def save_or_ask(writer: DurableWriter, frames: Sequence[dict[str, Any]]) -> None
 
     Args:
         writer: Without an episode in progress.
-        frames: All frames of the episode. Where pictures did not reach the disk, they are written anew.
+        frames: All frames of the episode. Where pictures did not reach the disk, they are written again.
 
     Raises:
         DatasetWriteError: It could not be written, and nobody is there to make room, or they gave it up.

@@ -3,7 +3,6 @@
 Its folder on PYTHONPATH is all that LeRobot's discovery needs.
 """
 
-from lerobot_robot_playbyear_sim.camera import PlaybyearSimLamp, PlaybyearSimLampConfig
 from lerobot_robot_playbyear_sim.devices import (
     PlaybyearSim,
     PlaybyearSimConfig,
@@ -19,8 +18,6 @@ __all__ = [
     "JointLeaderConfig",
     "PlaybyearSim",
     "PlaybyearSimConfig",
-    "PlaybyearSimLamp",
-    "PlaybyearSimLampConfig",
     "PlaybyearSimLeader",
     "PlaybyearSimLeaderConfig",
 ]
