@@ -13,13 +13,13 @@ import httpx
 import pytest
 import yaml
 from dataset_factory import make_dataset
-from hub_client import HubClient, Result
 from hub_faults import down_after, every_second, everything_fails, nothing_fails, one_in
 from hub_repositories import File, Repository, git_oid
 from hub_server import TOKEN, HubServer
 from huggingface_hub import HfApi, ModelCard, get_session, set_client_factory
 from huggingface_hub.errors import HfHubHTTPError
 from huggingface_hub.utils import _http, hf_raise_for_status
+from support.commands import Commands, Result
 
 from lerobot_playbyear.datasets.locking import DatasetLock
 from lerobot_playbyear.hub import datasets as pushing_datasets
@@ -54,7 +54,7 @@ def server():
 
 @pytest.fixture(scope="module")
 def client(server, tmp_path_factory):
-    client = HubClient(tmp_path_factory.mktemp("client"), server.environment())
+    client = Commands(tmp_path_factory.mktemp("client"), server.environment())
     yield client
     client.close()
 
@@ -333,12 +333,6 @@ def test_a_dataset_on_the_hub_that_claims_too_much_is_refused_before_its_data_co
     assert result.status == 2
     assert "total_episodes is 50,000,000, but meta/episodes has 2" in result.output
     assert not [path for _, path, _ in hub.requests if "/data/" in path]
-
-
-@pytest.mark.parametrize("command", ["lerobot-train", "lerobot-eval"])
-def test_to_discover_the_plugin_changes_nothing_for_other_commands(client, hub, command):
-    result = client.run("hub-clients", command, "--help")
-    assert "the plugin is there, and huggingface_hub has the same client" in result.output, result.output[-3000:]
 
 
 def test_a_job_whose_answer_is_lost_is_started_once(pushed, hub, client, tmp_path):

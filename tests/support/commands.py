@@ -1,13 +1,14 @@
-"""A process whose Hub is the one on loopback, and which runs commands.
+"""Commands as they are typed, in a tenth of a second: LeRobot is imported once, and every command is a fork of that process.
 
-`HF_ENDPOINT` is read when `huggingface_hub` is imported, so that commands need a process of their own. Importing LeRobot
-takes half a minute: it is done once, and every command runs in a fork of that process.
+Each command has its own arguments, environment, output and exit status. What is read while modules are imported, such as
+`HF_ENDPOINT` and `HF_HOME`, is that of the process they are forked from.
 """
 
 import contextlib
 import importlib
 import json
 import os
+import pkgutil
 import shutil
 import signal
 import subprocess
@@ -16,26 +17,16 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-COMMANDS = {
-    **{
-        f"playbyear-{name}": f"lerobot_playbyear.scripts.{name}"
-        for name in ("record", "push", "inspect", "train", "dagger")
-    },
-    **{f"lerobot-{name}": f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval")},
-    "hub-clients": "hub_clients",
+_COMMANDS = {
+    entry.name: entry
+    for entry in metadata.entry_points(group="console_scripts")
+    if entry.name.startswith(("playbyear-", "lerobot-"))
 }
-_IMPORTED_LATER = (
-    "lerobot_playbyear.dagger.run",
-    "lerobot_playbyear.hub.policies",
-    "lerobot_playbyear.hub.uploads",
-    "lerobot_playbyear.inspection.page_writer",
-    "lerobot_playbyear.recording.record",
-    "lerobot_playbyear.training.loop",
-    "lerobot_env_playbyear",
-)
+_IMPORTED = ("lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval", "lerobot_env_playbyear")
 
 
 @dataclass
@@ -46,7 +37,7 @@ class Result:
     output: str
 
 
-class HubClient:
+class Commands:
     """Runs commands.
 
     Args:
@@ -54,7 +45,7 @@ class HubClient:
         environment: Besides that of this process.
     """
 
-    def __init__(self, folder: Path, environment: Mapping[str, str]) -> None:
+    def __init__(self, folder: Path, environment: Mapping[str, str] | None = None) -> None:
         self._home, self._output = folder / "home", folder / "output"
         folder.mkdir(parents=True, exist_ok=True)
         self._process = subprocess.Popen(
@@ -62,12 +53,12 @@ class HubClient:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "HF_HOME": str(self._home), "OMP_NUM_THREADS": "1", **environment},
+            env={**os.environ, "HF_HOME": str(self._home), "OMP_NUM_THREADS": "1", **(environment or {})},
         )
 
     def run(
         self,
-        *arguments: str,
+        *arguments: str | Path,
         fresh: bool = True,
         environment: Mapping[str, str] | None = None,
         kill_when: Callable[[], bool] | None = None,
@@ -82,7 +73,12 @@ class HubClient:
         """
         if fresh:
             shutil.rmtree(self._home, ignore_errors=True)
-        job = {"arguments": arguments, "environment": dict(environment or {}), "output": str(self._output)}
+        job = {
+            "arguments": [str(argument) for argument in arguments],
+            "environment": dict(environment or {}),
+            "folder": os.getcwd(),
+            "output": str(self._output),
+        }
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.write(json.dumps(job) + "\n")
@@ -115,28 +111,31 @@ def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
 def _serve() -> None:
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever is printed meanwhile is no answer
-    modules = {name: importlib.import_module(module) for name, module in COMMANDS.items()}
-    for module in _IMPORTED_LATER:
-        importlib.import_module(module)
+    package = importlib.import_module("lerobot_playbyear")
+    ours = [module.name for module in pkgutil.walk_packages(package.__path__, "lerobot_playbyear.")]
+    for module in (*_IMPORTED, *ours):
+        with contextlib.suppress(ImportError):  # of what needs a sound card or a window
+            importlib.import_module(module)
     for line in sys.stdin:
         job = json.loads(line)
         pid = os.fork()
         if pid == 0:
-            _run(modules[job["arguments"][0]].main, job)
+            _run(job)
         print(pid, file=answers, flush=True)
         print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), file=answers, flush=True)
 
 
-def _run(main: Callable[[], Any], job: dict[str, Any]) -> None:
+def _run(job: dict[str, Any]) -> None:
     """Never returns."""
     status = 0
     os.environ.update(job["environment"])
+    os.chdir(job["folder"])
     with open(job["output"], "w") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)
     sys.argv = job["arguments"]
     try:
-        main()
+        _COMMANDS[sys.argv[0]].load()()
     except SystemExit as error:
         status = error.code if isinstance(error.code, int) else 0 if error.code is None else 1
         if isinstance(error.code, str):
