@@ -12,7 +12,7 @@ that learns has them at first. The command prints by how much the encodings of 2
 import argparse
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.utils.constants import OBS_IMAGES, OBS_STR
 from torch import Tensor, nn
+from torch.nn import functional
 from torchvision.ops import FrozenBatchNorm2d
 
 from experiments.protocol import shown
@@ -49,7 +50,7 @@ def saved_start(options: Sequence[str], dataset: Path, folder: Path, seed: int) 
     if not note.exists() or json.loads(note.read_text()) != made:
         shutil.rmtree(folder, ignore_errors=True)
         policy, processors, pictures = _prepared(options, dataset, seed)
-        calibrate(policy.model.backbone, torch.cat(list(pictures.values())))
+        calibrate(policy.model.backbone, alike(pictures.values()))
         for part in (policy, *processors):
             part.save_pretrained(folder)
         note.write_text(json.dumps(made))
@@ -83,6 +84,13 @@ def _pictures(data: LeRobotDataset, preprocessor: Any) -> dict[str, Tensor]:
     kept = [key for key in frames[0] if key.startswith(f"{OBS_STR}.")]
     batch = preprocessor({key: torch.stack([frame[key] for frame in frames]) for key in kept})
     return {key: batch[key] for key in kept if key.startswith(OBS_IMAGES)}
+
+
+def alike(pictures: Iterable[Tensor]) -> Tensor:
+    """Pictures of several sizes as one batch, (B, 3, H, W): all are shrunk to the smallest size."""
+    batches = list(pictures)
+    size = min(tuple(batch.shape[-2:]) for batch in batches)
+    return torch.cat([functional.interpolate(batch, size, mode="area") for batch in batches])
 
 
 @torch.no_grad()
