@@ -46,7 +46,7 @@ from experiments.protocol import (
 )
 from experiments.training import Job, clocked, evaluate
 from lerobot_playbyear.audio.sound_picture import read_pictures
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 
 STUDY = "others"
 CONDITIONS = ("picture", "deaf")

@@ -7,7 +7,7 @@ import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_playbyear.datasets.audio_feature import audio_feature
+from lerobot_playbyear.datasets.features import audio_feature
 
 CAMERA = "observation.images.front"
 MICROPHONE = "observation.audio.gripper"

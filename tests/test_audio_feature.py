@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from dataset_factory import CAMERA, MICROPHONE, make_dataset
 
-from lerobot_playbyear.datasets.audio_feature import (
+from lerobot_playbyear.datasets.audio_files import write_wav
+from lerobot_playbyear.datasets.features import (
     audio_feature,
     audio_keys,
     check_audio_features,
     episode_waveform,
-    write_wav,
 )
 
 FPS = 20

@@ -212,7 +212,8 @@ def test_what_a_process_could_not_save_is_rolled_back_by_the_next(tmp_path, capl
         assert "an episode that had not been saved was removed" in caplog.text
         assert write_episode(target, 1) == 1
     assert_recorded(root, 2, FEATURES)
-    assert {path.name for path in root.iterdir()} == {"data", "meta"}
+    assert {path.name for path in root.iterdir()} == {"data", "meta", "images"}
+    assert [path.name for path in (root / "images").iterdir()] == [".lock"]
 
 
 def test_a_process_that_was_killed_between_two_episodes_left_nothing_to_be_told(tmp_path, caplog):

@@ -21,7 +21,7 @@ from huggingface_hub.errors import HfHubHTTPError
 from huggingface_hub.utils import _http, hf_raise_for_status
 from support.commands import Commands, Result
 
-from lerobot_playbyear.datasets.locking import DatasetLock
+from lerobot_playbyear.datasets.journal import lock_dataset
 from lerobot_playbyear.hub import datasets as pushing_datasets
 from lerobot_playbyear.hub.client import patient_hub
 from lerobot_playbyear.hub.datasets import push_dataset
@@ -477,14 +477,13 @@ def test_a_dataset_that_is_being_recorded_to_is_not_uploaded(dataset, uploads):
     film = dataset.parent / "film.mp4"
     film.touch()
     options = PushOptions(preview=film)
-    lock = DatasetLock(dataset)
+    lock = lock_dataset(dataset)
     with pytest.raises(HubError, match=f"Not pushed. {dataset} is being recorded to"):
         push_dataset("me/set", dataset, options)
     lock.release()
     assert not uploads
     assert push_dataset("me/set", dataset, options) == "the Hub"
     assert uploads == ["create", "Upload dataset", "Upload card", "v3.0"]
-    assert not (dataset / "images" / ".lock").exists()
 
 
 @pytest.mark.parametrize("when", ["before", "while"])
@@ -497,7 +496,7 @@ def test_a_dataset_that_changes_meanwhile_gets_no_tag(dataset, uploads, monkeypa
     def no_lock(root):
         raise PermissionError(13, "Permission denied", str(root))
 
-    monkeypatch.setattr(pushing_datasets, "DatasetLock", no_lock)
+    monkeypatch.setattr(pushing_datasets, "lock_dataset", no_lock)
     if when == "before":
         monkeypatch.setattr(pushing_datasets, "film_preview", change)
     else:

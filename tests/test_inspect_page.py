@@ -14,7 +14,7 @@ from dataset_factory import make_dataset
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.datasets.audio_feature import audio_feature
+from lerobot_playbyear.datasets.features import audio_feature
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
 from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.page_writer import PageWriter

@@ -27,7 +27,7 @@ from lerobot_playbyear.audio.sample_strip import (
 )
 from lerobot_playbyear.audio.session_files import session_path
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.datasets.audio_feature import write_wav
+from lerobot_playbyear.datasets.audio_files import write_wav
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig

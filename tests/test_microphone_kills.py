@@ -13,7 +13,7 @@ from lerobot.utils.feature_utils import hw_to_dataset_features
 from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, attach_audio
 from lerobot_playbyear.audio.control_steps import ControlStepSound
 from lerobot_playbyear.audio.sample_strip import Strip, read_timecode
-from lerobot_playbyear.datasets.audio_feature import write_wav
+from lerobot_playbyear.datasets.audio_files import write_wav
 from lerobot_playbyear.datasets.repair.command import RepairConfig, repair
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 

@@ -20,7 +20,7 @@ from sound_server import RATE, Player, started, why_not
 from lerobot_playbyear.audio.control_steps import HALF
 from lerobot_playbyear.audio.sample_strip import Strip, read_strip
 from lerobot_playbyear.audio.session_files import SessionSound, find_session
-from lerobot_playbyear.datasets.audio_feature import write_wav
+from lerobot_playbyear.datasets.audio_files import write_wav
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig, MicrophoneOptionError
 from lerobot_playbyear.microphones.file import PlayedMicrophone
 from lerobot_playbyear.microphones.microphone import MicrophoneError, register_source

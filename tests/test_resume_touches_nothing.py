@@ -76,7 +76,8 @@ def test_episodes_whose_files_are_damaged_are_not_dropped(root, how, which):
     assert "othing was changed" in str(error.value)
     assert everything(root.parent) == before
     assert {path.name for path in root.parent.iterdir()} == {"dataset"}
-    assert {path.name for path in root.iterdir()} == {"data", "meta"}
+    assert {path.name for path in root.iterdir()} == {"data", "meta", "images"}
+    assert [path.name for path in (root / "images").iterdir()] == [".lock"]
 
 
 @pytest.mark.parametrize("victim", ["meta/stats.json", "meta/tasks.parquet", "meta/info.json"])

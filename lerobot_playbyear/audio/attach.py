@@ -12,11 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_playbyear.audio.audio_layout import has_audio_files, read_layout
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import EPISODES_DIR, HF_LEROBOT_HOME, INFO_PATH, check_can_be_made, list_files
-from lerobot_playbyear.datasets.journal import flush, flush_all
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
+from lerobot_playbyear.datasets.files import (
+    EPISODES_DIR,
+    HF_LEROBOT_HOME,
+    INFO_PATH,
+    check_can_be_made,
+    flush,
+    flush_all,
+    list_files,
+)
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
 

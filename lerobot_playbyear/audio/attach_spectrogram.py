@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from lerobot_playbyear.audio.attach import DatasetPlace, new_folder, open_for_copy, write_new_dataset
 from lerobot_playbyear.audio.sound_picture import picture_feature
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, check_audio_features
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

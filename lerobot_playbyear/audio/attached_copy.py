@@ -18,8 +18,8 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attached_sound import EpisodesSound
 from lerobot_playbyear.audio.audio_layout import AUDIO_FOLDER
-from lerobot_playbyear.datasets.audio_feature import audio_feature, audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.features import audio_feature, audio_keys
 from lerobot_playbyear.datasets.parquet_files import (
     ParquetDamageError,
     open_checked,

@@ -17,10 +17,10 @@ from typing import Any
 
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, AUDIO_PREFIX
 from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.confines import check_links, file_inside
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.features import AUDIO_DTYPE, AUDIO_PREFIX
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, list_files
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, read_table
 

@@ -9,8 +9,8 @@ from PIL import Image
 
 from lerobot_playbyear.audio.sample_strip import read_timecode
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, MICROPHONE
 from lerobot_playbyear.datasets.confines import file_inside, open_picture
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, MICROPHONE
 from lerobot_playbyear.datasets.parquet_files import open_parquet, row_group_parts
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX, SoundPicture
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 
 _SECONDS = 2.0
 

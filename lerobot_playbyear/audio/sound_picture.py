@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 from lerobot_playbyear.datasets.files import INFO_PATH
 
 PICTURE_PREFIX = "observation.images."

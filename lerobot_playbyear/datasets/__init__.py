@@ -3,17 +3,16 @@
 from typing import TYPE_CHECKING
 
 from lerobot_playbyear import lazy_names
-from lerobot_playbyear.datasets.audio_feature import (
+from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio, write_wav
+from lerobot_playbyear.datasets.columns import check_dataset_files
+from lerobot_playbyear.datasets.episode_clock import note_episode_start
+from lerobot_playbyear.datasets.features import (
     AUDIO_PREFIX,
     audio_feature,
     audio_keys,
     check_audio_features,
     episode_waveform,
-    write_wav,
 )
-from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio
-from lerobot_playbyear.datasets.columns import check_dataset_files
-from lerobot_playbyear.datasets.episode_clock import note_episode_start
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.episode_store import EpisodeStore

@@ -1,6 +1,7 @@
 """Sound in files: WAV, FLAC and the sound tracks of videos in, WAV and FLAC out, and how a recording meets frames."""
 
 import math
+import wave
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
@@ -8,7 +9,7 @@ from typing import Any, Protocol
 import av
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_feature import pcm_channels, samples_per_frame, to_pcm_s16, write_wav
+from lerobot_playbyear.datasets.features import samples_per_frame, to_pcm_s16
 
 _GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
 _SILENCE_AT_ONCE = 2**14  # samples
@@ -87,6 +88,39 @@ def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarr
         raise AudioFileError(f"The sound of {path} cannot be decoded: {error}.") from error
     if not position:
         raise AudioFileError(f"{path} holds no samples.")
+
+
+def pcm_channels(waveform: np.ndarray) -> np.ndarray:
+    """Sound (n,) or (n, channels) as (n, channels) int16 PCM. Raises as `to_pcm_s16`, also where the shape is another."""
+    samples = to_pcm_s16(waveform)
+    if samples.ndim not in (1, 2):
+        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
+    return samples[:, None] if samples.ndim == 1 else samples
+
+
+def write_wav(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
+    """Write sound as a 16-bit WAV file.
+
+    Args:
+        path: The file to write; its folder is made.
+        waveform: (n,) or (n, channels), int16 PCM or floats in [-1, 1].
+        sample_rate: Samples per second [Hz].
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        ValueError: If the samples are neither, or the shape is another.
+    """
+    samples = pcm_channels(waveform)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(samples.shape[1])
+        file.setsampwidth(2)
+        file.setframerate(sample_rate)
+        file.writeframes(np.ascontiguousarray(samples).astype("<i2").tobytes())
+    return path
 
 
 def write_audio(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:

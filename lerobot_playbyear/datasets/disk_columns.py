@@ -26,8 +26,7 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
-from lerobot_playbyear.datasets.journal import flush
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, flush
 
 DEFAULT_CACHE = HF_LEROBOT_HOME.with_name("lerobot_playbyear")
 """Where the columns are kept: beside LeRobot's own cache."""

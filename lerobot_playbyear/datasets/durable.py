@@ -19,12 +19,12 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_playbyear.datasets.episode_checks import IncompleteEpisodeError, LostFramesError
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.existing import check_compatible, check_root, check_undamaged, has_dataset
-from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, publish
-from lerobot_playbyear.datasets.locking import DatasetLock
+from lerobot_playbyear.datasets.features import check_features
+from lerobot_playbyear.datasets.files import FolderLock
+from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, lock_dataset, publish
 from lerobot_playbyear.datasets.repair.replacing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
 from lerobot_playbyear.datasets.staging import Staging, remove_leftovers
-from lerobot_playbyear.datasets.writable import check_features
 
 logger = logging.getLogger(__name__)
 
@@ -94,11 +94,11 @@ class DurableWriter:
         }
         self._n_episodes = self._n_frames = 0
         self._episode: Staging | None = None
-        self._lock: DatasetLock | None = None
+        self._lock: FolderLock | None = None
         try:
             finish_repair(self.root)
             check_root(self.root, resume=resume)
-            self._lock = DatasetLock(self.root)
+            self._lock = lock_dataset(self.root)
             finish_journal(self.root)
             if has_dataset(self.root):
                 check_undamaged(self.root)
@@ -137,7 +137,6 @@ class DurableWriter:
             ValueError: The frame does not fit the features, or its sound is none.
             DatasetWriteError: The disk does not take it; or the episode before is not saved yet.
         """
-        self._check_place()
         try:
             staging = self._staging
             if staging.is_complete:
@@ -161,7 +160,6 @@ class DurableWriter:
         """
         if self._episode is None or self._episode.length == 0:
             raise DatasetWriteError(f"Episode {self.num_episodes} has no frames: add some before it is saved.")
-        self._check_place()
         episode = self._episode
         try:
             self._save(episode)
@@ -184,7 +182,6 @@ class DurableWriter:
         Raises:
             DatasetWriteError: It is complete on disk already, and only has to be moved to its place.
         """
-        self._check_place()
         if (self.root / JOURNAL).exists():
             raise DatasetWriteError(
                 f"Episode {self.num_episodes} is complete on disk already: call save_episode again.",
@@ -197,14 +194,14 @@ class DurableWriter:
 
     def close(self) -> None:
         """Drops an episode in progress and removes what was needed only for writing. Safe to call twice."""
-        if self._lock is None or not self._lock.is_held:
+        if self._lock is None:
             return
-        if not self._lock.is_replaced:
-            self._drop_staging()
-            with contextlib.suppress(OSError):  # the next writer tries again
-                finish_journal(self.root)
-                remove_leftovers(self.root)
+        self._drop_staging()
+        with contextlib.suppress(OSError):  # the next writer tries again
+            finish_journal(self.root)
+            remove_leftovers(self.root)
         self._lock.release()
+        self._lock = None
 
     def __enter__(self) -> "DurableWriter":
         return self
@@ -241,14 +238,6 @@ class DurableWriter:
                 raise _another_count(self.root, episode.index, self.num_episodes)
             self._episode = episode
         return self._episode
-
-    def _check_place(self) -> None:
-        """Whether the folder is still the one that was opened: in another's scratch folder frames would be mixed up."""
-        if self._lock is not None and self._lock.is_replaced:
-            raise DatasetWriteError(
-                f"{self.root} was moved away, and another program writes to a dataset of this name now. The episodes that "
-                "were saved before are complete where it was moved to; record there with resume=true."
-            )
 
     def _drop_staging(self) -> None:
         if self._episode is not None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.journal import write_at_once
+from lerobot_playbyear.datasets.files import write_atomically
 
 CLOCK_PATH = "meta/playbyear_clock.json"
 """Where in a dataset's folder its episodes' times stand."""
@@ -73,7 +73,7 @@ def _write(path: Path, starts: Mapping[int, float]) -> None:
             raise ClockError(f"{part} is a link; wanted one of the dataset's own. Put what it leads to in its place.")
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = {str(episode): starts[episode] for episode in sorted(starts)}
-    write_at_once(path, json.dumps({_EPISODES: lines}, indent=1) + "\n")
+    write_atomically(path, json.dumps({_EPISODES: lines}, indent=1) + "\n")
 
 
 def read_episode_starts(root: str | Path) -> dict[int, float] | None:

@@ -6,10 +6,10 @@ import shlex
 from pathlib import Path
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_playbyear.datasets.confines import OutsideError, check_templates
 from lerobot_playbyear.datasets.errors import DatasetWriteError
+from lerobot_playbyear.datasets.features import differences
 from lerobot_playbyear.datasets.files import list_files
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
@@ -83,37 +83,12 @@ def check_compatible(
     Raises:
         ValueError: With every difference in the message.
     """
-    differences = []
-    if meta.fps != fps:
-        differences.append(f"fps is {meta.fps} there and {fps} here")
-    there = {key: _signature(value) for key, value in meta.features.items() if key not in DEFAULT_FEATURES}
-    here = {key: _signature(value) for key, value in features.items() if key not in DEFAULT_FEATURES}
-    differences += [
-        f"{key} is {there.get(key, 'absent')} there and {here.get(key, 'absent')} here"
-        for key in sorted(there.keys() | here.keys())
-        if there.get(key) != here.get(key)
-    ]
-    names = ((key, _names(meta.features.get(key)), _names(feature)) for key, feature in features.items())
-    differences += [
-        f"the numbers of {key} are {', '.join(old)} there and {', '.join(new)} here"
-        for key, old, new in names
-        if old and new and old != new
-    ]
+    found = [f"fps is {meta.fps} there and {fps} here"] if meta.fps != fps else []
+    found += differences(meta.features, features)
     if meta.robot_type and robot_type and meta.robot_type != robot_type:
-        differences.append(f"the robot is {meta.robot_type} there and {robot_type} here")
-    if differences:
+        found.append(f"the robot is {meta.robot_type} there and {robot_type} here")
+    if found:
         raise ValueError(
-            f"The dataset in {meta.root} does not fit what is to be appended: {'; '.join(differences)}. "
+            f"The dataset in {meta.root} does not fit what is to be appended: {'; '.join(found)}. "
             "Record with the same settings, or choose another root."
         )
-
-
-def _signature(feature: dict) -> str:
-    rate = (feature.get("info") or {}).get("sample_rate")
-    return f"{feature['dtype']} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
-
-
-def _names(feature: dict | None) -> list[str]:
-    """What the numbers of a vector are called; those of a picture's axes tell nothing."""
-    names = None if feature is None or len(feature["shape"]) != 1 else feature.get("names")
-    return [str(name) for name in names] if isinstance(names, list | tuple | dict) else []

@@ -1,9 +1,10 @@
-"""Which files a folder has, held apart from which of its files cannot be seen now.
+"""Files and folders: what is missing told from what cannot be read, what is written there whole or not at all, one lock.
 
 What a damaged dataset lacks is dropped. So a file counts as missing only where its folder can be listed and does not
 name it; a folder that cannot be listed is an error, never an empty one.
 
-The names are LeRobot's, spelled here as well because its own modules with them take seconds to import; a test compares them.
+Nothing is written or deleted through a link. The names are LeRobot's, spelled here as well because its own modules
+with them take seconds to import; a test compares them.
 """
 
 import contextlib
@@ -16,9 +17,10 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 
+from filelock import FileLock, Timeout
 from huggingface_hub.constants import HF_HOME
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
 
 HF_LEROBOT_HOME = Path(os.getenv("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser()
 """LeRobot's own cache, where datasets without a root are."""
@@ -27,6 +29,13 @@ INFO_PATH = "meta/info.json"
 EPISODES_DIR = "meta/episodes"
 DEFAULT_DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 DEFAULT_VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+
+PARTIAL = ".partial"
+"""What the name of a file or a folder ends in while it is written."""
+
+
+class FolderLockedError(PlaybyearError, RuntimeError):
+    """Another process works in the folder."""
 
 
 def list_files(root: Path, pattern: str) -> list[Path]:
@@ -104,6 +113,88 @@ def naming(path: Path) -> Iterator[None]:
         if error.filename is not None or not error.errno:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error
+
+
+def flush(path: Path) -> None:
+    """Asks the operating system to put a file, or the entries of a folder, on the disk itself."""
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def flush_all(folder: Path) -> None:
+    """As `flush`, of a folder and all that is in it but links."""
+    for path in entries_below(folder):
+        if not path.is_symlink():
+            flush(path)
+    flush(folder)
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Writes a file that is there as a whole, on the disk itself, or as it was before."""
+    partial = path.with_name(path.name + PARTIAL)
+    partial.unlink(missing_ok=True)
+    with partial.open("xb") as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+    flush(partial)
+    os.replace(partial, path)
+    flush(path.parent)
+
+
+@contextlib.contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """A folder that is there as a whole, on the disk itself, or not at all: it is written beside its place, and renamed.
+
+    Args:
+        target: Its place, where nothing is. What an earlier process left unfinished beside it is removed.
+
+    Yields:
+        The empty folder to write into. Where that raises, it is removed.
+
+    Raises:
+        OSError: It cannot be written, or something is at its place.
+    """
+    partial = target.absolute().with_name(f".{target.name}{PARTIAL}")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        flush_all(partial)
+        os.rename(partial, target)
+        flush(partial.parent)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+class FolderLock:
+    """At most one process works in a folder: held until `release` or the end of the process, however it ends.
+
+    The lock's file stays where it is: two processes that found different files under its name could both hold one.
+
+    Args:
+        path: The lock's file; its folder is made where it is missing.
+        in_use: What is said where another process holds it.
+
+    Raises:
+        FolderLockedError: Another process holds it.
+        OSError: It cannot be written, or is a link.
+    """
+
+    def __init__(self, path: Path, in_use: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(path, timeout=0, thread_local=False)
+        try:
+            self._lock.acquire()
+        except Timeout as error:
+            raise FolderLockedError(in_use) from error
+
+    def release(self) -> None:
+        """Lets another process in. Safe to call twice."""
+        self._lock.release()
 
 
 _trial = ".playbyear-"  # begin of the name of a folder that is made for a moment

@@ -8,7 +8,7 @@ moved stays inside the dataset, and no folder is followed that is a link.
 import os
 from pathlib import Path
 
-from lerobot_playbyear.datasets.files import INFO_PATH, entries_below
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, write_atomically
 
 SCRATCH = Path("images")
 STAGING = SCRATCH / ".staging"
@@ -43,7 +43,7 @@ def publish(root: Path) -> None:
     for folder in sorted({staging / parent for name in names for parent in name.parents}):
         flush(folder)
     flush(staging.parent)
-    write_at_once(root / JOURNAL, "")
+    write_atomically(root / JOURNAL, "")
     flush(root)
     finish_journal(root)
 
@@ -71,6 +71,18 @@ def finish_journal(root: Path) -> None:
     flush(journal.parent)
 
 
+def lock_dataset(root: Path) -> FolderLock:
+    """Makes this process the only one that writes to a dataset, or uploads it; its folder is made where it is missing.
+
+    Raises:
+        FolderLockedError: Another process does.
+        JournalError: The folder that the lock lies in is a link.
+        OSError: It cannot be written.
+    """
+    check_scratch(root)
+    return FolderLock(root / LOCK, f"Another process is writing to {root}, or uploading it: wait until it has ended.")
+
+
 def check_scratch(root: Path) -> None:
     """Whether what is written and removed while recording lies in the dataset's folder.
 
@@ -87,34 +99,6 @@ def make_folders(folder: Path) -> list[Path]:
     missing = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     return [path.parent for path in missing]
-
-
-def flush(path: Path) -> None:
-    """Asks the operating system to put a file, or the entries of a folder, on the disk itself."""
-    if os.name == "nt" and path.is_dir():
-        return
-    descriptor = os.open(path, os.O_RDONLY if os.name != "nt" else os.O_RDWR)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def write_at_once(path: Path, text: str) -> None:
-    """Writes a file that is there as a whole, on the disk itself, or not at all."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(text)
-    flush(partial)
-    os.replace(partial, path)
-    flush(path.parent)
-
-
-def flush_all(folder: Path) -> None:
-    """As `flush`, of a folder and all that is in it but links."""
-    for path in folder.rglob("*"):
-        if not path.is_symlink():
-            flush(path)
-    flush(folder)
 
 
 def _staged_files(root: Path) -> list[Path]:

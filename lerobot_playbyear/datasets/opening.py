@@ -9,8 +9,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear.datasets.audio_feature import AUDIO_DTYPE, check_audio_features
 from lerobot_playbyear.datasets.columns import check_dataset_files
+from lerobot_playbyear.datasets.features import AUDIO_DTYPE, check_audio_features
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
 
 if TYPE_CHECKING:

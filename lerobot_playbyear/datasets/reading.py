@@ -14,9 +14,9 @@ from lerobot.utils.import_utils import get_safe_default_video_backend
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.audio_feature import IS_FIRST, check_audio_features
 from lerobot_playbyear.datasets.columns import episode_bounds
 from lerobot_playbyear.datasets.disk_columns import DEFAULT_CACHE, disk_columns
+from lerobot_playbyear.datasets.features import IS_FIRST, check_audio_features
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.identity import dataset_identity
 from lerobot_playbyear.datasets.long_dataset import LongDataset

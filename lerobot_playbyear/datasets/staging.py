@@ -20,11 +20,10 @@ from lerobot.utils.utils import SuppressProgressBars
 from torch import Tensor
 
 from lerobot_playbyear.compat import forget_unsaved_rows
-from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.episode_checks import check_pictures, check_videos
+from lerobot_playbyear.datasets.features import audio_keys, check_frame
 from lerobot_playbyear.datasets.files import take_over
 from lerobot_playbyear.datasets.journal import EPISODE, PICTURES, SCRATCH, STAGING
-from lerobot_playbyear.datasets.writable import check_frame
 
 
 class Staging:

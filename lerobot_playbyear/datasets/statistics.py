@@ -24,7 +24,7 @@ from lerobot.datasets.compute_stats import (
 )
 from lerobot.datasets.utils import STATS_PATH, serialize_dict
 
-from lerobot_playbyear.datasets.audio_feature import audio_keys
+from lerobot_playbyear.datasets.features import audio_keys
 
 Stats = dict[str, dict[str, np.ndarray]]
 """Per feature and statistic, as LeRobot keeps them."""

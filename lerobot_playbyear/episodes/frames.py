@@ -18,8 +18,8 @@ from lerobot.utils.constants import (
     SUCCESS,
 )
 
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.episodes.environment import EnvFacts
 from lerobot_playbyear.episodes.episode import Episode, Observation
 

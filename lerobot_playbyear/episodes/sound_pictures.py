@@ -17,8 +17,8 @@ import numpy as np
 from gymnasium import spaces
 
 from lerobot_playbyear.audio.sound_picture import SoundPicture, read_pictures
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 
 _PIXELS = "pixels"
 

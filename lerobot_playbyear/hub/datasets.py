@@ -10,9 +10,8 @@ from tempfile import TemporaryDirectory
 from huggingface_hub import DatasetCard, HfApi
 
 from lerobot_playbyear.datasets.confines import OutsideError, check_links
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, entries_below
-from lerobot_playbyear.datasets.journal import JournalError
-from lerobot_playbyear.datasets.locking import DatasetLock, DatasetLockedError
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, FolderLockedError, entries_below
+from lerobot_playbyear.datasets.journal import JournalError, lock_dataset
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview
 from lerobot_playbyear.hub.pushing import HubError, PushOptions, check_name, push_patiently
@@ -65,8 +64,8 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
 def _locked(folder: Path) -> Iterator[None]:
     """Keeps recordings away from a dataset; where no lock can be made, only `_check_unchanged` notices them."""
     try:
-        lock = DatasetLock(folder) if folder.is_dir() else None
-    except DatasetLockedError as error:
+        lock = lock_dataset(folder) if folder.is_dir() else None
+    except FolderLockedError as error:
         raise HubError(
             f"Not pushed. {folder} is being recorded to, repaired or uploaded by another process: push when it has ended."
         ) from error

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.confines import ClaimError, OutsideError, file_inside, open_picture
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound

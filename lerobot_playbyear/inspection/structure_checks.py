@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_feature import check_audio_features
+from lerobot_playbyear.datasets.features import check_audio_features
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
 from lerobot_playbyear.inspection.verdict import Verdict, name_episodes
 

@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_feature import to_pcm_s16
+from lerobot_playbyear.datasets.features import to_pcm_s16
 from lerobot_playbyear.microphones.clock import CardClock
 
 KEPT_S = 10.0

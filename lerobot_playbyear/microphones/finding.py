@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_feature import write_wav
+from lerobot_playbyear.datasets.audio_files import write_wav
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.microphone import MicrophoneError
 from lerobot_playbyear.microphones.portaudio import (

@@ -10,7 +10,7 @@ from lerobot.optim.optimizers import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_playbyear.compat import encode_choice
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX, MICROPHONE
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, MICROPHONE
 from lerobot_playbyear.policy.feature_checks import check_features, sample_rate_of
 from lerobot_playbyear.policy.option_checks import check_options
 from lerobot_playbyear.policy.precision import training_dtype

@@ -7,7 +7,7 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import ObservationProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 
 _FULL_SCALE = 32768  # int16: samples are in [-32768, 32767]
 

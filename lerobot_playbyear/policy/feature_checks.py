@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata

@@ -12,8 +12,8 @@ from torch import Tensor
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
 from lerobot_playbyear.audio.sample_strip import Strip, read_strip
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
-from lerobot_playbyear.datasets.audio_feature import AUDIO_PREFIX
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 
 _USUAL_RATES = (16000, 48000, 44100, 32000, 22050, 8000, 96000)  # Hz
 _PACE_STEPS = slice(

@@ -20,8 +20,8 @@ from lerobot.datasets.utils import (
 )
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from lerobot_playbyear.datasets.audio_feature import audio_keys
 from lerobot_playbyear.datasets.confines import is_template
+from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.datasets.files import is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing
 from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport

@@ -12,8 +12,8 @@ import os
 import shutil
 from pathlib import Path
 
-from lerobot_playbyear.datasets.files import entries_below
-from lerobot_playbyear.datasets.journal import SCRATCH, flush, flush_all, write_at_once
+from lerobot_playbyear.datasets.files import entries_below, flush, flush_all, write_atomically
+from lerobot_playbyear.datasets.journal import SCRATCH
 from lerobot_playbyear.datasets.repair.report import DatasetDamagedError
 
 _BEGUN = SCRATCH / ".repairing"
@@ -64,7 +64,7 @@ def replace(root: Path, copy: Path, source: str) -> Path:
     names = (real.with_name(f"{real.name}.damaged{f'-{number}' if number else ''}") for number in itertools.count())
     original = next(name for name in names if not os.path.lexists(name))
     flush_all(copy)
-    write_at_once(copy / _FINISHED, json.dumps({"source": source, "original": original.name}))
+    write_atomically(copy / _FINISHED, json.dumps({"source": source, "original": original.name}))
     os.rename(real, original)
     try:
         os.rename(copy, real)

@@ -1,4 +1,4 @@
-"""How a LeRobotDataset carries sound.
+"""How a LeRobotDataset carries sound, and whether features and frames can become one.
 
 Every microphone is one column `observation.audio.<microphone>`: a row holds the samples heard since the previous
 frame, so its length is `sample_rate / fps`, an integer. Integers are PCM at full scale, floats are already in
@@ -6,14 +6,13 @@ frame, so its length is `sample_rate / fps`, an integer. Integers are PCM at ful
 a plain LeRobotDataset v3.0.
 """
 
-import wave
 from collections.abc import Iterable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -173,34 +172,135 @@ def to_pcm_s16(waveform: np.ndarray) -> np.ndarray:
     return np.clip(scaled, -_PCM_S16_FULL_SCALE, _PCM_S16_FULL_SCALE - 1).astype(np.int16)
 
 
-def pcm_channels(waveform: np.ndarray) -> np.ndarray:
-    """Sound (n,) or (n, channels) as (n, channels) int16 PCM. Raises as `to_pcm_s16`, also where the shape is another."""
-    samples = to_pcm_s16(waveform)
-    if samples.ndim not in (1, 2):
-        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
-    return samples[:, None] if samples.ndim == 1 else samples
-
-
-def write_wav(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
-    """Write sound as a 16-bit WAV file.
+def differences(
+    there: Mapping[str, Mapping[str, Any]],
+    here: Mapping[str, Mapping[str, Any]],
+    keys: Iterable[str] | None = None,
+    pictures_as_stored: bool = True,
+) -> list[str]:
+    """In what the features of two datasets, or of a dataset and what would be written, differ.
 
     Args:
-        path: The file to write; its folder is made.
-        waveform: (n,) or (n, channels), int16 PCM or floats in [-1, 1].
-        sample_rate: Samples per second [Hz].
+        there: The features of one.
+        here: Those of the other.
+        keys: Which to compare; None: all but those that LeRobot adds itself.
+        pictures_as_stored: Whether pictures that are stored one by one differ from a video.
 
     Returns:
-        The path of the file.
+        A phrase for each difference in type, shape or sample rate, and in the names of numbers where both have them, such
+        as "action is float32 (7,) there and absent here".
+    """
+    if keys is None:
+        from lerobot.utils.constants import DEFAULT_FEATURES
+
+        keys = sorted((there.keys() | here.keys()) - DEFAULT_FEATURES.keys())
+    found = []
+    for key in keys:
+        old, new = (_describe(features.get(key), pictures_as_stored) for features in (there, here))
+        old_names, new_names = (_number_names(features.get(key)) for features in (there, here))
+        if old != new:
+            found.append(f"{key} is {old} there and {new} here")
+        elif old_names and new_names and old_names != new_names:
+            found.append(f"the numbers of {key} are {', '.join(old_names)} there and {', '.join(new_names)} here")
+    return found
+
+
+def _describe(feature: Mapping[str, Any] | None, pictures_as_stored: bool) -> str:
+    if feature is None:
+        return "absent"
+    kind = "picture" if feature["dtype"] in ("image", "video") and not pictures_as_stored else feature["dtype"]
+    rate = (feature.get("info") or {}).get("sample_rate")
+    return f"{kind} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
+
+
+def _number_names(feature: Mapping[str, Any] | None) -> list[str]:
+    """What the numbers of a vector are called; those of a picture's axes tell nothing."""
+    names = None if feature is None or len(feature["shape"]) != 1 else feature.get("names")
+    return [str(name) for name in names] if isinstance(names, list | tuple | dict) else []
+
+
+def check_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> None:
+    """Whether a dataset of these features can be written.
+
+    Args:
+        features: LeRobot features, without the ones LeRobot adds itself.
+        fps: Frames per second.
 
     Raises:
-        ValueError: If the samples are neither, or the shape is another.
+        ValueError: Naming the key, the value seen and the value wanted.
     """
-    samples = pcm_channels(waveform)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(samples.shape[1])
-        file.setsampwidth(2)
-        file.setframerate(sample_rate)
-        file.writeframes(np.ascontiguousarray(samples).astype("<i2").tobytes())
-    return path
+    if not isinstance(fps, int) or isinstance(fps, bool) or fps < 1:
+        raise InputError(f"fps={fps!r}: wanted a whole number of frames per second, 1 or more.")
+    for key, feature in features.items():
+        _check_shape(key, feature)
+        if not key.startswith(AUDIO_PREFIX):
+            _check_type(key, feature)
+    check_audio_features(features, fps)
+    for key in audio_keys(features):
+        rate = features[key]["info"]["sample_rate"]
+        if not isinstance(rate, int):  # a reader takes any number that is whole; what is written is plain
+            raise InputError(
+                f"'{key}' has sample_rate {rate!r}; wanted a whole number of Hz, a Python int such as 16000."
+            )
+
+
+def check_frame(frame: Mapping[str, Any], features: Mapping[str, Mapping[str, Any]]) -> None:
+    """Whether a frame can become part of an episode.
+
+    Args:
+        frame: A numpy array of its dtype and shape per feature, and `task`.
+        features: All features of the dataset.
+
+    Raises:
+        InputError: Naming the key, the value seen and the value wanted.
+    """
+    from lerobot.datasets.feature_utils import validate_frame
+
+    with errors_of_input():
+        validate_frame(dict(frame), dict(features))
+    if not isinstance(frame["task"], str):
+        raise InputError(f"'task' is {frame['task']!r}; wanted a text that says what is done.")
+    for key in audio_keys(features):
+        sound = frame[key]
+        if np.issubdtype(sound.dtype, np.floating):
+            wrong = ~(np.abs(sound) <= 1)  # true for NaN
+            if wrong.any():
+                index = int(wrong.argmax())
+                raise InputError(
+                    f"'{key}': sample {index} is {sound[index]:g}; floats are sound in [-1, 1]. Divide integers by "
+                    "their full scale (32768 for 16 bits), clip what is louder, and put 0 where nothing was heard."
+                )
+
+
+def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
+    for name in ("dtype", "shape"):
+        if name not in feature:
+            raise InputError(f"'{key}' has no {name}: give dtype, shape and names, as LeRobot's features have them.")
+    shape = feature["shape"]
+    sizes = shape if isinstance(shape, tuple | list) else [None]
+    if "/" in key or not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
+        raise InputError(
+            f"'{key}' has shape {shape!r}; wanted a name without '/', and a tuple of positive whole numbers."
+        )
+    if key.startswith(AUDIO_PREFIX) and len(shape) > 1:
+        n_channels = min(shape)
+        advice = (
+            f"wanted ({max(shape)},)"
+            if n_channels == 1
+            else f"every microphone is its own key: write {n_channels} features of shape ({max(shape)},), such as "
+            f"'{key}_left' and '{key}_right'"
+        )
+        raise InputError(f"'{key}' has shape {tuple(shape)}; {advice}.")
+
+
+def _check_type(key: str, feature: Mapping[str, Any]) -> None:
+    """Whether LeRobot's files can hold a feature that is no sound."""
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    own = {key: {**feature, "shape": tuple(feature["shape"])}}
+    try:
+        get_hf_features_from_features(own).arrow_schema  # noqa: B018  (raises for what it does not know)
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(
+            f"'{key}' has dtype {feature['dtype']!r} and shape {feature['shape']!r}, which no dataset can hold: {error}"
+        ) from error
