@@ -24,13 +24,13 @@ from test_attach_audio import silent_dataset, write_sounds
 
 from lerobot_playbyear.audio import attached_sound
 from lerobot_playbyear.audio.attach import attach_audio
-from lerobot_playbyear.datasets import EpisodeStore, audio_feature, opening, parquet_files, resample
+from lerobot_playbyear.datasets import EpisodeStore, audio_feature, opening, parquet, resample
 from lerobot_playbyear.datasets.audio_files import Resampled
-from lerobot_playbyear.datasets.columns import with_values
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
+from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.datasets.repair import carry_out, check_dataset, repair_dataset
 from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 from lerobot_playbyear.datasets.video_pictures import video_pictures
@@ -76,13 +76,13 @@ def peak_of_process(work: Callable[[], object]) -> int:
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Pieces of 16 kB, so that a short episode has many."""
-    for module in (parquet_files, attached_sound, carry_out):
+    for module in (parquet, attached_sound, carry_out):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**14)
 
 
 @pytest.fixture
 def megabyte_pieces(monkeypatch):
-    for module in (parquet_files, attached_sound, carry_out):
+    for module in (parquet, attached_sound, carry_out):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**20)
 
 
@@ -243,7 +243,7 @@ def test_attaching_in_pieces_gives_the_same_dataset_and_holds_no_file(tmp_path, 
     silent_dataset(tmp_path / "silent")
     files = write_sounds(tmp_path / "sound")
     in_pieces = attach_audio(attach_config(tmp_path / "silent", tmp_path / "pieces", files))
-    for module in (parquet_files, attached_sound):
+    for module in (parquet, attached_sound):
         module.PIECE_BYTES = 2**26  # put back by the fixture
     at_once = attach_audio(attach_config(tmp_path / "silent", tmp_path / "once", files))
     tables = [pq.read_table(root / "data") for root in (in_pieces, at_once)]
@@ -273,7 +273,7 @@ def test_repairing_in_pieces_gives_the_same_dataset(tmp_path, small_pieces, use_
         (data,) = root.glob("data/*/*.parquet")
         data.write_bytes(data.read_bytes()[:-8])  # as a recording that was killed leaves it
         assert repair_dataset(root).kept == {0: 0, 1: 1, 2: 2}
-        for module in (parquet_files, carry_out):
+        for module in (parquet, carry_out):
             module.PIECE_BYTES = 2**26
     tables = [pq.read_table(root / "data") for root in (*roots, tmp_path / "whole")]
     assert tables[0].equals(tables[1])
@@ -308,12 +308,12 @@ def test_a_damaged_row_group_gives_no_rows_however_large_it_is(tmp_path, small_p
     content = bytearray(path.read_bytes())
     content[offset + 60000] ^= 1
     path.write_bytes(content)
-    with parquet_files.open_checked(path) as file:
-        found = list(parquet_files.read_row_groups(file))
+    with parquet.open_checked(path) as file:
+        found = list(parquet.read_row_groups(file))
     good = [part for part in found if isinstance(part, pa.Table)]
     assert len(good) > 1
     assert pa.concat_tables(good).equals(table.slice(0, 100))
-    assert [type(part) for part in found[len(good) :]] == [parquet_files.ParquetDamageError]
+    assert [type(part) for part in found[len(good) :]] == [parquet.ParquetDamageError]
 
 
 def test_a_long_episode_is_written_in_row_groups_that_a_reader_can_hold(tmp_path, small_pieces):
@@ -326,7 +326,7 @@ def test_a_long_episode_is_written_in_row_groups_that_a_reader_can_hold(tmp_path
     file = pq.read_metadata(path)
     rows = [file.row_group(i).num_rows for i in range(file.num_row_groups)]
     assert sum(rows) == 30
-    assert max(rows) * 2 * BLOCK <= parquet_files.PIECE_BYTES
+    assert max(rows) * 2 * BLOCK <= parquet.PIECE_BYTES
 
 
 @pytest.mark.parametrize("episodes", [None, [0, 2]])

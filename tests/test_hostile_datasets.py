@@ -28,7 +28,7 @@ from PIL import Image
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.datasets.confines import check_links
+from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.repair import check_dataset
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import at_a_rate_of_aac
@@ -507,7 +507,7 @@ def _claims(kind: str, root: Path) -> None:
 _OPEN = """
 import resource, sys
 from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.datasets.confines import check_links
+from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
 from lerobot_playbyear.inspection.source import InspectionError
 from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_playbyear.datasets.columns import with_values
 from lerobot_playbyear.datasets.features import audio_feature
+from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.inspection import InspectionError, Verdict
 from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.onsets import sudden_sounds

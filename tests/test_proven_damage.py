@@ -10,10 +10,10 @@ import pyarrow as pa
 import pytest
 from recording_factory import FEATURES, FPS, REPO_ID, episode_frames
 
-from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.files import is_listed, list_files
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing, read_table
+from lerobot_playbyear.datasets.info import check_dataset_files
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, parsing, read_table
 from lerobot_playbyear.datasets.repair import check_dataset, repair_dataset, repairing
 from lerobot_playbyear.datasets.repair.rescue import rescue
 from lerobot_playbyear.datasets.repair.video_times import picture_times

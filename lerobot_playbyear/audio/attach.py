@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lerobot_playbyear.audio.audio_layout import has_audio_files, read_layout
-from lerobot_playbyear.datasets.confines import check_links
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 from lerobot_playbyear.datasets.files import (
@@ -24,8 +23,9 @@ from lerobot_playbyear.datasets.files import (
     flush_all,
     list_files,
 )
+from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.opening import open_dataset
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError
+from lerobot_playbyear.datasets.parquet import ParquetDamageError
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

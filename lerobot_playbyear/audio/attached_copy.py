@@ -18,10 +18,11 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attached_sound import EpisodesSound
 from lerobot_playbyear.audio.audio_layout import AUDIO_FOLDER
-from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.features import audio_feature, audio_keys
-from lerobot_playbyear.datasets.parquet_files import (
+from lerobot_playbyear.datasets.info import read_info
+from lerobot_playbyear.datasets.parquet import (
     ParquetDamageError,
+    column_to_numpy,
     open_checked,
     read_row_groups,
     read_table,
@@ -117,7 +118,7 @@ def write_changed(root: Path, target: Path, change: DatasetChange) -> None:
     Args:
         change: In what it differs.
     """
-    info = json.loads((root / INFO_PATH).read_text())
+    info = read_info(root)
     features = _changed_features(info["features"], change)
     in_columns = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in features.items()}
     schema = get_hf_features_from_features(in_columns).arrow_schema

@@ -9,9 +9,8 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramError, PicturePlan
 from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture
-from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.long_dataset import LongDataset
-from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES
+from lerobot_playbyear.datasets.parquet import PIECE_BYTES, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.statistics import Stats, channel_stats
 from lerobot_playbyear.datasets.tensors import read_rows
 

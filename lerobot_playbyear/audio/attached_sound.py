@@ -13,9 +13,8 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled, audio_pieces
-from lerobot_playbyear.datasets.columns import numpy_to_column
 from lerobot_playbyear.datasets.long_dataset import LongDataset
-from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES
+from lerobot_playbyear.datasets.parquet import PIECE_BYTES, numpy_to_column
 from lerobot_playbyear.datasets.statistics import Stats, repeated_stats
 
 

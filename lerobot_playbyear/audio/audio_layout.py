@@ -17,12 +17,11 @@ from typing import Any
 
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.columns import check_dataset_files
-from lerobot_playbyear.datasets.confines import check_links, file_inside
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, AUDIO_PREFIX
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, list_files
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, read_table
+from lerobot_playbyear.datasets.info import check_dataset_files, check_links, file_inside, read_info
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, read_table
 
 AUDIO_FOLDER = "audio"
 DEFAULT_AUDIO_PATH = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
@@ -110,9 +109,9 @@ def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> 
     with errors_of_input():
         footers = check_dataset_files(repo_id, root)
         check_links(root)
-        info = json.loads((root / INFO_PATH).read_text())
-        fps, features = info.get("fps"), info["features"]
-        if isinstance(fps, bool) or not isinstance(fps, int | float) or fps % 1 or fps < 1:
+        info = read_info(root)
+        fps, features = info["fps"], info["features"]
+        if fps % 1:
             raise AudioLayoutError(
                 f"{root / INFO_PATH}: fps is {fps!r}; wanted a whole number of frames per second. Correct it."
             )
@@ -125,7 +124,7 @@ def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> 
         tracks = [
             _track(root, key, feature, template, rows, sum(lengths) / fps, start_time_s)
             for key, feature in features.items()
-            if feature.get("dtype") == AUDIO_DTYPE
+            if feature["dtype"] == AUDIO_DTYPE
         ]
         _check_names(tracks, set(features))
     return AudioLayout(root, int(fps), lengths, tracks)

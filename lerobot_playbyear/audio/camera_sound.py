@@ -21,9 +21,9 @@ from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone
 from lerobot_playbyear.audio.sample_strip import Strip, n_kept, read_strip, read_timecode
 from lerobot_playbyear.audio.session_files import SESSIONS, SessionSound, find_session
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
-from lerobot_playbyear.datasets.columns import column_to_numpy, numpy_to_column
 from lerobot_playbyear.datasets.features import IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
+from lerobot_playbyear.datasets.parquet import column_to_numpy, numpy_to_column
 from lerobot_playbyear.datasets.statistics import Stats, numeric_stats
 from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 

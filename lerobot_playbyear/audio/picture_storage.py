@@ -1,7 +1,6 @@
 """Pictures of sound in a dataset: as images in its data files, or as video beside them."""
 
 import io
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,13 +8,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from lerobot.configs.video import RGBEncoderConfig
-from lerobot.datasets.utils import DEFAULT_VIDEO_PATH, INFO_PATH
+from lerobot.datasets.utils import DEFAULT_VIDEO_PATH
 from lerobot.datasets.video_utils import encode_video_frames, get_video_info
 from PIL import Image
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.attached_copy import DatasetChange
 from lerobot_playbyear.audio.attached_pictures import EpisodePictures
+from lerobot_playbyear.datasets.info import read_info
 from lerobot_playbyear.datasets.long_dataset import scratch_folder
 from lerobot_playbyear.datasets.statistics import Stats
 from lerobot_playbyear.datasets.video_seal import seal
@@ -71,7 +71,7 @@ def video_change(
     Raises:
         OSError: A file cannot be written.
     """
-    info = json.loads((source / INFO_PATH).read_text())
+    info = read_info(source)
     template = info.get("video_path") or DEFAULT_VIDEO_PATH
     chunk_size = int(info["chunks_size"])
     added: dict[str, dict[str, Any]] = {}

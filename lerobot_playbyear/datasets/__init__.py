@@ -4,7 +4,6 @@ from typing import TYPE_CHECKING
 
 from lerobot_playbyear import lazy_names
 from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio, write_wav
-from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_clock import note_episode_start
 from lerobot_playbyear.datasets.features import (
     AUDIO_PREFIX,
@@ -13,6 +12,7 @@ from lerobot_playbyear.datasets.features import (
     check_audio_features,
     episode_waveform,
 )
+from lerobot_playbyear.datasets.info import check_dataset_files
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.episode_store import EpisodeStore

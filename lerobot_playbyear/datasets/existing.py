@@ -1,16 +1,15 @@
 """What is in a folder already, and whether episodes can be appended to it."""
 
-import json
 import os
 import shlex
 from pathlib import Path
 
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-from lerobot_playbyear.datasets.confines import OutsideError, check_templates
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.features import differences
 from lerobot_playbyear.datasets.files import list_files
+from lerobot_playbyear.datasets.info import InfoError, OutsideError, read_info
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH
 from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
 from lerobot_playbyear.datasets.settling import INFO
@@ -56,7 +55,6 @@ def check_undamaged(root: Path) -> None:
     """
     try:
         report = check_dataset(root, thorough=False)
-        info = json.loads((root / INFO).read_text()) if report.is_sound else {}
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
     if not report.is_sound:
@@ -68,8 +66,8 @@ def check_undamaged(root: Path) -> None:
             "after them move up."
         )
     try:
-        check_templates(root, info)
-    except OutsideError as error:
+        read_info(root)
+    except (InfoError, OutsideError) as error:
         raise DatasetDamagedError(f"{error} Nothing was changed.") from error
 
 

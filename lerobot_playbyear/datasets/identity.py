@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
-from lerobot_playbyear.datasets.confines import file_inside
+from lerobot_playbyear.datasets.info import file_inside
+from lerobot_playbyear.datasets.parquet import column_to_numpy
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset

@@ -11,7 +11,7 @@ from datasets.table import table_cast
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 
-from lerobot_playbyear.datasets.parquet_files import open_parquet, row_group_parts
+from lerobot_playbyear.datasets.parquet import open_checked, row_group_parts
 
 
 class LongDataset:
@@ -43,7 +43,7 @@ class LongDataset:
         features = get_hf_features_from_features(self.meta.features)
         with ArrowWriter(features=features, path=str(path)) as writer:
             for name in sorted((self.root / "data").glob("*/*.parquet")):
-                with open_parquet(name) as file:
+                with open_checked(name) as file:
                     for group in range(file.num_row_groups):
                         for table in row_group_parts(file, group):
                             is_wanted = (

@@ -5,13 +5,12 @@ episode as one: two hours with two microphones take more than 4 GB. Such a datas
 imported when the files have been looked at, so that damage is told at once.
 """
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, check_audio_features
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
+from lerobot_playbyear.datasets.info import check_dataset_files, read_info
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
@@ -52,9 +51,6 @@ def _check_sound(folder: Path) -> None:
     """Refuses sound in files, as LeRobot's pull request 2824 has it, which LeRobot itself cannot open."""
     if not (folder / INFO_PATH).is_file():
         return
-    try:
-        features = json.loads((folder / INFO_PATH).read_text()).get("features")
-        in_files = {key: one for key, one in features.items() if one.get("dtype") == AUDIO_DTYPE}
-    except (ValueError, AttributeError):
-        return  # LeRobot says what is wrong
+    features = read_info(folder)["features"]
+    in_files = {key: one for key, one in features.items() if one["dtype"] == AUDIO_DTYPE}
     check_audio_features(in_files, 1)

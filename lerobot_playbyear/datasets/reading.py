@@ -14,12 +14,12 @@ from lerobot.utils.import_utils import get_safe_default_video_backend
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.columns import episode_bounds
 from lerobot_playbyear.datasets.disk_columns import DEFAULT_CACHE, disk_columns
 from lerobot_playbyear.datasets.features import IS_FIRST, check_audio_features
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.identity import dataset_identity
 from lerobot_playbyear.datasets.long_dataset import LongDataset
+from lerobot_playbyear.datasets.parquet import episode_bounds
 from lerobot_playbyear.datasets.resampling import features_at, resampled_pieces
 from lerobot_playbyear.datasets.shrinking import kept_shape, shrink
 from lerobot_playbyear.datasets.tensors import image_pieces, value_pieces, video_pieces

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_playbyear.datasets.audio_files import Resampled
-from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.features import samples_per_frame, to_pcm_s16
+from lerobot_playbyear.datasets.parquet import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.tensors import check_finite, finite_rows, read_rows
 
 if TYPE_CHECKING:

@@ -19,14 +19,15 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.io_utils import load_stats, write_info
 from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DatasetInfo
 
-from lerobot_playbyear.datasets.columns import numpy_to_column, with_values
 from lerobot_playbyear.datasets.journal import STAGING
-from lerobot_playbyear.datasets.parquet_files import (
+from lerobot_playbyear.datasets.parquet import (
     ParquetDamageError,
     fit_to_schema,
+    numpy_to_column,
     open_checked,
     read_row_groups,
     read_table,
+    with_values,
     write_tables,
 )
 from lerobot_playbyear.datasets.staging import Staging, last_episode

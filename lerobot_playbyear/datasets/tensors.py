@@ -17,9 +17,10 @@ import numpy as np
 import pyarrow as pa
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
-from lerobot_playbyear.datasets.confines import file_inside, open_picture
+from lerobot_playbyear.datasets.confines import open_picture
+from lerobot_playbyear.datasets.info import file_inside
 from lerobot_playbyear.datasets.long_dataset import LongDataset
+from lerobot_playbyear.datasets.parquet import column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 
 _PICTURES_AT_ONCE = 32

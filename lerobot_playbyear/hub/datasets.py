@@ -9,8 +9,8 @@ from tempfile import TemporaryDirectory
 
 from huggingface_hub import DatasetCard, HfApi
 
-from lerobot_playbyear.datasets.confines import OutsideError, check_links
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, FolderLockedError, entries_below
+from lerobot_playbyear.datasets.info import OutsideError, check_links
 from lerobot_playbyear.datasets.journal import JournalError, lock_dataset
 from lerobot_playbyear.hub.dataset_card import card_tags, describe_dataset
 from lerobot_playbyear.hub.preview import film_preview

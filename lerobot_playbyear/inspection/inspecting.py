@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.confines import OutsideError, check_links_out
+from lerobot_playbyear.datasets.info import OutsideError, check_links_out
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 from lerobot_playbyear.inspection.verdict import Verdict
 

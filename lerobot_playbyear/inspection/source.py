@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_playbyear.datasets.columns import column_to_numpy, episode_bounds
-from lerobot_playbyear.datasets.confines import ClaimError, OutsideError, file_inside, open_picture
+from lerobot_playbyear.datasets.confines import open_picture
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
+from lerobot_playbyear.datasets.info import InfoError, OutsideError, file_inside
 from lerobot_playbyear.datasets.opening import open_dataset
+from lerobot_playbyear.datasets.parquet import column_to_numpy, episode_bounds
 from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ class DatasetSource:
             dataset = open_dataset(repo_id, root, episodes, video_backend)
             source = cls(dataset, video_backend)
             n_episodes = len(source.episodes)
-        except (OutsideError, ClaimError) as error:
+        except (OutsideError, InfoError) as error:
             raise InspectionError(str(error)) from error
         except Exception as error:  # whatever LeRobot, Arrow or the network may raise
             where = f"in '{folder}'" if root is not None else f"'{repo_id}' (neither in '{folder}' nor from the Hub)"

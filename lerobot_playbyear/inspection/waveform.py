@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
+from lerobot_playbyear.datasets.parquet import column_to_numpy
 
 FULL_SCALE = 32768.0
 """Of 16-bit PCM, in its steps."""

@@ -18,10 +18,10 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
 from torch import Tensor
 
-from lerobot_playbyear.datasets.columns import check_dataset_files
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
 from lerobot_playbyear.datasets.errors import errors_of_input
 from lerobot_playbyear.datasets.files import check_can_be_made
+from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, run_weights
 from lerobot_playbyear.hub.policies import push_policy

@@ -4,8 +4,8 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from torch import Tensor
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.datasets.parquet import column_to_numpy
 from lerobot_playbyear.training.parts import TrainingParts
 from lerobot_playbyear.training.windows import PolicyWindows
 

@@ -19,10 +19,16 @@ from lerobot.datasets.utils import (
     STATS_PATH,
 )
 
-from lerobot_playbyear.datasets.columns import column_to_numpy, with_values
 from lerobot_playbyear.datasets.episode_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.files import list_files, take_over
-from lerobot_playbyear.datasets.parquet_files import PIECE_BYTES, ParquetDamageError, open_checked, write_tables
+from lerobot_playbyear.datasets.parquet import (
+    PIECE_BYTES,
+    ParquetDamageError,
+    column_to_numpy,
+    open_checked,
+    with_values,
+    write_tables,
+)
 from lerobot_playbyear.datasets.repair.episodes import Row
 from lerobot_playbyear.datasets.repair.frames import DataFile
 from lerobot_playbyear.datasets.repair.plan import Kept, Plan

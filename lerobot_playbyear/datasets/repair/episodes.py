@@ -12,7 +12,7 @@ import numpy as np
 from lerobot.datasets.utils import EPISODES_DIR, DatasetInfo
 
 from lerobot_playbyear.datasets.files import list_files
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing, read_table
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, parsing, read_table
 from lerobot_playbyear.datasets.repair.frames import Run
 from lerobot_playbyear.datasets.repair.report import RepairReport, name_episodes
 

@@ -14,10 +14,9 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.utils import DatasetInfo
 from PIL import Image, UnidentifiedImageError
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
 from lerobot_playbyear.datasets.confines import PICTURE_FORMATS
 from lerobot_playbyear.datasets.files import list_files
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, read_row_groups
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, column_to_numpy, open_checked, read_row_groups
 from lerobot_playbyear.datasets.repair.info import check_columns, own_schema
 from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.repair.rescue import rescue

@@ -20,10 +20,10 @@ from lerobot.datasets.utils import (
 )
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from lerobot_playbyear.datasets.confines import is_template
 from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.datasets.files import is_listed, list_files, read_listed
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, open_checked, parsing
+from lerobot_playbyear.datasets.info import _TEMPLATE
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, parsing
 from lerobot_playbyear.datasets.repair.report import DatasetDamagedError, RepairReport
 
 _TOLERANCE = 0.01  # of rates
@@ -185,7 +185,7 @@ def _new_info(
 
 
 def _leads_somewhere(root: Path, template: str | None) -> bool:
-    if not isinstance(template, str) or not is_template(template):
+    if not isinstance(template, str) or not _TEMPLATE.fullmatch(template):
         return False
     try:
         return bool(list_files(root, re.sub(r"\{[^{}]*\}", "*", template)))

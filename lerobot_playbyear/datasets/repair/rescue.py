@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.files import naming
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, leaf_columns, open_checked, parsing
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, leaf_columns, open_checked, parsing
 from lerobot_playbyear.datasets.repair import thrift
 from lerobot_playbyear.datasets.repair.thrift import Elements, Struct, ThriftError
 

@@ -19,10 +19,11 @@ from lerobot.datasets.compute_stats import auto_downsample_height_width, sample_
 from lerobot.datasets.io_utils import cast_stats_to_numpy
 from lerobot.datasets.utils import STATS_PATH, DatasetInfo
 
-from lerobot_playbyear.datasets.columns import column_to_numpy
-from lerobot_playbyear.datasets.confines import file_inside, open_picture
+from lerobot_playbyear.datasets.confines import open_picture
 from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.datasets.files import read_listed
+from lerobot_playbyear.datasets.info import file_inside
+from lerobot_playbyear.datasets.parquet import column_to_numpy
 from lerobot_playbyear.datasets.repair.episodes import Row
 from lerobot_playbyear.datasets.repair.report import RepairReport
 from lerobot_playbyear.datasets.repair.videos import TOLERANCE, video_file

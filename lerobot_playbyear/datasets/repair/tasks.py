@@ -9,7 +9,7 @@ import pandas as pd
 from lerobot.datasets.utils import DEFAULT_TASKS_PATH
 
 from lerobot_playbyear.datasets.files import read_listed
-from lerobot_playbyear.datasets.parquet_files import ParquetDamageError, parsing
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, parsing
 from lerobot_playbyear.datasets.repair.episodes import Episode, Row
 from lerobot_playbyear.datasets.repair.frames import Run
 from lerobot_playbyear.datasets.repair.report import RepairReport, name_episodes

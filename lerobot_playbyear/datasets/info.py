@@ -1,0 +1,270 @@
+"""What a dataset says about itself in `meta/info.json`, and what it may refer to and claim: it may be a stranger's.
+
+Files that it names lie in its folder. A feature claims no more values a row than the data files hold. Whoever opens, copies
+or uploads a dataset reads it through this module. LeRobot, which takes seconds to import, is not needed for that.
+"""
+
+import json
+import math
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePath, PureWindowsPath
+from typing import Any
+
+import pyarrow.parquet as pq
+
+from lerobot_playbyear.datasets.files import (
+    DEFAULT_DATA_PATH,
+    DEFAULT_VIDEO_PATH,
+    EPISODES_DIR,
+    HF_LEROBOT_HOME,
+    INFO_PATH,
+    entries_below,
+    fits,
+    list_files,
+)
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked
+
+INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
+"""That every dataset of LeRobot's has."""
+
+_TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
+_FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
+_MOST_FPS = 1000
+_TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
+
+
+class InfoError(ValueError):
+    """A dataset's `meta/info.json` says what cannot be right, or claims what its files do not hold."""
+
+
+class OutsideError(ValueError):
+    """A dataset refers to something outside its folder."""
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """Reads `meta/info.json`.
+
+    Args:
+        root: The dataset's folder.
+
+    Returns:
+        All its fields. What LeRobot relies on is there and of the right kind; no template leads out of the folder.
+
+    Raises:
+        InfoError: A field is missing or cannot be right, or the dataset is of another version of LeRobot's format.
+        OutsideError: A template, or a feature's name that it is filled with, leads out of the folder.
+        FileNotFoundError: There is none.
+        OSError: It cannot be read now.
+    """
+    path = root / INFO_PATH
+    try:
+        info = json.loads(path.read_bytes())
+        if not isinstance(info, dict):
+            raise ValueError("it holds no fields")
+        _check_version(root, info.get("codebase_version"))
+        _check_fields(info)
+    except InfoError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InfoError(
+            f"{path} is damaged: {error}. Put it back from a copy, or let it be made anew: playbyear-repair --root={root} "
+            "--like=<folder of a dataset that was recorded with the same settings>."
+        ) from error
+    _check_templates(root, info)
+    return info
+
+
+def file_inside(root: Path, name: str | PurePath) -> Path:
+    """A file that a dataset names.
+
+    Raises:
+        OutsideError: The name leads out of the folder.
+    """
+    windows = PureWindowsPath(name)
+    if windows.anchor or PurePath(name).is_absolute() or ".." in (*windows.parts, *PurePath(name).parts):
+        raise OutsideError(f"The dataset in '{root}' names the file '{name}', which is not in its folder.")
+    return root / name
+
+
+def check_dataset_files(
+    repo_id: str, root: str | Path | None = None, revision: str | None = None
+) -> list[pq.FileMetaData]:
+    """Refuse a local dataset that is empty or was cut off while it was written, or that no one should trust.
+
+    Where no local dataset is, what the Hub's says about itself is fetched and checked; the rest LeRobot fetches later.
+
+    Args:
+        repo_id: The dataset's name.
+        root: Its folder; None means LeRobot's own place for `repo_id`.
+        revision: Of the dataset on the Hub, as LeRobot takes it.
+
+    Returns:
+        What its data files say of themselves; nothing where no local dataset is.
+
+    Raises:
+        ValueError: Naming the file that is damaged, the folder without data, or what leads out of the folder or claims
+            more than is there.
+        OSError: A file cannot be read now, which says nothing about what it holds.
+    """
+    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    if not (folder / INFO_PATH).is_file():
+        from lerobot.datasets import LeRobotDatasetMetadata
+
+        meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+        check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
+        return []
+    footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
+    for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, f"{EPISODES_DIR}/*/*.parquet")]:
+        try:
+            with open_checked(path) as file:
+                footers[path.relative_to(folder).parts[0]].append(file.metadata)
+        except ParquetDamageError as error:
+            raise ValueError(
+                f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
+                f"killed, its episodes can be saved: playbyear-repair --root={folder}"
+            ) from error
+    if not footers["data"]:
+        raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
+    check_claims(folder, footers["data"], sum(footer.num_rows for footer in footers["meta"]))
+    return footers["data"]
+
+
+def check_claims(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) -> None:
+    """Refuses a dataset whose `meta/info.json` claims far more than its files hold.
+
+    Args:
+        root: The dataset's folder.
+        footers: Of its data files.
+        n_episodes: The rows of its `meta/episodes`.
+
+    Raises:
+        InfoError: A shape or a number of episodes is out of all proportion.
+        Exception: As `read_info`.
+    """
+    info = read_info(root)
+    held = _values_held(footers, list(info["features"]))
+    for key, feature in info["features"].items():
+        claimed = math.prod(feature["shape"])
+        if key in held and claimed > _TOLERANCE * held[key]:
+            raise InfoError(
+                f"{root / INFO_PATH}: '{key}' has shape {feature['shape']}, {claimed:,} values a row, but the data files "
+                f"hold {held[key]:,.4g} a row. Correct the shape."
+            )
+    total = info["total_episodes"]
+    if total > _TOLERANCE * max(n_episodes, 1):
+        raise InfoError(
+            f"{root / INFO_PATH}: total_episodes is {total:,}, but meta/episodes has {n_episodes:,}. "
+            f"Repair it: playbyear-repair --root={root}"
+        )
+
+
+def check_links(root: Path) -> None:
+    """Refuses links that lead out of a dataset's folder: a copy or an upload would hold what they lead to.
+
+    Args:
+        root: The dataset's folder, also a snapshot in the Hub's cache, whose files are links to the cache's.
+
+    Raises:
+        OutsideError: Naming the link; or one to a folder where the dataset's files lie, which would be left out.
+    """
+    check_links_out(root)
+    for path in entries_below(root):
+        name = path.relative_to(root)
+        if path.is_symlink() and path.is_dir() and fits(name, *_FOLDERS):
+            raise OutsideError(
+                f"'{path}' is a link to a folder, whose files would be left out. Put the folder itself there."
+            )
+
+
+def check_links_out(root: Path) -> None:
+    """As `check_links` for a page, which reads through links: those to folders within the dataset's are allowed."""
+    home = root.resolve()
+    if home.parent.name == "snapshots" and home.parent.parent.name.startswith("datasets--"):
+        home = home.parent.parent  # the Hub's cache of this dataset: its files lie in blobs/
+    for path in entries_below(root):
+        real = real_path(path)
+        if path.is_symlink() and not real.is_relative_to(home):
+            raise OutsideError(
+                f"'{path}' is a link to '{real}', outside the dataset's folder. Put the file itself there if it "
+                "belongs to the dataset, or remove the link."
+            )
+
+
+def real_path(path: Path) -> Path:
+    """Where a path leads; `Path.resolve` raises where a link leads to itself."""
+    return Path(os.path.realpath(path))
+
+
+def _check_version(root: Path, version: Any) -> None:
+    found = re.fullmatch(r"v(\d+)\..*", version) if isinstance(version, str) else None
+    if found is None:
+        raise ValueError(f"codebase_version is {version!r}; wanted 'v3.0'")
+    if int(found[1]) < 3:
+        raise InfoError(
+            f"{root} is a dataset of LeRobot's older format {version}; wanted v3.0. Convert it with "
+            "`python -m lerobot.scripts.convert_dataset_v21_to_v30`."
+        )
+    if int(found[1]) > 3:
+        raise InfoError(f"{root} was written by a newer LeRobot (format {version}); wanted v3.0. Update lerobot.")
+
+
+def _check_fields(info: Mapping[str, Any]) -> None:
+    """Raises a ValueError that names a field, what it is, and what is wanted."""
+    for name in ("total_episodes", "total_frames", "chunks_size"):
+        if not _is_count(info.get(name)):
+            raise ValueError(f"{name} is {info.get(name)!r}; wanted a whole number")
+    fps = info.get("fps")
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= _MOST_FPS:
+        raise ValueError(f"fps is {fps!r}; wanted a number above 0, and at most {_MOST_FPS:,}")
+    features = info.get("features")
+    if not isinstance(features, dict):
+        raise ValueError(f"features is {features!r}; wanted a dtype and a shape for each")
+    for key in INDEX_COLUMNS:
+        if key not in features:
+            raise ValueError(f"the feature '{key}' is missing")
+    for key, feature in features.items():
+        if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
+            raise ValueError(f"the feature '{key}' has no dtype")
+        shape = feature.get("shape")
+        if not isinstance(shape, list) or not all(map(_is_count, shape)):
+            raise ValueError(f"the feature '{key}' has shape {shape!r}; wanted a list of whole numbers")
+        if not isinstance(feature.get("info") or {}, dict):
+            raise ValueError(f"the feature '{key}' has info {feature['info']!r}; wanted fields such as sample_rate")
+    if not isinstance(info.get("data_path"), str):
+        raise ValueError(f"data_path is {info.get('data_path')!r}; wanted {DEFAULT_DATA_PATH!r}")
+    if not isinstance(info.get("video_path"), str) and any(one["dtype"] == "video" for one in features.values()):
+        raise ValueError(f"video_path is {info.get('video_path')!r}; wanted {DEFAULT_VIDEO_PATH!r}")
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _check_templates(root: Path, info: Mapping[str, Any]) -> None:
+    keys = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    for name, default in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
+        template = info.get(name)
+        if template is None:
+            continue
+        if not isinstance(template, str) or not _TEMPLATE.fullmatch(template):
+            raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
+        for key in keys or [""]:
+            file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))
+
+
+def _values_held(footers: Iterable[pq.FileMetaData], keys: Sequence[str]) -> dict[str, float]:
+    """How many values of each feature of numbers a row has on average; those of pictures and text are left out."""
+    n_values: dict[str, int] = {}
+    n_rows = 0
+    for footer in footers:
+        n_rows += footer.num_rows
+        for group in (footer.row_group(index) for index in range(footer.num_row_groups)):
+            for column in (group.column(index) for index in range(group.num_columns)):
+                key = max(
+                    (key for key in keys if f"{column.path_in_schema}.".startswith(f"{key}.")), key=len, default=None
+                )
+                if key is not None and column.physical_type != "BYTE_ARRAY":
+                    n_values[key] = n_values.get(key, 0) + column.num_values
+    return {key: count / n_rows for key, count in n_values.items()} if n_rows else {}

@@ -1,0 +1,338 @@
+"""Parquet files of frames: columns as arrays, files that lost their end, and how ours are written.
+
+Written with LeRobot's own options (snappy, dictionaries, one row group per episode) and two differences that every
+reader of parquet understands: PCM is stored as the differences of neighbouring samples, in as many bits as these need,
+and every page carries a checksum, so that a flipped bit is found instead of heard.
+"""
+
+import contextlib
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+
+class ParquetDamageError(ValueError):
+    """A parquet file, or a part of it, does not hold what was written."""
+
+
+PIECE_BYTES = 2**26
+"""Of the rows that are in memory together, about: more is read and written in parts."""
+
+_BUFFER_BYTES = 2**20
+_IMPOSSIBLE_BYTES = 2**40  # more memory than any part of a file takes
+_PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
+
+
+@contextlib.contextmanager
+def parsing(path: Path | None = None) -> Iterator[None]:
+    """Tells bytes that are wrong from bytes that cannot be read now, in whatever pyarrow does within.
+
+    Args:
+        path: The file that is read; None where it lies in memory.
+
+    Raises:
+        ParquetDamageError: The bytes were read, and are not what a parquet file holds.
+        OSError: They could not be read, which says nothing about the file.
+        MemoryError: There is no room for them.
+    """
+    try:
+        yield
+    except _PARSE_ERRORS as error:
+        if isinstance(error, ParquetDamageError):
+            raise
+        if isinstance(error, OSError) and error.errno:  # pyarrow sets it where the system refused
+            raise OSError(error.errno, os.strerror(error.errno), error.filename or (path and str(path))) from error
+        if isinstance(error, MemoryError) and not _asks_for_the_impossible(error):
+            raise
+        raise ParquetDamageError(_first_line(error)) from error
+
+
+def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.ParquetFile:
+    """Opens a file for reading with its pages' checksums verified, where it has them.
+
+    Args:
+        path: The file.
+        footer: What is taken for its footer; None: its own.
+
+    Raises:
+        ParquetDamageError: It is not a complete parquet file.
+        OSError: It cannot be read now; nor may later reads, see `parsing`.
+    """
+    with parsing(path):
+        if footer is None:
+            with path.open("rb") as file:
+                if file.read(4) != b"PAR1":
+                    raise ParquetDamageError("it does not begin as a parquet file does")
+        return pq.ParquetFile(
+            path, metadata=footer, page_checksum_verification=True, pre_buffer=False, buffer_size=_BUFFER_BYTES
+        )
+
+
+class DataFile:
+    """A parquet file that is read row group by row group; where one is damaged, the others can still be read.
+
+    Args:
+        path: The file.
+        footer: What is taken for its footer where it has lost its own.
+
+    Attributes:
+        path: The file.
+        footer: Its footer, or what is taken for it.
+        schema: Of its columns.
+        n_rows: All its rows.
+        is_rescued: Whether it has lost its own footer.
+
+    Raises:
+        ParquetDamageError: It is not a complete parquet file.
+        OSError: It cannot be read now.
+    """
+
+    def __init__(self, path: Path, footer: pq.FileMetaData | None = None) -> None:
+        with open_checked(path, footer) as file:
+            self.path, self.footer, self.schema = path, file.metadata, file.schema_arrow
+        self.is_rescued = footer is not None
+        sizes = [self.footer.row_group(group).num_rows for group in range(self.footer.num_row_groups)]
+        self._edges = [0, *np.cumsum(sizes, dtype=int).tolist()]
+        self._last: tuple[int, list[str] | None, pa.Table | ParquetDamageError] | None = None  # what was read last
+
+    @property
+    def n_rows(self) -> int:
+        return self._edges[-1]
+
+    def row_groups(self, columns: list[str] | None = None) -> Iterator[tuple[int, pa.Table | ParquetDamageError]]:
+        """The first row of every row group, and its rows, or what is wrong with them.
+
+        Args:
+            columns: Which to read; None: all.
+
+        Raises:
+            OSError: They cannot be read now.
+            MemoryError: There is no room for them.
+        """
+        with open_checked(self.path, self.footer) as file:
+            yield from zip(self._edges, read_row_groups(file, columns, self.path), strict=False)
+
+    def read(self, start: int, stop: int, columns: list[str] | None = None) -> pa.Table:
+        """Some of the rows. Whoever reads on reads no row group twice.
+
+        Args:
+            start: The first.
+            stop: The one after the last.
+            columns: Which to read; None: all.
+
+        Raises:
+            ParquetDamageError: Some of them are damaged.
+            OSError: They cannot be read now.
+            MemoryError: There is no room for them.
+        """
+        tables = [
+            self._group(group, columns).slice(max(start - first, 0), min(stop, end) - max(start, first))
+            for group, (first, end) in enumerate(zip(self._edges, self._edges[1:], strict=False))
+            if first < stop and end > start
+        ]
+        return pa.concat_tables(tables) if tables else self._empty(columns)
+
+    def _group(self, group: int, columns: list[str] | None) -> pa.Table:
+        if self._last is None or self._last[:2] != (group, columns):
+            with open_checked(self.path, self.footer) as file:
+                self._last = (group, columns, read_row_group(file, group, columns, self.path))
+        table = self._last[2]
+        if isinstance(table, ParquetDamageError):
+            raise ParquetDamageError(f"{self.path} is damaged: {table}.")
+        return table
+
+    def _empty(self, columns: list[str] | None) -> pa.Table:
+        table = self.schema.empty_table()
+        return table if columns is None else table.select(columns)
+
+
+def read_row_groups(
+    file: pq.ParquetFile, columns: list[str] | None = None, path: Path | None = None
+) -> Iterator[pa.Table | ParquetDamageError]:
+    """Every row group of an opened file; arguments and errors as for `read_row_group`."""
+    for group in range(file.num_row_groups):
+        yield read_row_group(file, group, columns, path)
+
+
+def read_row_group(
+    file: pq.ParquetFile, group: int, columns: list[str] | None = None, path: Path | None = None
+) -> pa.Table | ParquetDamageError:
+    """A row group as a table, or what is wrong with it.
+
+    Args:
+        file: An opened file.
+        group: Which.
+        columns: Which to read; None: all.
+        path: Its name, for errors.
+
+    Raises:
+        OSError: The file cannot be read now.
+        MemoryError: There is no room for it.
+    """
+    try:
+        with parsing(path):
+            table = file.read_row_group(group, columns=columns, use_threads=False)
+            table.validate(full=True)
+            return table
+    except ParquetDamageError as error:
+        return error
+
+
+def row_group_parts(file: pq.ParquetFile, index: int, columns: list[str] | None = None) -> Iterator[pa.Table]:
+    """A row group in parts of bounded size. Raises what pyarrow raises where it cannot be read."""
+    group = file.metadata.row_group(index)
+    rows = _rows_within(PIECE_BYTES, group.total_byte_size, group.num_rows)
+    for batch in file.iter_batches(rows, row_groups=[index], columns=columns, use_threads=False):
+        table = pa.Table.from_batches([batch])
+        table.validate(full=True)
+        yield table
+
+
+def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """Reads a whole file, with checksums.
+
+    Raises:
+        ParquetDamageError: A part of it is damaged.
+        OSError: It cannot be read now.
+    """
+    with open_checked(path) as file, parsing(path):
+        table = file.read(columns=columns, use_threads=False)
+        table.validate(full=True)
+    return table
+
+
+def fit_to_schema(table: pa.Table, schema: pa.Schema) -> pa.Table:
+    """A table's columns in the order and types of a schema; what the table lacks is null, what it has more is left.
+
+    Raises:
+        pyarrow.ArrowInvalid: A column's type cannot become the schema's.
+    """
+    columns = [
+        table.column(field.name).cast(field.type)
+        if field.name in table.column_names
+        else pa.nulls(len(table), field.type)
+        for field in schema
+    ]
+    return pa.Table.from_arrays(columns, schema=schema)
+
+
+def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
+    """A column of numbers or of fixed-length lists of numbers, as an array (N,) or (N, values per row).
+
+    Raises:
+        ValueError: If rows are missing or of different lengths.
+    """
+    parts = [_flat(chunk) for chunk in column.chunks]
+    flat = np.concatenate(parts) if parts else np.empty(0)
+    if not _is_list(column.type):
+        return flat
+    if len(column) == 0 or len(flat) % len(column):
+        raise ValueError(f"{len(flat)} values in {len(column)} rows: the rows differ in length, or some are missing")
+    return flat.reshape(len(column), -1)
+
+
+def numpy_to_column(values: np.ndarray, kind: pa.DataType) -> pa.Array:
+    """Numbers (N,) or (N, values per row) as a column of some type, as a feature of this shape has it."""
+    column = pa.array(np.ascontiguousarray(values).reshape(-1))
+    if pa.types.is_fixed_size_list(kind):
+        column = pa.FixedSizeListArray.from_arrays(column, kind.list_size)
+    return column.cast(kind)
+
+
+def with_values(table: pa.Table, name: str, values: Sequence | np.ndarray) -> pa.Table:
+    """A table with other values in one of its columns, which keeps its place and its type."""
+    field = table.schema.field(name)
+    return table.set_column(table.column_names.index(name), field, pa.array(values, field.type))
+
+
+def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
+    """First row, and row after the last, of every episode, from the episode of each row (N,)."""
+    changes = np.flatnonzero(np.diff(episode_index)) + 1
+    starts = [0, *changes.tolist()]
+    return starts, [*starts[1:], len(episode_index)]
+
+
+def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
+    """Writes a file with one row group per table, or several where a table is large: readers hold a whole one.
+
+    Args:
+        path: The file; its folder is made.
+        tables: All of one schema.
+        schema: Theirs.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with pq.ParquetWriter(path, schema, **writer_options(schema)) as writer:
+        for table in tables:
+            writer.write_table(table, row_group_size=_rows_within(PIECE_BYTES, table.nbytes, len(table)))
+
+
+def writer_options(schema: pa.Schema) -> dict:
+    """Options of `pyarrow.parquet.ParquetWriter` for a data file."""
+    leaves = [leaf for field in schema for leaf in leaf_columns(field.name, field.type)]
+    pcm = {leaf.path for leaf in leaves if leaf.nested and leaf.kind == pa.int16()}
+    counters = {leaf.path for leaf in leaves if not leaf.nested and leaf.kind == pa.int64()}  # most go up by one
+    pictures = {leaf.path for leaf in leaves if pa.types.is_binary(leaf.kind)}
+    deltas = pcm | counters
+    return {
+        "compression": "snappy",
+        "use_dictionary": [leaf.path for leaf in leaves if leaf.path not in deltas | {"timestamp"}],
+        "column_encoding": dict.fromkeys(deltas, "DELTA_BINARY_PACKED") or None,
+        "write_page_checksum": True,
+        # Readers skip row groups by these; for sound and pictures they would only take room.
+        "write_statistics": [leaf.path for leaf in leaves if not leaf.nested and leaf.path not in pictures] or False,
+    }
+
+
+class Leaf(NamedTuple):
+    """A column of parquet: its path and type, whether it lies in a list, and its values in a row; 0 where that varies."""
+
+    path: str
+    kind: pa.DataType
+    nested: bool
+    values_per_row: int
+
+
+def leaf_columns(path: str, kind: pa.DataType) -> list[Leaf]:
+    """Parquet's columns below an Arrow column, in the file's order."""
+    if isinstance(kind, pa.BaseExtensionType):
+        return leaf_columns(path, kind.storage_type)
+    if pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        size = kind.list_size if pa.types.is_fixed_size_list(kind) else 0
+        leaves = leaf_columns(f"{path}.list.element", kind.value_type)
+        return [Leaf(leaf.path, leaf.kind, True, size * leaf.values_per_row) for leaf in leaves]
+    if pa.types.is_struct(kind):
+        return [column for field in kind for column in leaf_columns(f"{path}.{field.name}", field.type)]
+    return [Leaf(path, kind, False, 1)]
+
+
+def _rows_within(limit: int, n_bytes: int, n_rows: int) -> int:
+    """How many rows take so many bytes, where `n_rows` take `n_bytes`; at least one."""
+    return max(min(n_rows, limit * n_rows // max(n_bytes, 1)), 1)
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return isinstance(kind, pa.BaseExtensionType) or pa.types.is_nested(kind)
+
+
+def _flat(chunk: pa.Array) -> np.ndarray:
+    while _is_list(chunk.type):
+        chunk = chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk.flatten()
+    if chunk.null_count:
+        raise ValueError(f"{chunk.null_count} values are missing")
+    return chunk.to_numpy(zero_copy_only=False)
+
+
+def _asks_for_the_impossible(error: MemoryError) -> bool:
+    """Whether more memory was asked for than there can be: a size in the file was misread."""
+    asked = re.search(r"alloc of size (\d+) failed", str(error))
+    return asked is not None and int(asked[1]) > _IMPOSSIBLE_BYTES
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
