@@ -157,7 +157,7 @@ def _module(name: str, *options: str) -> list[str]:
 def hub() -> Iterator[dict[str, str]]:
     """The Hub of the tests; what makes a client come to it."""
     sys.path.insert(0, str(_TESTS))
-    import hub_server
+    from support import hub as hub_server
 
     class Forgetful(hub_server.HubServer):
         def store(self, request: "hub_server._Handler", oid: str) -> hub_server.Answer:

@@ -60,10 +60,6 @@ BORROWED = {
     "convolution_pointwise_binary": ("torch:ops.mkldnn._convolution_pointwise.binary", _ACTS),
     "BasicBlock": ("torchvision.models.resnet:BasicBlock", "the vision encoder cannot be built"),
     "encode_choice": ("draccus.parsers.encoding:encode_choice", "a policy's configuration cannot be saved"),
-    "_GLOBAL_CLIENT_FACTORY": (
-        "huggingface_hub.utils._http:_GLOBAL_CLIENT_FACTORY",
-        "one lost request ends a download of hundreds",
-    ),
 }
 """By the names that they have here: where things are, `module:name`, and what does not work without them."""
 
@@ -192,8 +188,3 @@ def look_for_cards_again(sounddevice: "ModuleType") -> None:
 def stream_kind(sounddevice: "ModuleType") -> type:
     """What all streams of the package sounddevice are."""
     return sounddevice._StreamBase
-
-
-def hub_client_factory() -> Any:
-    """What makes the Hub's clients now; the library has a function to set it, and none to ask for it."""
-    return __getattr__("_GLOBAL_CLIENT_FACTORY")

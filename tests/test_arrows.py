@@ -1,6 +1,8 @@
 """How the package is laid out: who imports whom, where modules lie, how long they are, and which one steps environments."""
 
 import ast
+import io
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,9 +91,19 @@ def test_every_module_lies_in_a_package_of_the_table():
     assert places - _AT_THE_TOP <= set(_ALLOWED)
 
 
+def n_code_lines(text: str) -> int:
+    """Those that hold more than a comment or a docstring."""
+    ends = (tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER, tokenize.COMMENT)
+    tokens = [token for token in tokenize.generate_tokens(io.StringIO(text).readline) if token.type not in ends]
+    texts = [node.value for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Expr)]
+    prose = [range(node.lineno, (node.end_lineno or 0) + 1) for node in texts if isinstance(node, ast.Constant)]
+    lines = {line for token in tokens for line in range(token.start[0], token.end[0] + 1)}
+    return len(lines.difference(*prose))
+
+
 def test_no_module_is_too_long_to_be_read_nor_too_short_to_be_one():
+    long = {path: n for path, text in modules().items() if (n := n_code_lines(text)) > _MOST_LINES}
     lengths = {path: len(text.splitlines()) for path, text in modules().items()}
-    long = {path: n for path, n in lengths.items() if n > _MOST_LINES}
     short = {path: n for path, n in lengths.items() if n < _FEWEST_LINES and not path.endswith("__init__.py")}
     assert not long
     assert not set(short) - set(_SHORT), short

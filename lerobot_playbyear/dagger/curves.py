@@ -10,7 +10,7 @@ from typing import Any
 
 from lerobot_playbyear.dagger.figures import Totals, steps_until
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
+from lerobot_playbyear.hub.push import METRICS_NAME, figures_in
 
 Lines = Sequence[Mapping[str, Any]]
 Curve = tuple[list[float], list[float]]

@@ -21,7 +21,7 @@ from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.run_lock import LOCK, RunLock
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import check_can_be_made, flush, is_trial
-from lerobot_playbyear.hub.training_run import METRICS_NAME, figures_in
+from lerobot_playbyear.hub.push import METRICS_NAME, figures_in
 from lerobot_playbyear.training.checkpoints import BEST_LINK
 
 STATE_NAME = "dagger_state.json"

@@ -40,9 +40,7 @@ from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
-from lerobot_playbyear.hub.policies import push_policy
-from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
-from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.hub.push import METRICS_NAME, PushOptions, check_name, push_policy, warn_without_login
 from lerobot_playbyear.training.checkpoints import BEST_LINK
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.loop import read_store

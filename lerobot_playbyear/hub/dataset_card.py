@@ -1,18 +1,33 @@
-"""What the card of a dataset says: what is in it, how it looks and sounds, and how to use it."""
+"""The card of a dataset: what is in it, how it looks and sounds, how to use it, and a film of one episode."""
 
+import itertools
 import json
+import logging
 import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from huggingface_hub import HfApi
 
+from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.markdown import code, text
-from lerobot_playbyear.hub.preview import Preview
-from lerobot_playbyear.inspection.source import INTERVENTION, SUCCESS, DatasetSource
+from lerobot_playbyear.film.video import amplify, at_a_rate_of_aac, compose, episode_sound, write_film
+from lerobot_playbyear.inspection.film import tile
+from lerobot_playbyear.inspection.source import INTERVENTION, SUCCESS, DatasetSource, Episode
+from lerobot_playbyear.inspection.structure_checks import fit_microphones
+
+CARD = "README.md"
+FILM = "preview.mp4"
 
 AUDIO_TAGS = ("audio", "multimodal", "playbyear")
 """Tags of a dataset with sound, besides LeRobot's own."""
 
 _MOST_TASKS = 5
+_LONGEST_S = 30
+_PICTURE_HEIGHT = 336  # pixels, at most
+_BLANK = np.zeros((2, 480, 3), np.uint8)  # above the spectrogram of a dataset without cameras
 
 _LISTEN = """```python
 from lerobot.datasets import LeRobotDataset
@@ -24,9 +39,61 @@ write_audio("episode_0.wav", waveform, sample_rate)
 ```"""
 
 
-def card_tags(source: DatasetSource, tags: list[str] | None = None) -> list[str]:
-    """The card's tags besides "LeRobot": those given, and `AUDIO_TAGS` where there is sound."""
-    return list(dict.fromkeys([*(tags or []), *(AUDIO_TAGS if source.microphones else [])]))
+@dataclass(frozen=True)
+class Preview:
+    """What a film shows.
+
+    Args:
+        episode: The index of its episode.
+        microphones: The keys of those that are heard: the first two where they have one rate, left and right.
+        is_whole: Whether it shows the whole episode.
+    """
+
+    episode: int
+    microphones: tuple[str, ...]
+    is_whole: bool
+
+
+def write_dataset_card(
+    source: DatasetSource, repo_id: str, folder: Path, tags: list[str] | None, license: str, film: Path | None
+) -> dict[str, Path]:
+    """Writes what goes up beside a dataset.
+
+    Args:
+        source: The dataset.
+        repo_id: Its name on the Hub.
+        folder: Where the files are written.
+        tags: Besides LeRobot's, and `AUDIO_TAGS` where there is sound.
+        license: As the Hub names licences.
+        film: What the card shows. None: one is made, unless that fails.
+
+    Returns:
+        The files, by their names there: the card, and the film if there is one.
+
+    Raises:
+        OutsideError: A picture lies outside the dataset.
+    """
+    from lerobot.datasets.utils import create_lerobot_dataset_card
+
+    preview = None
+    if film is None:
+        try:
+            preview = film_preview(source, folder / FILM)
+            film = folder / FILM
+        except OutsideError:
+            raise
+        except Exception:  # a film is not worth an upload
+            logging.warning("No film could be made for the dataset's card", exc_info=True)
+    url = f"{HfApi().endpoint}/datasets/{repo_id}/resolve/main/{FILM}" if film is not None else None
+    card = create_lerobot_dataset_card(
+        tags=list(dict.fromkeys([*(tags or []), *(AUDIO_TAGS if source.microphones else [])])),
+        dataset_info=source.dataset.meta.info,
+        license=license,
+        repo_id=repo_id,
+        dataset_description=describe_dataset(source, repo_id, url, preview),
+    )
+    card.save(folder / CARD)
+    return {CARD: folder / CARD} | ({FILM: film} if film is not None else {})
 
 
 def describe_dataset(source: DatasetSource, repo_id: str, film_url: str | None, preview: Preview | None) -> str:
@@ -122,3 +189,39 @@ def _short(key: str) -> str:
 def _quoted(name: str) -> str:
     """A name as Python and JSON write it: on one line, so that it cannot end the block of code."""
     return json.dumps(name, ensure_ascii=False)
+
+
+def film_preview(source: DatasetSource, path: Path) -> Preview:
+    """Films the first episode with success, or without any the first, for at most 30 seconds.
+
+    Args:
+        source: The dataset.
+        path: The mp4 to write.
+    """
+    solved = [each for each in source.episodes if source.succeeded(each) not in (None, -1)]
+    episode = (solved or source.episodes)[0]
+    n_frames = min(len(episode), _LONGEST_S * source.fps)
+    microphones = _heard_together(source, fit_microphones(source))
+    shown = Episode(episode.index, episode.start, episode.start + n_frames)
+    blocks = [
+        np.clip(source.sound(key, shown)[:], -32768, 32767).astype(np.int16).reshape(n_frames, -1)
+        for key in microphones
+    ]
+    stacked = np.stack(blocks, axis=-1) if blocks else np.zeros((n_frames, 0, 0), np.int16)  # (n, S, n_microphones)
+    heard, sample_rate = at_a_rate_of_aac(amplify(episode_sound(stacked)), stacked.shape[1] * source.fps)
+    pictures, sound = itertools.islice(_pictures(source, shown), n_frames), heard[:]
+    write_film(path, compose(pictures, n_frames, sound, sample_rate), source.fps, sound, sample_rate)
+    return Preview(episode.index, tuple(microphones), n_frames == len(episode))
+
+
+def _pictures(source: DatasetSource, episode: Episode) -> Iterator[np.ndarray]:
+    if not source.cameras:
+        return itertools.repeat(_BLANK)
+    streams = {camera: source.pictures(episode, camera) for camera in source.cameras}
+    return tile(streams, len(episode), _PICTURE_HEIGHT)[1]
+
+
+def _heard_together(source: DatasetSource, microphones: list[str]) -> list[str]:
+    first_two = microphones[:2]
+    rates = {source.features[key]["shape"][0] for key in first_two}
+    return first_two if len(rates) == 1 else first_two[:1]

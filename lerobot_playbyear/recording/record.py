@@ -20,8 +20,7 @@ from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
-from lerobot_playbyear.hub.datasets import push_dataset
-from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
+from lerobot_playbyear.hub.push import PushOptions, check_name, push_dataset, warn_without_login
 from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 

@@ -122,13 +122,13 @@ def run_alone[Result](work: Callable[[Any], Result], parse: Callable[[type], Any
     from draccus.utils import DecodingError
 
     from lerobot_playbyear.datasets.errors import errors_of_input
-    from lerobot_playbyear.hub.client import patient_hub
+    from lerobot_playbyear.hub.client import be_patient
 
+    be_patient()
     (argument,) = inspect.signature(work).parameters.values()
-    with patient_hub():
-        with errors_of_input(DecodingError, OSError):
-            cfg = (parse or draccus.parse)(argument.annotation)
-        return work(cfg)
+    with errors_of_input(DecodingError, OSError):
+        cfg = (parse or draccus.parse)(argument.annotation)
+    return work(cfg)
 
 
 def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:

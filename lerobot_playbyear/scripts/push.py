@@ -29,7 +29,7 @@ def main() -> None:
 
 def _push() -> None:
     logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.hub.uploads import push
+    from lerobot_playbyear.hub.push import push
 
     run_alone(push)
 

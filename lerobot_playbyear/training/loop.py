@@ -24,8 +24,7 @@ from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.reading import choose_place
 from lerobot_playbyear.datasets.samplers import RunSampler, run_weights
-from lerobot_playbyear.hub.policies import push_policy
-from lerobot_playbyear.hub.pushing import PushOptions, check_name, warn_without_login
+from lerobot_playbyear.hub.push import PushOptions, check_name, push_policy, warn_without_login
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.parts import TrainingParts, make_training_parts, read_recorded_noise
 from lerobot_playbyear.training.prefetch import pinned, prefetched

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +23,7 @@ from lerobot_playbyear.compat import (
     save_checkpoint,
     update_last_checkpoint,
 )
-from lerobot_playbyear.hub.policies import push_checkpoint
-from lerobot_playbyear.hub.pushing import push_meanwhile
+from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.shared_statistics import mean_over_processes
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.checkpoints import load_training_state
@@ -109,7 +107,7 @@ class TrainingParts:
         self.write_checkpoint(folder, cfg)
         update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
-            push_meanwhile(partial(push_checkpoint, folder, cfg.policy.repo_id, cfg.policy.private), folder)
+            push_checkpoint(folder, cfg.policy.repo_id, cfg.policy.private)
         return folder
 
     def write_checkpoint(self, folder: Path, cfg: PlaybyearTrainConfig) -> None:

@@ -15,7 +15,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_playbyear.compat import WandBLogger
 from lerobot_playbyear.datasets.episode_store import EpisodeStore
-from lerobot_playbyear.hub.training_run import METRICS_NAME
+from lerobot_playbyear.hub.push import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.figures import Figures
 from lerobot_playbyear.training.parts import TrainingParts

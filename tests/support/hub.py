@@ -3,8 +3,12 @@
 Large files go up and down by git-lfs's basic transfer; clients have to be started with `HF_HUB_DISABLE_XET=1`.
 """
 
+import base64
 import contextlib
+import hashlib
+import itertools
 import json
+import random
 import re
 import socket
 import threading
@@ -18,14 +22,166 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import yaml
-from hub_faults import Fault, nothing_fails
-from hub_repositories import LARGE_SUFFIXES, HubAnswerError, Repository
 
 TOKEN = "hf_loopback"
 USER = "tester"
+LARGE_SUFFIXES = (".parquet", ".safetensors", ".mp4", ".png")
+"""Files that the Hub keeps apart from a commit's text, as its `.gitattributes` says."""
 
 _REPO = r"(?P<kind>models|datasets)/(?P<name>[^/]+/[^/]+)"
 _SLOW_S = 0.3
+
+Fault = Callable[[str, str], str | None]
+"""Given method and path, what goes wrong: "unavailable" (status 503), "cut" (no answer, and nothing is done), "lost" (it is
+done, and half of the answer arrives), "late" (status 504, and it is done when the next commit comes), "slow", or
+None."""
+
+
+def nothing_fails(method: str, path: str) -> None:
+    """All is well."""
+
+
+def everything_fails(method: str, path: str) -> str:
+    """There is no Hub."""
+    return "cut"
+
+
+def one_in(n: int, seed: int) -> Fault:
+    """One request in n fails on average, in each of the four ways alike."""
+    rng = random.Random(seed)
+    return lambda method, path: rng.choice(["unavailable", "cut", "lost", "slow"]) if rng.random() < 1 / n else None
+
+
+def down_after(n: int) -> Fault:
+    """After n large files have come up there is no Hub any more."""
+    count = itertools.count()
+    is_down = False
+
+    def fault(method: str, path: str) -> str | None:
+        nonlocal is_down
+        if method == "PUT" and not is_down:
+            is_down = next(count) >= n
+        return "cut" if is_down else None
+
+    return fault
+
+
+def every_second(kind: str, method: str, pattern: str) -> Fault:
+    """What goes wrong with the first, the third, ... request to the paths that match."""
+    count = itertools.count()
+    return lambda asked, path: kind if asked == method and re.search(pattern, path) and next(count) % 2 == 0 else None
+
+
+# What a Hub keeps
+
+
+class HubAnswerError(Exception):
+    """The request is answered with an error.
+
+    Args:
+        status: HTTP status.
+        code: The header `X-Error-Code`, from which the client makes its exceptions.
+        message: For a person.
+    """
+
+    def __init__(self, status: int, code: str = "", message: str = "") -> None:
+        super().__init__(message or code)
+        self.status, self.code, self.message = status, code, message or code
+
+
+@dataclass(frozen=True)
+class File:
+    """A file of a commit: `oid` is the SHA-256 of a large one, and git's SHA-1 of another."""
+
+    oid: str
+    data: bytes
+    is_large: bool
+
+    def describe(self, path: str) -> dict[str, Any]:
+        facts: dict[str, Any] = {"type": "file", "path": path, "size": len(self.data), "oid": self.oid}
+        if self.is_large:
+            facts["oid"] = git_oid(self.oid.encode())  # of the pointer
+            facts["lfs"] = {"oid": self.oid, "size": len(self.data), "pointerSize": 134}
+        return facts
+
+
+@dataclass
+class Repository:
+    """One repository; `commits` maps each commit to its files."""
+
+    kind: str
+    name: str
+    private: bool = False
+    commits: dict[str, dict[str, File]] = field(default_factory=dict)
+    messages: list[str] = field(default_factory=list)
+    branches: dict[str, str] = field(default_factory=dict)
+    tags: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.branches["main"] = self._add_commit({}, "initial commit")
+
+    def resolve(self, revision: str) -> str:
+        """The commit that a branch, a tag or a commit's name means."""
+        commit = self.branches.get(revision) or self.tags.get(revision) or revision
+        if commit not in self.commits:
+            raise HubAnswerError(404, "RevisionNotFound")
+        return commit
+
+    def files(self, revision: str = "main") -> dict[str, File]:
+        return self.commits[self.resolve(revision)]
+
+    def commit(self, branch: str, lines: list[dict[str, Any]], objects: dict[str, bytes]) -> str:
+        """Apply the lines of a commit's body; all of it or nothing."""
+        if branch not in self.branches:
+            raise HubAnswerError(404, "RevisionNotFound")
+        files = dict(self.files(branch))
+        message = ""
+        for line in lines:
+            key, value = line["key"], line["value"]
+            if key == "header":
+                message = value["summary"]
+                if value.get("parentCommit", self.branches[branch]) != self.branches[branch]:
+                    raise HubAnswerError(412, message="A commit has happened since. Please refresh and try again.")
+            elif key == "file":
+                data = base64.b64decode(value["content"])
+                files[value["path"]] = File(git_oid(data), data, is_large=False)
+            elif key == "lfsFile":
+                if value["oid"] not in objects:
+                    raise HubAnswerError(400, message=f"{value['path']} was never uploaded")
+                files[value["path"]] = File(value["oid"], objects[value["oid"]], is_large=True)
+            elif key == "deletedFile":
+                if files.pop(value["path"], None) is None:
+                    raise HubAnswerError(404, "EntryNotFound", "A file with this name doesn't exist")
+            else:
+                raise HubAnswerError(400, message=f"unknown line {key}")
+        self.branches[branch] = self._add_commit(files, message)
+        return self.branches[branch]
+
+    def info(self, revision: str) -> dict[str, Any]:
+        commit = self.resolve(revision)
+        siblings = [{"rfilename": path} for path in self.commits[commit]]
+        return {"id": self.name, "sha": commit, "private": self.private, "tags": [], "siblings": siblings}
+
+    def refs(self) -> dict[str, Any]:
+        def named(refs: dict[str, str], folder: str) -> list[dict[str, str]]:
+            return [{"name": name, "ref": f"refs/{folder}/{name}", "targetCommit": c} for name, c in refs.items()]
+
+        return {"branches": named(self.branches, "heads"), "tags": named(self.tags, "tags"), "converts": []}
+
+    def _add_commit(self, files: dict[str, File], message: str) -> str:
+        content = {path: file.oid for path, file in sorted(files.items())}
+        oid = hashlib.sha1(json.dumps([len(self.commits), self.name, content]).encode()).hexdigest()
+        self.commits[oid] = files
+        self.messages.append(message)
+        return oid
+
+
+def git_oid(data: bytes) -> str:
+    """The name that git gives to a file."""
+    return hashlib.sha1(b"blob %d\0" % len(data) + data).hexdigest()
+
+
+# The server
 
 
 @dataclass
@@ -46,7 +202,6 @@ class HubServer:
         repositories: By (kind, name), kind "models" or "datasets".
         objects: Large files by their SHA-256.
         arrivals: How many times each large file came up as a whole.
-        jobs: What was asked to be run.
         requests: Method, path and what went wrong, of every request.
         fault: Decides what goes wrong.
     """
@@ -55,7 +210,6 @@ class HubServer:
         self.repositories: dict[tuple[str, str], Repository] = {}
         self.objects: dict[str, bytes] = {}
         self.arrivals: Counter[str] = Counter()
-        self.jobs: list[dict[str, Any]] = []
         self.requests: list[tuple[str, str, str | None]] = []
         self.fault: Fault = nothing_fails
         self.lock = threading.Lock()
@@ -193,16 +347,6 @@ class HubServer:
     def fetch(self, request: "_Handler", oid: str) -> Answer:
         return request.part_of(self.objects[oid], {"ETag": f'"{oid}"'})
 
-    def start_job(self, request: "_Handler") -> Answer:
-        self.jobs.append(request.json())
-        job = {
-            "id": f"job-{len(self.jobs)}",
-            "createdAt": "2025-01-01T00:00:00.000Z",
-            "status": {"stage": "RUNNING", "message": None},
-            "owner": {"id": "1", "name": USER, "type": "user"},
-        }
-        return Answer({**request.json(), **job})
-
     def whoami(self, request: "_Handler") -> Answer:
         return Answer({"type": "user", "name": USER, "orgs": [], "auth": {"type": "access_token"}})
 
@@ -216,7 +360,6 @@ _ROUTES: list[tuple[str, str, Callable[..., Answer]]] = [
     ("POST", r"/api/repos/create", HubServer.create),
     ("POST", r"/api/validate-yaml", HubServer.validate_card),
     ("GET", r"/api/whoami-v2", HubServer.whoami),
-    ("POST", rf"/api/jobs/{USER}", HubServer.start_job),
     ("POST", rf"/api/{_REPO}/preupload/(?P<revision>[^/]+)", HubServer.preupload),
     ("POST", rf"/api/{_REPO}/commit/(?P<revision>[^/]+)", HubServer.commit),
     ("POST DELETE", rf"/api/{_REPO}/tag/(?P<revision>[^/]+)", HubServer.tag),
