@@ -35,7 +35,7 @@ main()
 def first_work_of(folder: Path) -> dict[str, list[str]]:
     """The options with which each command begins to work on something in a folder."""
     data = ["--dataset.repo_id=a/b", f"--dataset.root={folder / 'dataset'}"]
-    env = ["--env.type=playbyear", "--env.task=OccludedGrasp-v0"]
+    env = ["--env.type=playbyear", "--env.task=OccludedGrasp-v1"]
     policy = f"--policy.path={folder / 'policy'}"
     demos = ["--demos.repo_id=a/b", f"--demos.root={folder / 'dataset'}", "--interventions.repo_id=a/c"]
     return {

@@ -58,7 +58,7 @@ def main() -> None:
     window = Window("Benchmark")
     rows["hand a frame to the window"] = measured(lambda: window.show(status, scene), args.n_frames)
     window.close()
-    env = gym.make("gym_playbyear/OccludedGrasp-v0", render_mode="rgb_array")
+    env = gym.make("gym_playbyear/OccludedGrasp-v1", render_mode="rgb_array")
     env.reset(seed=0)
     rows["render the scene, 480 x 480"] = measured(env.render, args.n_frames)
     env.close()

@@ -21,6 +21,7 @@ from sb3_contrib import RecurrentPPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from experiments.numeric_task import DISCOUNT, NumericTask
 from experiments.protocol import RESULTS, RUNS, command_line, save
 from experiments.recurrent_player import (
     RecurrentPlayer,
@@ -30,7 +31,6 @@ from experiments.recurrent_player import (
     play_episode,
     save_checkpoint,
 )
-from gym_playbyear.adversaries.numeric_env import DISCOUNT, NumericTask
 from gym_playbyear.adversaries.players import EXPERT
 
 DEMONSTRATION_SEED = 10000
@@ -68,7 +68,7 @@ def make_model(arguments: Any) -> RecurrentPPO:
 
 def environment_options(arguments: Any) -> dict[str, Any]:
     """What the environment is made with besides its name."""
-    options = {"horizon": arguments.horizon, "variant": arguments.variant}
+    options = {"horizon": arguments.horizon}
     return {name: value for name, value in options.items() if value is not None}
 
 
@@ -153,8 +153,7 @@ def run(arguments: Any) -> dict[str, Any]:
 def run_name(arguments: Any) -> str:
     """Names a run's folder and result."""
     sense = "hears" if arguments.hears else "deaf"
-    variant = f"-{arguments.variant}" if arguments.variant else ""
-    return f"{arguments.task}{variant}-{sense}-{arguments.teacher}-seed{arguments.seed}"
+    return f"{arguments.task}-{sense}-{arguments.teacher}-seed{arguments.seed}"
 
 
 def parser():
@@ -171,7 +170,6 @@ def parser():
     made.add_argument("--seed", type=int, default=1)
     made.add_argument("--episodes", type=int, default=100, help="that judge the result")
     made.add_argument("--horizon", type=int)
-    made.add_argument("--variant")
     made.add_argument("--repeat", type=int, help="steps of the task for each action; by default the task's")
     made.add_argument("--n_demonstrations", type=int, default=200)
     made.add_argument("--imitation_updates", type=int, default=1500)

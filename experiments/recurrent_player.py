@@ -15,7 +15,7 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from gym_playbyear.adversaries.numeric_env import N_PLAYER, NumericTask
+from experiments.numeric_task import N_PLAYER, NumericTask
 from gym_playbyear.adversaries.players import EXPERT, deaf_scripts
 from gym_playbyear.arm import ACTION_SCALE
 

@@ -16,7 +16,6 @@ import numpy as np
 
 from experiments.protocol import RESULTS, command_line
 from experiments.sound_scenes import CONTROL_HZ, Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
-from gym_playbyear.sound import ContactPair, ContactSound
 from gym_playbyear.sound_v2 import ContactSynth
 
 _STEPS = (0.002, 0.001)  # s: the physics steps that are compared
@@ -81,9 +80,6 @@ def solver_softness() -> Iterator[Row]:
     softnesses = (0.004, 0.01, 0.02)
     levels = [level(blow(box_on_table(softness=softness, speed=0.2))) for softness in softnesses]
     yield _row("cube on table: level over the solver's time constant", softnesses, "s", levels, "dBFS", *_same(levels))
-    before = [level(_version_one(rise)) for rise in (1, 5)]
-    holds = before[0] - before[1] > 20
-    yield _row("the same in version 1: 0.6 N reached in", (2, 10), "ms", before, "dBFS", "why it was changed", holds)
 
 
 def friction() -> Iterator[Row]:
@@ -182,14 +178,6 @@ def cost() -> str:
             times.append((time.thread_time() - start) / len(contacts))
         figures.append(f"{1000 * min(times):.2f} ms with {count} microphone{'s' * (count > 1)}")
     return f"a control step costs {', '.join(figures)}"
-
-
-def _version_one(rise: int) -> np.ndarray:
-    """A force of 0.6 N that is reached in some physics steps, as `gym_playbyear.sound` plays it."""
-    sound = ContactSound([ContactPair("x", ("cube", "table"), ("cube", "table"))], ("table",), 16000, 20, 0.002, 0.0)
-    forces = np.zeros((50, 1))
-    forces[5:, 0] = 0.6 * np.clip(np.arange(1, 46) / rise, 0.0, 1.0)
-    return np.concatenate([sound.step(block, np.zeros(25))["table"] for block in forces.reshape(2, 25, 1)])
 
 
 def _same(levels: Sequence[float]) -> tuple[str, bool]:

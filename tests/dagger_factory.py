@@ -20,7 +20,7 @@ from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig
 from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
 from lerobot_playbyear.training.loop import train
 
-ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v0", "--env.image_size=16")
+ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v1", "--env.image_size=16")
 QUICK = ("--expert.type=test_quick", "--env.episode_length=12")
 """Attempts of a few steps, of which every third is not worth keeping."""
 

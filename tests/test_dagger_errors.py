@@ -205,7 +205,7 @@ def test_the_folder_of_a_run_is_not_touched_without_resume(finished):
 @pytest.mark.parametrize(
     ("options", "difference"),
     [
-        (("--env.task=OccludedPickPlace-v0",), r"--env was .*OccludedGrasp-v0.* and is .*OccludedPickPlace-v0"),
+        (("--env.task=OccludedPickPlace-v1",), r"--env was .*OccludedGrasp-v1.* and is .*OccludedPickPlace-v1"),
         (("--demos.repo_id=other/demos",), r"--demos was .*tests/demos.* and is .*other/demos"),
         (("--expert.n_steps=9",), "--expert was .*'n_steps': 8.* and is .*'n_steps': 9"),
         (("--episode_seed=5",), "--episode_seed was 10000 and is 5"),

@@ -24,7 +24,7 @@ needs_screen = pytest.mark.skipif(
 )
 
 
-def make(task: str = "OccludedGrasp-v0", **options) -> gym.Env:
+def make(task: str = "OccludedGrasp-v1", **options) -> gym.Env:
     return gym.make(f"gym_playbyear:gym_playbyear/{task}", **options)
 
 
@@ -165,7 +165,7 @@ def python(code: str, *arguments: str, **environment: str) -> str:
 
 _BASELINES = """
 import runpy, sys
-sys.argv = ["baselines", "--n_episodes=1", "--task", "OccludedGrasp-v0"]
+sys.argv = ["baselines", "--n_episodes=1", "--task", "OccludedGrasp-v1"]
 runpy.run_module("gym_playbyear.baselines", run_name="__main__")
 """
 
@@ -218,7 +218,7 @@ def spot_on(picture: np.ndarray, colour: int, before: tuple[float, float] | None
 
 
 @needs_screen
-@pytest.mark.parametrize(("task", "colour"), [("OccludedGrasp-v0", _BLUE), ("OccludedGrasp-v1", _RED)])
+@pytest.mark.parametrize(("task", "colour"), [("OccludedGrasp-v1", _BLUE), ("OccludedGrasp-v1", _RED)])
 def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen, task, colour):
     """The program does not close it: a window that is open when the process ends must not crash it either."""
     process = subprocess.Popen(

@@ -1,5 +1,6 @@
 """`--env.type=playbyear`: what LeRobot's commands get from the environments."""
 
+import re
 from dataclasses import replace
 
 import draccus
@@ -58,7 +59,7 @@ class ExpertPolicy(nn.Module):
             {"observation.audio.gripper", "observation.audio.table"},
         ),
         ({"sound": "contact_force"}, {"observation.contact_force"}),
-        ({"sound": "none", "task": "OccludedPickPlace-v0"}, set()),
+        ({"sound": "none", "task": "OccludedPickPlace-v1"}, set()),
     ],
 )
 def test_declared_features_are_what_an_observation_holds(options, extra_keys):
@@ -130,7 +131,7 @@ def test_environments_in_processes_of_their_own_see_the_same():
 
 def test_options_reach_the_environment():
     sizes = {"image_size": 32, "visualization_width": 96, "visualization_height": 96}
-    config = PlaybyearEnvConfig(task="OccludedGrasp-v0", variant="paper", episode_length=7, **sizes)
+    config = PlaybyearEnvConfig(task="OccludedGrasp-v1", task_options={"cube_material": "tin"}, episode_length=7, **sizes)
     vec = vector_env(config)
     vec.reset(seed=0)
     assert vec.call("_max_episode_steps") == (7,)
@@ -168,9 +169,9 @@ def test_the_pouch_is_found_with_its_own_rate_and_options():
 @pytest.mark.parametrize(
     ("argument", "wanted"),
     [
-        ("task=Nope-v0", "OccludedGrasp-v0, OccludedPickPlace-v0"),
+        ("task=Nope-v0", "OccludedGrasp-v1, OccludedPickPlace-v1"),
         ("sound=loud", "waveform, contact_force, none"),
-        ("task=OccludedGrasp-v0 variant=ours", "default, paper"),
+        ("task_options={cube_material: jelly}", "cube, glass, tin"),
         ("sample_rate=16001", "a multiple of 20"),
         ("fps=30", "20 Hz"),
         ("microphones=[]", "at least one"),
@@ -184,9 +185,9 @@ def test_the_pouch_is_found_with_its_own_rate_and_options():
     ],
 )
 def test_a_wrong_option_says_what_would_work(argument, wanted):
-    options = [f"--env.{option}" for option in argument.split()]
+    options = [f"--env.{option}" for option in re.split(r"(?<!:) ", argument)]
     with pytest.raises(DecodingError) as error:
         draccus.parse(RecordConfig, args=["--env.type=playbyear", *options, "--dataset.repo_id=a/b"])
-    name = argument.split()[-1].split("=")[0]
+    name = re.split(r"(?<!:) ", argument)[-1].split("=")[0]
     assert f"env.{name}" in str(error.value)
     assert wanted in str(error.value)

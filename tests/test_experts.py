@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from gym_playbyear.experts import EXACT_EXPERT, ExpertConfig, GraspExpert, PickPlaceExpert
+from gym_playbyear.experts import EXACT_EXPERT
 
 
 def searches(task: str, seeds: range) -> list[dict[str, float]]:
@@ -70,20 +70,4 @@ def test_its_hops_miss_the_cube_on_both_sides_and_are_mended(task):
     low, high = EXACT_EXPERT.hop_error
     assert min(missed) < low / 2
     assert max(missed) > high / 2
-    env.close()
-
-
-@pytest.mark.parametrize(
-    ("task", "kind"), [("OccludedGrasp-v0", GraspExpert), ("OccludedPickPlace-v0", PickPlaceExpert)]
-)
-def test_those_of_version_0_show_what_they_always_showed(task, kind):
-    assert ExpertConfig() == ExpertConfig(
-        back_off=0.004, higher=None, hop_step=None, hop_error=None, hop_tolerance=None
-    )
-    env = gym.make(f"gym_playbyear:gym_playbyear/{task}", image_size=8, sound="none", disable_env_checker=True)
-    env.reset(seed=1)
-    expert = env.unwrapped.scripted_expert()
-    assert type(expert) is kind
-    assert expert.config == ExpertConfig()
-    assert (expert.back_off, expert.hop_step, expert.sweep_height) == (0.004, None, 0.022)
     env.close()

@@ -90,7 +90,7 @@ def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, dat
         lerobot_eval,
         f"--policy.path={checkpoint}",
         "--env.type=playbyear",
-        "--env.task=OccludedGrasp-v0",
+        "--env.task=OccludedGrasp-v1",
         "--env.image_size=16",
         "--env.episode_length=5",
         "--eval.n_episodes=1",
@@ -122,7 +122,7 @@ def test_a_step_gets_runs_in_training_and_frames_in_a_rollout_and_nothing_but_so
 
 def test_their_expert_takes_over_when_it_is_loud():
     expert_config = draccus.decode(ExpertConfig, {"type": "startled", "loud": 0.2, "steps": 2})
-    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0")
+    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1")
     observation, _ = env.reset(seed=0)
     expert = expert_config.make(env)
     expert.reset(env)

@@ -32,7 +32,7 @@ def run_without(blocked: set[str], code: str) -> str:
 def test_the_tasksrun_without_torch_and_lerobot():
     code = """
 import gymnasium
-env = gymnasium.make("gym_playbyear:gym_playbyear/OccludedGrasp-v0")
+env = gymnasium.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1")
 env.reset(seed=0)
 observation, *_ = env.step(env.unwrapped.scripted_expert().act())
 print(sorted(observation))

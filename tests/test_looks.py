@@ -11,7 +11,6 @@ import pytest
 from gym_playbyear.arena import TABLE_TOP
 from gym_playbyear.arm import ArmConfig
 from gym_playbyear.looks import PeopleView, Stage
-from gym_playbyear.rendering import SceneRenderer
 from gym_playbyear.task_env import TaskEnv
 from gym_playbyear.tell_apart import tell_apart
 
@@ -104,15 +103,6 @@ def test_fingers_are_seen_to_end_where_they_touch():
             vertices = vertices + model.geom_pos[geom]
             assert (sign * vertices[:, 1] > -0.001).all()
             assert vertices[:, 2].max() < lowest + 0.001
-
-
-def test_version_0_looks_as_it_always_did():
-    env = make("OccludedGrasp-v0")
-    env.begin_episode(seed=0)
-    plain = SceneRenderer(env.model, 120)
-    np.testing.assert_array_equal(env.render(), plain.render(env.data, "people"))
-    plain.close()
-    env.close()
 
 
 def test_a_copy_looks_the_same_and_draws_for_itself():

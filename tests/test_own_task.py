@@ -58,9 +58,9 @@ def installed(tmp_path_factory):
     (broken / "entry_points.txt").write_text(
         "[gym_playbyear.tasks]\nBroken-v1 = module_that_is_not_there:task\nno name at all! = json:dumps\n"
         "OccludedGrasp-v1 = json:dumps\n"
-        "[gym_playbyear.materials_v2]\nno_material = json:dumps\n[gym_playbyear.microphones_v2]\nno_microphone = json:dumps\n"
+        "[gym_playbyear.materials]\nno_material = json:dumps\n[gym_playbyear.microphones]\nno_microphone = json:dumps\n"
     )
-    _install(folder / "site", "ears", _EARS, "[gym_playbyear.microphones_v2]\nbase = ears:BASE\n")
+    _install(folder / "site", "ears", _EARS, "[gym_playbyear.microphones]\nbase = ears:BASE\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder / "site")
         with pytest.warns(UserWarning, match="'no name at all!' is left out"):
@@ -111,7 +111,7 @@ def test_a_microphone_of_another_distribution_hears_in_our_tasks():
         ({"microphones": ("none",)}, r"microphones is \('none',\); name at least one of base, gripper, .*table"),
         (
             {"microphones": ("no_microphone",)},
-            r"'no_microphone' of the entry points gym_playbyear\.microphones_v2 is a builtins",
+            r"'no_microphone' of the entry points gym_playbyear\.microphones is a builtins",
         ),
     ],
 )
@@ -136,7 +136,7 @@ def test_a_material_that_is_none_says_so():
     assert len(material("tin_can").frequencies) == 4
     with pytest.raises(ValueError, match=r"Material 'marble' is not known: choose one of bag, .*tin_can"):
         material("marble")
-    with pytest.raises(ValueError, match=r"'no_material' of .*materials_v2 is a .*; wanted a .*materials_v2\.Material"):
+    with pytest.raises(ValueError, match=r"'no_material' of .*materials is a .*; wanted a .*materials_v2\.Material"):
         material("no_material")
 
 

@@ -239,5 +239,5 @@ def test_the_command_prints_one_line_for_an_unknown_task(tmp_path):
     command += ["--dataset.repo_id=a/b", f"--dataset.root={tmp_path}"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode != 0
-    assert "OccludedGrasp-v0, OccludedPickPlace-v0" in result.stderr
+    assert "OccludedGrasp-v1, OccludedPickPlace-v1" in result.stderr
     assert "Traceback" not in result.stderr

@@ -15,9 +15,9 @@ from lerobot.envs.configs import EnvConfig  # noqa: F401  (registers LeRobot's o
 from scipy import signal
 from scipy.io import wavfile
 
-from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.options import OptionError
 from gym_playbyear.room import _recording
+from gym_playbyear.sound_v2 import BACKGROUND_RMS
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.policy.recorded_noise import RecordedNoise
 
@@ -58,7 +58,7 @@ def test_a_recording_is_added_at_its_level_and_goes_on_from_step_to_step(chirp):
     added = sound - plain
     assert len(added) == (N_STEPS + 1) * 800
     assert np.sqrt(np.mean(added[:8000] ** 2)) == pytest.approx(
-        8 * SyntheticEars.background_rms, rel=0.02
+        8 * BACKGROUND_RMS, rel=0.02
     )  # the recording, once around
     np.testing.assert_allclose(added[8000:], added[: len(added) - 8000], atol=1.1 / 32767)  # and again
     assert np.abs(np.diff(added)).max() < 0.02 * 8  # no clicks between steps
@@ -80,7 +80,7 @@ def test_the_usual_background_is_as_loud_as_the_unit_says():
     _, plain = heard(None, microphones=("gripper",))
     _, silent = heard(None, microphones=("gripper",), noise_level=0.0)
     background = (plain - silent)[: 4 * 800]
-    assert 0.5 * SyntheticEars.background_rms < np.sqrt(np.mean(background**2)) < 2 * SyntheticEars.background_rms
+    assert 0.5 * BACKGROUND_RMS < np.sqrt(np.mean(background**2)) < 2 * BACKGROUND_RMS
 
 
 @pytest.mark.parametrize("response", ["phone", "dull", "boomy"])

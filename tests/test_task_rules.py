@@ -1,7 +1,5 @@
 """Version 1 of the cube tasks: how an attempt ends, and what a twin world is."""
 
-import warnings
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -148,16 +146,3 @@ def test_the_twin_world_is_the_same_until_touch(task):
     assert twin.unwrapped.contact_forces["gripper-cube"] == 0
     env.close()
     twin.close()
-
-
-def test_version_0_says_once_what_version_1_brings(monkeypatch):
-    from gym_playbyear import options
-
-    monkeypatch.setattr(options, "_WARNED", set())
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        for _ in range(3):
-            make("OccludedGrasp-v0")
-    said = [str(warning.message) for warning in caught if warning.category is options.OldTaskWarning]
-    assert len(said) == 1
-    assert "OccludedGrasp-v1 stops a hand that presses" in said[0]

@@ -9,8 +9,6 @@ from gym_playbyear.plugins import Registry
 __version__ = "0.1.0"
 
 _OWN = {
-    "OccludedGrasp-v0": "gym_playbyear.occluded_grasp:occluded_grasp_v0",
-    "OccludedPickPlace-v0": "gym_playbyear.occluded_pick_place:occluded_pick_place_v0",
     "OccludedGrasp-v1": "gym_playbyear.occluded_grasp:occluded_grasp",
     "OccludedPickPlace-v1": "gym_playbyear.occluded_pick_place:occluded_pick_place",
     "TellApart-v1": "gym_playbyear.tell_apart:tell_apart",

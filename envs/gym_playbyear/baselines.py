@@ -44,7 +44,6 @@ def success_rates(task: str, strategies: tuple[str, ...], seeds: range, **option
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", nargs="+", default=list(gym_playbyear.TASKS))
-    parser.add_argument("--variant", default="default")
     parser.add_argument("--n_episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=1000, help="of the first episode")
     parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
@@ -52,14 +51,12 @@ def main() -> None:
     arguments = parser.parse_args()
     seeds = range(arguments.seed, arguments.seed + arguments.n_episodes)
     results = []
-    own = {} if arguments.variant == "default" else {"variant": arguments.variant}
-    scripts = {task: make_definition(task, own, warn=False).blind for task in arguments.task}  # all, before any plays
+    scripts = {task: make_definition(task, {}).blind for task in arguments.task}  # all, before any plays
     if arguments.output:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
     for task, blind in scripts.items():
-        rates = success_rates(task, (EXPERT, *blind), seeds, horizon=arguments.horizon, **own)
-        options = {"variant": arguments.variant, "horizon": arguments.horizon}
-        results.append({"task": task, **options, "seeds": [seeds[0], seeds[-1]], "success": rates})
+        rates = success_rates(task, (EXPERT, *blind), seeds, horizon=arguments.horizon)
+        results.append({"task": task, "horizon": arguments.horizon, "seeds": [seeds[0], seeds[-1]], "success": rates})
         print(json.dumps(results[-1]), flush=True)
     if arguments.output:
         arguments.output.write_text(json.dumps(results, indent=1) + "\n")

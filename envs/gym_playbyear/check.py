@@ -25,6 +25,7 @@ from gym_playbyear.adversaries.players import EXPERT, KINDS, outcomes, players, 
 from gym_playbyear.adversaries.progress import Progress
 from gym_playbyear.adversaries.scripts import Outcome
 from gym_playbyear.adversaries.twin import TwinError, TwinResult, twin_test
+from gym_playbyear.task import Task
 
 FIRST_SEED = 80000  # nothing was tuned on episodes from here on
 
@@ -85,7 +86,7 @@ class Report:
 
 
 def check(
-    task: str,
+    task: str | Task,
     n_episodes: int = 100,
     *,
     first_seed: int = FIRST_SEED,
@@ -100,7 +101,7 @@ def check(
     """Plays a task with everyone, and compares twin worlds.
 
     Args:
-        task: Its name, such as `OccludedGrasp-v1`.
+        task: Its name, such as `OccludedGrasp-v1`, or the task.
         n_episodes: Of each player, and of the twin test.
         first_seed: Of the episodes; they count up.
         names: Of the players; all by default.
@@ -108,46 +109,47 @@ def check(
         jobs: Processes side by side.
         limits: What the task promises; by default what it says itself, or else `Limits()`.
         learned: Results of learned adversaries: `name`, `successes`, `n_episodes`, `hears`.
-        options: For `gymnasium.make`.
+        options: Of `TaskEnv`.
         progress: A file of who has played already; a check that was stopped goes on from there.
 
     Raises:
         ValueError: A name is not among the task's players, or a learner's result is of another task.
     """
-    by_learners = [_row_of(result, task) for result in learned or []]
+    name = task if isinstance(task, str) else task.name
+    by_learners = [_row_of(result, name) for result in learned or []]
     options = options or {}
     limits = limits or Limits(**promised_limits(task, **options))
     known = players(task, **options)
-    for name in names or []:
-        if name not in known:
-            raise ValueError(f"player={name!r} is not known: choose from {', '.join(map(repr, known))}.")
-    chosen = {name: kind for name, kind in known.items() if not names or name in names}
+    for player in names or []:
+        if player not in known:
+            raise ValueError(f"player={player!r} is not known: choose from {', '.join(map(repr, known))}.")
+    chosen = {player: kind for player, kind in known.items() if not names or player in names}
     seeds = range(first_seed, first_seed + n_episodes)
     play = partial(outcomes, task, seeds=seeds, options=options)
-    done = Progress(progress, {"task": task, "options": options, "seeds": [first_seed, n_episodes]})
-    missing = [name for name in chosen if done.attempts(name) is None]
+    done = Progress(progress, {"task": name, "options": options, "seeds": [first_seed, n_episodes]})
+    missing = [player for player in chosen if done.attempts(player) is None]
     found: TwinResult | None = None
     faults: list[str] = []
     if jobs > 1:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             pending = pool.submit(partial(twin_test, task, seeds, **options)) if twin else None
-            for name, attempts in zip(missing, pool.map(play, missing), strict=True):
-                done.keep(name, _told(name, attempts))
+            for player, attempts in zip(missing, pool.map(play, missing), strict=True):
+                done.keep(player, _told(player, attempts))
             if pending:
                 found, faults = _compared(pending.result)
     else:
-        for name in missing:
-            done.keep(name, _told(name, play(name)))
+        for player in missing:
+            done.keep(player, _told(player, play(player)))
         if twin:
             found, faults = _compared(partial(twin_test, task, seeds, **options))
     rows = []
-    for name, kind in chosen.items():
-        attempts = done.attempts(name) or []
+    for player, kind in chosen.items():
+        attempts = done.attempts(player) or []
         ends = dict(Counter(attempt.end for attempt in attempts).most_common())
-        rows.append(Row(name, kind, sum(attempt.success for attempt in attempts), n_episodes, ends))
+        rows.append(Row(player, kind, sum(attempt.success for attempt in attempts), n_episodes, ends))
     judged = judge(rows + by_learners, limits)
     broken = [describe(row) for row in judged if not row.holds] + faults + twin_faults(found, limits)
-    return Report(task, options, first_seed, judged, found, limits, broken)
+    return Report(name, options, first_seed, judged, found, limits, broken)
 
 
 def _row_of(result: dict[str, Any], task: str) -> Row:
@@ -256,12 +258,11 @@ def main() -> int:
     )
     parser.add_argument("--no-twin", action="store_true", help="do not compare twin worlds")
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side (default: 1)")
-    parser.add_argument("--variant", help="of the task")
     parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
     parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments.adversaries")
     parser.add_argument("--output", type=Path, help="a JSON file for the results; a check that was stopped goes on")
     arguments = parser.parse_args()
-    given = {"variant": arguments.variant, "horizon": arguments.horizon}
+    given = {"horizon": arguments.horizon}
     progress = None
     if arguments.output:  # before the hours that it takes
         arguments.output.parent.mkdir(parents=True, exist_ok=True)

@@ -9,13 +9,13 @@ from gym_playbyear.arena import CUBE_HALF_SIZE, FRONT_CAMERA, TABLE, TABLE_TOP, 
 from gym_playbyear.arm import FINGER_FRICTION
 from gym_playbyear.gates import InterventionGate
 from gym_playbyear.haste import ClosedUnheard
-from gym_playbyear.materials import CUBE_MATERIALS
 from gym_playbyear.options import check_option
 from gym_playbyear.rules import Groped, Pressed, Rule, Shoved, Solved
 from gym_playbyear.task import Prop
 from gym_playbyear.variant import Variant
 
 CUBE = "cube"
+CUBE_MATERIALS = ("cube", "glass", "tin", "cardboard", "rubber")
 _CARRIED_HEIGHT = TABLE_TOP + CUBE_HALF_SIZE + 0.015  # m: the cube's centre is this high only when it was picked up
 _RAIL_GAP, _RAIL_HEIGHT, _RAIL_THICKNESS = 0.06, 0.02, 0.01  # m
 _STILL = 0.015  # m: how far a cube that is held still, or lies still, may move meanwhile

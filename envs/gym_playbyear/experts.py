@@ -68,16 +68,6 @@ cube and not on the way there, and it shows that only the touch tells where that
 differs from search to search, and a hop first misses the cube by up to 12 mm, either way, and is mended. Four of five hops end
 within 18 steps of the touch, while a policy of twenty frames remembers where it was."""
 
-CORRECTING_EXPERT = ExpertConfig(
-    sweep_step=(0.008, 0.011),
-    pause_probability=0.0,
-    pause=(0, 1),
-    dwell=(0, 1),
-    rise_step=(0.013, 0.018),
-    hover=(0, 1),
-)
-"""In version 0 an expert that corrects has less time than one that demonstrates: it moves as that one does when it is quick."""
-
 
 class GraspExpert:
     """Grasps the hidden cube by touch and lifts it.

@@ -14,7 +14,6 @@ from gym_playbyear.bag_blind import STRATEGIES, BlindBag
 from gym_playbyear.bag_contents import CONTENTS, FRICTION, contents_prop, drop, middle_of
 from gym_playbyear.bag_experts import FINGERS, FOR_TALLER_THINGS, BagExpert
 from gym_playbyear.bag_gate import BagGate
-from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.haste import ClosedUnheard
 from gym_playbyear.proprioception import SensorNoise
 from gym_playbyear.rules import Groped, Pressed, Solved
@@ -168,7 +167,6 @@ def _task(name: str, numbers: BagNumbers, contents: str, **more: Any) -> Task:
         start_spread=0.01,
         sensors=numbers.sensors,
         felt=CONTENTS,
-        sound=SyntheticEars,
         numbers=numbers,
         **more,
     )

@@ -23,13 +23,13 @@ class PeopleView:
     """Pictures and a window for people; opened when they are first asked for.
 
     Args:
-        task: The task. One of version 0 is shown as it always was: as the policy sees it.
+        task: The task.
         size: Height and width of the picture [pixels].
         hidden_object: As for `compose`.
     """
 
     def __init__(self, task: Task, size: int, hidden_object: bool):
-        self._stage = None if task.is_old else Stage(task, size, hidden_object)
+        self._stage = Stage(task, size, hidden_object)
         self._size = size
         self._renderer: SceneRenderer | None = None
         self._window: Window | None = None
@@ -38,7 +38,7 @@ class PeopleView:
         """The simulation's state as a picture (size, size, 3) uint8."""
         model, data = self._shown(model, data)
         if self._renderer is None:
-            self._renderer = SceneRenderer(model, self._size, shadows=self._stage is not None)
+            self._renderer = SceneRenderer(model, self._size, shadows=True)
         return self._renderer.render(data, PEOPLE_CAMERA.name)
 
     def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -55,8 +55,6 @@ class PeopleView:
                 resource.close()
 
     def _shown(self, model: mujoco.MjModel, data: mujoco.MjData) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        if self._stage is None:
-            return model, data
         self._stage.follow(model, data)
         return self._stage.model, self._stage.data
 

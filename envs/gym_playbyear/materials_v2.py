@@ -150,7 +150,7 @@ MATERIALS: dict[str, Material] = {
 }  # fmt: skip
 
 
-ALL_MATERIALS = Registry("materials_v2", MATERIALS)
+ALL_MATERIALS = Registry("materials", MATERIALS)
 """Ours, and those of other distributions (`gym_playbyear.plugins`)."""
 
 

@@ -6,14 +6,12 @@ from typing import Any
 import numpy as np
 
 from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box
-from gym_playbyear.blind import BLIND_STRATEGIES, BlindGrasp, SteadyBlindGrasp
+from gym_playbyear.blind import BLIND_STRATEGIES, SteadyBlindGrasp
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
-from gym_playbyear.ears_v2 import SyntheticEars
-from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, GraspExpert, SteadyGraspExpert
+from gym_playbyear.experts import EXACT_EXPERT, SteadyGraspExpert
 from gym_playbyear.looks_props import panel_on_posts, wall_on_the_table
-from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
-from gym_playbyear.variant import OLD, PAPER, Variant
+from gym_playbyear.variant import Variant
 
 WALL_HALF_SIZE = (0.02, 0.40, 0.30)  # m
 WALL_CENTRE = (0.20, 0.0, 0.775)  # m: its top is 0.275 m above the table
@@ -21,10 +19,6 @@ INDICATOR_HALF_SIZE = (0.02, 0.1, 0.1)  # m
 INDICATOR_X, INDICATOR_Z = 0.25, 0.95  # m
 LIFT_HEIGHT = 0.04  # m above the table
 
-VARIANTS = {
-    "default": Variant(cube_x=(0.0, 0.0), cube_y=(-0.28, 0.28), cube_density=2000, horizon=102, **OLD),
-    "paper": Variant(cube_x=(0.0, 0.0), cube_y=(-0.17, 0.17), cube_density=2000, horizon=250, **PAPER),
-}
 NUMBERS = Variant(
     cube_x=(0.0, 0.0),
     cube_y=(-0.28, 0.28),
@@ -91,7 +85,6 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
 
     ## Version History
     - v1: ends attempts that press or grope, wants the cube to stay where it belongs, leaves time for a second search.
-    - v0: first version.
     """
     return _task(
         "OccludedGrasp-v1",
@@ -99,28 +92,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
         cube_material,
         (rails(-0.38, 0.38),),
         expert=partial(SteadyGraspExpert, config=EXACT_EXPERT),
-        sound=SyntheticEars,
         blind={name: partial(SteadyBlindGrasp, strategy=name) for name in BLIND_STRATEGIES},
-    )
-
-
-def occluded_grasp_v0(*, variant: str = "default", cube_material: str = "cube") -> Task:
-    """
-    Version 0, for old results: `OccludedGrasp-v1` (`occluded_grasp`), except that a cube higher than 0.04 m solves it at once,
-    that only shoving and time end an attempt, and that the time is 102 steps. A script that cannot hear solves most
-    episodes by tapping: the arm's own position tells where it came down on the cube.
-
-    `variant="paper"` has the numbers of the paper and its code, in which a blind gripper often succeeds.
-    """
-    check_option("variant", variant, tuple(VARIANTS))
-    return _task(
-        "OccludedGrasp-v0",
-        VARIANTS[variant],
-        cube_material,
-        expert=GraspExpert,
-        correcting_expert=partial(GraspExpert, config=CORRECTING_EXPERT),
-        blind={name: partial(BlindGrasp, strategy=name) for name in BLIND_STRATEGIES},
-        is_old=True,
     )
 
 

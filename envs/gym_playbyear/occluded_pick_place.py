@@ -8,12 +8,10 @@ import numpy as np
 from gym_playbyear.arena import TABLE_TOP, WALL_COLOUR, box, on_table, tray
 from gym_playbyear.blind import BLIND_STRATEGIES, BlindPickPlace
 from gym_playbyear.cube import cube, cube_task, place_cube, rails
-from gym_playbyear.ears_v2 import SyntheticEars
-from gym_playbyear.experts import CORRECTING_EXPERT, EXACT_EXPERT, PickPlaceExpert
+from gym_playbyear.experts import EXACT_EXPERT, PickPlaceExpert
 from gym_playbyear.looks_props import wall_on_the_table
-from gym_playbyear.options import check_option
 from gym_playbyear.task import Prop, Task
-from gym_playbyear.variant import OLD, PAPER, Variant
+from gym_playbyear.variant import Variant
 
 WALL_HALF_SIZE = (0.02, 0.20, 0.18)  # m
 WALL_CENTRE = (0.10, 0.20, 0.80)  # m
@@ -23,10 +21,6 @@ BIN_Y, BIN_Y_RANGE = -0.15, 0.1  # m: the bin stands at y = -0.15 - U(0, 0.1)
 PLACE_TOLERANCE = 0.025  # m
 PLACE_HEIGHT = 0.85  # m, world frame
 
-VARIANTS = {
-    "default": Variant(cube_x=(-0.001, 0.001), cube_y=(0.11, 0.31), cube_density=3000, horizon=220, **OLD),
-    "paper": Variant(cube_x=(-0.001, 0.001), cube_y=(0.15, 0.179), cube_density=3000, horizon=400, **PAPER),
-}
 NUMBERS = Variant(
     cube_x=(-0.001, 0.001),
     cube_y=(0.06, 0.34),
@@ -93,7 +87,6 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
 
     ## Version History
     - v1: ends attempts that press or grope, wants the cube to stay where it belongs, leaves time for a second search.
-    - v0: first version.
     """
     return _task(
         "OccludedPickPlace-v1",
@@ -101,21 +94,7 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
         cube_material,
         (rails(0.0, 0.38),),
         expert=partial(PickPlaceExpert, config=EXACT_EXPERT),
-        sound=SyntheticEars,
     )
-
-
-def occluded_pick_place_v0(*, variant: str = "default", cube_material: str = "cube") -> Task:
-    """
-    Version 0, for old results: `OccludedPickPlace-v1` (`occluded_pick_place`), except that a cube in the tray solves it at
-    once, that only shoving and time end an attempt, and that the time is 220 steps.
-
-    `variant="paper"` has the numbers of the paper and its code, in which a blind gripper mostly succeeds.
-    """
-    check_option("variant", variant, tuple(VARIANTS))
-    correcting = partial(PickPlaceExpert, config=CORRECTING_EXPERT)
-    traits: dict[str, Any] = {"expert": PickPlaceExpert, "correcting_expert": correcting, "is_old": True}
-    return _task("OccludedPickPlace-v0", VARIANTS[variant], cube_material, **traits)
 
 
 def _task(name: str, numbers: Variant, cube_material: str, more: tuple[Prop, ...] = (), **traits: Any) -> Task:

@@ -1,17 +1,12 @@
 """From a task's name and options to the task."""
 
 import inspect
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 from typing import Any
 
 from gym_playbyear import ALL_TASKS
 from gym_playbyear.task import Task
-
-
-class OldTaskWarning(FutureWarning):
-    """A task has a later version, which is better. Shown once per process and task."""
 
 
 class OptionError(ValueError):
@@ -57,9 +52,6 @@ class ResetOptions(dict[str, Any]):
                 raise OptionError(f"reset(options) {name}", self[name], f"the task's options of reset are {known}")
 
 
-_WARNED: set[str] = set()
-
-
 def check_option(name: str, value: Any, allowed: Iterable) -> None:
     """Raises OptionError if an option has none of the values that it may have."""
     allowed = tuple(allowed)
@@ -67,13 +59,12 @@ def check_option(name: str, value: Any, allowed: Iterable) -> None:
         raise OptionError(name, value, f"choose one of {', '.join(map(str, allowed))}")
 
 
-def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str, Any], *, warn: bool = True) -> Task:
+def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str, Any]) -> Task:
     """The task that a name, or a function, and options stand for.
 
     Args:
         task: A name, a task, or a function that makes one of its options.
         options: For that function.
-        warn: Whether to say that a task is old.
 
     Raises:
         OptionError: No task has this name, or the task no such option, or not with this value.
@@ -90,17 +81,4 @@ def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str
     definition = named if isinstance(named, Task) else named(**options)
     if not isinstance(definition, Task):
         raise OptionError("task", task, f"it gave a {type(definition).__name__}, wanted a gym_playbyear.task.Task")
-    if warn and definition.is_old and definition.name not in _WARNED:
-        _WARNED.add(definition.name)
-        _warn(definition.name)
     return definition
-
-
-def _warn(name: str) -> None:
-    warnings.warn(
-        f"{name} stays as it is, for old results: scripts that cannot hear solve it by tapping, and one failed grasp takes its "
-        f"time. {name.replace('-v0', '-v1')} stops a hand that presses, wants the cube held still, and leaves time for a "
-        "second search.",
-        OldTaskWarning,
-        stacklevel=4,
-    )

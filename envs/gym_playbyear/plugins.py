@@ -14,8 +14,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 GROUP = "gym_playbyear"
-KINDS = ("tasks", "arms", "props", "materials_v2", "microphones_v2", "materials", "microphones")
-"""Those with `_v2` are for tasks with `sound=SyntheticEars`, the other two for the sound of contact forces alone."""
+KINDS = ("tasks", "arms", "props", "materials", "microphones")
 
 
 class PluginError(RuntimeError):
@@ -71,7 +70,7 @@ class Registry(Mapping[str, Any]):
             PluginError: Another distribution's cannot be loaded.
         """
         if name not in self:
-            noun = self.kind.removesuffix("_v2").removesuffix("s").capitalize()
+            noun = self.kind.removesuffix("s").capitalize()
             raise ValueError(f"{noun} '{name}' is not known: choose one of {', '.join(sorted(self))}.")
         found = self[name]
         if not isinstance(found, kind):

@@ -28,9 +28,6 @@ class SensorNoise:
     wander_seconds: float = 2.0
 
 
-NO_SENSOR_NOISE = SensorNoise(0, 0, 0, 0, 0, 0, differentiated=False)
-
-
 class Proprioception:
     """The sensors of one arm.
 

@@ -11,9 +11,10 @@ import numpy as np
 from scipy import signal
 from scipy.io import wavfile
 
-from gym_playbyear.ears import MaterialEars, Moment
+from gym_playbyear.ears import Moment
+from gym_playbyear.ears_v2 import MaterialEars
 from gym_playbyear.options import OptionError, check_option
-from gym_playbyear.sound import pcm16
+from gym_playbyear.sound_v2 import BACKGROUND_RMS, pcm16
 
 RESPONSES: dict[str, tuple[str, float | tuple[float, float], float]] = {
     "flat": ("none", 0.0, 0.0),
@@ -54,7 +55,7 @@ class Room:
             raise OptionError("room_noise_level", noise_level, "give 0 (silent) or more")
         self._ears, self._microphones = ears, microphones
         recording = np.zeros(1, np.float32) if noise is None else _recording(str(noise), sample_rate)
-        self._recording = noise_level * ears.background_rms * recording
+        self._recording = noise_level * BACKGROUND_RMS * recording
         kind, corner, self._added = RESPONSES[response]
         self._filter = None if response == "flat" else signal.butter(1, corner, kind, fs=sample_rate, output="sos")
         self.reset(np.random.default_rng(0))

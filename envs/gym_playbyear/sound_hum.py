@@ -1,4 +1,4 @@
-"""The hum of an arm's motors, in both versions of the sound."""
+"""The hum of an arm's motors."""
 
 import math
 

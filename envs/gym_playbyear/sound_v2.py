@@ -13,7 +13,6 @@ import numpy as np
 
 from gym_playbyear.contact_kinematics import Contacts, SoundingPair
 from gym_playbyear.materials_v2 import material
-from gym_playbyear.sound import pcm16
 from gym_playbyear.sound_hum import HUM_RMS, Hum
 from gym_playbyear.sound_timing import physics_steps, samples_per_step
 from gym_playbyear.sound_v2_background import Drive, Noise
@@ -28,8 +27,15 @@ __all__ = ["MICROPHONES", "Bending", "ContactSynth"]
 
 _STRUCK = 4.8  # amplitude of a mode of amplitude 1 per Ns of a short blow (chosen)
 _MIX_SPREAD = 0.2  # of the mix of modes between blows, which fall on different places
-BACKGROUND = 0.25  # noise and hum, of version 0's: a touch of a finger must stand out of a room eight times as loud
+_BACKGROUND = 0.25  # of noise and hum: a touch of a finger must stand out of a room eight times as loud
+BACKGROUND_RMS = _BACKGROUND * 10 ** (-60 / 20)
+"""Of noise and hum, relative to full scale."""
 _STREAMS = 6
+
+
+def pcm16(wave: np.ndarray) -> np.ndarray:
+    """Converts a wave in [-1, 1] to 16-bit samples of the same shape; what lies outside is clipped."""
+    return np.rint(np.clip(wave, -1.0, 1.0) * 32767.0).astype(np.int16)
 
 
 class ContactSynth:
@@ -87,7 +93,7 @@ class ContactSynth:
         bank = self._bank
         draws = draw(draws_rng, bank.body_of_mode, len(self.pairs), len(self.microphones), self.randomise)
         self._gain = draws.gain[:, None]
-        self._noise_gain = BACKGROUND * self.noise_level * draws.noise
+        self._noise_gain = _BACKGROUND * self.noise_level * draws.noise
         self._weights = self._own_weights * (bank.amplitudes * draws.loudness[bank.body_of_mode])
         bank.reset(draws.pitch, draws.damping)
         self._blows.reset(draws.stiffness)

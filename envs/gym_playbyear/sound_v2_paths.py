@@ -55,7 +55,7 @@ MICROPHONES: dict[str, Microphone] = {
 }
 
 
-ALL_MICROPHONES = Registry("microphones_v2", MICROPHONES)
+ALL_MICROPHONES = Registry("microphones", MICROPHONES)
 """Ours, and those of other distributions (`gym_playbyear.plugins`)."""
 
 

@@ -7,7 +7,6 @@ from typing import Any, Protocol
 import mujoco
 import numpy as np
 
-from gym_playbyear.ears import Ears, HeardPair, contact_sound
 from gym_playbyear.haste import Haste
 from gym_playbyear.proprioception import SensorNoise
 from gym_playbyear.rules import Rule, Solved
@@ -87,8 +86,7 @@ class Prop:
         spec: That body as MJCF, `<body name=...>...</body>` or a whole `<mujoco>`, or as an `MjSpec` (kept as MJCF, so that
             tasks can be copied). Angles are in radians unless the `<mujoco>` says otherwise. Geoms that leave `contype` and
             `conaffinity` alone touch what a thing of this kind touches; zero for both means that one only sees them.
-        material: Name in `materials_v2.ALL_MATERIALS`, or `materials.ALL_MATERIALS` for `contact_sound`. None: its
-            contacts make no sound and are not measured.
+        material: Name in `materials_v2.ALL_MATERIALS`. None: its contacts make no sound and are not measured.
         loudness: Factor on its own share of a contact's sound.
         loose: It moves freely, by a free joint that has the prop's name, and may touch whatever is there.
         hidden: What no camera sees and hearing has to find. With `hidden_object=False` the hand passes through it.
@@ -128,9 +126,6 @@ class Camera:
     attributes: str
 
 
-SoundFactory = Callable[[list[HeardPair], tuple[str, ...], int, int, float, float], Ears]
-
-
 @dataclass(frozen=True)
 class Task:
     """A task, complete. `TaskEnv` plays it; a function that returns one may take options of its own (`contents="bottle"`).
@@ -151,7 +146,6 @@ class Task:
         expert: `expert(env)` makes the scripted expert: `act()` gives the next action.
         horizon: Steps after which an attempt is cut off.
         haste: What tells whether an attempt acted before it had heard anything (`info["acted_early"]`).
-        correcting_expert: An expert that corrects, where that differs from one that demonstrates.
         gate: `gate(env, expert)` makes the intervention gate; None: there is none.
         blind: Scripts without any sense of contact, by name; each is `script(env)`.
         deaf: Scripts that feel with the arm and do not hear, by name; each is `script(facts, rng)`, see
@@ -165,10 +159,8 @@ class Task:
         start, start_spread: Where the tool is before an episode [m, world], and how far it may be off along each axis.
         sensors: What is wrong with what the arm measures of itself.
         felt: Prop whose contact force stands in for sound with `sound="contact_force"`.
-        sound: What synthesises the sound; see `gym_playbyear.ears`.
         numbers: The task's own numbers, for its functions and scripts: `env.variant`.
         limits: What the task promises of those who play it, where that differs from other tasks (`env.check_limits`).
-        is_old: A later version is better; a warning says so when an environment is made.
     """
 
     name: str
@@ -182,7 +174,6 @@ class Task:
     horizon: int
     ends: tuple[Rule, ...] = ()
     haste: Haste = field(default_factory=Haste)
-    correcting_expert: Callable[[Any], Any] | None = None
     gate: Callable[[Any, Any], Any] | None = None
     blind: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
     deaf: Mapping[str, Callable[[Any, np.random.Generator], Any]] = field(default_factory=dict)
@@ -197,7 +188,5 @@ class Task:
     start_spread: float = 0.02
     sensors: SensorNoise = field(default_factory=SensorNoise)
     felt: str | None = None
-    sound: SoundFactory = contact_sound
     numbers: Any = None
     limits: Mapping[str, float] = field(default_factory=dict)
-    is_old: bool = False

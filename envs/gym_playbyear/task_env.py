@@ -12,7 +12,8 @@ from gymnasium import spaces
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from mujoco import rollout
 
-from gym_playbyear.ears import MaterialEars, Moment
+from gym_playbyear.ears import Moment
+from gym_playbyear.ears_v2 import MaterialEars
 from gym_playbyear.force_proxy import ForceProxy
 from gym_playbyear.looks import PeopleView
 from gym_playbyear.options import OptionError, ResetOptions, check_option, make_definition
@@ -94,7 +95,7 @@ class TaskEnv(PrivilegedState, gym.Env):
         self._sound: Any = None
         if sound == "waveform":
             rates = (self._sample_rate, definition.control_hz, definition.physics_dt)
-            ears = MaterialEars(definition.sound, self.contacts.heard(), self.microphones, *rates, noise_level)
+            ears = MaterialEars(self.contacts.heard(), self.microphones, *rates, noise_level)
             self._sound = in_room(ears, self.microphones, self._sample_rate, room or {})
         spec = compose(definition, max(render_size, image_size), hidden_object)
         self.contacts.add_sensors(spec, definition.felt)
@@ -155,7 +156,7 @@ class TaskEnv(PrivilegedState, gym.Env):
 
     def _make_gate(self) -> Any:
         assert self.definition.gate is not None
-        return self.definition.gate(self, (self.definition.correcting_expert or self.definition.expert)(self))
+        return self.definition.gate(self, self.definition.expert(self))
 
     def blind_baselines(self) -> dict[str, Any]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""

@@ -8,7 +8,6 @@ import numpy as np
 
 from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP, on_table
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.haste import MovedUnheard
 from gym_playbyear.options import check_option
 from gym_playbyear.pouch import CONTENTS, HALF_SIZE, PIECES, POUCH, pieces, pouch, put_pouch
@@ -123,7 +122,6 @@ def tell_apart(*, contents: str | None = None) -> Task:
         cameras=(FRONT_CAMERA,),
         start=(-0.05, -0.22, 0.96),
         sensors=NUMBERS.sensors,
-        sound=SyntheticEars,
         numbers=NUMBERS,
         limits={"blind": 0.55},
     )

@@ -1,12 +1,11 @@
 """The numbers of the tasks with a hidden cube, which decide whether they can be solved without hearing."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
 from gym_playbyear.arm import ArmConfig
-from gym_playbyear.proprioception import NO_SENSOR_NOISE, SensorNoise
+from gym_playbyear.proprioception import SensorNoise
 
 
 @dataclass(frozen=True)
@@ -37,18 +36,3 @@ class Variant:
     sweep_step: tuple[float, float] = (0.005, 0.011)
     arm: ArmConfig = field(default_factory=ArmConfig)
     sensors: SensorNoise = field(default_factory=SensorNoise)
-
-
-_OLD_TOUCHING = ("left_finger", "right_finger")  # version 0 does not count what the palm touches
-
-OLD: dict[str, Any] = {"arm": ArmConfig(touching=_OLD_TOUCHING)}
-"""Version 0's arm."""
-
-PAPER: dict[str, Any] = {
-    "cube_yaw": np.pi,
-    "cube_friction": 5,
-    "max_shove": np.inf,
-    "arm": ArmConfig(max_opening=0.08, gripper_cooldown=0.0, touching=_OLD_TOUCHING),
-    "sensors": NO_SENSOR_NOISE,
-}
-"""What the paper's tasks have in common, and ours have not."""

@@ -51,9 +51,7 @@ class PlaybyearEnvConfig(EnvConfig):
         microphone_response: `flat`, or the frequency response of another microphone: `phone`, `dull`, `boomy`.
         spectrogram: For policies that look at pictures of sound: the folder of the dataset that they learned from, made by
             `playbyear-attach-spectrogram`, or its `meta/info.json`. The same pictures then come as `pixels/<microphone>`.
-        cube_material: What the cube sounds like: `cube` (wood), `glass`, `tin`, `cardboard`, `rubber`; for tasks with a cube.
-        variant: `default`, or `paper` for the paper's values where ours differ; for version 0 of the tasks.
-        task_options: More options of the task, by name.
+        task_options: The task's own options by name, such as `{cube_material: glass}` or `{contents: pens}`.
         hidden_object: False: the hand passes through what is hidden; all else is the same world.
         visualization_width, visualization_height: Of the picture that `render()` gives people; the same number twice [pixels].
         render_mode: `rgb_array` (for videos), or `human` for a window.
@@ -78,8 +76,6 @@ class PlaybyearEnvConfig(EnvConfig):
     microphone_response: str = "flat"
     spectrogram: str | None = None
     # Task
-    cube_material: str = "cube"
-    variant: str = "default"
     task_options: dict[str, Any] = field(default_factory=dict)
     hidden_object: bool = True
     # For people
@@ -129,7 +125,7 @@ class PlaybyearEnvConfig(EnvConfig):
             "room": self._room(),
             "render_mode": self.render_mode,
             "render_size": self.visualization_width,
-            **self._own_options(),
+            **self.task_options,
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
@@ -180,15 +176,9 @@ class PlaybyearEnvConfig(EnvConfig):
             return None
         return {"noise": self.room_noise, "noise_level": self.room_noise_level, "response": self.microphone_response}
 
-    def _own_options(self) -> dict[str, Any]:
-        """Those that belong to the task. What has its default is left out: not every task knows it."""
-        defaults = {"cube_material": "cube", "variant": "default"}
-        changed = {name: getattr(self, name) for name, value in defaults.items() if getattr(self, name) != value}
-        return {**self.task_options, **changed}
-
     def _definition(self) -> Task:
         try:
-            return make_definition(self.task or "", self._own_options(), warn=False)
+            return make_definition(self.task or "", self.task_options)
         except OptionError as error:
             name = error.option if hasattr(self, error.option) else "task_options"
             raise self._error(name, error.wanted) from error

@@ -11,7 +11,6 @@ import numpy as np
 
 from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP, WALL_COLOUR, box
 from gym_playbyear.arm import ACTION_SCALE, ArmConfig
-from gym_playbyear.ears_v2 import SyntheticEars
 from gym_playbyear.materials_v2 import TINPLATE, cup, ringing
 from gym_playbyear.rules import Shoved, Solved
 from gym_playbyear.task import Prop, Task
@@ -44,7 +43,6 @@ def stop_at_the_tin() -> Task:
         expert=Expert,
         horizon=200,
         start=(0.0, -0.25, 0.9),
-        sound=SyntheticEars,
     )
 
 

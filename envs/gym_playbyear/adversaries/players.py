@@ -4,17 +4,18 @@ from typing import Any
 
 from gym_playbyear.adversaries.scripts import SCRIPTS, Outcome, ScriptMaker, play
 from gym_playbyear.adversaries.view import DeafTask, camera_numbers
+from gym_playbyear.task import Task
 
 EXPERT = "expert"
 KINDS = (EXPERT, "blind", "deaf")
 
 
-def players(task: str, **options: Any) -> dict[str, str]:
+def players(task: str | Task, **options: Any) -> dict[str, str]:
     """The names of a task's players, each with its kind.
 
     Args:
-        task: Its name, such as `OccludedGrasp-v1`.
-        options: For `gymnasium.make`.
+        task: Its name, such as `OccludedGrasp-v1`, or the task.
+        options: Of `TaskEnv`.
     """
     deaf_task = DeafTask(task, **options)
     deaf_task.begin(0)
@@ -32,7 +33,7 @@ def deaf_scripts(deaf_task: DeafTask) -> dict[str, ScriptMaker]:
     return own or (SCRIPTS if "hidden_range" in camera_numbers(deaf_task.env) else {})
 
 
-def promised_limits(task: str, **options: Any) -> dict[str, float]:
+def promised_limits(task: str | Task, **options: Any) -> dict[str, float]:
     """The limits that a task sets for itself (`check_limits` of its environment), by name."""
     deaf_task = DeafTask(task, **options)
     limits = dict(getattr(deaf_task.env, "check_limits", {}))
@@ -40,14 +41,14 @@ def promised_limits(task: str, **options: Any) -> dict[str, float]:
     return limits
 
 
-def outcomes(task: str, name: str, seeds: range, options: dict[str, Any] | None = None) -> list[Outcome]:
+def outcomes(task: str | Task, name: str, seeds: range, options: dict[str, Any] | None = None) -> list[Outcome]:
     """How a player's attempts end, one for each seed.
 
     Args:
-        task: Its name.
+        task: Its name, or the task.
         name: Of the player.
         seeds: Of the episodes.
-        options: For `gymnasium.make`.
+        options: Of `TaskEnv`.
     """
     deaf_task = DeafTask(task, **(options or {}))
     deaf_task.begin(seeds[0])

@@ -18,6 +18,7 @@ import numpy as np
 from gym_playbyear.adversaries.classifier import CLASSIFIERS, area_under_curve
 from gym_playbyear.adversaries.view import DeafTask, DeafView
 from gym_playbyear.arm import ACTION_SCALE
+from gym_playbyear.task import Task
 
 _HISTORY = 10  # steps in a window
 _AFTER = 10  # steps after the touch that are judged
@@ -72,14 +73,14 @@ class Twins:
     """Both worlds of a task.
 
     Args:
-        task: Its name.
-        options: For `gymnasium.make`.
+        task: Its name, or the task.
+        options: Of `TaskEnv`.
 
     Raises:
         TwinError: The worlds differ by what is hidden, and nothing is.
     """
 
-    def __init__(self, task: str, **options: Any):
+    def __init__(self, task: str | Task, **options: Any):
         asked = DeafTask(task, **options)
         definition = asked.env.definition
         first, second = definition.twins
@@ -180,14 +181,14 @@ def windows(run: _Run, actions: list[np.ndarray], steps: range) -> np.ndarray:
     return np.stack(features)
 
 
-def twin_test(task: str, seeds: range, *, n_pictured: int = 3, **options: Any) -> TwinResult:
+def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options: Any) -> TwinResult:
     """Whether anything but sound tells that the object was touched.
 
     Args:
-        task: Its name.
+        task: Its name, or the task.
         seeds: One episode each; every second one trains the classifiers, the others judge them.
         n_pictured: In so many episodes whole observations are compared, with pictures.
-        options: For `gymnasium.make`.
+        options: Of `TaskEnv`.
 
     Raises:
         TwinError: As of `Twins`, or the expert touched the object in fewer than four episodes.

@@ -8,11 +8,11 @@ from them.
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
-import gym_playbyear  # noqa: F401 (registers the tasks)
 from gym_playbyear.proprioception import Proprioception
+from gym_playbyear.task import Task
+from gym_playbyear.task_env import TaskEnv
 
 _NOISE_STREAM = 7  # tells the sensors' random numbers from those of a script with the same seed
 _WANDER_STREAM = 8
@@ -77,16 +77,15 @@ class DeafTask:
     """A task as a deaf player meets it: nothing is rendered, nothing is heard.
 
     Args:
-        task: Its name, such as `OccludedGrasp-v1`.
-        options: For `gymnasium.make`.
+        task: Its name, such as `OccludedGrasp-v1`, or the task.
+        options: Of `TaskEnv`.
 
     Attributes:
         env: The unwrapped environment, for whoever judges. Never hand it to a script.
     """
 
-    def __init__(self, task: str, **options: Any):
-        made: Any = gym.make(f"gym_playbyear/{task}", **{"sound": "none", "disable_env_checker": True, **options})
-        self.env: Any = made.unwrapped
+    def __init__(self, task: str | Task, **options: Any):
+        self.env = TaskEnv(task, **{"sound": "none", **options})
         definition, variant, hz = self.env.definition, self.env.variant, float(self.env.control_hz)
         arm = definition.arm
         self.facts = TaskFacts(

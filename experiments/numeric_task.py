@@ -11,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from gym_playbyear.adversaries.numeric_terms import N_SHOWN, N_TRUTH, terms_of
+from experiments.numeric_terms import N_SHOWN, N_TRUTH, terms_of
 from gym_playbyear.adversaries.view import DeafTask, DeafView
 from gym_playbyear.arm import ACTION_SCALE
 
