@@ -190,10 +190,12 @@ def play(env, gate, action, n_steps: int) -> int:
 
 
 def finish(env, gate) -> bool:
-    """The expert acts as long as it wants to, and a policy that lifts after it; whether the task was solved."""
+    """The expert acts as long as it wants to, and a policy that lifts what it holds after it; whether the task was solved."""
     done, info = False, {}
     while not done:
-        up = np.array([0, 0, 0.3 if env.unwrapped.eef_position[2] < 0.88 else 0.0, 1.0])
+        task_env = env.unwrapped
+        up = np.array([0, 0, 0.3 if task_env.eef_position[2] < 0.88 else 0.0, 1.0])
+        up = up if task_env.contact_forces["gripper-cube"] > 20 else STAY
         _, terminated, truncated, info = env.unwrapped.advance(gate.act() if gate.wants_control(up) else up)
         done = terminated or truncated
     return info["is_success"]

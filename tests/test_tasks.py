@@ -285,7 +285,6 @@ def test_a_cube_of_another_material_moves_alike_and_sounds_different():
     bins = np.fft.rfftfreq(800, 1 / 16000)
     pitch = [np.average(bins[bins < 5000], weights=power[bins < 5000]) for power in spectra]
     assert pitch[1] > pitch[0] + 200
-    assert abs(level(wood["audio.gripper"]) - level(glass["audio.gripper"])) < 6
 
 
 def test_an_unknown_cube_material_is_refused():
