@@ -131,7 +131,9 @@ def test_environments_in_processes_of_their_own_see_the_same():
 
 def test_options_reach_the_environment():
     sizes = {"image_size": 32, "visualization_width": 96, "visualization_height": 96}
-    config = PlaybyearEnvConfig(task="OccludedGrasp-v1", task_options={"cube_material": "tin"}, episode_length=7, **sizes)
+    config = PlaybyearEnvConfig(
+        task="OccludedGrasp-v1", task_options={"cube_material": "tin"}, episode_length=7, **sizes
+    )
     vec = vector_env(config)
     vec.reset(seed=0)
     assert vec.call("_max_episode_steps") == (7,)
