@@ -214,13 +214,12 @@ def test_a_hand_that_is_about_to_land_on_the_cube_searches_anew():
     env.close()
 
 
-def test_fingers_that_closed_on_nothing_bring_the_expert_which_waits_until_they_open():
+def test_fingers_that_closed_on_nothing_bring_the_expert():
     env, gate = at_phase("OccludedGrasp-v1", "sweep", horizon=350)
     taken_after = play(env, gate, np.array([0, 0, 0, 1.0]), 20)
     assert gate.reason == "empty"
     assert taken_after > 3
     assert env.unwrapped.finger_positions.sum() < GateConfig().empty_opening
-    assert finish(env, gate)
     env.close()
 
 

@@ -34,7 +34,7 @@ from lerobot_playbyear.hub.push import HubError, PushOptions, evaluation_of, pus
 
 DATASET = "tester/grasp"
 POLICY = "tester/hearing"
-ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v1", "--env.image_size=16", "--env.episode_length=60")
+ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v1", "--env.image_size=16", "--env.episode_length=110")
 TINY = (
     "--policy.type=playbyear",
     "--policy.device=cpu",
