@@ -14,7 +14,7 @@ from common import Row, in_turns, medians, parser_for, run
 from policies import make_policy, random_runs
 from training import update_of
 
-from lerobot_playbyear.policy.precision import computes_bfloat16
+from lerobot_playbyear.policy.optimization import computes_bfloat16
 from lerobot_playbyear.training.heap import keep_freed_memory
 from lerobot_playbyear.training.presets import RECIPES
 

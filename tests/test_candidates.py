@@ -9,14 +9,14 @@ from test_policy_contract import make_config, make_episode, run_ending_at, step_
 from torch._subclasses.fake_tensor import FakeTensorMode
 from training_digest import probe, trained
 
-from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads
+from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads, onsets, ways_from_onsets
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.policy.precision import computes_512_bits
+from lerobot_playbyear.policy.optimization import computes_512_bits
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 MICROPHONE, N_FRAMES = "observation.audio.gripper", 16
-TRAINED = {"d1a39e5a6f87a521": "9d03b8ddf2f5e894"}
+TRAINED = {"d1a39e5a6f87a521": "9d03b8ddf2f5e894", "e213f808f21bff54": "131ba9e78762b0ee"}
 """By the probe of a machine: what the usual options trained there, since pictures are shrunk before they are recoloured."""
 
 SMALL = {"audio_window_s": 0.9, "n_memory_steps": 3, "n_supervised_steps": 5, "n_frame_stack": 2}
@@ -49,6 +49,14 @@ def test_with_the_usual_options_training_is_what_it_was_bit_for_bit():
     if probe() not in TRAINED:
         pytest.skip(f"no digest for this machine ({probe()}): python tests/training_digest.py")
     assert trained() == TRAINED[probe()]
+
+
+def losses_of(policy, batch, encodings, outputs):
+    """Errors and weights of every head."""
+    config = policy.config
+    waves = [batch[key][:, -config.n_audio_frames :] / 32768 for key in config.audio_keys]
+    felt = [batch["observation.state"][:, -config.n_run_frames :]]
+    return list(policy.model.auxiliary(waves, felt, encodings, outputs).values())
 
 
 def test_the_usual_options_make_no_new_module_and_say_nothing_new():
@@ -198,12 +206,11 @@ def test_a_head_changes_the_loss_by_its_weight_and_its_gradient_reaches_the_sens
     factor = CANDIDATES[kind][f"auxiliary_{kind}"]
     torch.testing.assert_close(loss, figures["loss_action"] + factor * figures[f"loss_{kind}"])
     network = policy.model
-    weight = (batch["action"] * 0 + 1)[..., 0]
     encodings = network.encode_run(batch, policy.config.n_run_frames)
     outputs = network.memory_head.recall(encodings)
-    (other,) = network.auxiliary(batch, encodings[:, -weight.shape[1] :], outputs, weight)
+    ((error, _),) = losses_of(policy, batch, encodings[:, -outputs.shape[1] :], outputs)
     policy.zero_grad()
-    other.error.sum().backward()
+    error.sum().backward()
     ear = next(iter(network.hearing.parameters())).grad
     assert ear is not None
     assert ear.abs().max() > 0
@@ -253,18 +260,25 @@ def clicks(policy, frames, seed=1):
     return episode
 
 
-def onsets(policy, batch):
+def levels_of(batch):
+    return torch.log10((batch[MICROPHONE] / 32768).square().mean(dim=2) + 1e-10).unsqueeze(2)
+
+
+def onsets_of(batch):
     """Of the last five frames."""
-    heads = policy.model.auxiliary
-    return heads._onsets(heads._levels(batch), 5).tolist()
+    return onsets(levels_of(batch), 5).tolist()
+
+
+def ways_of(policy, batch):
+    return ways_from_onsets(levels_of(batch), batch["observation.state"][:, -policy.config.n_run_frames :], 3)
 
 
 def test_an_onset_is_a_click_and_not_what_rings_on_nor_steady_noise():
     policy = make_policy(auxiliary_onset=1.0)
     batch = run_ending_at(clicks(policy, (12, 13, 15)), N_FRAMES - 1, policy.config)
-    assert onsets(policy, batch) == [[0, 1, 0, 0, 1]]  # frames 11 to 15
+    assert onsets_of(batch) == [[0, 1, 0, 0, 1]]  # frames 11 to 15
     louder = {**batch, MICROPHONE: run_ending_at(clicks(policy, ()), 15, policy.config)[MICROPHONE] * 40}
-    assert onsets(policy, louder) == [[0] * 5]
+    assert onsets_of(louder) == [[0] * 5]
 
 
 def test_what_swells_is_no_onset():
@@ -274,26 +288,21 @@ def test_what_swells_is_no_onset():
     for k, frame in enumerate(range(12, 16), start=1):
         episode[MICROPHONE][frame] = (episode[MICROPHONE][frame] * 2.2**k).to(torch.int16)
     batch = run_ending_at(episode, 15, policy.config)
-    assert onsets(policy, batch) == [[0, 0, 0, 0, 0]]
+    assert onsets_of(batch) == [[0, 0, 0, 0, 0]]
     episode[MICROPHONE][14] = episode[MICROPHONE][11]  # what comes after a pause is one
-    assert onsets(policy, run_ending_at(episode, 15, policy.config)) == [[0, 0, 0, 0, 1]]
+    assert onsets_of(run_ending_at(episode, 15, policy.config)) == [[0, 0, 0, 0, 1]]
 
 
 def test_the_way_is_from_the_last_onset_that_the_memory_holds():
     policy = make_policy(auxiliary_way=1.0)  # three frames of memory
     episode = clicks(policy, (11, 14))
     episode["observation.state"] = torch.arange(N_FRAMES * 1.0).square().unsqueeze(1) * torch.full((7,), 0.03)
-    batch, heads = run_ending_at(episode, 15, policy.config), policy.model.auxiliary
-    ways, is_known = heads._ways(batch, heads._levels(batch), 5)
+    batch = run_ending_at(episode, 15, policy.config)
+    ways, is_known = ways_of(policy, batch)
     assert is_known.tolist() == [[1, 1, 1, 1, 1]]
     assert ways[0, :, 0].tolist() == pytest.approx([0, -0.69, -1, 0, -0.87], abs=1e-5)  # frames 11 to 15; -1.44 is far
     quiet = batch | {MICROPHONE: run_ending_at(clicks(policy, (11,)), 15, policy.config)[MICROPHONE]}
-    ways, is_known = heads._ways(quiet, heads._levels(quiet), 5)
-    assert is_known.tolist() == [[1, 1, 1, 0, 0]]
-    # The head is asked for nothing where nothing is known.
-    outputs = torch.zeros(1, 5, policy.config.embedding_size)
-    (loss,) = heads(quiet, outputs, outputs, torch.tensor([[1.0, 1.0, 0.0, 1.0, 1.0]]))
-    assert loss.weight.tolist() == [[1, 1, 0, 0, 0]]
+    assert ways_of(policy, quiet)[1].tolist() == [[1, 1, 1, 0, 0]]
 
 
 def test_an_envelope_keeps_how_loud_it_was():
@@ -340,17 +349,16 @@ def clicks_of_two(policy, clicked):
 def test_the_balance_is_who_hears_an_onset_louder():
     policy = two_ears(auxiliary_balance=1.0)
     batch = clicks_of_two(policy, {12: LEFT, 15: RIGHT})
-    heads, weight = policy.model.auxiliary, torch.ones(1, 5)
-    head = heads.heads["balance"]
+    head = policy.model.auxiliary.heads["balance"]
     for parameter in head.parameters():
         torch.nn.init.zeros_(parameter)
     encodings = torch.zeros(1, 5, policy.config.embedding_size)
 
     def errors(logits):
         head[-1].bias.data = torch.tensor(logits)
-        (loss,) = heads(batch, encodings, encodings, weight)
-        assert loss.weight.tolist() == [[0, 1, 0, 0, 1]]  # of frames 11 to 15
-        return loss.error[0, [1, 4]].tolist()
+        ((error, weight),) = losses_of(policy, batch, encodings, encodings)
+        assert weight.tolist() == [[0, 1, 0, 0, 1]]  # of frames 11 to 15
+        return error[0, [1, 4]].tolist()
 
     for_left, for_right = errors([math.log(100.0), 0.0])  # the click is 20 dB louder there
     assert for_left < 0.02 < 3 < for_right
@@ -380,7 +388,7 @@ def test_the_balance_is_learned_from_the_ears_and_needs_two_of_them():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"auxiliary_onset": -1.0}, r"auxiliary_onset must be at least 0 \(off\) and finite, got -1.0"),
+        ({"auxiliary_onset": -1.0}, r"auxiliary_onset must be at least 0 \(none\) and finite, got -1.0"),
         ({"auxiliary_way": math.inf}, r"auxiliary_way must be at least 0"),
         ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
         ({"memory_displacement_gain": 10.0, "low_dimensional_gain": 0.0}, r"low_dimensional_gain is 0: give 4"),

@@ -22,7 +22,8 @@ from lerobot_playbyear.datasets import EpisodeStore, disk_columns, reading
 from lerobot_playbyear.datasets.disk_columns import CacheError
 from lerobot_playbyear.datasets.identity import dataset_identity
 from lerobot_playbyear.datasets.opening import open_dataset
-from lerobot_playbyear.policy.augmentation import Augmentation, resize
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
 
 LENGTHS = (12, 17, 9)
 SIZE = 32
@@ -104,7 +105,7 @@ def test_a_shrunk_picture_is_augmented_like_the_recorded_one():
     recorded = torch.rand(2, 3, 3, 60, 80).mul(255).byte()
     kept = torch.from_numpy(np.stack([reading.shrink(run.numpy(), 24) for run in recorded]))
     assert kept.shape == (2, 3, 3, 24, 24)
-    augment = Augmentation(crop=4, brightness=0.3, hue=0.1, degrees=5, translate=0.05, scale=0.1)
+    augment = Augmentation(PlaybyearConfig(augmentation_brightness=0.3, augmentation_hue=0.1, augmentation_scale=0.1))
     torch.manual_seed(0)
     expected = augment(recorded.float() / 255, 24)
     torch.manual_seed(0)

@@ -17,7 +17,7 @@ SHARE = """
 import sys
 import torch
 from safetensors.torch import load_file, save_file
-from lerobot_playbyear.policy.shared_statistics import SharedBatchNorm2d, mean_over_processes
+from lerobot_playbyear.policy.batch_norm import SharedBatchNorm2d, mean_over_processes
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram
 
 folder, rank, n_processes = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])

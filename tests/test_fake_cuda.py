@@ -16,8 +16,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import lerobot_playbyear
-from lerobot_playbyear.policy.history import RecentFrames
-from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy, RecentFrames
 
 PACKAGE = Path(lerobot_playbyear.__file__).parent
 

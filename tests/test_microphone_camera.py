@@ -31,7 +31,7 @@ from lerobot_playbyear.datasets.audio_files import write_wav
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.microphone_step import MicrophonePicturesToAudioStep
+from lerobot_playbyear.policy.processor_playbyear import MicrophonePicturesToAudioStep
 
 RATE, FPS, SIZE = 16000, 20, 800
 KEY, PICTURE = "observation.audio.mic", "observation.images.mic"

@@ -17,7 +17,7 @@ from test_policy_contract import make_config, make_episode, run_ending_at
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from lerobot_playbyear.policy.augmentation import Augmentation, sample
+from lerobot_playbyear.policy.image_augmentation import Augmentation, sample
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 ZEROS, BILINEAR = 0, 0  # how aten counts paddings and interpolations
@@ -151,10 +151,10 @@ def test_repeated_edges_are_those_of_padding_border(height, width):
 
 def test_images_in_bfloat16_are_moved_as_exactly_as_others():
     images = torch.rand(2, 3, 3, 84, 84).to(torch.bfloat16)
-    strengths = {"crop": 4.0, "brightness": 0.0, "hue": 0.0, "degrees": 5.0, "translate": 0.05, "scale": 0.05}
+    config = make_config(augmentation_brightness=0.0, augmentation_hue=0.0)
     moved = []
     for values in (images, images.float()):
         torch.manual_seed(1)
-        moved.append(Augmentation(**strengths)(values, 84))
+        moved.append(Augmentation(config)(values, 84))
     assert moved[0].dtype == torch.bfloat16
     torch.testing.assert_close(moved[0].float(), moved[1], rtol=0, atol=2**-7)  # their last bit, and that of colours

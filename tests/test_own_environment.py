@@ -10,7 +10,7 @@ import torch
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts import lerobot_eval
 
-from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
+from lerobot_playbyear.policy.processor_playbyear import Pcm16ToFloatProcessorStep
 from lerobot_playbyear.scripts import record, train
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -7,8 +7,8 @@ import pytest
 import torch
 from test_policy_contract import make_episode, make_policy, run_ending_at, step_through
 
+from lerobot_playbyear.policy.cpu_inference import FoldedVisionEncoder, PackedResNet
 from lerobot_playbyear.policy.networks import VisionEncoder
-from lerobot_playbyear.policy.packed_encoder import FoldedVisionEncoder, PackedResNet
 
 
 @pytest.fixture

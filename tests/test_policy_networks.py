@@ -3,16 +3,19 @@
 import pytest
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
+from test_policy_contract import make_config
 from torch import nn
 from torchvision.models import resnet18
 
-from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.cpu_inference import FoldedVisionEncoder
+from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
-from lerobot_playbyear.policy.packed_encoder import FoldedVisionEncoder
 
-STRENGTHS = {"crop": 4.0, "brightness": 0.05, "hue": 0.05, "degrees": 5.0, "translate": 0.05, "scale": 0.05}
+NO_AUGMENTATION = {
+    f"augmentation_{kind}": 0.0 for kind in ("crop", "brightness", "hue", "degrees", "translate", "scale")
+}
 
 
 def count(module: nn.Module) -> int:
@@ -109,7 +112,7 @@ def test_a_training_item_has_as_many_frames_as_its_windows_reach_back(policy):
 def test_all_frames_of_a_run_share_one_draw_and_runs_differ():
     torch.manual_seed(0)
     image = torch.rand(1, 1, 3, 40, 40)
-    augmented = Augmentation(**STRENGTHS)(image.expand(2, 6, 3, 40, 40), 32)
+    augmented = Augmentation(make_config())(image.expand(2, 6, 3, 40, 40), 32)
     assert augmented.shape == (2, 6, 3, 32, 32)
     assert (augmented == augmented[:, :1]).all()
     assert not torch.allclose(augmented[0], augmented[1], atol=1e-3)
@@ -122,13 +125,13 @@ def test_a_rotated_wide_image_keeps_its_right_angles():
     torch.manual_seed(3)
     images = torch.zeros(1, 1, 3, 60, 120)
     corners = [(20, 50), (20, 70), (40, 50)]
-    turned = {**dict.fromkeys(STRENGTHS, 0.0), "degrees": 30.0}
+    turned = NO_AUGMENTATION | {"augmentation_degrees": 30.0}
     found = []
     for row, column in corners:
         torch.manual_seed(3)
         dot = images.clone()
         dot[..., row - 1 : row + 2, column - 1 : column + 2] = 1.0
-        dot = Augmentation(**turned)(dot, 120)[0, 0, 0]
+        dot = Augmentation(make_config(**turned))(dot, 120)[0, 0, 0]
         grid = torch.arange(120.0)
         # Back to pixels of the original: the height was stretched by two.
         found.append(torch.stack([(dot.sum(1) @ grid) / dot.sum() / 2, (dot.sum(0) @ grid) / dot.sum()]))
@@ -141,7 +144,7 @@ def test_a_rotated_wide_image_keeps_its_right_angles():
 def test_shrinking_averages_instead_of_skipping_pixels():
     stripes = torch.zeros(1, 1, 3, 96, 96)
     stripes[..., ::2] = 1.0
-    plain = Augmentation(**dict.fromkeys(STRENGTHS, 0.0))
+    plain = Augmentation(make_config(**NO_AUGMENTATION))
     for shrunk in (resize(stripes, 32), plain(stripes, 32)):
         torch.testing.assert_close(shrunk, torch.full_like(shrunk, 0.5), rtol=0, atol=0.1)
 
@@ -149,14 +152,14 @@ def test_shrinking_averages_instead_of_skipping_pixels():
 @pytest.mark.parametrize(("height", "size"), [(40, 40), (40, 90), (60, 32)])
 def test_augmentation_without_strength_is_resizing(height, size):
     images = torch.rand(2, 3, 3, height, 40)
-    plain = Augmentation(**dict.fromkeys(STRENGTHS, 0.0))(images, size)
+    plain = Augmentation(make_config(**NO_AUGMENTATION))(images, size)
     torch.testing.assert_close(plain, resize(images, size), rtol=0, atol=1e-4)
 
 
 def test_brightness_and_hue_leave_grey_grey():
     grey = torch.full((4, 2, 3, 20, 20), 0.5)
-    colours = {**dict.fromkeys(STRENGTHS, 0.0), "brightness": 0.05, "hue": 0.05}
-    augmented = Augmentation(**colours)(grey, 20)
+    colours = NO_AUGMENTATION | {"augmentation_brightness": 0.05, "augmentation_hue": 0.05}
+    augmented = Augmentation(make_config(**colours))(grey, 20)
     torch.testing.assert_close(augmented[:, :, 0], augmented[:, :, 2], rtol=0, atol=5e-3)
     levels = augmented[:, 0, 0, 0, 0]
     assert ((levels > 0.5 * 0.94) & (levels < 0.5 * 1.06)).all()

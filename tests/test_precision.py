@@ -15,7 +15,7 @@ from safetensors.torch import load_file
 from test_policy_contract import make_config
 from torch import nn
 
-from lerobot_playbyear.policy.precision import training_dtype
+from lerobot_playbyear.policy.optimization import training_dtype
 from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.processes import make_accelerator
 

@@ -19,7 +19,7 @@ from gym_playbyear.options import OptionError
 from gym_playbyear.room import _recording
 from gym_playbyear.sound_v2 import BACKGROUND_RMS
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.policy.recorded_noise import RecordedNoise
+from lerobot_playbyear.policy.sound_augmentation import RecordedNoise
 
 TASK = "gym_playbyear:gym_playbyear/OccludedGrasp-v1"
 N_STEPS = 12

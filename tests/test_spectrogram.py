@@ -7,9 +7,9 @@ import pytest
 import torch
 from torchaudio.functional import resample
 
+from lerobot_playbyear.policy.configuration_playbyear import segment_and_hop
 from lerobot_playbyear.policy.networks import AudioEncoder
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
-from lerobot_playbyear.policy.window_lengths import segment_and_hop
 from lerobot_playbyear.training.presets import RECIPES
 
 SEGMENT_S, HOP_S, N_BINS, WINDOW_S = 0.040, 0.035, 160, 2.0

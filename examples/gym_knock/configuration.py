@@ -8,7 +8,7 @@ from lerobot.envs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 
 from gym_knock.environment import FPS, SAMPLE_RATE, SIZE
-from lerobot_playbyear.policy.environment_sound import Pcm16ToFloatProcessorStep
+from lerobot_playbyear.policy.processor_playbyear import Pcm16ToFloatProcessorStep
 
 
 @EnvConfig.register_subclass("knock")

@@ -1,143 +1,129 @@
 """What training predicts beside the action, so that encodings hold more than this action needs. Nothing of it acts.
 
-In comments: B items, K supervised windows of each, M microphones, D numbers in a joint encoding.
+In comments: B items, n frames of each, K supervised windows, M microphones, D numbers in a joint encoding.
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.history import newest
-from lerobot_playbyear.policy.spectrogram import POWER_FLOOR, to_float_wave
+from lerobot_playbyear.policy.spectrogram import POWER_FLOOR
 
-KINDS = ("onset", "balance", "way")
 _HIDDEN = 128
 _ONSET = 1.2  # [10 dB] above the item's median frame, and above the frame before
 _NEAR = 0.1  # [normalised units] errors of a way count squared up to here, and then as they are
 _FAR = 1.0  # [normalised units] what is farther away is told as that far: carrying takes it to several, and nothing hangs on it
 
 
-@dataclass(frozen=True)
-class AuxiliaryLoss:
-    """One of `KINDS` in one batch.
-
-    Attributes:
-        kind: Its name.
-        factor: Its weight beside the action's loss.
-        error: (B, n) of n predictions per item.
-        weight: (B, n), 0 where there was nothing to predict.
-    """
-
-    kind: str
-    factor: float
-    error: Tensor
-    weight: Tensor
-
-
-class AuxiliaryHeads(nn.Module):
-    """A small head with one hidden layer for every kind that has a weight.
-
-    Args:
-        config: The policy's configuration.
-    """
-
-    def __init__(self, config: PlaybyearConfig):
-        super().__init__()
-        self.config = config
-        self.factors = weights_of(config)
-        n_felt = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
-        sizes = {"onset": 1, "balance": len(config.audio_keys), "way": n_felt}
-        heads = {kind: _head(config.embedding_size, sizes[kind]) for kind in KINDS if self.factors[kind]}
-        self.heads = nn.ModuleDict(heads)
-
-    def forward(
-        self, batch: dict[str, Tensor], encodings: Tensor, outputs: Tensor, weight: Tensor
-    ) -> Iterator[AuxiliaryLoss]:
-        """The losses of a batch.
-
-        Args:
-            batch: As `PlaybyearPolicy.forward` gets it.
-            encodings: (B, K, D) joint encodings of the frames that the windows end at.
-            outputs: (B, K, D) the memory's outputs after the windows.
-            weight: (B, K), 0 for windows that are not learned from.
-        """
-        levels, n_windows = self._levels(batch), encodings.shape[1]
-        for kind in self.heads:
-            if kind == "onset":
-                logits, begins = self._predict(kind, encodings).squeeze(2), self._onsets(levels, n_windows)  # (B, K)
-                error = functional.binary_cross_entropy_with_logits(logits, begins, reduction="none")
-                counts = weight
-            elif kind == "balance":
-                counts = weight * self._onsets(levels, n_windows)
-                shares = (levels[:, -n_windows:] * math.log(10)).softmax(dim=2)  # of the power, (B, K, M)
-                logits = self._predict(kind, encodings).log_softmax(dim=2)
-                error = functional.kl_div(logits, shares, reduction="none").sum(dim=2)
-            else:
-                ways, is_known = self._ways(batch, levels, n_windows)
-                predicted, counts = self._predict(kind, outputs), weight * is_known
-                error = functional.smooth_l1_loss(predicted, ways, beta=_NEAR, reduction="none").mean(dim=2)
-            yield AuxiliaryLoss(kind, self.factors[kind], error, counts)
-
-    def _predict(self, kind: str, inputs: Tensor) -> Tensor:
-        return self.heads[kind](inputs).float()  # whatever autocast computed in
-
-    def _levels(self, batch: dict[str, Tensor]) -> Tensor:
-        """How loud each frame is at each of M microphones, without augmentation, (B, frames, M) [10 dB]."""
-        sounds = (self._sound(batch, key, self.config.n_audio_frames) for key in self.config.audio_keys)
-        return torch.stack([torch.log10(sound.square().mean(dim=2) + POWER_FLOOR) for sound in sounds], dim=2)
-
-    @staticmethod
-    def _onsets(levels: Tensor, n_windows: int) -> Tensor:
-        """Whether a sudden sound begins, at any microphone, in each of the last frames: 0 or 1, (B, n_windows).
-
-        What swells, as the rubbing of a thing that is carried, crosses the first threshold up and down by chance: it has to be
-        a jump, too, or nobody could learn to tell it.
-        """
-        louder = levels - levels.sort(dim=1).values[:, (levels.shape[1] - 1) // 2, None]
-        loud, sudden = ((rise > _ONSET).any(dim=2) for rise in (louder, levels.diff(dim=1)))
-        return (loud[:, 1:] & ~loud[:, :-1] & sudden)[:, -n_windows:].float()
-
-    def _ways(self, batch: dict[str, Tensor], levels: Tensor, n_windows: int) -> tuple[Tensor, Tensor]:
-        """Where the arm was at the last sudden sound that a window remembers, from where it is at the window's end.
-
-        Returns:
-            (B, n_windows, numbers that are felt) without noise, `_FAR` at most; and whether there was such a sound, 0 or 1,
-            (B, n_windows).
-        """
-        config = self.config
-        n_steps = config.memory_steps
-        n_frames = n_windows + n_steps - 1
-        shapes = {key: config.feature_shape(key) for key in config.low_dimensional_keys}
-        felt = [newest(batch, key, n_frames, shape).flatten(2) for key, shape in shapes.items()]
-        places = torch.cat(felt, dim=2)  # (B, n_frames, numbers)
-        frames = torch.arange(n_frames, device=places.device)
-        last = torch.where(self._onsets(levels, n_frames) > 0, frames, -1).cummax(dim=1).values[:, n_steps - 1 :]
-        is_known = last > frames[n_steps - 1 :] - n_steps  # (B, n_windows)
-        at_sound = last.clamp(min=0).unsqueeze(2).expand(-1, -1, places.shape[2])
-        ways = places.gather(1, at_sound) - places[:, n_steps - 1 :]
-        return ways.clamp(-_FAR, _FAR), is_known.to(places.dtype)
-
-    def _sound(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
-        """The newest sound of a microphone, (B, n_frames, S)."""
-        return to_float_wave(newest(batch, key, n_frames, self.config.feature_shape(key)), key)
-
-
-def make_auxiliary(config: PlaybyearConfig) -> AuxiliaryHeads | None:
+def make_auxiliary(config: PlaybyearConfig) -> "AuxiliaryHeads | None":
     """The heads that a configuration asks for; None where it asks for none."""
     return AuxiliaryHeads(config) if any(weights_of(config).values()) else None
 
 
 def weights_of(config: PlaybyearConfig) -> dict[str, float]:
-    """The weight of each of `KINDS`; a policy leaves out what needs more ears than it has, so that all take the same preset."""
+    """The weight of each kind of loss. A policy leaves out what needs more ears than it has: all take the same preset."""
     n_ears = len(config.audio_keys) if config.use_audio else 0
     needs = {"onset": 1, "balance": 2, "way": 1}
-    return {kind: getattr(config, f"auxiliary_{kind}") if n_ears >= needs[kind] else 0.0 for kind in KINDS}
+    return {kind: getattr(config, f"auxiliary_{kind}") if n_ears >= least else 0.0 for kind, least in needs.items()}
 
 
-def _head(n_in: int, n_out: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(n_in, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, n_out))
+class AuxiliaryHeads(nn.Module):
+    """A small head with one hidden layer for every kind of loss that has a weight: onset, balance, way.
+
+    Args:
+        config: The policy's configuration.
+
+    Attributes:
+        weights: By kind, beside the action's loss.
+    """
+
+    def __init__(self, config: PlaybyearConfig):
+        super().__init__()
+        self.weights, self.memory_steps = weights_of(config), config.memory_steps
+        n_felt = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
+        sizes = {"onset": 1, "balance": len(config.audio_keys), "way": n_felt}
+        self.heads = nn.ModuleDict(
+            {
+                kind: nn.Sequential(nn.Linear(config.embedding_size, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, size))
+                for kind, size in sizes.items()
+                if self.weights[kind]
+            }
+        )
+
+    def forward(
+        self, waves: list[Tensor], felt: list[Tensor], encodings: Tensor, outputs: Tensor
+    ) -> dict[str, tuple[Tensor, Tensor]]:
+        """The losses of a batch.
+
+        Args:
+            waves: Of every microphone (B, n_audio_frames, S), in [-1, 1], without augmentation.
+            felt: Every low-dimensional observation (B, n_run_frames, its numbers), without noise.
+            encodings: (B, K, D) joint encodings of the frames that the windows end at.
+            outputs: (B, K, D) the memory's outputs after the windows.
+
+        Returns:
+            By kind the errors (B, K), and their weights (B, K): 0 where there was nothing to predict.
+        """
+        # How loud each frame is at each microphone, (B, n_audio_frames, M) [10 dB]
+        levels = torch.stack([torch.log10(wave.square().mean(dim=2) + POWER_FLOOR) for wave in waves], dim=2)
+        losses = {"onset": self._onset, "balance": self._balance, "way": self._way}
+        return {kind: losses[kind](levels, felt, encodings, outputs) for kind in self.heads}
+
+    def _onset(self, levels: Tensor, felt: list[Tensor], encodings: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Whether a sudden sound begins in a window's last frame."""
+        logits = self._predict("onset", encodings).squeeze(2)  # (B, K)
+        begins = onsets(levels, logits.shape[1])
+        return functional.binary_cross_entropy_with_logits(logits, begins, reduction="none"), torch.ones_like(begins)
+
+    def _balance(self, levels: Tensor, felt: list[Tensor], encodings: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Each microphone's share of the power, where a sudden sound begins."""
+        n_windows = encodings.shape[1]
+        shares = (levels[:, -n_windows:] * math.log(10)).softmax(dim=2)  # (B, K, M)
+        logits = self._predict("balance", encodings).log_softmax(dim=2)
+        return functional.kl_div(logits, shares, reduction="none").sum(dim=2), onsets(levels, n_windows)
+
+    def _way(self, levels: Tensor, felt: list[Tensor], encodings: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """How far the arm was, at the last sudden sound that the memory holds, from where it is now."""
+        ways, is_known = ways_from_onsets(levels, torch.cat(felt, dim=2), self.memory_steps)
+        error = functional.smooth_l1_loss(self._predict("way", outputs), ways, beta=_NEAR, reduction="none")
+        return error.mean(dim=2), is_known
+
+    def _predict(self, kind: str, inputs: Tensor) -> Tensor:
+        return self.heads[kind](inputs).float()  # whatever autocast computed in
+
+
+def onsets(levels: Tensor, n_frames: int) -> Tensor:
+    """Whether a sudden sound begins, at any microphone, in each of the last frames: 0 or 1, (B, n_frames).
+
+    What swells, as the rubbing of a thing that is carried, crosses the first threshold up and down by chance: it has to be
+    a jump, too, or nobody could learn to tell it.
+
+    Args:
+        levels: (B, more than n_frames, M) [10 dB].
+        n_frames: How many frames are asked for.
+    """
+    louder = levels - levels.sort(dim=1).values[:, (levels.shape[1] - 1) // 2, None]
+    loud, sudden = ((rise > _ONSET).any(dim=2) for rise in (louder, levels.diff(dim=1)))
+    return (loud[:, 1:] & ~loud[:, :-1] & sudden)[:, -n_frames:].float()
+
+
+def ways_from_onsets(levels: Tensor, felt: Tensor, memory_steps: int) -> tuple[Tensor, Tensor]:
+    """Where the arm was at the last sudden sound that a window remembers, from where it is at the window's end.
+
+    Args:
+        levels: (B, more than n, M) [10 dB].
+        felt: (B, n, numbers).
+        memory_steps: Frames of a window, H.
+
+    Returns:
+        (B, K, numbers) with K = n - H + 1, `_FAR` at most; and whether there was such a sound, 0 or 1, (B, K).
+    """
+    frames = torch.arange(felt.shape[1], device=felt.device)
+    last = torch.where(onsets(levels, len(frames)) > 0, frames, -1).cummax(dim=1).values[:, memory_steps - 1 :]
+    is_known = last > frames[memory_steps - 1 :] - memory_steps  # (B, K)
+    at_sound = last.clamp(min=0).unsqueeze(2).expand(-1, -1, felt.shape[2])
+    ways = felt.gather(1, at_sound) - felt[:, memory_steps - 1 :]
+    return ways.clamp(-_FAR, _FAR), is_known.to(felt.dtype)

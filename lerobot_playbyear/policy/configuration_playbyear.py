@@ -1,7 +1,9 @@
-"""Configuration of the policy `playbyear`."""
+"""Configuration of the policy `playbyear`: its options, the windows that follow from them, and what is refused."""
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import draccus
 from lerobot.configs.policies import PreTrainedConfig
@@ -9,18 +11,24 @@ from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
 from lerobot.utils.constants import OBS_STATE
 
+from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
 from lerobot_playbyear.compat import encode_choice
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, MICROPHONE
-from lerobot_playbyear.policy.feature_checks import check_features, sample_rate_of
-from lerobot_playbyear.policy.option_checks import check_options
-from lerobot_playbyear.policy.precision import training_dtype
-from lerobot_playbyear.policy.schedule import PlaybyearSchedulerConfig
-from lerobot_playbyear.policy.window_lengths import WindowLengths
+from lerobot_playbyear.policy.optimization import DTYPES, PlaybyearSchedulerConfig, training_dtype
+
+if TYPE_CHECKING:
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+_AT_LEAST_1 = ("fps", "n_frame_stack", "n_memory_steps", "n_supervised_steps", "vision_width", "image_size")
+_AT_LEAST_0 = (
+    *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
+    *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
+)
 
 
 @PreTrainedConfig.register_subclass("playbyear")
 @dataclass
-class PlaybyearConfig(WindowLengths, PreTrainedConfig):
+class PlaybyearConfig(PreTrainedConfig):
     """The audio-visual LSTM of "Play it by Ear" (Du et al., RSS 2022). Defaults are the paper's unless a line says otherwise.
 
     Every frame is encoded from the last `n_frame_stack` images of every camera, the last `audio_window_s` of every
@@ -155,7 +163,7 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_options(self)
+        self._check_options()
         self._asked_dtype = self.dtype
         self.dtype = training_dtype(self.dtype, self.use_amp, str(self.device))  # LeRobot reads this, and not use_amp
 
@@ -186,26 +194,63 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
         """Shape of one frame of an observation."""
         return tuple((self.input_features or {})[key].shape)
 
-    def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
-        """Takes the sample rate from the dataset's features, and leaves microphones' pictures out of the observations: a policy
-        that sees them hears, also one that should be deaf. LeRobot calls it before it builds the policy.
+    # Windows, in frames, samples and columns of the spectrogram
 
-        Raises:
-            ValueError: There is no sound, or a microphone's rate or frame length is missing or differs from the
-                configuration.
-        """
-        for key, feature in features.items():
-            if MICROPHONE in (feature.get("info") or {}) and self.input_features:
-                self.input_features.pop(key, None)
-        self.sample_rate = sample_rate_of(features, self)
+    @property
+    def memory_steps(self) -> int:
+        """Encodings that the LSTM reads: H, or 1 without memory."""
+        return self.n_memory_steps if self.use_memory else 1
 
-    def validate_features(self) -> None:
-        """Checks that the features are ones that the policy can use.
+    @property
+    def frame_stack(self) -> int:
+        """Images per encoding, 1 without memory."""
+        return self.n_frame_stack if self.use_memory else 1
 
-        Raises:
-            ValueError: Names what is missing or does not fit, and what to do.
-        """
-        check_features(self)
+    @property
+    def audio_frames(self) -> int:
+        """Frames whose sound one encoding hears."""
+        return math.ceil(round(self.audio_window_s * self.fps, 6))
+
+    @property
+    def n_run_frames(self) -> int:
+        """Frames that a training item encodes, R = K + H - 1."""
+        return self.n_supervised_steps + self.memory_steps - 1
+
+    @property
+    def n_image_frames(self) -> int:
+        """Images that a training item needs."""
+        return self.n_run_frames + self.frame_stack - 1
+
+    @property
+    def n_audio_frames(self) -> int:
+        """Frames of sound that a training item needs."""
+        return self.n_run_frames + self.audio_frames - 1
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        longest = max(self.n_image_frames, self.n_audio_frames if self.use_audio else 0)
+        return list(range(1 - longest, 1))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        return list(range(1 - self.n_supervised_steps, 1))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None
+
+    @property
+    def window_samples(self) -> int:
+        """Samples of one encoding's sound."""
+        assert self.sample_rate is not None
+        return round(self.audio_window_s * self.sample_rate)
+
+    @property
+    def n_segments(self) -> int:
+        """Columns of the spectrogram of one encoding's sound."""
+        assert self.sample_rate is not None
+        segment, hop = segment_and_hop(self.sample_rate, self.segment_s, self.hop_s)
+        return (self.window_samples - segment) // hop + 1
 
     # Training presets
 
@@ -228,8 +273,155 @@ class PlaybyearConfig(WindowLengths, PreTrainedConfig):
             decay_lr=self.scheduler_final_share * self.optimizer_lr,
         )
 
+    # Refusals: of options, of features, of a dataset
+
+    def _check_options(self) -> None:
+        """Checks the numbers, and that they go together.
+
+        Raises:
+            ValueError: Names the option.
+        """
+        for name in _AT_LEAST_1:
+            if getattr(self, name) < 1:
+                raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
+        for name in _AT_LEAST_0:
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"--policy.{name} must be at least 0 (none) and finite, got {getattr(self, name)}.")
+        if not 0 < self.action_range < math.inf:
+            raise ValueError(f"--policy.action_range must be above 0 and finite, got {self.action_range}.")
+        if self.memory_displacement_gain and not self.low_dimensional_gain:
+            raise ValueError(
+                f"--policy.memory_displacement_gain={self.memory_displacement_gain} compares low-dimensional observations, and "
+                "--policy.low_dimensional_gain is 0: give 4, its usual value."
+            )
+        if self.memory_readers and not self.memory_displacement_gain:
+            raise ValueError(
+                f"--policy.memory_readers={self.memory_readers} read displacements, and "
+                "--policy.memory_displacement_gain is 0: give 10, its usual value."
+            )
+        if self.audio_noise_files is not None and self.audio_noise_db is None:
+            raise ValueError(
+                f"--policy.audio_noise_files={self.audio_noise_files} says nothing of how loud the noise may be: add "
+                "--policy.audio_noise_db=24 (dB above the recordings' own noise floor)."
+            )
+        if self.audio_window_s < self.segment_s or self.hop_s <= 0:
+            raise ValueError(
+                f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "
+                f"--policy.segment_s ({self.segment_s}), and --policy.hop_s ({self.hop_s}) must be positive."
+            )
+        if not (self.use_vision or self.use_audio or self.low_dimensional_keys or not self.input_features):
+            raise ValueError(
+                "--policy.use_vision=false and --policy.use_audio=false leave no observation to learn from: drop one of them."
+            )
+        if self.dtype not in (None, *DTYPES):
+            raise ValueError(f"--policy.dtype must be one of {', '.join(DTYPES)}, got {self.dtype!r}.")
+
+    def validate_features(self) -> None:
+        """Checks that the features are ones that the policy can use.
+
+        Raises:
+            ValueError: Names what is missing or does not fit, and what to do.
+        """
+        features = self.input_features or {}
+        if self.action_feature is None:
+            raise ValueError("The dataset has no 'action': a policy cannot be trained without.")
+        if self.use_vision and not self.camera_keys:
+            raise ValueError(
+                f"No camera among the observations {sorted(features)}: set --policy.use_vision=false to train without."
+            )
+        if not self.use_audio:
+            return
+        if not self.audio_keys:
+            raise ValueError(_no_microphone_in(features))
+        if self.sample_rate is None:
+            raise ValueError(f"The sample rate of {self.audio_keys} is not known: set --policy.sample_rate.")
+        for key in self.audio_keys:
+            _check_samples(key, int(features[key].shape[0]), self.sample_rate, self.fps)
+
+    def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
+        """Takes the sample rate from the dataset's features, and leaves microphones' pictures out of the observations: a policy
+        that sees them hears, also one that should be deaf. LeRobot calls it before it builds the policy.
+
+        Raises:
+            ValueError: There is no sound, or a microphone's rate or frame length is missing or differs from the
+                configuration.
+        """
+        for key, feature in features.items():
+            if MICROPHONE in (feature.get("info") or {}) and self.input_features:
+                self.input_features.pop(key, None)
+        if not self.use_audio:
+            return
+        microphones = {key: feature for key, feature in features.items() if key.startswith(AUDIO_PREFIX)}
+        if not microphones:
+            raise ValueError(_no_microphone_in(features))
+        for key, feature in microphones.items():
+            seen = (feature.get("info") or {}).get("sample_rate", self.sample_rate)
+            if seen is None:
+                raise ValueError(
+                    f"{key} has no info.sample_rate in the dataset: give it with --policy.sample_rate, or write it into "
+                    "the dataset's meta/info.json."
+                )
+            if self.sample_rate is not None and int(seen) != self.sample_rate:
+                raise ValueError(
+                    f"{key} was recorded at {seen} Hz, but the policy is configured for {self.sample_rate} Hz: train with "
+                    f"playbyear-train, which resamples, or a new policy with --policy.sample_rate={seen}."
+                )
+            self.sample_rate = int(seen)
+            _check_samples(key, int(feature["shape"][0]), self.sample_rate, self.fps)
+
+    def check_dataset(self, meta: "LeRobotDatasetMetadata") -> None:
+        """Checks a dataset's frame rate, and leaves its microphones' pictures out of the observations.
+
+        Raises:
+            ValueError: The frame rate is not the configured one, or the sound of a microphone is not attached: a policy would
+                see it instead of hearing it.
+        """
+        if meta.fps != self.fps:
+            raise ValueError(
+                f"The dataset has fps={meta.fps}, but the policy is configured for fps={self.fps}: set "
+                f"--policy.fps={meta.fps}, or train a new policy for this dataset."
+            )
+        inputs = self.input_features or {}
+        for key in [key for key in microphone_pictures(meta) if key in inputs]:
+            if audio_key_of(key) not in meta.features:
+                raise ValueError(
+                    f"'{key}' is a microphone's picture, and its sound is not attached: playbyear-attach-audio "
+                    f"--dataset.repo_id={meta.repo_id} --dataset.root={meta.root}. Then train on {meta.repo_id}_with_sound, in "
+                    f"{meta.root}_with_sound."
+                )
+            del inputs[key]
+
 
 @draccus.encode.register(PlaybyearConfig)
 def _encode(config: PlaybyearConfig, declared_type: type | None = None) -> dict[str, Any]:
     """For a file: with the `dtype` that was asked for, since the next machine may have other formats."""
     return {**encode_choice(config, PreTrainedConfig), "dtype": config._asked_dtype}
+
+
+def segment_and_hop(sample_rate: int, segment_s: float, hop_s: float) -> tuple[int, int]:
+    """Samples of a spectrogram's segment and of a step.
+
+    The step is rounded down, so that a window holds as many segments at every sample rate.
+    """
+    return round(segment_s * sample_rate), math.floor(hop_s * sample_rate + 1e-6)
+
+
+def _no_microphone_in(features: Iterable[str]) -> str:
+    return (
+        f"No '{AUDIO_PREFIX}<microphone>' among the features {sorted(features)}: record with sound, attach it "
+        "(playbyear-attach-audio, also where a microphone was recorded as a camera), or set --policy.use_audio=false to "
+        "train a deaf policy."
+    )
+
+
+def _check_samples(key: str, samples: int, sample_rate: int, fps: int) -> None:
+    if sample_rate % fps:
+        raise ValueError(
+            f"sample_rate {sample_rate} / fps {fps} is not an integer: {key} cannot hold whole frames. Set "
+            "--policy.fps to the dataset's."
+        )
+    if samples * fps != sample_rate:
+        raise ValueError(
+            f"{key} has {samples} samples per frame, which at {sample_rate} Hz means {sample_rate / samples:g} frames per "
+            f"second, but the policy is configured for fps={fps}: set --policy.fps={sample_rate / samples:g}."
+        )

@@ -10,7 +10,8 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import ObservationProcessorStep
 from torch import Tensor, nn
 
-from lerobot_playbyear.policy.configuration_playbyear import AUDIO_PREFIX, PlaybyearConfig
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.spectrogram import to_float_wave
 
 EncoderFactory = Callable[[PlaybyearConfig], nn.Module]

@@ -1,5 +1,7 @@
 """The policy `playbyear`: what LeRobot calls. What it computes is in `networks.py`."""
 
+from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +14,12 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lerobot_playbyear.compat import card_writer
+from lerobot_playbyear.policy.batch_norm import is_first_process, mean_over_processes, share_batch_norm
 from lerobot_playbyear.policy.card import with_hearing, write_card
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.feature_checks import check_fps, refuse_unheard_microphones
-from lerobot_playbyear.policy.history import RecentFrames, newest
-from lerobot_playbyear.policy.networks import PlaybyearNetwork
-from lerobot_playbyear.policy.packed_encoder import act_by_folded_copies, prepare_to_act
-from lerobot_playbyear.policy.shared_statistics import is_first_process, mean_over_processes, share_batch_norm
-from lerobot_playbyear.policy.spectrogram import LogSpectrogram
+from lerobot_playbyear.policy.cpu_inference import act_by_folded_copies, prepare_to_act
+from lerobot_playbyear.policy.networks import PlaybyearNetwork, newest
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, to_float_wave
 
 
 class PlaybyearPolicy(PreTrainedPolicy):
@@ -41,8 +41,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
             )
         super().__init__(config)
         if dataset_meta is not None:
-            check_fps(dataset_meta.fps, config)
-            refuse_unheard_microphones(dataset_meta, config)
+            config.check_dataset(dataset_meta)
         config.validate_features()
         self.config: PlaybyearConfig = config
         self.model = PlaybyearNetwork(config)
@@ -118,8 +117,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
         Raises:
             ValueError: A key is missing or sound is not finite.
         """
-        network, n_frames = self.model, self.config.n_run_frames
-        encodings = network.encode_run(batch, n_frames)  # (B, R, D)
+        network, config = self.model, self.config
+        encodings = network.encode_run(batch, config.n_run_frames)  # (B, R, D)
         outputs = network.memory_head.recall(encodings)  # (B, K, D)
         predicted = network.memory_head.act(outputs)  # (B, K, n_actions)
         n_windows = predicted.shape[1]
@@ -132,12 +131,17 @@ class PlaybyearPolicy(PreTrainedPolicy):
         if network.auxiliary is None or not self.training:
             return loss, {}
         figures = {"loss_action": loss.detach().mean()}
-        fused = encodings[:, -n_windows:, : self.config.embedding_size]
-        for other in network.auxiliary(batch, fused, outputs, weight):
-            average = self._average(other.error, other.weight, reduction)
-            figures[f"loss_{other.kind}"] = average.detach().mean()
-            loss = loss + other.factor * average
+        waves = [to_float_wave(self._newest(batch, key, config.n_audio_frames), key) for key in config.audio_keys]
+        felt = [self._newest(batch, key, config.n_run_frames).flatten(2) for key in config.low_dimensional_keys]
+        fused = encodings[:, -n_windows:, : config.embedding_size]
+        for kind, (error, counts) in network.auxiliary(waves, felt, fused, outputs).items():
+            average = self._average(error, weight * counts, reduction)
+            figures[f"loss_{kind}"] = average.detach().mean()
+            loss = loss + network.auxiliary.weights[kind] * average
         return loss, figures
+
+    def _newest(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
+        return newest(batch, key, n_frames, self.config.feature_shape(key))
 
     def _average(self, error: Tensor, weight: Tensor, reduction: str) -> Tensor:
         """Of errors (B, n) with weights: one number, or with "none" one of every item, (B,)."""
@@ -210,3 +214,45 @@ class PlaybyearPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """The action of `select_action` as a chunk of one, (B, 1, n_actions)."""
         return self.select_action(batch).unsqueeze(1)
+
+
+class RecentFrames:
+    """The last images of every camera and the last seconds of every microphone, of B episodes that began together."""
+
+    def __init__(self, config: PlaybyearConfig) -> None:
+        self._config = config
+        self._images: dict[str, deque[Tensor]] = {}
+        self._sound: dict[str, Tensor] = {}
+        self._n_heard = 0
+
+    def add(self, frame: dict[str, Tensor], prepare_images: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+        """Takes the newest frame.
+
+        Args:
+            frame: Images (B, 3, H, W), sound (B, S), the rest (B, n).
+            prepare_images: Makes of images, (B, 1, 3, H, W), what the encoder looks at. Called once per image.
+
+        Returns:
+            What one encoding needs, as a batch of runs of one frame.
+        """
+        config = self._config
+        run: dict[str, Tensor] = {}
+        for key in config.camera_keys if config.use_vision else ():
+            image = prepare_images(frame[key].unsqueeze(1)).squeeze(1)  # (B, 3, size, size)
+            buffer = self._images.setdefault(key, deque([image] * config.frame_stack, maxlen=config.frame_stack))
+            buffer.append(image)
+            run[key] = torch.stack(list(buffer), dim=1)  # (B, frame_stack, 3, size, size)
+        if config.use_audio:
+            self._n_heard = min(self._n_heard + 1, config.audio_frames)
+        for key in config.audio_keys if config.use_audio else ():
+            sound = newest({key: frame[key].unsqueeze(1)}, key, 1, config.feature_shape(key)).squeeze(1)  # (B, S)
+            earlier = self._sound.get(key)
+            if earlier is None:
+                earlier = sound.new_zeros(sound.shape[0], sound.shape[1] * config.audio_frames)
+            self._sound[key] = torch.cat([earlier[:, sound.shape[1] :], sound], dim=1)
+            run[key] = self._sound[key].unflatten(1, (config.audio_frames, -1))
+            is_pad = torch.arange(config.audio_frames, device=sound.device) < config.audio_frames - self._n_heard
+            run[f"{key}_is_pad"] = is_pad.expand(sound.shape[0], -1)
+        for key in config.low_dimensional_keys:
+            run[key] = frame[key].unsqueeze(1)
+        return run

@@ -1,7 +1,7 @@
-"""The network, from top to bottom: how a frame is encoded, and its blocks (paper, appendix "Architecture Details").
+"""The network of the policy, from top to bottom (paper, appendix "Architecture Details").
 
 In comments: B items, n frames of each, K windows of H frames, D numbers that the memory reads of a frame, W channels of the
-first stage.
+first stage. What makes it fast on a CPU is attached from outside (`cpu_inference.py`).
 """
 
 import math
@@ -13,23 +13,17 @@ from torch.nn import functional
 from torchvision.models import ResNet
 
 from lerobot_playbyear.compat import BasicBlock
-from lerobot_playbyear.policy.augmentation import Augmentation, resize
 from lerobot_playbyear.policy.auxiliary import make_auxiliary
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
-from lerobot_playbyear.policy.fusion import Fusion
-from lerobot_playbyear.policy.history import before_episode, newest
-from lerobot_playbyear.policy.memory import MemoryHead
-from lerobot_playbyear.policy.precision import computes_512_bits
+from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
-from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, make_ear, to_float_wave
+from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
-_HAS_512_BITS = computes_512_bits()
-_IN_CACHE = 16  # stacks of small pictures that a processor's cache holds
-_SAFE_EMBEDDING = 64  # 8 channels in the first stage, and multiples of them
 _ENCODING_SIZE = 0.5  # root mean square of a normalised encoding
+_SHARPNESS = 4.0  # a choice among frames is learned in as few updates as the rest
 
 
 class PlaybyearNetwork(nn.Module):
@@ -39,21 +33,19 @@ class PlaybyearNetwork(nn.Module):
         super().__init__()
         self.config = config
         assert config.action_feature is not None
-        self.augment = Augmentation(
-            config.augmentation_crop,
-            config.augmentation_brightness,
-            config.augmentation_hue,
-            config.augmentation_degrees,
-            config.augmentation_translate,
-            config.augmentation_scale,
-        )
+        self.augment = Augmentation(config)
         sizes: list[int] = []  # of what is fused, in the order in which `_encode` lists it
         if config.use_vision:
             encoders = {_module_name(key): make_encoder("vision_encoder", config) for key in config.camera_keys}
             self.vision = nn.ModuleDict(encoders)
             sizes += [encoder.embedding_size for encoder in self.vision.values()]  # type: ignore[misc]
         if config.use_audio:
-            self.spectrogram = nn.ModuleDict({_module_name(key): make_ear(config) for key in config.audio_keys})
+            assert config.sample_rate is not None
+            grid = (config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins)
+            spectrograms = {
+                _module_name(key): LogSpectrogram(*grid, config.spectrogram_momentum) for key in config.audio_keys
+            }
+            self.spectrogram = nn.ModuleDict(spectrograms)
             encoders = {_module_name(key): make_encoder("audio_encoder", config) for key in config.audio_keys}
             self.hearing = nn.ModuleDict(encoders)
             self.disturb = SoundAugmentation(config)
@@ -183,18 +175,7 @@ class VisionEncoder(nn.Module):
 
     def normalize(self, stacks: Tensor) -> Tensor:
         """(N, 3 * n_stacked, size, size) in [0, 1] -> the same shape, as networks for images want it."""
-        if stacks.device.type == "cpu" and self.embedding_size % _SAFE_EMBEDDING and not _HAS_512_BITS:
-            return (stacks - self.mean).div_(
-                self.std
-            )  # oneDNN writes gradients of 4 channels beyond their memory (torch 2.11)
-        # Activations alone: the optimizer's state of channels_last weights is more than safetensors can save.
-        normalized = torch.empty_like(stacks, memory_format=torch.channels_last)
-        together = (
-            _IN_CACHE if stacks.device.type == "cpu" and not torch.compiler.is_compiling() else max(1, len(stacks))
-        )
-        for part, place in zip(stacks.split(together), normalized.split(together), strict=True):
-            place.copy_((part - self.mean).div_(self.std))
-        return normalized
+        return (stacks - self.mean) / self.std
 
 
 class SlimResNet(ResNet):
@@ -265,6 +246,142 @@ def _vision_encoder(config: PlaybyearConfig) -> VisionEncoder:
 @register_audio_encoder("spectrogram_cnn")
 def _audio_encoder(config: PlaybyearConfig) -> AudioEncoder:
     return AudioEncoder(config.n_frequency_bins, config.n_segments, tuple(config.audio_channels))
+
+
+class Fusion(nn.Module):
+    """MLP from all encodings of a frame, cameras', microphones' and low-dimensional observations', to one joint encoding z."""
+
+    def __init__(self, size: int, config: PlaybyearConfig):
+        super().__init__()
+        self.layers = mlp(size, config.hidden_size, config.embedding_size)
+
+    def forward(self, encodings: list[Tensor]) -> Tensor:
+        """[(N, ...)], `size` numbers together -> (N, embedding size)."""
+        return self.layers(torch.cat(encodings, dim=-1))
+
+
+class MemoryHead(nn.Module):
+    """One-layer LSTM over a window of frames, fresh for every window, and an MLP from its last output.
+
+    Of every frame it reads the joint encoding (the paper) and, with `memory_displacement_gain`, how far what the arm measured
+    then is from what it measures now. Without that the LSTM has to find a way of centimetres as the difference of two places
+    that it knows in units of the whole workspace.
+
+    In comments: B items, K windows of H frames, D numbers of a frame: the joint encoding and the displacement.
+
+    Args:
+        config: The policy's configuration.
+        n_actions: Numbers of an action.
+        n_felt: Of all low-dimensional observations of a frame together.
+    """
+
+    def __init__(self, config: PlaybyearConfig, n_actions: int, n_felt: int):
+        super().__init__()
+        self.memory_steps, self.action_range = config.memory_steps, config.action_range
+        self.displacement_gain = config.memory_displacement_gain / config.low_dimensional_gain
+        self.n_fused = config.embedding_size
+        n_compared = n_felt if self.displacement_gain else 0
+        self.lstm = nn.LSTM(self.n_fused + n_compared, config.embedding_size, batch_first=True)
+        self.head = mlp(config.embedding_size, config.hidden_size, n_actions)
+        self.recollection = None
+        if config.memory_readers and n_compared:
+            self.recollection = Recollection(config.memory_readers, self.n_fused, n_compared, self.memory_steps)
+
+    def with_felt(self, fused: Tensor, felt: list[Tensor]) -> Tensor:
+        """What is kept of frames: their joint encodings (N, embedding size), and with displacements what was felt, (N, D)."""
+        return torch.cat([fused, *felt], dim=-1) if self.displacement_gain else fused
+
+    def forward(self, encodings: Tensor) -> Tensor:
+        """The action after every full window of consecutive frames, (B, n, D).
+
+        Returns:
+            (B, K, n_actions) with K = n - H + 1, in [-1, 1] times the action range.
+        """
+        return self.act(self.recall(encodings))
+
+    def recall(self, encodings: Tensor) -> Tensor:
+        """(B, n, D) consecutive frames -> (B, K, embedding size), the memory's output after every full window."""
+        windows = encodings.unfold(1, self.memory_steps, 1).transpose(2, 3)  # (B, K, H, D)
+        if self.displacement_gain:
+            felt = windows[..., self.n_fused :]
+            displacement = self.displacement_gain * (felt - felt[:, :, -1:])
+            windows = torch.cat([windows[..., : self.n_fused], displacement], dim=-1)
+        outputs, _ = self.lstm(windows.flatten(0, 1))  # (B * K, H, embedding size)
+        remembered = outputs[:, -1].unflatten(0, windows.shape[:2])
+        if self.recollection is None:
+            return remembered
+        return remembered + self.recollection(encodings[..., : self.n_fused], windows[..., self.n_fused :])
+
+    def act(self, memories: Tensor) -> Tensor:
+        """(..., embedding size) of `recall` -> (..., n_actions)."""
+        actions = self.head(memories.flatten(0, -2)).float()  # whatever autocast computed in
+        actions = self.action_range * torch.tanh(actions / self.action_range)
+        return actions.unflatten(0, memories.shape[:-1])
+
+
+class Recollection(nn.Module):
+    """Reads, of the frames that it chooses by what was seen and heard in them, how far the arm was from where it is now.
+
+    An LSTM has to carry such a length through all later frames, and hops of six centimetres end millimetres beside the cube.
+    Here each of M readers gives every frame of the window a weight (a softmax over frames, of its
+    joint encoding and of how long ago it was), and the mean of the displacements is added to what the LSTM remembers.
+
+    Args:
+        n_readers: M.
+        n_fused: Of a joint encoding.
+        n_compared: Of a displacement.
+        n_steps: Frames in a window, H.
+    """
+
+    def __init__(self, n_readers: int, n_fused: int, n_compared: int, n_steps: int):
+        super().__init__()
+        self.score = nn.Linear(n_fused, n_readers)
+        self.recency = nn.Parameter(torch.zeros(n_readers, n_steps))
+        self.read = nn.Linear(n_readers * n_compared, n_fused, bias=False)
+        # Displacements are tens of units: other weights drive the actions' tanh to its ends.
+        nn.init.zeros_(self.read.weight)
+
+    def forward(self, fused: Tensor, displacement: Tensor) -> Tensor:
+        """Joint encodings (B, n, D) and every window's displacements (B, K, H, numbers) -> (B, K, D)."""
+        scores = _SHARPNESS * self.score(fused).unfold(1, displacement.shape[2], 1)  # (B, K, M, H)
+        weights = (scores + self.recency).softmax(dim=-1)
+        return self.read((weights @ displacement).flatten(2))
+
+
+def mlp(n_in: int, hidden: int, n_out: int) -> nn.Sequential:
+    """Two hidden layers: (N, n_in) -> (N, n_out)."""
+    return nn.Sequential(
+        nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, n_out)
+    )
+
+
+def newest(batch: dict[str, Tensor], key: str, n_frames: int, shape: tuple[int, ...] | None = None) -> Tensor:
+    """The last `n_frames` frames of a key, (B, n_frames, ...), each of the given shape."""
+    if key not in batch:
+        raise ValueError(f"The batch has no '{key}', which the policy was built for; it has {sorted(batch)}.")
+    values = batch[key]
+    if values.dim() < 2 or values.shape[1] < n_frames:
+        raise ValueError(
+            f"'{key}' has shape {tuple(values.shape)}, but {n_frames} frames are needed along its second dimension."
+        )
+    values = values[:, -n_frames:]
+    if shape == (1,) and values.dim() == 2:  # LeRobot reads a column of single numbers as scalars
+        values = values.unsqueeze(-1)
+    if shape is not None and values.shape[2:] != shape:
+        raise ValueError(
+            f"'{key}' has shape {tuple(values.shape[2:])} per frame, but the policy was made for {tuple(shape)}: use "
+            "the sensor, the sample rate and the frame rate that it was trained with."
+        )
+    return values
+
+
+def before_episode(batch: dict[str, Tensor], n_frames: int) -> Tensor | None:
+    """Which of the last `n_frames` frames lie before the episode, (B, n_frames), or None when nothing says so.
+
+    All keys end at the same frame, so any key's flags do; a renamed key has lost its own.
+    """
+    flags = [batch[name] for name in batch if name.startswith(OBS_PREFIX) and name.endswith("_is_pad")]
+    return next((is_pad[:, -n_frames:] for is_pad in flags if is_pad.shape[1] >= n_frames), None)
 
 
 def _module_name(key: str) -> str:

@@ -7,9 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.shared_statistics import mean_over_processes
-from lerobot_playbyear.policy.window_lengths import segment_and_hop
+from lerobot_playbyear.policy.batch_norm import mean_over_processes
+from lerobot_playbyear.policy.configuration_playbyear import segment_and_hop
 
 POWER_FLOOR = 1e-10  # below 16-bit quantisation noise: -100 dB re full scale
 _IN_CACHE = 1_000_000  # samples of overlapping segments that a processor's cache holds with what becomes of them
@@ -182,11 +181,3 @@ class LogSpectrogram(nn.Module):
         self.mean.lerp_(mean, momentum)
         self.variance.lerp_(variance, momentum)
         self.n_batches += counts
-
-
-def make_ear(config: PlaybyearConfig) -> LogSpectrogram:
-    """One microphone's spectrogram, as a policy's options say."""
-    assert config.sample_rate is not None
-    return LogSpectrogram(
-        config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins, config.spectrogram_momentum
-    )

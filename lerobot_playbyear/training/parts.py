@@ -24,7 +24,7 @@ from lerobot_playbyear.compat import (
     update_last_checkpoint,
 )
 from lerobot_playbyear.hub.push import push_checkpoint
-from lerobot_playbyear.policy.shared_statistics import mean_over_processes
+from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.checkpoints import load_training_state
 from lerobot_playbyear.training.config import PlaybyearTrainConfig

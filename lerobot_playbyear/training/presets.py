@@ -84,6 +84,6 @@ def apply_preset(args: Sequence[str]) -> list[str]:
 
 
 def _computes_bfloat16() -> bool:
-    from lerobot_playbyear.policy.precision import computes_bfloat16  # imports torch
+    from lerobot_playbyear.policy.optimization import computes_bfloat16  # imports torch
 
     return computes_bfloat16()

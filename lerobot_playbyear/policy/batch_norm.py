@@ -1,4 +1,4 @@
-"""What the processes of one training share, so that several of them learn what one with all their data would."""
+"""Batch norm, and means, over the processes of one training: several of them learn what one with all their data would."""
 
 from typing import Any
 

@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+
 # Colour as luma and two chroma components (NTSC); turning the chroma plane turns the hue.
 _YIQ = torch.tensor([[0.299, 0.587, 0.114], [0.5959, -0.2746, -0.3213], [0.2115, -0.5227, 0.3112]])
 
@@ -14,16 +16,15 @@ class Augmentation(nn.Module):
     """Draws a change of colour and of position per run. It learns nothing; its constants lie where the images do.
 
     Args:
-        crop, brightness, hue, degrees, translate, scale: Strengths, as in `PlaybyearConfig`; crop in pixels.
+        config: Of the policy, with its strengths.
     """
 
     yiq: Tensor
     rgb: Tensor
 
-    def __init__(self, crop: float, brightness: float, hue: float, degrees: float, translate: float, scale: float):
+    def __init__(self, config: PlaybyearConfig):
         super().__init__()
-        self.crop, self.brightness, self.hue = crop, brightness, hue
-        self.degrees, self.translate, self.scale = degrees, translate, scale
+        self.config = config
         # Buffers, for a copy to the device at every update would make the host wait for it.
         self.register_buffer("yiq", _YIQ.clone(), persistent=False)
         self.register_buffer("rgb", torch.linalg.inv(_YIQ), persistent=False)
@@ -45,9 +46,9 @@ class Augmentation(nn.Module):
         return self._warp(self._recolour(images), size, recorded or (height, width))
 
     def _recolour(self, images: Tensor) -> Tensor:
-        n_runs, device = images.shape[0], images.device
-        brightness = 1 + self.brightness * _uniform(n_runs, device)
-        angle = 2 * math.pi * self.hue * _uniform(n_runs, device)
+        config, n_runs, device = self.config, images.shape[0], images.device
+        brightness = 1 + config.augmentation_brightness * _uniform(n_runs, device)
+        angle = 2 * math.pi * config.augmentation_hue * _uniform(n_runs, device)
         turn = torch.zeros(n_runs, 3, 3, device=device)
         turn[:, 0, 0] = 1
         turn[:, 1, 1] = turn[:, 2, 2] = angle.cos()
@@ -58,19 +59,20 @@ class Augmentation(nn.Module):
         return recoloured.view(images.shape[0], 3, images.shape[1], *images.shape[3:]).transpose(1, 2)
 
     def _warp(self, images: Tensor, size: int, original: tuple[int, ...]) -> Tensor:
+        config, device = self.config, images.device
         n_runs, n_frames = images.shape[:2]
         height, width = original
-        device = images.device
-        angle = math.radians(self.degrees) * _uniform(n_runs, device)
-        scale = 1 / (1 + self.scale * _uniform(n_runs, device))
+        angle = math.radians(config.augmentation_degrees) * _uniform(n_runs, device)
+        scale = 1 / (1 + config.augmentation_scale * _uniform(n_runs, device))
         theta = torch.zeros(n_runs, 2, 3, device=device)
         theta[:, 0, 0] = theta[:, 1, 1] = scale * angle.cos()
         # In pixels a rotation, in coordinates from -1 to 1 only where the image is square.
         theta[:, 0, 1] = -scale * angle.sin() * height / width
         theta[:, 1, 0] = scale * angle.sin() * width / height
         # Coordinates run from -1 to 1: a shift of the whole size is 2.
-        shift_x = self.translate * _uniform(n_runs, device) + self.crop / width * _uniform(n_runs, device)
-        shift_y = self.translate * _uniform(n_runs, device) + self.crop / height * _uniform(n_runs, device)
+        crop, translate = config.augmentation_crop, config.augmentation_translate
+        shift_x = translate * _uniform(n_runs, device) + crop / width * _uniform(n_runs, device)
+        shift_y = translate * _uniform(n_runs, device) + crop / height * _uniform(n_runs, device)
         theta[:, 0, 2], theta[:, 1, 2] = 2 * shift_x, 2 * shift_y
         grid = functional.affine_grid(theta, [n_runs, 1, size, size], align_corners=False)
         # In the grid's precision: 8 bits of mantissa would be a wrong place by a tenth of a pixel.
