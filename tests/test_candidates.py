@@ -392,7 +392,7 @@ def test_the_balance_is_learned_from_the_ears_and_needs_two_of_them():
         ({"auxiliary_way": math.inf}, r"auxiliary_way must be at least 0"),
         ({"low_dimensional_offset": -0.1}, r"low_dimensional_offset must be at least 0 \(none\) and finite, got -0.1"),
         ({"memory_displacement_gain": 10.0, "low_dimensional_gain": 0.0}, r"low_dimensional_gain is 0: give 4"),
-        ({"memory_readers": -1}, r"memory_readers must be at least 0 \(none\), got -1"),
+        ({"memory_readers": -1}, r"memory_readers must be at least 0 \(none\) and finite, got -1"),
         ({"memory_readers": 2}, r"memory_readers=2 read displacements, .*memory_displacement_gain is 0: give 10"),
     ],
 )
