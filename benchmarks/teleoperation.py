@@ -37,10 +37,8 @@ def main() -> None:
     from OpenGL import GL
 
     import gym_playbyear  # noqa: F401
-    from lerobot_playbyear.teleoperation.panel import draw
-    from lerobot_playbyear.teleoperation.status import Control, Status
-    from lerobot_playbyear.teleoperation.window import Window
-    from lerobot_playbyear.teleoperation.window_process import Screen
+    from lerobot_playbyear.teleoperation.panel import Control, Status, draw
+    from lerobot_playbyear.teleoperation.window import Screen, Window
 
     keys = [("Space", "hold to take over")] * 9
     levels = {"gripper": [-60.0, -20.0] * 40}

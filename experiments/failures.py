@@ -24,7 +24,7 @@ from gym_playbyear.occluded_pick_place import PLACE_TOLERANCE
 from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
-from lerobot_playbyear.film.episode_film import write_episode_film
+from lerobot_playbyear.film.rollout_film import write_episode_film
 
 LIFTED_M = 0.01
 BESIDE_MM = 6.0

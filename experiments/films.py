@@ -17,7 +17,7 @@ from experiments.sound_probe import SoundProbe, make_donors
 from experiments.training import Job
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.film.episode_film import write_episode_film
+from lerobot_playbyear.film.rollout_film import write_episode_film
 
 
 def film(condition: str, env: gym.Env, wanted: Callable[[bool], bool], path: Path) -> None:

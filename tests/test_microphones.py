@@ -3,12 +3,10 @@
 import contextlib
 import gc
 import logging
-import sys
-import threading
+import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,14 +18,24 @@ from sound_server import RATE, Player, started, why_not
 from lerobot_playbyear.audio.control_steps import HALF
 from lerobot_playbyear.audio.sample_strip import Strip, read_strip
 from lerobot_playbyear.audio.session_files import SessionSound, find_session
-from lerobot_playbyear.datasets.audio_files import write_wav
+from lerobot_playbyear.datasets.audio_files import read_audio, write_wav
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig, MicrophoneOptionError
+from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.file import PlayedMicrophone
+from lerobot_playbyear.microphones.finding import (
+    FindMicrophonesConfig,
+    described,
+    find_microphones,
+    suggested_device,
+)
 from lerobot_playbyear.microphones.microphone import MicrophoneError, register_source
-from lerobot_playbyear.microphones.portaudio import SoundCard, channels_to_open, find_card
+from lerobot_playbyear.microphones.portaudio import SoundCard, cards_called, find_card, sound_cards
 from lerobot_playbyear.microphones.session_file import SessionFile
 
-TICK_S = 1 / 20
+FPS, CHUNK = 20, 144
+TICK_S = 1 / FPS
+ROUND_S = 3.0  # after which the samples' values begin again
+STEPS_PER_S = 10_000  # of these values
 TAP = np.full(48, 20000, np.int16)  # a millisecond
 
 needs_server = pytest.mark.skipif(bool(why_not()), reason=why_not())
@@ -85,7 +93,6 @@ def test_a_card_is_found_by_its_number_its_name_and_a_part_of_its_name_that_no_o
     ("changes", "said"),
     [
         ({"device": "bench_"}, "fits more than one sound card"),
-        ({"device": "piano"}, "is no sound card with an input"),
         ({"device": 7}, "is no sound card with an input"),
         ({"device": "bench_left", "channel": 40}, "channel 40 is asked for"),
     ],
@@ -129,14 +136,6 @@ def test_a_channel_is_that_of_the_card_and_no_mixture_of_several():
             samples = heard(cameras["mic"]).samples
     assert set(np.unique(samples)) <= {0, 1000}
     assert 1000 in samples
-
-
-def test_how_many_channels_are_opened():
-    def card(channels: int) -> SoundCard:
-        return SoundCard(0, "card", channels, RATE, True)
-
-    assert [channels_to_open(card(4), 1), channels_to_open(card(1), 1), channels_to_open(card(32), 1)] == [4, 1, 2]
-    assert channels_to_open(card(32), 3) == 3
 
 
 # Which samples
@@ -218,6 +217,94 @@ def test_microphones_of_one_card_have_one_sample_rate(tmp_path):
         pass
 
 
+# The clock of a card; here time is made up, so that minutes take seconds
+
+
+class Simulation:
+    """A card whose samples tell when they were heard, and control steps at which its newest sample is looked at.
+
+    Args:
+        seconds: For how long.
+        speed: Of the card's clock beside this machine's.
+        came: When a chunk comes that was complete at a time [s]; None: never.
+    """
+
+    def __init__(
+        self, seconds: float, speed: float = 1.0, came: Callable[[float], float | None] = lambda at: at
+    ) -> None:
+        rng = np.random.default_rng(0)
+        self.recording = CardRecording("the card", RATE, 1)
+        true_rate, chunks = RATE * speed, []
+        for k in range(int((seconds + 1) * true_rate / CHUNK)):
+            comes = came((k + 1) * CHUNK / true_rate)
+            if comes is not None:
+                heard = (k * CHUNK + np.arange(CHUNK)) / true_rate
+                values = np.floor(heard % ROUND_S * STEPS_PER_S).astype(np.int16)
+                chunks.append((comes + rng.uniform(0, 0.004), values[:, None]))
+        first, n_written, last = 1.0, 0, 0.0
+        self.counters: list[int] = []
+        # How long before the step its newest sample was heard [s]; nan where it is silence.
+        self.errors: list[float] = []
+        for step in range(round((seconds - first) * FPS)):
+            now = first + step * TICK_S
+            while chunks[n_written][0] <= now:
+                last = max(last, chunks[n_written][0])  # a thread takes one after the other
+                self.recording.write(chunks[n_written][1], last)
+                n_written += 1
+            self.counters.append(self.recording.heard_at(now))
+            newest = self.recording.samples(self.counters[-1] - 10, self.counters[-1])[:, 0].astype(float)
+            away = (now - newest[-1] / STEPS_PER_S) % ROUND_S
+            self.errors.append(float(away - ROUND_S if away > ROUND_S / 2 else away) if newest.any() else float("nan"))
+
+    def errors_from(self, seconds: float) -> np.ndarray:
+        """Of all steps from a time on [s]."""
+        return np.array(self.errors[round((seconds - 1) * FPS) :])
+
+
+@pytest.mark.parametrize("speed", [1.0, 1.005, 0.998])
+def test_the_newest_sample_is_a_chunk_old_for_a_minute_beside_a_clock_that_is_fast_or_slow(speed):
+    simulation = Simulation(60, speed)
+    errors = simulation.errors_from(2)
+    assert errors.min() > 0
+    assert errors.max() < 0.012
+    assert np.ptp(errors) < 0.007  # and steps have the same length, whatever the chunks do
+
+
+@pytest.mark.parametrize("period_s", [0.0213, 0.1])
+def test_steps_have_the_length_that_they_have_in_time_where_a_sound_server_sends_bursts(period_s):
+    simulation = Simulation(20, came=lambda at: float(np.ceil(at / period_s) * period_s))
+    lengths = np.diff(simulation.counters)[3 * FPS :]
+    assert np.abs(lengths / RATE * FPS - 1).max() < 0.1  # the made-up chunks come up to 4 ms late
+    assert simulation.errors_from(4).max() < period_s + 0.012
+
+
+@pytest.mark.parametrize("held_s", [0.06, 0.9])
+def test_chunks_that_were_held_up_are_late_and_not_lost_and_shift_nothing(held_s, caplog):
+    simulation = Simulation(9, came=lambda at: max(at, 5 + held_s) if at >= 5 else at)
+    assert "lost" not in caplog.text
+    assert np.abs(simulation.errors_from(5 + held_s + 2 * TICK_S)).max() < 0.012
+    assert np.abs(simulation.errors_from(1)[: round(3.9 * FPS)]).max() < 0.012
+    assert np.diff(simulation.counters).min() >= 0
+
+
+@pytest.mark.parametrize("lost_s", [0.02, 2.0])
+def test_samples_that_were_lost_are_told_and_are_silence_so_that_numbers_follow_the_time(lost_s, caplog):
+    simulation = Simulation(11, came=lambda at: None if 5 <= at < 5 + lost_s else at)
+    (told,) = (float(n) for n in re.findall(r"the card lost (\d+) ms", caplog.text))
+    assert told == pytest.approx(1000 * lost_s, abs=6)
+    assert np.abs(simulation.errors_from(5 + lost_s + 0.25 + 2 * TICK_S)).max() < 0.012
+
+
+def test_a_card_that_lost_an_hour_costs_no_memory_and_the_last_seconds_are_kept():
+    recording = CardRecording("the card", RATE, 1)
+    for k in range(1000):
+        chunk = np.full((CHUNK, 1), k % 100 + 1, np.int16)
+        recording.write(chunk, (k + 1) * CHUNK / RATE + (3600 if k >= 500 else 0))
+    assert recording.written == pytest.approx(3603 * RATE, abs=CHUNK)
+    newest = recording.samples(recording.written - 2 * CHUNK, recording.written + 5)[:, 0]
+    np.testing.assert_array_equal(newest, np.repeat([99, 100, 0], [CHUNK, CHUNK, 5]))
+
+
 # What goes wrong
 
 
@@ -263,85 +350,12 @@ def test_a_card_that_gives_nothing_but_zeros_is_told_once(caplog):
     assert caplog.text.count("gives nothing but zeros") == 1
 
 
-class MadeUpPortAudio(ModuleType):
-    """Cards of one channel that are found by their names, and get another handle when they are plugged in again."""
-
-    class PortAudioError(Exception):
-        pass
-
-    class _StreamBase:
-        samplerate: float
-
-        def __init__(self) -> None:
-            self.closed = False
-
-        def close(self, ignore_errors: bool = True) -> None:
-            self.closed = True
-
-        abort = close
-
-    def __init__(self, **handles: int) -> None:
-        super().__init__("sounddevice")
-        self.plugged_in, self.seen = dict(handles), dict(handles)
-        self.default = SimpleNamespace(device=(0, 0))
-        self.open: list[MadeUpPortAudio._StreamBase] = []
-
-    def query_hostapis(self) -> list[dict[str, str]]:
-        return [{"name": "Core Audio"}]
-
-    def query_devices(self) -> list[dict[str, object]]:
-        rest = {"hostapi": 0, "max_input_channels": 1, "default_samplerate": RATE}
-        return [{"name": name, **rest} for name in self.seen]
-
-    def _terminate(self) -> None:
-        assert all(stream.closed for stream in self.open)
-
-    def _initialize(self) -> None:
-        self.seen = dict(self.plugged_in)
-
-    def InputStream(self, samplerate, blocksize, device, callback, **options):  # noqa: N802
-        name, handle = list(self.seen.items())[device]
-        if self.plugged_in.get(name) != handle:
-            raise self.PortAudioError("Device unavailable")
-        stream = self._StreamBase()
-        stream.samplerate = samplerate
-        self.open.append(stream)
-
-        def play() -> None:
-            while not stream.closed:
-                time.sleep(blocksize / samplerate)
-                if self.plugged_in.get(name) == handle:
-                    callback(np.ones((blocksize, 1), np.int16), blocksize, None, None)
-
-        stream.start = threading.Thread(target=play, daemon=True).start
-        return stream
-
-
-def test_of_two_cards_one_that_was_plugged_in_again_is_found(monkeypatch):
-    port_audio = MadeUpPortAudio(left=10, right=11)
-    monkeypatch.setitem(sys.modules, "sounddevice", port_audio)
-    left, right = (MicrophoneCamera(options(device=name)) for name in ("left", "right"))
-    left.connect()
-    right.connect()
-    del port_audio.plugged_in["right"]
-    assert "has brought nothing" in str(until_error(right, 5))
-    port_audio.plugged_in["right"] = 12
-    right.disconnect()
-    with pytest.raises(MicrophoneError, match="Device unavailable"):  # PortAudio would close the left one to look again
-        right.connect()
-    left.disconnect()
-    for camera in (left, right):
-        camera.connect()
-        camera.read_latest()
-        camera.disconnect()
-    assert all(stream.closed for stream in port_audio.open)
-
-
 # Other people's microphones
 
 _PLUGIN = """
 import numpy as np
 from lerobot_playbyear.microphones import register_source
+from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.file import PlayedMicrophone
 
 @register_source("tin_can")
@@ -372,12 +386,9 @@ def test_an_installed_distribution_brings_its_own_source_and_a_broken_one_harms_
         ({"file": None}, "nothing: give one of device, file and tone_hz"),
         ({"tone_hz": 440.0}, "file and tone_hz: give one"),
         ({"sample_rate": 0}, "sample_rate=0"),
-        ({"channel": -1}, "channel=-1"),
         ({"gain_db": float("nan")}, "gain_db=nan"),
         ({"low_db": -10.0}, "low_db=-10.0"),
-        ({"high_db": float("inf")}, "high_db=inf"),
         ({"width": 90}, "width=96"),
-        ({"width": 225}, "both even"),
         ({"height": 98}, "at this width height=100"),
     ],
 )
@@ -386,12 +397,9 @@ def test_an_option_without_meaning_is_named(changes, said):
         options(**{"file": "x.wav", **changes})
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"), [({"channel": 2}, "channel 2 is asked for"), ({"file": "no.wav"}, "no.wav")]
-)
-def test_a_file_that_does_not_fit_is_refused(changes, said, tmp_path):
+def test_a_file_that_does_not_fit_is_refused(tmp_path):
     path = str(write_wav(tmp_path / "sound.wav", np.ones((RATE, 2), np.int16), RATE))
-    with pytest.raises(MicrophoneError, match=said), listening(mic=options(**{"file": path, **changes})):
+    with pytest.raises(MicrophoneError, match="channel 2 is asked for"), listening(mic=options(file=path, channel=2)):
         pass
 
 
@@ -443,3 +451,77 @@ def test_a_microphone_that_is_forgotten_listens_no_longer(tmp_path):
 def test_without_a_file_it_says_that_a_video_loses_the_sound(caplog):
     with listening(mic=options(tone_hz=440.0)):
         assert "a dataset with videos loses it" in caplog.text
+
+
+# playbyear-find-microphones
+
+
+@needs_server
+def test_each_card_is_listed_heard_and_written(tmp_path, capsys):
+    loud = np.full((20 * RATE, 2), [8000, 1], np.int16)  # for longer than a slow machine needs
+    with (
+        started(bench=2, table=1) as server,
+        Player(server.fifo("bench"), 2) as bench,
+        Player(server.fifo("table"), 1, noise=0),
+    ):
+        find_microphones(FindMicrophonesConfig(list=True, output_dir=tmp_path))
+        assert "bench" in capsys.readouterr().out
+        assert not list(tmp_path.iterdir())
+        bench.play(loud, time.perf_counter())
+        find_microphones(FindMicrophonesConfig(seconds=0.5, output_dir=tmp_path))
+    said = capsys.readouterr().out
+    assert "0: bench, ALSA (default)" in said
+    assert "sample rates: 8000, 16000, 32000, 44100, 48000, 96000 Hz" in said
+    assert "--robot.cameras='{mic: {type: microphone, device: \"table, ALSA\", sample_rate: 16000}}'" in said
+    assert said.count("nothing but zeros") == 1
+    samples, rate = read_audio(tmp_path / "microphone_0.wav")
+    assert rate == 16000
+    assert len(samples) == 0.5 * rate
+    assert np.median(samples, axis=0).tolist() == pytest.approx([8000, 1], abs=3)
+
+
+@needs_server
+def test_a_card_that_cannot_be_opened_is_told_and_the_others_are_heard(tmp_path, capsys):
+    with started(bench=1, table=1) as server, Player(server.fifo("table"), 1):
+        server.remove("bench")
+        find_microphones(FindMicrophonesConfig(seconds=0.3, output_dir=tmp_path))
+        assert "bench, ALSA cannot be opened" in capsys.readouterr().out
+        assert [path.name for path in tmp_path.iterdir()] == ["microphone_1.wav"]
+        server.remove("table")
+        with pytest.raises(MicrophoneError, match="None of these"):
+            find_microphones(FindMicrophonesConfig(seconds=0.3, output_dir=tmp_path))
+
+
+@needs_server
+def test_where_there_is_no_card_it_says_what_to_do():
+    with started():
+        if sound_cards():
+            pytest.skip("this machine has a sound card")
+        with pytest.raises(MicrophoneError, match="Plug a microphone in"):
+            find_microphones(FindMicrophonesConfig())
+
+
+def plugged_in(*names: str) -> list[SoundCard]:
+    return [SoundCard(number, name, 1, 48000, False) for number, name in enumerate(names)]
+
+
+def test_the_name_that_is_suggested_holds_in_another_order_of_plugging():
+    """ALSA numbers cards as they come, and one's name may be a part of another's."""
+    before = plugged_in("USB Mic: Audio (hw:1,0), ALSA", "My USB Mic: Audio (hw:2,0), ALSA", "pulse, ALSA")
+    after = plugged_in("My USB Mic: Audio (hw:0,0), ALSA", "pulse, ALSA", "USB Mic: Audio (hw:3,0), ALSA")
+    suggested = [suggested_device(card, before) for card in before]
+    assert suggested == [("USB Mic: Audio", True), ("My USB Mic: Audio", True), ("pulse, ALSA", True)]
+    assert [cards_called(name, after) for name, _ in suggested] == [[after[2]], [after[0]], [after[1]]]
+
+
+def test_cards_that_cannot_be_told_apart_are_told_to_be_so():
+    cards = plugged_in("USB Mic, Core Audio", "USB Mic, Core Audio")
+    *_, option, warning = described(cards[0], (48000,), cards)
+    assert 'device: "0"' in option
+    assert "may swap after a restart" in warning
+
+
+def test_a_name_with_quotes_stays_one_name():
+    card = SoundCard(1, 'The "good" one', 1, 44100, False)
+    (*_, option) = described(card, (44100,), [card])
+    assert 'device: "The \\"good\\" one", sample_rate: 44100' in option

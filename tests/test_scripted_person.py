@@ -2,12 +2,9 @@
 
 from types import SimpleNamespace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 
-from lerobot_playbyear.episodes.environment import EnvSpec
-from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig, ScriptedPerson
 
 FPS = 20
@@ -88,47 +85,9 @@ def test_a_person_takes_over_without_need_now_and_then_and_gives_back():
     assert 2 < np.mean(taken) < 4
 
 
-def test_a_wrong_takeover_is_no_reason_to_stay():
-    """The gate says that the expert is in control; a person who is in control by mistake does not take that for a mistake."""
-    expert, gate = person(wrong_per_minute=60 * FPS, wrong_s=0.5, reaction_s=0.3)
-    steps, _ = control(expert, 12)
-    assert steps == [*range(10), 11]
-    assert gate.told[:3] == [(0, True), (10, None), (11, True)]
-
-
 def test_the_same_seed_meets_the_same_person_and_another_one_another():
     options = {"steps": range(20, 40), "wrong_per_minute": 10.0}
     first, again, other = (control(person(seed=seed, **options)[0]) for seed in (3, 3, 4))
     assert first[0] == again[0]
     np.testing.assert_array_equal(first[1], again[1])
     assert first[0] != other[0]
-
-
-class Nobody:
-    """A policy that does nothing."""
-
-    def reset(self, env):
-        pass
-
-    def act(self, observation):
-        return np.array([0, 0, 0, -1], np.float32)
-
-
-def test_in_a_task_it_does_the_same_again():
-    options = {"sound": "none", "image_size": 16, "max_episode_steps": 60}
-    env = EnvSpec("gym_playbyear:gym_playbyear/OccludedGrasp-v1", options).make()
-    expert = ScriptedExpertConfig(person=True, wrong_per_minute=0.0).make(env)
-    episodes = [play(env, Nobody(), seed=5, expert=expert) for _ in range(2)]
-    script = play(env, Nobody(), seed=5, expert=ScriptedExpertConfig().make(env))
-    env.close()
-    np.testing.assert_array_equal(episodes[0].actions, episodes[1].actions)
-    begins = [int(np.flatnonzero(episode.interventions)[0]) for episode in (script, episodes[0])]
-    assert begins[1] == begins[0] + 6
-
-
-def test_without_a_clock_there_is_no_reaction():
-    env = gym.make("CartPole-v1")
-    env.unwrapped.intervention_gate = lambda: Gate(())
-    env.unwrapped.metadata = {}
-    with pytest.raises(ValueError, match=r"--expert\.person=true needs an environment that says its steps per second"):
-        ScriptedExpertConfig(person=True).make(env)

@@ -22,9 +22,8 @@ from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.recording.demonstrations import Nobody
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
-from lerobot_playbyear.teleoperation.expert import PersonLeftError
-from lerobot_playbyear.teleoperation.panel import FRAME
-from lerobot_playbyear.teleoperation.status import Control
+from lerobot_playbyear.teleoperation.controls import PersonLeftError
+from lerobot_playbyear.teleoperation.panel import FRAME, Control
 from lerobot_playbyear.teleoperation.window import Window
 
 pytestmark = [

@@ -18,7 +18,7 @@ from lerobot_playbyear.audio.attach import AttachAudioConfig
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.repair.command import RepairConfig
-from lerobot_playbyear.film.filming import VideoConfig
+from lerobot_playbyear.film.rollout_film import VideoConfig
 from lerobot_playbyear.hub.push import PushConfig
 from lerobot_playbyear.inspection.inspecting import InspectConfig
 from lerobot_playbyear.microphones.finding import FindMicrophonesConfig

@@ -30,9 +30,8 @@ from lerobot_playbyear.audio.sample_strip import (
 )
 from lerobot_playbyear.audio.session_files import SESSIONS, session_path
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.microphones.card import KEPT_S, CardRecording
+from lerobot_playbyear.microphones.card import KEPT_S, CardRecording, OpenCard, join_card, leave_card
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
-from lerobot_playbyear.microphones.open_cards import OpenCard, join_card, leave_card
 from lerobot_playbyear.microphones.session_file import SessionFile
 
 _NO_FILE = "none"

@@ -1,14 +1,21 @@
-"""The last seconds of one sound card, by number of sample, and when each was heard."""
+"""Sound cards that listen: their clock beside this machine's, their last seconds, and the microphones that share them."""
 
 import logging
 import math
 import threading
+import time
 from collections import deque
+from collections.abc import Hashable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lerobot_playbyear.audio.sample_strip import n_kept
 from lerobot_playbyear.datasets.features import to_pcm_s16
-from lerobot_playbyear.microphones.clock import CardClock
+from lerobot_playbyear.microphones.microphone import MicrophoneError
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
 
 KEPT_S = 10.0
 """How much of a card's sound is kept [s]."""
@@ -19,6 +26,79 @@ CHUNK_S = 0.003
 _USUAL = 0.9  # share of the bursts that come no later than it is reckoned with
 _LONGEST_WAIT_S = 0.15
 _LATE_S = 0.01  # samples that come later than this, for a quarter of a second, come after others that were lost
+_STEADY_S = 1.0  # of sound, over which chunks are compared
+_PATIENCE_S = 0.25  # for how long chunks may come late before samples are taken for lost
+_FIRST_SOUND_S = 5.0  # how long a card may take until its first chunk; a null sink of PulseAudio takes 2
+_SAME_STEP_S = 0.1  # microphones of one card that are read one after the other within this have the same newest sample
+
+
+class CardClock:
+    """Follows a card's clock by the times at which its chunks come.
+
+    A chunk may come late and never early. So the earliest of the last second's, as if the card's rate were exact, tells when
+    samples come; it follows a clock that is fast or slow, and a chunk that comes late changes nothing. A burst of chunks that
+    were held up ends with one that is not late. Where all chunks of a quarter of a second come late by more than
+    `tolerance_s`, samples were lost.
+
+    Args:
+        sample_rate: What the card says [Hz].
+        tolerance_s: What is no loss [s].
+    """
+
+    def __init__(self, sample_rate: int, tolerance_s: float) -> None:
+        self._rate, self._tolerance = sample_rate, tolerance_s
+        # Last sample's number + 1, and when sample 0 came by it [s]: only those that no later one undercuts, so the first is
+        # the earliest of the last second.
+        self._offsets: deque[tuple[int, float]] = deque()
+        self._late: list[tuple[int, float]] = []  # those since the last one in time
+        self._late_since_s = 0.0
+
+    def note(self, n_written: int, came_s: float) -> int:
+        """A chunk came, of which the last sample has the number `n_written - 1`.
+
+        Returns:
+            How many samples were lost before; the caller counts them as written.
+        """
+        offset = came_s - n_written / self._rate
+        if self._offsets and offset - self._start > self._tolerance:
+            return self._note_late(n_written, offset, came_s)
+        self._late = []
+        self._keep(n_written, offset)
+        while self._offsets[0][0] < n_written - _STEADY_S * self._rate:
+            self._offsets.popleft()
+        return 0
+
+    def _note_late(self, n_written: int, offset: float, came_s: float) -> int:
+        if not self._late:
+            self._late_since_s = came_s
+        self._late.append((n_written, offset))
+        if came_s - self._late_since_s < _PATIENCE_S:
+            return 0
+        lost = round((min(late for _, late in self._late) - self._start) * self._rate)
+        shift = lost / self._rate
+        late, self._late = self._late, []
+        self._offsets.clear()
+        for n, offset_of_late in late:
+            self._keep(n + lost, offset_of_late - shift)
+        return lost
+
+    def _keep(self, n_written: int, offset: float) -> None:
+        while self._offsets and self._offsets[-1][1] >= offset:
+            self._offsets.pop()
+        self._offsets.append((n_written, offset))
+
+    @property
+    def is_set(self) -> bool:
+        """Whether a chunk has come."""
+        return bool(self._offsets)
+
+    def written_at(self, time_s: float) -> float:
+        """How many samples had come at a time, or will have [s of time.perf_counter]; a fraction between two."""
+        return (time_s - self._start) * self._rate
+
+    @property
+    def _start(self) -> float:
+        return self._offsets[0][1]
 
 
 class CardRecording:
@@ -118,3 +198,117 @@ class CardRecording:
             block[-len(samples) :] = samples[-n_kept:]
         self._kept[np.arange(last - n_kept, last) % len(self._kept)] = block
         self._written = last
+
+
+class OpenCard:
+    """A card that listens, for all microphones that are its channels.
+
+    Args:
+        config: Of one of them.
+        channels: How many to open, at least.
+
+    Raises:
+        MicrophoneError: It has fewer.
+    """
+
+    def __init__(self, config: "MicrophoneCameraConfig", channels: int) -> None:
+        self.n_users = 0
+        self.microphone = config.make(channels)
+        if self.microphone.channels < channels:
+            raise MicrophoneError(
+                f"{self.microphone.name} gives {self.microphone.channels} channels, wanted {channels}."
+            )
+        self.recording = CardRecording(self.microphone.name, config.sample_rate, self.microphone.channels)
+        self._step_s, self._step_counter = -math.inf, 0
+        self._readers: set[int] = set()  # in this control step
+        self._lock = threading.Lock()
+
+    def open(self) -> None:
+        """Listens, and waits until a strip's sound is there. A card that brings nothing is opened once more: through a sound
+        server a stream that was opened now and then never begins."""
+        enough = n_kept(self.microphone.sample_rate) + round(2 * CHUNK_S * self.microphone.sample_rate)
+        try:
+            self.microphone.connect(self.recording.write)
+            if not self.recording.wait_for(1, _FIRST_SOUND_S):
+                self.microphone.disconnect()
+                self.microphone.connect(self.recording.write)
+            if not self.recording.wait_for(enough, _FIRST_SOUND_S):
+                raise MicrophoneError(
+                    f"From {self.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened "
+                    "again. Is it plugged in, and used by no other program? `playbyear-find-microphones` shows what it hears."
+                )
+        except BaseException:
+            self.microphone.disconnect()
+            raise
+
+    def newest(self, reader: int) -> int:
+        """How many samples have come; within a control step, which ends when one reads again, the same for all readers."""
+        with self._lock:
+            now = time.perf_counter()
+            if reader in self._readers or now - self._step_s > _SAME_STEP_S:
+                self._readers.clear()
+                self._step_s, self._step_counter = now, max(self.recording.heard_at(now), self._step_counter)
+            self._readers.add(reader)
+            return self._step_counter
+
+
+_open_cards: dict[Hashable, OpenCard] = {}
+_lock = threading.Lock()
+
+
+def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int], name: str) -> OpenCard:
+    """The card of a microphone, which listens from now on if it did not yet.
+
+    Args:
+        config: The microphone's options.
+        channels: Its channel, and those of all other microphones of the card that were made.
+        name: Of the microphone, for messages.
+
+    Raises:
+        MicrophoneError: The card cannot be opened, nothing comes from it, or it is open in another way.
+    """
+    with _lock:
+        card = _open_cards.get(config.card)
+        if card is None:
+            card = _open_cards[config.card] = _opened(config, max(channels) + 1)
+        if card.microphone.problem:
+            raise MicrophoneError(
+                f"{card.microphone.name} is gone: {card.microphone.problem}. Disconnect its other microphones first."
+            )
+        if card.microphone.sample_rate != config.sample_rate:
+            raise MicrophoneError(
+                f"Microphones of one card ({name}) have sample_rate {card.microphone.sample_rate} and {config.sample_rate}: "
+                "give them the same."
+            )
+        if config.channel >= card.microphone.channels:
+            raise MicrophoneError(
+                f"channel={config.channel} of a microphone ({name}): the card is open with {card.microphone.channels} "
+                "channels. Make all of its microphones before one is connected."
+            )
+        card.n_users += 1
+        return card
+
+
+def leave_card(key: Hashable, card: OpenCard) -> None:
+    """A microphone needs its card no longer; without any the card is closed."""
+    with _lock:
+        card.n_users -= 1
+        if card.n_users == 0:
+            _open_cards.pop(key, None)
+            card.microphone.disconnect()
+
+
+def _opened(config: "MicrophoneCameraConfig", channels: int) -> OpenCard:
+    """A card that listens; with the microphone's own channel alone, if one that is not used any more wants too many.
+
+    Raises:
+        MicrophoneError: It cannot be opened, or nothing comes from it.
+    """
+    try:
+        card = OpenCard(config, channels)
+        card.open()
+    except MicrophoneError:
+        if channels == config.channel + 1:
+            raise
+        return _opened(config, config.channel + 1)
+    return card

@@ -27,7 +27,7 @@ def main() -> None:
 def _film() -> None:
     logging.basicConfig(level=logging.WARNING)
     from lerobot_playbyear.datasets.errors import errors_of_input
-    from lerobot_playbyear.film.filming import film
+    from lerobot_playbyear.film.rollout_film import film
 
     with errors_of_input(OSError):
         run_with_lerobot(film)

@@ -1,8 +1,9 @@
 """A person beside a policy, or alone: the expert of `--expert.type=teleop`."""
 
 import time
-from dataclasses import dataclass
-from typing import ClassVar
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar
 
 import gymnasium as gym
 import numpy as np
@@ -11,14 +12,33 @@ from lerobot.teleoperators import Teleoperator
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.episode import Observation, Verdict
 from lerobot_playbyear.episodes.expert import Expert
-from lerobot_playbyear.teleoperation.actions import CLOSE, GRIPPER, OPEN, ActionMapping, Gripper
-from lerobot_playbyear.teleoperation.controls import OVERRIDE, Controls, PersonLeftError, Wish
-from lerobot_playbyear.teleoperation.levels import level_db, microphone_blocks
-from lerobot_playbyear.teleoperation.pace import Pace
-from lerobot_playbyear.teleoperation.speaker import Speaker
-from lerobot_playbyear.teleoperation.status import HISTORY_S, Control, Status
+from lerobot_playbyear.teleoperation.controls import (
+    CLOSE,
+    GRIPPER,
+    OPEN,
+    ActionMapping,
+    Controls,
+    Gripper,
+    PersonLeftError,
+    Wish,
+)
+from lerobot_playbyear.teleoperation.panel import HISTORY_S, Control, Status
+from lerobot_playbyear.teleoperation.speaker import Speaker, level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.window import Window
 
+if TYPE_CHECKING:
+    from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
+
+_DIRECTIONS = {"keyboard_ee": "-x,-y,z", "gamepad": "-y,x,z"}
+"""For the view of our tasks (right on the screen is x, away is y), per type of teleoperator; others have `x,y,z`."""
+
+_MOVING_KEYS = {
+    "keyboard_window": [("Arrows", "right, left, away, near"), ("E  D", "up, down")],
+    "keyboard_ee": [("Arrows", "right, left, away, near"), ("Shift", "left: down, right: up")],
+    "gamepad": [("Sticks", "left: plane, right: height"), ("RB", "hold to take over")],
+}
+
+_RATE_OVER_S = 1.0
 _BEGIN = "Press P to begin"
 _NOTES = {
     Verdict.SUCCESS: "Ended as a success",
@@ -27,48 +47,107 @@ _NOTES = {
 }
 
 
-@dataclass(eq=False)
+class Pace:
+    """Keeps a person's time: waits for each step's turn, as many control steps per second as the robot makes.
+
+    A step that comes late moves all later ones: a person cannot use steps that are rushed through to catch up.
+
+    Args:
+        fps: Steps per second.
+        clock, sleep: As in `time`.
+    """
+
+    def __init__(
+        self,
+        fps: float,
+        clock: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.fps = fps
+        self._clock, self._sleep = clock, sleep
+        self._due: float | None = None
+        self._times: deque[float] = deque()
+
+    def start(self) -> None:
+        """The next step is due at once; what was measured is forgotten."""
+        self._due = None
+        self._times.clear()
+
+    def wait(self) -> None:
+        """Returns when the next step is due."""
+        now = self._clock()
+        if self._due is None or now > self._due:
+            self._due = now
+        else:
+            self._sleep(self._due - now)
+        self._due += 1 / self.fps
+        self._times.append(self._clock())
+        while self._times[-1] - self._times[0] > _RATE_OVER_S and len(self._times) > 2:
+            self._times.popleft()
+
+    @property
+    def achieved_fps(self) -> float:
+        """Steps per second of late; 0 for the first half second, in which that is not known."""
+        if len(self._times) < 2 or self._times[-1] - self._times[0] < _RATE_OVER_S / 2:
+            return 0.0
+        return (len(self._times) - 1) / (self._times[-1] - self._times[0])
+
+
 class TeleopExpert(Expert):
     """Shows a person each step in its turn, and lets them take over while they hold a key.
 
     Args:
+        options: How they move the arm and take over.
+        env: The environment.
         window: Shows the scene and hears keys.
         teleop: A connected LeRobot teleoperator.
-        mapping: Makes actions of what it gives.
-        gripper: What the gripper is told.
-        pace: Of the control loop.
-        speaker: Plays the first microphone.
-        keys: What to press, for the window.
-        begins_paused: Whether each attempt waits until the person is ready.
         demonstrates: Whether nobody but the person acts.
-        toggles: Whether a press of the key takes over, or hands back, instead of holding it.
-        override: The key.
-    """
 
-    window: Window
-    teleop: Teleoperator
-    mapping: ActionMapping
-    gripper: Gripper
-    pace: Pace
-    speaker: Speaker
-    keys: list[tuple[str, str]]
-    begins_paused: bool = True
-    demonstrates: bool = False
-    toggles: bool = False
-    override: str = OVERRIDE
+    Raises:
+        ExpertError: The teleoperator and the environment do not fit.
+    """
 
     decides: ClassVar[bool] = True
     can_label: ClassVar[bool] = False
 
-    def __post_init__(self) -> None:
-        self._controls = Controls(self.teleop, self.window.keys, self.toggles, self.override)
-        self.clock_fps = self.pace.fps
+    def __init__(
+        self, options: "TeleopExpertConfig", env: gym.Env, window: Window, teleop: Teleoperator, demonstrates: bool
+    ) -> None:
+        env_fps, kind = float(env.metadata["render_fps"]), options.teleop.type
+        self.clock_fps = options.steps_per_second or env_fps
+        self.window, self.teleop, self.demonstrates = window, teleop, demonstrates
+        directions = options.directions or _DIRECTIONS.get(kind, "x,y,z")
+        self.mapping = ActionMapping(teleop.action_features, env.action_space, directions, options.speed)
+        self.gripper = Gripper(round(options.gripper_cooldown_s * env_fps))
+        self.pace = Pace(self.clock_fps)
+        n_samples, reason = _samples_of_a_step(env), ""
+        if not options.play_sound:
+            reason = "--expert.play_sound=false"
+        elif self.clock_fps != env_fps:
+            reason = "slow motion"
+        self.speaker = Speaker(round(n_samples * env_fps), n_samples, reason if n_samples else "no microphone")
+        key, toggles = options.takeover_key.lower(), options.takeover == "toggle"
+        self._controls = Controls(teleop, window.keys, toggles, key)
+        self._begins_paused = options.begin_paused
         self._wish = Wish({})
         self._is_called = self._stays = False
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
-        waiting = "The next attempt is being prepared" if self.demonstrates else "The policy is learning or evaluated"
-        self._status = Status(fps=self.pace.fps, keys=self.keys, waiting=waiting)
+        takeover = [] if demonstrates else [(key.title(), "take over, hand back" if toggles else "hold to take over")]
+        self._status = Status(
+            fps=self.clock_fps,
+            keys=[
+                *takeover,
+                *_MOVING_KEYS.get(kind, []),
+                *([("G", "open or close the gripper")] if self.mapping.has_gripper else []),
+                ("P", "pause"),
+                ("S", "success: end and keep"),
+                ("R", "throw away, once more" if demonstrates else "throw away, next one"),
+                ("Q", "end as failed"),
+                ("Esc", "leave"),
+            ],
+            waiting="The next attempt is being prepared" if demonstrates else "The policy is learning or evaluated",
+        )
         self.window.show(self._status)
 
     def reset(self, env: gym.Env) -> None:
@@ -78,7 +157,7 @@ class TeleopExpert(Expert):
         status.n_steps, status.task = int(env.get_wrapper_attr("_max_episode_steps")), task_description(env)
         status.levels_db = {}
         status.note = _NOTES[self._verdict] if self._verdict else ""
-        self._verdict, self._last_command, self._is_paused = None, None, self.begins_paused
+        self._verdict, self._last_command, self._is_paused = None, None, self._begins_paused
         status.control = Control.PERSON if self.demonstrates else Control.POLICY
         self._controls.reset()
         if self._controls.read().leaves:  # all else that was pressed meanwhile was not meant for this attempt
@@ -179,3 +258,9 @@ class TeleopExpert(Expert):
             status.cooldown_s = round(self.gripper.blocked_steps / self.pace.fps, 2)
         status.sound = self.speaker.problem
         self.window.show(status, picture)
+
+
+def _samples_of_a_step(env: gym.Env) -> int:
+    """How many samples the first microphone of an environment gives in a step; 0 without one."""
+    assert isinstance(env.observation_space, gym.spaces.Dict)
+    return len(next(iter(microphone_blocks(env.observation_space.sample()).values()), ()))

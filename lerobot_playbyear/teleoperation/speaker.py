@@ -1,4 +1,4 @@
-"""Plays what a microphone hears, if the package `sounddevice` is there."""
+"""What a microphone hears: how loud it is, and playing it, if the package `sounddevice` is there."""
 
 import contextlib
 import sys
@@ -7,9 +7,32 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_playbyear.episodes.episode import Observation
+
+FLOOR_DB = -80.0
+_AUDIO = "audio."  # how raw observations name microphones
+_FULL_SCALE = 32768.0
+
 _LATENCY_BLOCKS = 2  # that are there before the first is played, so that a late step leaves no gap
 _BELL_HZ, _BELL_S, _BELL_LEVEL = 880.0, 0.2, 0.3
 _MOST_BLOCKS = 6  # more than this is too late to be played
+
+
+def microphone_blocks(observation: Observation) -> dict[str, np.ndarray]:
+    """The samples (S,) of each microphone in a raw observation, floats of full scale 1, by the microphone's name."""
+    blocks = {key.removeprefix(_AUDIO): np.asarray(v) for key, v in observation.items() if key.startswith(_AUDIO)}
+    return {name: as_float(block) for name, block in blocks.items()}
+
+
+def as_float(block: np.ndarray) -> np.ndarray:
+    """Samples as float32: integers are PCM at full scale, floats are in [-1, 1] already."""
+    return block.astype(np.float32) / (_FULL_SCALE if np.issubdtype(block.dtype, np.integer) else 1.0)
+
+
+def level_db(block: np.ndarray) -> float:
+    """Root mean square of samples in [-1, 1] [dB of full scale], at least `FLOOR_DB`."""
+    power = float(np.mean(np.square(block, dtype=np.float64))) if block.size else 0.0
+    return max(10 * np.log10(power), FLOOR_DB) if power > 0 else FLOOR_DB
 
 
 class Speaker:
@@ -18,7 +41,7 @@ class Speaker:
     Args:
         sample_rate: [Hz].
         block_size: Samples per step.
-        problem: Why it shall stay silent, if so.
+        problem: Why it stays silent, if so.
 
     Attributes:
         problem: Why nothing is heard; empty if it is.
