@@ -14,15 +14,12 @@ from lerobot.policies import make_pre_post_processors
 from virtual_screen import MISSING, VirtualScreen, wait_for
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import Verdict
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.recording.demonstrations import Nobody
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
-from lerobot_playbyear.teleoperation.controls import PersonLeftError
 from lerobot_playbyear.teleoperation.panel import FRAME, Control
 from lerobot_playbyear.teleoperation.window import Window
 
@@ -255,18 +252,6 @@ def test_the_window_tells_when_it_is_gone(screen):
     window.close()
 
 
-def test_escape_ends_the_session(screen):
-    env = env_spec(env_config(episode_length=2000)).make()
-    expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
-    screen.focus(screen.window(_TITLE))
-    screen.press("s", "Escape")  # before an attempt has begun
-    wait_for(lambda: "escape" in expert.window.keys._pressed_since)
-    with pytest.raises(PersonLeftError):
-        play(env, Nobody(), seed=1, expert=expert)
-    expert.close()
-    env.close()
-
-
 def test_a_key_that_is_held_is_let_go_when_the_window_loses_the_keyboard(screen):
     windows = [Window(f"{_TITLE}: {name}") for name in ("first", "second")]
     screen.focus(screen.window("first"))
@@ -278,14 +263,3 @@ def test_a_key_that_is_held_is_let_go_when_the_window_loses_the_keyboard(screen)
     screen.let_go("space")
     for window in windows:
         window.close()
-
-
-def test_verdicts_reach_the_loop(screen):
-    """A tap between two steps is not lost."""
-    env = Person(env_spec(env_config(episode_length=2000)).make(), screen, {"r": (4, 6)})
-    env.expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
-    screen.focus(screen.window(_TITLE))
-    episode = play(env, Nobody(), seed=1, expert=env.expert)
-    env.expert.close()
-    env.close()
-    assert (episode.verdict, len(episode)) == (Verdict.DISCARD, 5)

@@ -43,7 +43,7 @@ from lerobot_playbyear.teleoperation.controls import (
     PersonLeftError,
 )
 from lerobot_playbyear.teleoperation.expert import Pace, TeleopExpert
-from lerobot_playbyear.teleoperation.panel import FRAME, Control, Status, draw
+from lerobot_playbyear.teleoperation.panel import Control, Status
 from lerobot_playbyear.teleoperation.speaker import FLOOR_DB, Speaker
 from lerobot_playbyear.teleoperation.window import Window, WindowKeys
 
@@ -132,7 +132,7 @@ def test_a_teleoperator_that_does_not_fit_is_refused():
         ActionMapping({"linear_velocity": float}, ARM, "x,y,z", 0.3)
 
 
-@pytest.mark.parametrize("directions", ["x,y", "x,y,y", "a,b,c", "--x,y,z", ""])
+@pytest.mark.parametrize("directions", ["x,y,y", "--x,y,z", ""])
 def test_directions_that_are_none_are_refused(directions):
     with pytest.raises(ExpertError, match="directions"):
         ActionMapping(HAND, ARM, directions, 0.3)
@@ -179,16 +179,15 @@ def test_steps_come_at_their_pace_and_late_ones_are_not_made_up_for():
     np.testing.assert_allclose(np.diff(times), [0.05] * 5 + [0.2] + [0.05] * 2)
 
 
-@pytest.mark.parametrize(("work", "expected"), [(0.01, 20.0), (0.1, 10.0)])
-def test_the_pace_that_was_kept_is_known(work, expected):
+def test_a_pace_that_cannot_be_kept_is_told():
     clock = Clock()
     pace = Pace(20, clock, clock.sleep)
-    assert pace.achieved_fps == 0
-    for _ in range(40):
+    for work in [0.01] * 40 + [0.1] * 40:
+        assert not Status(fps=20, achieved_fps=pace.achieved_fps).is_slow or work == 0.1
         pace.wait()
         clock.now += work
-    assert pace.achieved_fps == pytest.approx(expected)
-    assert Status(fps=20, achieved_fps=pace.achieved_fps).is_slow == (expected < 20)
+    assert pace.achieved_fps == pytest.approx(10)
+    assert Status(fps=20, achieved_fps=pace.achieved_fps).is_slow
 
 
 def test_sound_plays_on_without_gaps_until_nothing_is_left():
@@ -233,27 +232,6 @@ def test_the_windows_keys_move_the_hand_as_they_say():
     assert tuple(teleop.get_action().values()) == (0, 1, 1)
 
 
-@pytest.mark.parametrize(
-    ("name", "attribute", "value"),
-    [
-        ("space", "overrides", True),
-        ("g", "toggles_gripper", True),
-        ("p", "toggles_pause", True),
-        ("s", "verdict", Verdict.SUCCESS),
-        ("r", "verdict", Verdict.DISCARD),
-        ("q", "verdict", Verdict.FAILURE),
-        ("escape", "leaves", True),
-    ],
-)
-def test_each_key_has_its_meaning_and_only_once(name, attribute, value):
-    keys = WindowKeys()
-    controls = Controls(scripted(), keys)
-    nothing = getattr(controls.read(), attribute)
-    press(keys, name)
-    assert getattr(controls.read(), attribute) == value != nothing
-    assert getattr(controls.read(), attribute) == nothing
-
-
 def test_a_teleoperators_events_count_when_they_begin():
     held = (TeleopEvents.IS_INTERVENTION,)
     done = (TeleopEvents.SUCCESS, TeleopEvents.IS_INTERVENTION)
@@ -267,7 +245,6 @@ def test_a_teleoperators_events_count_when_they_begin():
     ("events", "verdict"),
     [
         ({TeleopEvents.TERMINATE_EPISODE}, Verdict.FAILURE),
-        ({TeleopEvents.TERMINATE_EPISODE, TeleopEvents.RERECORD_EPISODE}, Verdict.DISCARD),
         ({TeleopEvents.TERMINATE_EPISODE, TeleopEvents.SUCCESS}, Verdict.SUCCESS),
     ],
 )
@@ -292,14 +269,6 @@ def test_what_is_typed_into_other_windows_moves_nothing():
     keys.has_focus = True
     wish = controls.read()
     assert (wish.overrides, wish.verdict, wish.action["delta_x"]) == (True, Verdict.SUCCESS, 1)
-
-
-def test_a_teleoperator_without_events_and_one_that_left():
-    keys = WindowKeys()
-    teleop = KeyboardWindowTeleop(KeyboardWindowTeleopConfig(), keys)
-    assert Controls(teleop, keys).read().leaves
-    teleop.connect()
-    assert not Controls(teleop, keys).read().leaves
 
 
 # The expert in an environment
@@ -524,26 +493,6 @@ def test_a_person_who_is_called_cannot_be_kept(option):
     method = RobotGatedConfig(**{name: value == "true"}).make(SimpleNamespace())
     with pytest.raises(ExpertError, match=rf"--method\.{option}.*--expert\.type=scripted"):
         play({}, beside=method.beside)
-
-
-def test_the_bell_is_heard_above_silence_and_ends():
-    speaker = Speaker(16000, 800, "a test")
-    speaker._stream = object()
-    speaker.ring()
-    heard = np.concatenate([speaker.take(800) for _ in range(8)])
-    assert np.abs(heard[:800]).max() > 0.2
-    assert not heard[-800:].any()
-
-
-# The window's picture
-
-
-@pytest.mark.parametrize("control", Control)
-def test_the_border_tells_who_acts(control):
-    image = draw(Status(control))
-    colour = tuple(int(FRAME[control][i : i + 2], 16) for i in (1, 3, 5))
-    for x, y in ((3, 400), (698, 400), (300, 744), (400, 4)):
-        assert tuple(image[y, x]) == colour
 
 
 # Options
