@@ -12,6 +12,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 _LAYOUT = "=qqiii1024s1024s"
@@ -36,16 +37,18 @@ class Control:
 
 
 def check(root: str) -> dict[str, Any]:
-    from lerobot_playbyear.datasets.repair import check_dataset
+    from lerobot_playbyear.repair.repair import look
 
-    report = check_dataset(root)
-    return {"kept": sorted(report.kept.items()), "dropped": report.dropped, "said": str(report)}
+    return _told(look(Path(root)))
 
 
 def repair(root: str) -> dict[str, Any]:
-    from lerobot_playbyear.datasets.repair import repair_dataset
+    from lerobot_playbyear.repair import repair_dataset
 
-    report = repair_dataset(root)
+    return _told(repair_dataset(root))
+
+
+def _told(report: Any) -> dict[str, Any]:
     return {"kept": sorted(report.kept.items()), "dropped": report.dropped, "said": str(report)}
 
 

@@ -15,6 +15,7 @@ _ARROWS = """
 datasets
 audio           datasets
 microphones     datasets audio
+repair          datasets audio
 policy          datasets audio
 episodes        datasets audio
 film            datasets audio episodes
@@ -24,7 +25,7 @@ training        datasets audio policy hub
 teleoperation   datasets episodes
 recording       datasets episodes hub teleoperation
 dagger          datasets episodes hub training
-scripts         datasets audio microphones policy episodes film inspection hub training teleoperation recording dagger
+scripts         datasets audio microphones repair policy episodes film inspection hub training teleoperation recording dagger
 """
 _ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}
 _AT_THE_TOP = {"__init__.py", "compat.py"}

@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import episode_waveform, write_audio
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.survey import survey
 
 FPS, RATE = 20, 16000
 SIZE = RATE // FPS
@@ -69,7 +69,7 @@ def test_every_frame_gets_what_was_heard_before_it(silent, tmp_path, ending):
         np.testing.assert_array_equal(waveform, sound[first : first + length * SIZE])
     item = dataset[12]
     assert item[KEY].shape == (SIZE,)
-    assert check_dataset(root).is_sound
+    assert survey(root).is_sound
     assert {path.name for path in tmp_path.iterdir()} == {"heard", "sound"}
 
 
@@ -98,7 +98,7 @@ def test_video_is_copied_and_two_channels_become_two_microphones(tmp_path):
     for channel, key in enumerate(("observation.audio.left", "observation.audio.right")):
         waveform, _ = episode_waveform(dataset, 1, key)
         np.testing.assert_array_equal(waveform[:100], expected[round(OFFSET * RATE) - SIZE :, channel][:100])
-    assert check_dataset(root).is_sound
+    assert survey(root).is_sound
 
 
 def test_sound_of_another_rate_is_resampled(silent, tmp_path):

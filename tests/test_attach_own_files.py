@@ -15,7 +15,7 @@ from test_attach_audio import FPS, LENGTHS, RATE, SIZE, silent_dataset
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import AUDIO_PREFIX, episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.survey import survey
 
 
 def heard(episode: int, n_channels: int, rate: int = RATE) -> np.ndarray:
@@ -80,7 +80,7 @@ def test_files_become_columns_with_the_same_samples(with_files, silent, tmp_path
             waveform, rate = episode_waveform(dataset, episode, key)
             assert rate == RATE
             np.testing.assert_array_equal(waveform, blocks_of(heard(episode, n_channels), length)[:, channel])
-    assert check_dataset(root).is_sound
+    assert survey(root).is_sound
     assert contents(with_files) == before
     old = LeRobotDataset("test/silent", root=silent, video_backend="pyav")
     for key, value in old[20].items():

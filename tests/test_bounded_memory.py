@@ -2,7 +2,6 @@
 
 import io
 import json
-import shutil
 import threading
 import tracemalloc
 from collections.abc import Callable
@@ -31,7 +30,6 @@ from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.parquet import with_values
-from lerobot_playbyear.datasets.repair import carry_out, check_dataset, repair_dataset
 from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import episode_sound
@@ -76,13 +74,13 @@ def peak_of_process(work: Callable[[], object]) -> int:
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Pieces of 16 kB, so that a short episode has many."""
-    for module in (parquet, attached_sound, carry_out):
+    for module in (parquet, attached_sound):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**14)
 
 
 @pytest.fixture
 def megabyte_pieces(monkeypatch):
-    for module in (parquet, attached_sound, carry_out):
+    for module in (parquet, attached_sound):
         monkeypatch.setattr(module, "PIECE_BYTES", 2**20)
 
 
@@ -261,42 +259,6 @@ def test_attaching_takes_no_memory_that_grows_with_the_sound(tmp_path, long_soun
     del sound
     cfg = attach_config(long_sound, tmp_path / "heard", f"{path.parent}/{{episode}}.wav", microphone="table", offset=0)
     assert peak_of_arrays(lambda: attach_audio(cfg)) < n_bytes
-
-
-@pytest.mark.parametrize("use_videos", [False, True], ids=["image", "video"])
-def test_repairing_in_pieces_gives_the_same_dataset(tmp_path, small_pieces, use_videos):
-    make_dataset(tmp_path / "whole", use_videos=use_videos)
-    roots = [tmp_path / "pieces", tmp_path / "once"]
-    for root in roots:
-        shutil.copytree(tmp_path / "whole", root)
-        shutil.rmtree(root / "meta" / "episodes")
-        (data,) = root.glob("data/*/*.parquet")
-        data.write_bytes(data.read_bytes()[:-8])  # as a recording that was killed leaves it
-        assert repair_dataset(root).kept == {0: 0, 1: 1, 2: 2}
-        for module in (parquet, carry_out):
-            module.PIECE_BYTES = 2**26
-    tables = [pq.read_table(root / "data") for root in (*roots, tmp_path / "whole")]
-    assert tables[0].equals(tables[1])
-    assert tables[0].equals(tables[2])
-    assert pq.read_table(roots[0] / "meta/episodes").equals(pq.read_table(roots[1] / "meta/episodes"))
-    stats, known = (
-        LeRobotDataset("tests/noise", root, video_backend="pyav").meta.stats for root in (roots[0], tmp_path / "whole")
-    )
-    for key in ("action", CAMERA):
-        np.testing.assert_allclose(stats[key]["mean"], known[key]["mean"], atol=0.02)
-    assert check_dataset(roots[0]).is_sound
-
-
-def test_rescuing_a_file_without_its_end_does_not_read_it_as_a_whole(tmp_path, long_sound, megabyte_pieces):
-    shutil.copytree(long_sound, tmp_path / "killed")
-    (data,) = (tmp_path / "killed").glob("data/*/*.parquet")
-    n_bytes = data.stat().st_size
-    with data.open("rb+") as file:
-        file.truncate(n_bytes - 8)
-    reports: list = []
-    assert peak_of_arrays(lambda: reports.append(repair_dataset(tmp_path / "killed"))) < n_bytes
-    assert reports[0].kept == {0: 0}
-    assert pq.read_table(tmp_path / "killed/data").equals(pq.read_table(long_sound / "data"))
 
 
 def test_a_damaged_row_group_gives_no_rows_however_large_it_is(tmp_path, small_pieces):

@@ -32,7 +32,7 @@ from recording_factory import (
 
 from lerobot_playbyear.datasets import audio_feature, journal, settling
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
-from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.survey import survey
 
 ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
 
@@ -66,7 +66,7 @@ def is_as_recorded(root: Path, numbers: range | list[int], features: dict[str, A
 def test_every_value_comes_back(tmp_path):
     write(tmp_path / "dataset", range(4), RICH_FEATURES)
     assert is_as_recorded(tmp_path / "dataset", range(4), RICH_FEATURES)
-    assert check_dataset(tmp_path / "dataset").is_sound
+    assert survey(tmp_path / "dataset").is_sound
 
 
 def test_nothing_but_the_dataset_stays_on_disk(tmp_path):
@@ -173,7 +173,7 @@ def test_lerobot_goes_on_with_our_dataset_and_we_with_lerobots(tmp_path):
     dataset.finalize()
     write(root, range(4, 6))
     assert is_as_recorded(root, range(6))
-    assert check_dataset(root).is_sound
+    assert survey(root).is_sound
     assert int(load(root).meta.stats[MICROPHONE]["count"][0]) == load(root).num_frames
 
 
@@ -184,9 +184,9 @@ def test_lerobot_merges_and_deletes(tmp_path):
         ["a/one", "a/two"], REPO_ID, roots=[tmp_path / "one", tmp_path / "two"], aggr_root=tmp_path / "merged"
     )
     assert is_as_recorded(tmp_path / "merged", range(5), RICH_FEATURES)
-    assert check_dataset(tmp_path / "merged").is_sound
+    assert survey(tmp_path / "merged").is_sound
     delete_episodes(load(tmp_path / "merged"), [1, 3], output_dir=tmp_path / "left", repo_id=REPO_ID)
-    assert check_dataset(tmp_path / "left").is_sound
+    assert survey(tmp_path / "left").is_sound
     write(tmp_path / "left", [7], RICH_FEATURES)
     assert is_as_recorded(tmp_path / "left", [0, 2, 4, 7], RICH_FEATURES)
 
@@ -321,7 +321,7 @@ def kill_at_random(forks: tuple[Forks, Forks], root: Path, n_kills: int) -> None
         saved = found["episodes"]
     with writer(root, RICH_FEATURES):
         pass
-    assert check_dataset(root).is_sound
+    assert survey(root).is_sound
     assert is_as_recorded(root, range(load(root).num_episodes), RICH_FEATURES)
 
 

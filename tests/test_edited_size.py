@@ -10,7 +10,7 @@ from lerobot.scripts import lerobot_edit_dataset
 
 from lerobot_playbyear.datasets import audio_feature, episode_waveform
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.survey import survey
 
 KEY = "observation.audio.gripper"
 FEATURES = {KEY: audio_feature(16000, 20), "action": {"dtype": "float32", "shape": (1,), "names": None}}
@@ -56,7 +56,7 @@ def test_deleting_episodes_costs_bytes_and_no_sample(tmp_path, monkeypatch):
 
     kept = waveform(tmp_path / "ours", 1)
     np.testing.assert_array_equal(waveform(tmp_path / "left", 0), kept)
-    assert check_dataset(tmp_path / "left").is_sound
+    assert survey(tmp_path / "left").is_sound
     (before, is_ours), (after, is_theirs) = sound_on_disk(tmp_path / "ours"), sound_on_disk(tmp_path / "left")
     assert (is_ours, is_theirs) == (True, False)
     assert before < 1.1

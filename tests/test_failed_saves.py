@@ -20,8 +20,8 @@ from recording_factory import FEATURES, FILM, FPS, REPO_ID, RICH_FEATURES, diffe
 
 from lerobot_playbyear.datasets import journal
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
-from lerobot_playbyear.datasets.repair import check_dataset
 from lerobot_playbyear.datasets.staging import Staging
+from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.episodes.saving import save_or_ask
 
 ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
@@ -48,7 +48,7 @@ def assert_recorded(root: Path, n_episodes: int, features: dict[str, Any] = RICH
     films = {key: feature for key, feature in features.items() if key != FILM + "2"}
     assert not differences(dataset, {n: n for n in range(n_episodes)}, films)
     assert int(dataset.meta.stats["action"]["count"][0]) == dataset.num_frames
-    assert check_dataset(root).is_sound
+    assert survey(root).is_sound
 
 
 @pytest.fixture

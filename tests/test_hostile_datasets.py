@@ -29,7 +29,7 @@ from support.hub import HubServer
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.info import check_links
-from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import at_a_rate_of_aac
 from lerobot_playbyear.hub.dataset_card import describe_dataset
@@ -188,8 +188,7 @@ def test_only_pictures_are_read_as_pictures(root):
     edit_column(root, CAMERA, lambda picture: {"bytes": postscript.getvalue(), "path": None})
     with pytest.raises(OSError, match="cannot identify"):
         EpisodeStore.load("a/b", str(root), device="cpu")
-    report = check_dataset(root)
-    assert "11 pictures are damaged" in str(report)
+    assert f"episodes 0, 1: a picture of '{CAMERA}' is damaged (it is none)" in str(survey(root))
 
 
 def test_a_picture_of_another_size_is_refused_before_it_is_decoded(root):
@@ -507,7 +506,7 @@ _OPEN = """
 import resource, sys
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.info import check_links
-from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
+from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 from lerobot_playbyear.inspection.source import InspectionError
 from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
 
@@ -526,7 +525,7 @@ attempt("warm", lambda: inspect(InspectConfig(InspectDatasetConfig("a/b", sys.ar
 for root in sys.argv[2:]:
     attempt(f"store {root}", lambda: EpisodeStore.load("a/b", root, device="cpu"))
     attempt(f"inspect {root}", lambda: inspect(InspectConfig(InspectDatasetConfig("a/b", root))))
-    attempt(f"check {root}", lambda: check_dataset(root))
+    attempt(f"check {root}", lambda: survey(root))
 """
 
 
@@ -572,7 +571,7 @@ def test_a_check_never_reads_what_a_picture_points_to(root, secret):
     point_to(root, str(secret))
     secret.unlink()
     os.mkfifo(secret)  # who reads it waits for ever
-    check_dataset(root)
+    survey(root)
 
 
 def test_features_of_an_honest_dataset_are_believed(tmp_path):

@@ -10,7 +10,7 @@ from recording_factory import FEATURES, FPS, REPO_ID, episode_frames, load
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.journal import JOURNAL, STAGING, JournalError, finish_journal, publish
-from lerobot_playbyear.datasets.repair import repair_dataset
+from lerobot_playbyear.repair import repair_dataset
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, atta
 from lerobot_playbyear.audio.control_steps import ControlStepSound
 from lerobot_playbyear.audio.sample_strip import Strip, read_timecode
 from lerobot_playbyear.datasets.audio_files import write_wav
-from lerobot_playbyear.datasets.repair.command import RepairConfig, repair
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
+from lerobot_playbyear.repair.repair import RepairConfig, repair
 
 RATE, FPS, N_FRAMES, KEY = 16000, 20, 12, "observation.images.mic"
 
@@ -55,7 +55,8 @@ def test_killed_at_ten_moments_every_episode_that_repair_keeps_gets_its_sound(vi
         os.waitpid(child, 0)
         if not (root / "meta/info.json").is_file():
             continue  # it was killed before there was anything
-        repair(RepairConfig(root=root))
+        report = repair(RepairConfig(root=root))
+        root = report.target or root
         repaired = LeRobotDataset("me/killed", root=root, video_backend="pyav", return_uint8=True)
         if repaired.num_episodes == 0:
             continue

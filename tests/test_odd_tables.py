@@ -1,7 +1,6 @@
 """Tables and metadata that are damaged in a part, or that a stranger wrote: the episodes behind them are kept."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -10,14 +9,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from dataset_factory import CAMERA, MICROPHONE, make_dataset
-from PIL import Image
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import EpisodeStore, write_audio
-from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset, repair_dataset
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.inspection.source import DatasetSource
-from lerobot_playbyear.scripts.repair import main as repair_command
 
 LENGTHS = (6, 5, 7)
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
@@ -85,104 +81,6 @@ def attach(root: Path, tmp_path: Path) -> Path:
     return attach_audio(AttachAudioConfig(*places, files=sound_files(tmp_path), microphone="new"))
 
 
-@pytest.mark.parametrize("name", PLACES)
-def test_a_row_that_has_lost_a_part_of_a_videos_place_is_made_anew(videos, name):
-    spoil_column(videos / EPISODES, f"videos/{CAMERA}/{name}")
-    report = repair_dataset(videos)
-    assert len(report.kept) == len(LENGTHS)
-    assert "the rows of episodes 0 to 2 were lost" in str(report)
-    assert EpisodeStore.load("a/b", str(videos), video_backend="pyav").n_episodes == len(LENGTHS)
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0])
-@pytest.mark.parametrize("name", PLACES)
-def test_an_episode_is_not_lost_to_a_number_that_is_no_place(videos, name, value):
-    known = pq.read_table(videos / EPISODES).column(f"videos/{CAMERA}/{name}").to_pylist()
-    change(videos / EPISODES, f"videos/{CAMERA}/{name}", [known[0], value, float(known[2])])
-    report = repair_dataset(videos)
-    assert len(report.kept) == len(LENGTHS)
-    assert "the row of episode 1 was wrong: it does not say where the video" in str(report)
-
-
-@pytest.mark.parametrize("field", ["{nope}", "{}", "{chunk_index.x}", "{chunk_index:>99999999999}"])
-@pytest.mark.parametrize("path", ["data_path", "video_path"])
-def test_a_template_that_cannot_be_filled_in_is_replaced(videos, path, field):
-    template = json.loads((videos / "meta/info.json").read_text())[path]
-    change_info(videos, **{path: template.replace("{chunk_index:03d}", field).replace("chunk-", "")})
-    report = repair_dataset(videos)
-    assert len(report.kept) == len(LENGTHS)
-    assert json.loads((videos / "meta/info.json").read_text())[path] == template
-
-
-@pytest.mark.parametrize("field", ["{nope}", "{}", "{chunk_index.x}", "{chunk_index:>99999999999}"])
-@pytest.mark.parametrize("path", ["data_path", "video_path"])
-def test_a_template_that_nothing_fits_is_for_a_person_to_decide(videos, path, field):
-    change_info(videos, **{path: f"{path}/{field}.mp4"})
-    shutil.move(videos / path.removesuffix("_path").replace("video", "videos"), videos.parent / "elsewhere")
-    report = check_dataset(videos)
-    assert f"{path} was '{path}/{field}.mp4', where nothing is, nor at" in report.undecided[0]
-    with pytest.raises(DatasetDamagedError):
-        repair_dataset(videos)
-
-
-@pytest.mark.parametrize("values", [[[1.0] * 4, [None] * 4, [1.0] * 4], [[1.0] * 4, None, [1.0] * 4], ["x", "y", "z"]])
-def test_a_row_whose_statistics_are_no_numbers_is_made_anew(root, values):
-    change(root / EPISODES, "stats/action/mean", values)
-    report = repair_dataset(root)
-    assert len(report.kept) == len(LENGTHS)
-    assert re.search("the row of episode 1 was wrong: (parts of )?its statistics", str(report))
-
-
-def test_statistics_of_one_number_move_with_their_episode(root):
-    table = pq.read_table(root / EPISODES)
-    change(root / EPISODES, "stats/index/min", [row[0] for row in table.column("stats/index/min").to_pylist()])
-    pictures = pq.read_table(root / DATA).column(CAMERA).to_pylist()
-    change(root / DATA, CAMERA, [{"bytes": b"damaged", "path": None}, *pictures[1:]])
-    assert repair_dataset(root).kept == {1: 0, 2: 1}
-    assert pq.read_table(root / EPISODES).column("stats/index/min").to_pylist() == [0, 5]
-
-
-def test_splits_that_are_none_stop_no_repair(root):
-    change_info(root, splits=[1])
-    (root / "meta/tasks.parquet").unlink()
-    assert len(repair_dataset(root).kept) == len(LENGTHS)
-
-
-def test_rows_without_a_number_cost_only_their_own_episode(root):
-    table = pq.read_table(root / DATA)
-    numbers = np.array(table.column("episode_index"))
-    with pq.ParquetWriter(root / DATA, table.schema) as writer:
-        for episode in range(len(LENGTHS)):
-            part = table.filter(pa.array(numbers == episode))
-            if episode == 1:
-                kind = part.schema.field("frame_index").type
-                place = part.column_names.index("frame_index")
-                part = part.set_column(place, "frame_index", pa.array([0, None, 2, 3, 4], kind))
-            writer.write_table(part)
-    report = repair_dataset(root)
-    assert report.kept == {0: 0, 2: 1}
-    store = EpisodeStore.load("a/b", str(root))
-    assert [end - start for start, end in zip(store.starts, store.ends, strict=True)] == [6, 7]
-
-
-def test_a_row_is_made_anew_of_pictures_in_files(root):
-    Image.new("RGB", (16, 16), (9, 8, 7)).save(root / "picture.png")
-    change(root / DATA, CAMERA, [{"bytes": None, "path": "picture.png"}] * sum(LENGTHS))
-    (root / EPISODES).write_bytes(b"lost")
-    assert len(repair_dataset(root).kept) == len(LENGTHS)
-    assert np.allclose(
-        np.ravel(pq.read_table(root / EPISODES).column(f"stats/{CAMERA}/max")[0].as_py()) * 255, [9, 8, 7]
-    )
-
-
-def test_a_repair_reads_no_picture_outside_the_folder(root, tmp_path):
-    Image.new("RGB", (16, 16)).save(tmp_path / "private.png")
-    change(root / DATA, CAMERA, [{"bytes": None, "path": "../private.png"}] * sum(LENGTHS))
-    (root / EPISODES).write_bytes(b"lost")
-    with pytest.raises(ValueError, match="outside its folder"):
-        repair_dataset(root)
-
-
 @pytest.mark.parametrize("column", ["stats/action/mean.list.element", "length"])
 def test_sound_is_attached_to_no_damaged_table(root, tmp_path, column):
     spoil_column(root / EPISODES, column)
@@ -218,12 +116,3 @@ def test_a_card_shows_a_sample_rate_that_is_none(root):
     card = describe_dataset(DatasetSource.open("a/b", root), "a/b", None, None)
     assert "abc" in card
     assert "<b>" not in card
-
-
-@pytest.mark.parametrize("text", ["[]", "{}", '{"features": 1}', "{"])
-def test_a_model_for_a_repair_that_is_none_is_told(root, tmp_path, monkeypatch, text):
-    (tmp_path / "like/meta").mkdir(parents=True)
-    (tmp_path / "like/meta/info.json").write_text(text)
-    monkeypatch.setattr("sys.argv", ["playbyear-repair", f"--root={root}", f"--like={tmp_path / 'like'}"])
-    with pytest.raises(SystemExit, match=r"error: --like=.*info\.json"):
-        repair_command()

@@ -15,7 +15,7 @@ from recording_factory import FPS, REPO_ID, RICH_FEATURES, differences, episode_
 
 from lerobot_playbyear.datasets import settling
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.datasets.repair import repair_dataset
+from lerobot_playbyear.repair import repair_dataset
 
 N_EPISODES = 4
 ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
@@ -115,24 +115,23 @@ def meet_fault(disk: FaultyDisk, original: Path, folder: Path, operation: str, *
     # Nothing was touched that need not be.
     assert neighbours(folder) == beside, story
     was_repaired = operation == "repair" and original.name == "killed" and "error" not in answer
-    damaged = [path.name for path in folder.iterdir() if path.name.startswith("dataset.damaged")]
-    assert damaged == (["dataset.damaged"] if was_repaired else []), story
-    if was_repaired:
-        assert contents(folder / "dataset.damaged") == before, story
-    elif operation != "record":
+    target = folder / "dataset_repaired"
+    assert target.exists() == was_repaired, story
+    if operation != "record":
         assert contents(root) == before, story
 
     # Without the fault every episode is there.
-    report = repair_dataset(root)
-    assert not report.dropped, f"{story}: {report}"
-    if original.name == "ours" or was_repaired:
-        assert not report.changed, f"{story}: {report}"
-    dataset = load(root)
+    if not was_repaired:
+        report = repair_dataset(root)
+        assert not report.dropped, f"{story}: {report}"
+        assert (report.target is None) == (original.name == "ours"), f"{story}: {report}"
+        target = report.target or root
+    dataset = load(target)
     assert dataset.num_episodes in ((N_EPISODES, N_EPISODES + 1) if operation == "record" else (N_EPISODES,)), story
     assert dataset.num_episodes >= N_EPISODES + saved, story
     assert not differences(dataset, {n: n for n in range(dataset.num_episodes)}, RICH_FEATURES), story
     assert answer.get("counted", dataset.num_episodes) <= dataset.num_episodes, story
-    assert not [path for path in folder.iterdir() if path.name.startswith(".dataset")], story
+    assert not [path for path in folder.iterdir() if path.name.startswith((".dataset", ".playbyear"))], story
     return answer
 
 

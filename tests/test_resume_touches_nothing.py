@@ -16,8 +16,9 @@ from lerobot_playbyear.datasets import settling
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.existing import has_dataset
-from lerobot_playbyear.datasets.repair import DatasetDamagedError, repair_dataset
+from lerobot_playbyear.datasets.survey import DatasetDamagedError
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.repair import repair_dataset
 
 N_EPISODES = 4
 
@@ -105,7 +106,7 @@ def test_the_command_that_is_named_makes_it_good(root):
     cut(data_files(root)[1])
     with pytest.raises(DatasetDamagedError):
         writer(root)
-    repair_dataset(root)
+    root = repair_dataset(root).target
     with writer(root) as target:
         assert target.num_episodes == N_EPISODES - 1
     assert not differences(load(root), {0: 0, 1: 2, 2: 3}, FEATURES)

@@ -31,7 +31,7 @@ from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, 
 from lerobot_playbyear.audio.sound_picture import SoundPicture, pictures_of, read_pictures
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.repair import check_dataset
+from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.episodes import frames
 from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
 from lerobot_playbyear.episodes.play import play
@@ -179,7 +179,7 @@ def test_every_frame_shows_the_last_seconds_and_all_else_stays(original, seen, t
     assert new.meta.stats[PICTURE]["mean"].shape == new.meta.stats[CAMERA]["mean"].shape
     pixels = np.stack([picture(new, row) for row in range(len(new))]) / 255
     np.testing.assert_allclose(new.meta.stats[PICTURE]["mean"].ravel(), pixels.mean((0, 1, 2)), atol=1e-6)
-    assert check_dataset(seen).is_sound
+    assert survey(seen).is_sound
     assert [verdict for verdict in check_numbers(DatasetSource(new)) if verdict.level == "error"] == []
 
 
@@ -191,7 +191,7 @@ def test_a_video_shows_nearly_the_same(original, seen, tmp_path):
     assert pictures_of(film.features) == pictures_of(stored.features)[:1]
     wrong = [np.abs(picture(film, row).astype(int) - picture(stored, row)).mean() for row in (0, 11, 12, 30, 40, 45)]
     assert max(wrong) < 8
-    assert check_dataset(film.root).is_sound
+    assert survey(film.root).is_sound
 
 
 def test_a_copy_that_fails_is_not_there_and_one_that_is_there_is_not_touched(original, seen, tmp_path, monkeypatch):

@@ -17,13 +17,13 @@ from draccus.utils import is_choice_type
 from lerobot_playbyear.audio.attach import AttachAudioConfig
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.datasets.repair.command import RepairConfig
 from lerobot_playbyear.film.rollout_film import VideoConfig
 from lerobot_playbyear.hub.push import PushConfig
 from lerobot_playbyear.inspection.inspecting import InspectConfig
 from lerobot_playbyear.microphones.finding import FindMicrophonesConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.recording.record import RecordConfig
+from lerobot_playbyear.repair.repair import RepairConfig
 from lerobot_playbyear.scripts.command import OPTIONS_FILE
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 

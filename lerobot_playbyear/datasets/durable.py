@@ -22,7 +22,6 @@ from lerobot_playbyear.datasets.existing import check_compatible, check_root, ch
 from lerobot_playbyear.datasets.features import check_features
 from lerobot_playbyear.datasets.files import FolderLock
 from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, lock_dataset, publish
-from lerobot_playbyear.datasets.repair.replacing import finish_repair
 from lerobot_playbyear.datasets.settling import INFO, settle_episode
 from lerobot_playbyear.datasets.staging import Staging, remove_leftovers
 
@@ -96,7 +95,6 @@ class DurableWriter:
         self._episode: Staging | None = None
         self._lock: FolderLock | None = None
         try:
-            finish_repair(self.root)
             check_root(self.root, resume=resume)
             self._lock = lock_dataset(self.root)
             finish_journal(self.root)

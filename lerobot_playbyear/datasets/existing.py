@@ -9,10 +9,9 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_playbyear.datasets.errors import DatasetWriteError
 from lerobot_playbyear.datasets.features import differences
 from lerobot_playbyear.datasets.files import list_files
-from lerobot_playbyear.datasets.info import InfoError, OutsideError, read_info
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH
-from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
 from lerobot_playbyear.datasets.settling import INFO
+from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 
 
 def check_root(root: Path, *, resume: bool) -> None:
@@ -54,21 +53,15 @@ def check_undamaged(root: Path) -> None:
         DatasetWriteError: It cannot be read.
     """
     try:
-        report = check_dataset(root, thorough=False)
+        found = survey(root, thorough=False)
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
-    if not report.is_sound:
+    if not found.is_sound:
         command = f"playbyear-repair --root={shlex.quote(str(root))}"
-        first = "Correct by hand what has to be decided. Then " if report.undecided else ""
         raise DatasetDamagedError(
-            f"{report}\nNothing was changed, and nothing is appended to a damaged dataset. {first}`{command} --dry_run=true` "
-            f"looks again, more closely, and `{command}` repairs it; episodes that are not whole are lost then, and those "
-            "after them move up."
+            f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "
+            f"again, more closely, and `{command}` writes a copy with the episodes that are whole."
         )
-    try:
-        read_info(root)
-    except (InfoError, OutsideError) as error:
-        raise DatasetDamagedError(f"{error} Nothing was changed.") from error
 
 
 def check_compatible(

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lerobot_playbyear.datasets.repair import DatasetDamagedError, check_dataset
+from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 
 _LISTED = 3
 
@@ -19,14 +19,13 @@ def find_damage(folder: Path) -> str | None:
     if not (folder / "meta" / "info.json").is_file():
         return None
     try:
-        report = check_dataset(folder, thorough=False)
+        found = survey(folder, thorough=False)
     except DatasetDamagedError as error:
         return " ".join(str(error).split())
     except (OSError, MemoryError) as error:
         return f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
-    if report.is_sound:
+    if found.is_sound:
         return None
-    lines = [*report.damage, *report.undecided]
+    lines = [str(finding) for finding in found.findings if finding.level == "error"]
     more = f"; and {len(lines) - _LISTED} more" if len(lines) > _LISTED else ""
-    first = "Correct by hand what has to be decided, then repair it" if report.undecided else "Repair it"
-    return f"{'; '.join(lines[:_LISTED])}{more}. {first}: playbyear-repair --root={folder}"
+    return f"{'; '.join(lines[:_LISTED])}{more}. Repair it: playbyear-repair --root={folder}"

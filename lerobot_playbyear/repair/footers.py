@@ -1,8 +1,11 @@
-"""Reads parquet files that have lost their end: those of a recording that was killed, or cut off by a full disk.
+"""Footers of parquet files, made anew: of a recording that was killed, or cut off by a full disk.
 
 A parquet file's footer says where everything is, and is written last. LeRobot writes it when the recording ends,
 but it writes every episode's pages, with a header each, when the episode is saved. From these headers, and the
 columns that the dataset's features demand, the footer is written anew; pyarrow then reads the file as usual.
+
+Headers and footers are structures of Thrift's compact protocol, of which the second half of this module is as much as
+parquet uses.
 """
 
 import io
@@ -10,21 +13,42 @@ import logging
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.files import naming
 from lerobot_playbyear.datasets.parquet import ParquetDamageError, leaf_columns, open_checked, parsing
-from lerobot_playbyear.datasets.repair import thrift
-from lerobot_playbyear.datasets.repair.thrift import Elements, Struct, ThriftError
 
 logger = logging.getLogger(__name__)
+
+BOOL_TRUE, BOOL_FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 
 _MAGIC = b"PAR1"
 _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
 _MAX_HEADER_BYTES = 2**16
+_MAX_DEPTH = 32
+
+
+class ThriftError(ValueError):
+    """The bytes are no Thrift structure."""
+
+
+@dataclass
+class Elements:
+    """A list of values of one type."""
+
+    type: int
+    values: list[Any]
+
+
+class Struct(dict[int, tuple[int, Any]]):
+    """Fields by their number: type and value."""
+
+    def value(self, field: int) -> Any:
+        """The value of a field; None where it is absent."""
+        return self[field][1] if field in self else None
 
 
 @dataclass
@@ -61,10 +85,10 @@ def rescue(path: Path, schema: pa.Schema) -> pq.FileMetaData | None:
         return None
     footer = _empty_footer(schema)
     columns = [chunk.value(3) for chunk in footer.value(4).values[0].value(1).values]
-    footer[3] = (thrift.I64, sum(n_rows for n_rows, _ in groups))
+    footer[3] = (I64, sum(n_rows for n_rows, _ in groups))
     row_groups = [_row_group(columns, n_rows, chunks) for n_rows, chunks in groups]
-    footer[4] = (thrift.LIST, Elements(thrift.STRUCT, row_groups))
-    encoded = thrift.write_struct(footer)
+    footer[4] = (LIST, Elements(STRUCT, row_groups))
+    encoded = write_struct(footer)
     try:
         with parsing(path):
             metadata = pq.read_metadata(io.BytesIO(_MAGIC + encoded + len(encoded).to_bytes(4, "little") + _MAGIC))
@@ -80,7 +104,7 @@ def _empty_footer(schema: pa.Schema) -> Struct:
     buffer = io.BytesIO()
     pq.write_table(schema.empty_table(), buffer, compression="snappy")
     data = buffer.getvalue()
-    return thrift.read_struct(data[-8 - int.from_bytes(data[-8:-4], "little") :])[0]
+    return read_struct(data[-8 - int.from_bytes(data[-8:-4], "little") :])[0]
 
 
 def _pages(file: BinaryIO) -> list[_Page]:
@@ -90,7 +114,7 @@ def _pages(file: BinaryIO) -> list[_Page]:
     while at < size:
         file.seek(at)
         try:
-            page = _page(at, *thrift.read_struct(file.read(_MAX_HEADER_BYTES)))
+            page = _page(at, *read_struct(file.read(_MAX_HEADER_BYTES)))
         except (ThriftError, AttributeError, TypeError):
             break
         if page.start + page.stored > size:
@@ -160,18 +184,120 @@ def _row_group(columns: list[Struct], n_rows: int, chunks: _Chunks) -> Struct:
     for column, chunk in zip(columns, chunks, strict=True):
         details = Struct({field: value for field, value in column.items() if field in (1, 2, 3, 4)})
         data = [page for page in chunk if not page.is_dictionary]
-        details[5] = (thrift.I64, sum(page.n_values for page in data))
-        details[6] = (thrift.I64, sum(page.inflated for page in chunk))
-        details[7] = (thrift.I64, sum(page.stored for page in chunk))
-        details[9] = (thrift.I64, data[0].start)
+        details[5] = (I64, sum(page.n_values for page in data))
+        details[6] = (I64, sum(page.inflated for page in chunk))
+        details[7] = (I64, sum(page.stored for page in chunk))
+        details[9] = (I64, data[0].start)
         if chunk[0].is_dictionary:
-            details[11] = (thrift.I64, chunk[0].start)
-        described.append(Struct({2: (thrift.I64, 0), 3: (thrift.STRUCT, details)}))
+            details[11] = (I64, chunk[0].start)
+        described.append(Struct({2: (I64, 0), 3: (STRUCT, details)}))
     size = sum(page.inflated for chunk in chunks for page in chunk)
     return Struct(
         {
-            1: (thrift.LIST, Elements(thrift.STRUCT, described)),
-            2: (thrift.I64, size),
-            3: (thrift.I64, n_rows),
+            1: (LIST, Elements(STRUCT, described)),
+            2: (I64, size),
+            3: (I64, n_rows),
         }
     )
+
+
+def read_struct(data: bytes) -> tuple[Struct, int]:
+    """Reads the structure that some bytes begin with.
+
+    Returns:
+        The structure, and how many bytes it takes.
+
+    Raises:
+        ThriftError: There is none.
+    """
+    stream = io.BytesIO(data)
+    try:
+        return _read_value(STRUCT, stream, 0), stream.tell()
+    except (IndexError, OverflowError) as error:
+        raise ThriftError("the structure is cut off") from error
+
+
+def write_struct(struct: Struct) -> bytes:
+    """The bytes of a structure. In parquet the numbers of two neighbouring fields are never more than 15 apart."""
+    out = bytearray()
+    last = 0
+    for field in sorted(struct):
+        kind, value = struct[field]
+        out.append(field - last << 4 | kind)
+        if kind not in (BOOL_TRUE, BOOL_FALSE):  # their type says it all
+            out += _write_value(kind, value)
+        last = field
+    out.append(0)
+    return bytes(out)
+
+
+def _read_struct(stream: io.BytesIO, depth: int) -> Struct:
+    struct, last = Struct(), 0
+    while head := stream.read(1)[0]:
+        kind, delta = head & 15, head >> 4
+        last = last + delta if delta else _read_integer(stream)
+        is_bool = kind in (BOOL_TRUE, BOOL_FALSE)
+        struct[last] = (kind, kind == BOOL_TRUE if is_bool else _read_value(kind, stream, depth + 1))
+    return struct
+
+
+def _read_value(kind: int, stream: io.BytesIO, depth: int) -> Any:
+    if depth > _MAX_DEPTH:
+        raise ThriftError("the structure is nested too deeply")
+    if kind in (I16, I32, I64):
+        return _read_integer(stream)
+    if kind in (BYTE, BOOL_TRUE, BOOL_FALSE):
+        return stream.read(1)[0]
+    if kind == BINARY:
+        size = _read_varint(stream)
+        value = stream.read(size)
+        if len(value) < size:
+            raise ThriftError("a value is longer than the file")
+        return value
+    if kind == LIST:
+        head = stream.read(1)[0]
+        size = head >> 4 if head >> 4 != 15 else _read_varint(stream)
+        return Elements(head & 15, [_read_value(head & 15, stream, depth + 1) for _ in range(size)])
+    if kind == STRUCT:
+        return _read_struct(stream, depth)
+    raise ThriftError(f"type {kind} does not occur in parquet")
+
+
+def _write_value(kind: int, value: Any) -> bytes:
+    if kind in (I16, I32, I64):
+        return _varint((value << 1) ^ (value >> 63))
+    if kind in (BYTE, BOOL_TRUE, BOOL_FALSE):
+        return bytes([value])
+    if kind == BINARY:
+        return _varint(len(value)) + value
+    if kind == LIST:
+        size = len(value.values)
+        head = bytes([size << 4 | value.type]) if size < 15 else bytes([0xF0 | value.type]) + _varint(size)
+        return head + b"".join(_write_value(value.type, element) for element in value.values)
+    if kind == STRUCT:
+        return write_struct(value)
+    raise ThriftError(f"type {kind} does not occur in parquet")
+
+
+def _read_integer(stream: io.BytesIO) -> int:
+    number = _read_varint(stream)
+    return (number >> 1) ^ -(number & 1)
+
+
+def _read_varint(stream: io.BytesIO) -> int:
+    number = 0
+    for shift in range(0, 64, 7):
+        byte = stream.read(1)[0]
+        number |= (byte & 127) << shift
+        if byte < 128:
+            return number
+    raise ThriftError("a number has more than 64 bits")
+
+
+def _varint(number: int) -> bytes:
+    out = bytearray()
+    while number > 127:
+        out.append(number & 127 | 128)
+        number >>= 7
+    out.append(number)
+    return bytes(out)

@@ -1,0 +1,583 @@
+"""What there is of a dataset, and what is wrong with it: its files, frames, episodes, films and tables held against each other.
+
+The repair keeps what a survey calls whole, inspection reports what it finds, and a recorder appends to nothing that it calls
+damaged. That something cannot be read now is no finding but an OSError: it says nothing about the dataset.
+"""
+
+import io
+import itertools
+import json
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from PIL import Image, UnidentifiedImageError
+
+from lerobot_playbyear.datasets.confines import PICTURE_FORMATS
+from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, OutsideError, read_info
+from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, read_table
+from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
+
+TASKS_PATH, STATS_PATH = "meta/tasks.parquet", "meta/stats.json"
+
+Rescue = Callable[[Path, pa.Schema], pq.FileMetaData | None]
+"""Makes the footer of a parquet file that has lost its own, from the file and the columns that it should have."""
+
+Level = Literal["ok", "info", "warning", "error"]
+
+LEVELS: tuple[Level, ...] = ("ok", "info", "warning", "error")
+"""From what needs no attention to what makes the dataset unfit."""
+
+_TIME_TOLERANCE_S = 1e-3
+_MOST_NAMED = 8  # episodes in a line before it is cut
+
+
+class DatasetDamagedError(ValueError):
+    """A dataset is damaged, or too damaged to say what it holds; the message says how, and what to do."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The result of one check: one line for a person, figures for a program.
+
+    Args:
+        check: What was checked, a few words.
+        level: "ok", "info" (told, not judged), "warning" (worth a look) or "error" (training on it would go wrong).
+        message: One sentence with the figures that the level rests on.
+        feature: The key it is about, where it is about one.
+        episodes: The episodes it is about; empty where it is about the whole dataset.
+        figures: What was measured, by name.
+        remedy: What a person has to do about it. Of a survey's finding without one: `playbyear-repair` makes it good.
+    """
+
+    check: str
+    level: Level
+    message: str
+    feature: str | None = None
+    episodes: Sequence[int] = ()
+    figures: dict[str, Any] = field(default_factory=dict)
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return ". ".join(part for part in (self.message, self.remedy) if part)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**asdict(self), "episodes": [int(episode) for episode in self.episodes]}
+
+
+def worst(findings: Iterable[Finding]) -> Level:
+    """The most severe level among them; "ok" without any."""
+    return max((finding.level for finding in findings), key=LEVELS.index, default="ok")
+
+
+def name_episodes(episodes: Sequence[int]) -> str:
+    """`episode 3`, or `episodes 1, 4, 7 and 12 more`."""
+    shown = ", ".join(str(episode) for episode in episodes[:_MOST_NAMED])
+    more = f" and {len(episodes) - _MOST_NAMED} more" if len(episodes) > _MOST_NAMED else ""
+    return f"episode{'s' if len(episodes) > 1 else ''} {shown}{more}"
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Rows of a data file that follow each other and belong to one episode.
+
+    Args:
+        file: Where they are.
+        start: The first row.
+        length: How many.
+        episode: The episode's number.
+        first_frame: The first row's number within the episode.
+        first_index: The first row's number within the dataset.
+        is_numbered: Whether the numbers of the others within the dataset follow from it.
+        is_timely: Whether the timestamps are frame / fps.
+        tasks: The numbers of the tasks that occur.
+        damage: What is wrong with one of the pictures; None for nothing.
+    """
+
+    file: DataFile
+    start: int
+    length: int
+    episode: int
+    first_frame: int
+    first_index: int
+    is_numbered: bool
+    is_timely: bool
+    tasks: tuple[int, ...]
+    damage: str | None = None
+
+
+@dataclass(frozen=True)
+class Episode:
+    """An episode that is there, or of which something tells that it was.
+
+    Args:
+        number: Its number.
+        frames: Where all of it is there.
+        row: Its row in `meta/episodes`, where that is right.
+        places: Of each camera with films, where its pictures are.
+        reason: Why not all of it is there.
+    """
+
+    number: int
+    frames: Frames | None = None
+    row: Mapping[str, Any] | None = None
+    places: Mapping[str, Place] = field(default_factory=dict)
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A dataset as it was found.
+
+    Args:
+        root: Its folder.
+        info: What it says about itself.
+        schema: Of its data files.
+        episodes: All episodes, in the order of their numbers, also those that are not whole.
+        tasks: The text of each task.
+        findings: What is wrong, or odd.
+    """
+
+    root: Path
+    info: dict[str, Any]
+    schema: pa.Schema
+    episodes: Sequence[Episode]
+    tasks: Mapping[int, str]
+    findings: Sequence[Finding]
+
+    @property
+    def whole(self) -> list[Episode]:
+        """The episodes of which everything is there."""
+        return [episode for episode in self.episodes if episode.frames]
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing is wrong; what is odd does not count."""
+        return worst(self.findings) != "error"
+
+    def __str__(self) -> str:
+        if not self.findings:
+            return f"{self.root}: {len(self.episodes)} episodes, nothing wrong."
+        verdict = "nothing wrong, but" if self.is_sound else "it is damaged:"
+        lines = [
+            f"{self.root}: {len(self.whole)} whole episodes; {verdict}",
+            *(f"  - {each}" for each in self.findings),
+        ]
+        return "\n".join(lines)
+
+
+def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None, like: Path | None = None) -> Survey:
+    """Reads a dataset, and changes nothing.
+
+    Args:
+        root: Its folder.
+        thorough: Read everything, with checksums, look at the pictures in columns, and hold films against the frames. Otherwise
+            only what tells whether it can be opened and continued: this takes seconds, whatever its size.
+        rescue: Reads files that lost their end. None: they are only named.
+        like: A dataset that was recorded with the same settings. Its frame rate and features are believed.
+
+    Raises:
+        DatasetDamagedError: It is no dataset, or nothing says what its columns are.
+        OSError: Something cannot be read now.
+        MemoryError: There is no room for something.
+    """
+    root, findings = Path(root), list[Finding]()
+    info = _read_info(root, like, findings)
+    schema = _schema(root, info)
+    found = [
+        frames
+        for path in list_files(root, "data/*/*.parquet")
+        if (file := _open(root, path, schema, rescue, findings)) is not None
+        for frames in _read_frames(root, file, info, thorough, findings)
+    ]
+    rows = _read_rows(root, findings)
+    episodes = _find_films(root, info, _match(found, rows, info), rows, thorough)
+    tasks = _read_tasks(root, episodes, rows, findings)
+    findings += _judge_episodes(root, info, episodes, rows)
+    findings += _judge_counts(root, info, episodes)
+    return Survey(root, info, schema, episodes, tasks, findings)
+
+
+def _wrong(
+    check: str, message: str, episodes: Sequence[int] = (), remedy: str = "", feature: str | None = None
+) -> Finding:
+    return Finding(check, "error", message, feature, episodes, remedy=remedy)
+
+
+def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[str, Any]:
+    has_data = root.is_dir() and bool(list_files(root, "data/*/*.parquet"))
+    if not has_data and not (root.is_dir() and is_listed(root, INFO_PATH)):
+        raise DatasetDamagedError(f"{root} holds no LeRobotDataset: it has no {INFO_PATH}, and no data.")
+    known = None if like is None else read_info(like)
+    remedy = (
+        f"Put it back from a copy, or let it be made anew: playbyear-repair --root={root} --like=<folder of a dataset "
+    )
+    try:
+        if not is_listed(root, INFO_PATH):
+            raise InfoError(f"{root / INFO_PATH} is missing. {remedy}that was recorded with the same settings>.")
+        info = read_info(root)
+    except (InfoError, OutsideError) as error:
+        if known is None:
+            raise DatasetDamagedError(str(error)) from error
+        findings.append(_wrong("info", f"{INFO_PATH} cannot be read; it is made from that of {like}"))
+        return known
+    if known is not None and any(info[name] != known[name] for name in ("fps", "features")):
+        findings.append(_wrong("info", f"{INFO_PATH}: its frame rate and features become those of {like}"))
+        info = {**info, "fps": known["fps"], "features": known["features"]}
+    for key in audio_keys(info["features"]):
+        try:
+            check_audio_features({key: info["features"][key]}, info["fps"])
+        except ValueError as error:
+            said = str(error).removeprefix(f"'{key}' ")
+            findings.append(_wrong("sample rate", said, remedy=f"Correct it in {INFO_PATH}", feature=key))
+    return info
+
+
+def _schema(root: Path, info: Mapping[str, Any]) -> pa.Schema:
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}
+    try:
+        return get_hf_features_from_features(features).arrow_schema
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DatasetDamagedError(
+            f"{root / INFO_PATH}: LeRobot does not know a feature: {error}. Correct it."
+        ) from error
+
+
+# Frames
+
+
+def _open(root: Path, path: Path, schema: pa.Schema, rescue: Rescue | None, findings: list[Finding]) -> DataFile | None:
+    """A data file that is whole, or what can be rescued of it."""
+    name = path.relative_to(root)
+    try:
+        file = DataFile(path)
+    except ParquetDamageError as error:
+        footer = rescue(path, schema) if rescue else None
+        if footer is not None:
+            said = f"{name} has no valid end, as if the recording had been killed: it is read from its beginning"
+            findings.append(_wrong("files", said))
+            return DataFile(path, footer)
+        said = f"{name} cannot be read ({error})" + (", and no whole episode was found in it" if rescue else "")
+        findings.append(_wrong("files", said))
+        return None
+    if problem := _difference(file.schema, schema):
+        remedy = (
+            f"Correct the features in {INFO_PATH}, or take them from a dataset like it with playbyear-repair --like"
+        )
+        findings.append(_wrong("files", f"{name}: {problem}", remedy=remedy))
+        return None
+    return file
+
+
+def _difference(found: pa.Schema, wanted: pa.Schema) -> str | None:
+    """In what a file's columns differ from the dataset's features; other tools write lists without their length."""
+    if set(found.names) != set(wanted.names):
+        names = ", ".join(sorted(set(found.names) ^ set(wanted.names)))
+        return f"its columns are not the dataset's features: {names}"
+    for column in wanted:
+        own, kind = found.field(column.name).type, column.type
+        own, kind = (each.storage_type if isinstance(each, pa.BaseExtensionType) else each for each in (own, kind))
+        sizes = [each.list_size for each in (own, kind) if pa.types.is_fixed_size_list(each)]
+        if pa.types.is_nested(own) != pa.types.is_nested(kind) or len(set(sizes)) > 1:
+            return f"its column '{column.name}' is {own}; wanted {kind}"
+    return None
+
+
+def _read_frames(
+    root: Path, file: DataFile, info: Mapping[str, Any], thorough: bool, findings: list[Finding]
+) -> Iterator[Frames]:
+    """A file's rows, cut where another episode begins or frames are missing."""
+    name = file.path.relative_to(root)
+    cameras = [key for key, feature in info["features"].items() if feature["dtype"] == "image"] if thorough else []
+    parts: list[dict[str, np.ndarray]] = []
+    spoilt: dict[int, str] = {}
+    for first, table in file.row_groups(None if thorough else list(INDEX_COLUMNS)):
+        try:
+            if isinstance(table, ParquetDamageError):
+                raise table
+            part = {key: column_to_numpy(table.column(key)) for key in INDEX_COLUMNS}
+        except ValueError as error:
+            findings.append(_wrong("files", f"{name}: rows from {first} on are damaged: {error}"))
+            continue
+        parts.append({**part, "row": first + np.arange(len(table))})
+        for key in cameras:
+            for row, problem in _damaged_pictures(table.column(key), info["features"][key]["shape"]):
+                spoilt[first + row] = f"a picture of '{key}' {problem}"
+    if not parts:
+        return
+    index = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    breaks = (
+        (np.diff(index["episode_index"]) != 0) | (np.diff(index["frame_index"]) != 1) | (np.diff(index["row"]) != 1)
+    )
+    for start, stop in itertools.pairwise([0, *(np.flatnonzero(breaks) + 1).tolist(), len(index["row"])]):
+        own = {key: values[start:stop] for key, values in index.items()}
+        late = np.abs(own["timestamp"] - own["frame_index"] / info["fps"])
+        yield Frames(
+            file,
+            start=int(own["row"][0]),
+            length=stop - start,
+            episode=int(own["episode_index"][0]),
+            first_frame=int(own["frame_index"][0]),
+            first_index=int(own["index"][0]),
+            is_numbered=bool((np.diff(own["index"]) == 1).all()),
+            is_timely=bool((late <= _TIME_TOLERANCE_S).all()),  # also not where it is NaN
+            tasks=tuple(np.unique(own["task_index"]).tolist()),
+            damage=next((spoilt[row] for row in own["row"].tolist() if row in spoilt), None) if spoilt else None,
+        )
+
+
+def _damaged_pictures(column: pa.ChunkedArray, shape: Sequence[int]) -> Iterator[tuple[int, str]]:
+    """Of every damaged picture in a column its row, and what is wrong with it. Those in files of their own stay there."""
+    for row, picture in enumerate(value.as_py() for value in column):
+        try:
+            if picture["bytes"] is not None:
+                with Image.open(io.BytesIO(picture["bytes"]), formats=PICTURE_FORMATS) as image:
+                    image.verify()
+                    if (image.height, image.width) not in itertools.pairwise(shape):
+                        yield (
+                            row,
+                            f"has {image.width} x {image.height} pixels; {INFO_PATH} gives the shape {tuple(shape)}",
+                        )
+        except UnidentifiedImageError:
+            yield row, "is damaged (it is none)"
+        except (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError) as error:
+            yield row, f"is damaged ({error})"
+
+
+# Episodes
+
+
+def _read_rows(root: Path, findings: list[Finding]) -> dict[int, dict[str, Any]]:
+    """The rows of all tables of episodes, by the episode's number."""
+    rows: dict[int, dict[str, Any]] = {}
+    for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
+        name = path.relative_to(root)
+        try:
+            found = read_table(path).to_pylist()
+        except ParquetDamageError as error:
+            findings.append(_wrong("rows", f"{name} cannot be read: {error}"))
+            continue
+        for row in found:
+            number = row.get("episode_index")
+            if not isinstance(number, int) or number in rows:
+                said = "names no episode" if not isinstance(number, int) else f"names episode {number} a second time"
+                findings.append(_wrong("rows", f"a row of {name} {said}"))
+            else:
+                rows[number] = row
+    return rows
+
+
+def _match(found: Iterable[Frames], rows: Mapping[int, Mapping[str, Any]], info: Mapping[str, Any]) -> list[Episode]:
+    """Finds each episode's frames, and where its row says that its pictures are."""
+    frames_of: dict[int, list[Frames]] = defaultdict(list)
+    for frames in found:
+        frames_of[frames.episode].append(frames)
+    films = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    episodes = []
+    for number in sorted({*frames_of, *rows}):
+        said = {key: place_in_row(rows.get(number, {}), key) for key in films}
+        places = {key: place for key, place in said.items() if place is not None}
+        episodes.append(replace(_choose(number, frames_of[number], rows.get(number, {})), places=places))
+    return episodes
+
+
+def _choose(number: int, found: Sequence[Frames], row: Mapping[str, Any]) -> Episode:
+    """The frames of an episode, if it is whole. Its row counts them in two ways, of which one may be wrong."""
+    length, first, end = (row.get(name) for name in ("length", "dataset_from_index", "dataset_to_index"))
+    lengths = {end - first} if isinstance(first, int) and isinstance(end, int) else set[int]()
+    lengths |= {length} if isinstance(length, int) else set()
+    whole = [frames for frames in found if frames.first_frame == 0 and (not lengths or frames.length in lengths)]
+    sound = [frames for frames in whole if frames.damage is None]
+    if sound:
+        return Episode(number, sound[0])
+    if whole:
+        reason = str(whole[0].damage)
+    elif found and lengths:
+        wanted = " or ".join(map(str, sorted(lengths)))
+        reason = f"{sum(frames.length for frames in found)} of its {wanted} frames are left"
+    else:
+        reason = "its first frames are lost" if found else "its frames are lost"
+    return Episode(number, reason=reason)
+
+
+def _find_films(
+    root: Path, info: Mapping[str, Any], episodes: list[Episode], rows: Mapping[int, Mapping[str, Any]], thorough: bool
+) -> list[Episode]:
+    """Finds each episode's pictures in films. An episode without them is lost."""
+    for key, feature in info["features"].items():
+        if feature["dtype"] == "video":
+            lengths = [episode.frames.length if episode.frames else None for episode in episodes]
+            said = [episode.places.get(key) for episode in episodes]
+            places = find_places(root, info, key, lengths, said, thorough)
+            for i, place in enumerate(places):
+                if isinstance(place, str):
+                    reason = f"its pictures of '{key}' are lost: {place}"
+                    episodes[i] = replace(episodes[i], frames=None, reason=reason)
+                elif place is not None:
+                    episodes[i] = replace(episodes[i], places={**episodes[i].places, key: place})
+    return [
+        replace(episode, row=row)
+        if episode.frames and (row := rows.get(episode.number)) and not _contradiction(root, info, row, episode)
+        else episode
+        for episode in episodes
+    ]
+
+
+def _contradiction(root: Path, info: Mapping[str, Any], row: Mapping[str, Any], episode: Episode) -> str | None:
+    """What an episode's row says that its frames and films do not."""
+    frames = episode.frames
+    assert frames is not None
+    try:
+        file = info["data_path"].format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+        span = (row["dataset_from_index"], row["dataset_to_index"])
+    except (KeyError, ValueError, TypeError) as error:
+        return f"{error} is missing"
+    if root / file != frames.file.path:
+        return f"its frames are in {frames.file.path.relative_to(root)}, not in {file}"
+    if span != (frames.first_index, frames.first_index + frames.length):
+        there = f"{frames.first_index} to {frames.first_index + frames.length}"
+        return f"it counted frames {span[0]} to {span[1]}; they are {there}"
+    if row.get("length") != frames.length:
+        return f"its length was {row.get('length')}; it has {frames.length} frames"
+    if not isinstance(row.get("tasks"), list):
+        return "its tasks are missing"
+    names: dict[str, set[str]] = defaultdict(set)
+    for column, value in row.items():
+        if column.startswith("stats/") and value is not None:
+            key, name = column.removeprefix("stats/").rsplit("/", 1)
+            names[key].add(name)
+            if not _are_numbers(value):
+                return f"its statistics '{key}/{name}' are no numbers"
+    if len(set(map(frozenset, names.values()))) > 1:
+        return "parts of its statistics are missing"
+    for key, place in episode.places.items():
+        if place_in_row(row, key) != place:
+            return f"it does not say rightly where the pictures of '{key}' are"
+    return None
+
+
+def _are_numbers(value: Any) -> bool:
+    try:
+        return np.array(value).dtype.kind in "fiub"
+    except ValueError:  # lists of different lengths
+        return False
+
+
+def _judge_episodes(
+    root: Path, info: Mapping[str, Any], episodes: Sequence[Episode], rows: Mapping[int, Mapping[str, Any]]
+) -> Iterator[Finding]:
+    lost: dict[str, list[int]] = defaultdict(list)
+    for episode in episodes:
+        if not episode.frames:
+            lost[episode.reason].append(episode.number)
+        elif episode.row is None and (row := rows.get(episode.number)):
+            said = f"the row of episode {episode.number} in {EPISODES_DIR} is wrong: {_contradiction(root, info, row, episode)}"
+            yield _wrong("rows", said, [episode.number])
+    for reason, numbers in lost.items():
+        yield _wrong("rows", f"{name_episodes(numbers)}: {reason}", numbers)
+    whole = [(episode.number, episode.frames) for episode in episodes if episode.frames]
+    if without := [number for number, _ in whole if number not in rows]:
+        yield _wrong("rows", f"the rows of {name_episodes(without)} in {EPISODES_DIR} are lost", without)
+    if mixed := [number for number, frames in whole if not frames.is_numbered]:
+        yield _wrong(
+            "rows", f"{name_episodes(mixed)}: the frames are not numbered one after the other in 'index'", mixed
+        )
+    if untimely := [number for number, frames in whole if not frames.is_timely]:
+        said = f"{name_episodes(untimely)}: timestamps are not frame / fps at {info['fps']} frames per second"
+        yield _wrong("times", said, untimely, f"If they are right, correct fps in {INFO_PATH}")
+
+
+# What is said of the whole dataset
+
+
+def _judge_counts(root: Path, info: Mapping[str, Any], episodes: Sequence[Episode]) -> Iterator[Finding]:
+    n_frames = sum(episode.frames.length for episode in episodes if episode.frames)
+    is_whole = all(episode.frames for episode in episodes)
+    if info["total_episodes"] != len(episodes) or (is_whole and info["total_frames"] != n_frames):
+        yield _wrong(
+            "rows",
+            f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all; there are "
+            f"{len(episodes)} of {n_frames}",
+        )
+    expected = 0
+    for place, episode in enumerate(episodes):
+        if episode.frames is None:
+            break
+        if (episode.number, episode.frames.first_index) != (place, expected):
+            said = f"episode {episode.number} begins with frame {episode.frames.first_index}; wanted episode {place}, frame"
+            yield _wrong("rows", f"{said} {expected}", [episode.number])
+            break
+        expected += episode.frames.length
+    data = read_listed(root, STATS_PATH)
+    if data is None:
+        if n_frames:
+            yield _wrong("statistics", f"{STATS_PATH} is missing")
+        return
+    try:
+        entries = json.loads(data)
+        bad = [key for key, own in entries.items() if not all(map(_are_numbers, own.values()))]
+    except (ValueError, AttributeError, RecursionError) as error:
+        yield _wrong("statistics", f"{STATS_PATH} cannot be read: {error}")
+    else:
+        if bad:
+            yield _wrong("statistics", f"{STATS_PATH}: the entries of {', '.join(bad)} are no numbers")
+
+
+def _read_tasks(
+    root: Path, episodes: Sequence[Episode], rows: Mapping[int, Mapping[str, Any]], findings: list[Finding]
+) -> dict[int, str]:
+    """The text of each task. Where the table lacks one, what all episodes of only this task say in their rows."""
+    frames_of = {episode.number: episode.frames for episode in episodes if episode.frames}
+    said: dict[int, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
+    for number, frames in frames_of.items():
+        texts = rows.get(number, {}).get("tasks")
+        if isinstance(texts, list) and len(texts) == len(frames.tasks) == 1:
+            said[frames.tasks[0]][str(texts[0])].append(number)
+    wanted = sorted({task for frames in frames_of.values() for task in frames.tasks})
+    known, problem = _tasks_in_table(root)
+    if problem and wanted:
+        findings.append(_wrong("tasks", f"{TASKS_PATH} {problem}; its texts are those that the episodes' rows say"))
+        n_frames = sum(frames.length for frames in frames_of.values())
+        texts = {task: next(iter(said[task])) if len(said[task]) == 1 else unknown_task(task) for task in wanted}
+        known = {task: text for task, text in texts.items() if task < n_frames}
+    if nameless := sorted(set(wanted) - set(known)):
+        remedy = "Put a table from a copy in its place, or correct the frames' task_index"
+        said_of = ", ".join(map(str, nameless[:_MOST_NAMED]))
+        findings.append(
+            _wrong("tasks", f"{TASKS_PATH}: frames are of task {said_of}, which has no text", remedy=remedy)
+        )
+    for task, text, numbers in ((each, text, own) for each in wanted for text, own in said[each].items()):
+        if text != known.get(task, text) and not problem:
+            message = (
+                f"{TASKS_PATH}: task {task} reads {known[task]!r}; the rows of {name_episodes(numbers)} say {text!r}"
+            )
+            remedy = "If nobody renamed it, lerobot-edit-dataset with --operation.type=modify_tasks sets the right one"
+            findings.append(Finding("tasks", "warning", message, episodes=numbers, remedy=remedy))
+    return known
+
+
+def unknown_task(number: int) -> str:
+    """What stands for a text that is lost."""
+    return f"unknown task {number}"
+
+
+def _tasks_in_table(root: Path) -> tuple[dict[int, str], str | None]:
+    """The tasks' texts, and what is wrong with their table: LeRobot finds a task by its place."""
+    if not is_listed(root, TASKS_PATH):
+        return {}, "is missing"
+    try:
+        table = read_table(root / TASKS_PATH).to_pandas()
+        known = dict(zip(table["task_index"].astype(int).tolist(), table.index.astype(str), strict=True))
+    except (ParquetDamageError, KeyError, ValueError, TypeError) as error:
+        return {}, f"cannot be read ({error})"
+    return known, None if list(known) == list(range(len(known))) else "does not number its tasks from 0 on"

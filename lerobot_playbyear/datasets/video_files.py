@@ -1,0 +1,202 @@
+"""The films of a camera: which are whole, when their pictures are shown, and where each episode's pictures lie.
+
+A recorder puts one episode behind the other into a film until that is full. So where an episode's pictures are, if its row
+in `meta/episodes` is lost, follows from where those of the episode before it are. Nothing is decoded: the times stand in
+the film's packets.
+"""
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import av
+import numpy as np
+
+from lerobot_playbyear.datasets.files import is_listed, naming
+from lerobot_playbyear.datasets.info import file_inside
+
+TOLERANCE_S = 1e-4
+"""How far a picture's time may be from its frame's; LeRobot's own."""
+
+_BOX_HEADER = 8
+_PLACE = ("chunk_index", "file_index", "from_timestamp", "to_timestamp")
+
+
+class Place(NamedTuple):
+    """Where an episode's pictures are: in which film, and from when to when in it [s]."""
+
+    chunk: int
+    file: int
+    start: float
+    end: float
+
+    def columns(self, key: str) -> dict[str, Any]:
+        """As `meta/episodes` has it for a camera."""
+        return {f"videos/{key}/{name}": value for name, value in zip(_PLACE, self, strict=True)}
+
+
+def place_in_row(row: Mapping[str, Any], key: str) -> Place | None:
+    """Where an episode's row in `meta/episodes` says that a camera's pictures are; None where it does not."""
+    values: list[Any] = [row.get(f"videos/{key}/{name}") for name in _PLACE]
+    if not all(isinstance(value, int | float) and 0 <= value < math.inf for value in values):
+        return None
+    chunk, file, start, end = values
+    return Place(int(chunk), int(file), float(start), float(end))
+
+
+def film_path(root: Path, info: Mapping[str, Any], key: str, place: Place) -> Path:
+    """The film of a place.
+
+    Raises:
+        OutsideError: It lies outside the dataset's folder.
+    """
+    name = str(info["video_path"]).format(video_key=key, chunk_index=place.chunk, file_index=place.file)
+    return file_inside(root, name)
+
+
+def find_places(
+    root: Path,
+    info: Mapping[str, Any],
+    key: str,
+    lengths: Sequence[int | None],
+    said: Sequence[Place | None],
+    thorough: bool,
+) -> list[Place | str | None]:
+    """Finds the pictures of each episode, and whether they are all there.
+
+    Args:
+        root: The dataset's folder.
+        info: What it says about itself.
+        key: The camera.
+        lengths: The frames of every episode, in the order of their numbers; None of one that is lost anyhow.
+        said: Where its row says that its pictures are, if it does.
+        thorough: Hold every film's pictures against the frames. Otherwise only those of episodes without a place, and of
+            the other films whether they are cut off.
+
+    Returns:
+        For every episode its place, or why its pictures are lost; None of one that is lost anyhow and says no place.
+
+    Raises:
+        OSError: A film cannot be read now.
+    """
+    films = _Films(root, info, key)
+    found: list[Place | str | None] = []
+    before: Place | None = Place(0, 0, 0.0, 0.0)
+    for length, own in zip(lengths, said, strict=True):
+        if length is None:
+            before = own
+            found.append(own)
+            continue
+        is_right = own is not None and abs((own.end - own.start) * info["fps"] - length) <= 1
+        place = own if is_right else films.after(before, length)
+        problem = films.problem(place, length, closely=thorough or not is_right) if place else "nothing says where"
+        found.append(problem or place)
+        before = None if problem else place
+    return found
+
+
+class _Films:
+    """The films of one camera. What was found out about one is kept, and not read again."""
+
+    def __init__(self, root: Path, info: Mapping[str, Any], key: str) -> None:
+        self._root, self._info, self._key = root, info, key
+        self._wrong: dict[Path, str | None] = {}
+        self._times: dict[Path, np.ndarray] = {}
+
+    def after(self, before: Place | None, length: int) -> Place | None:
+        """Where the next episode's pictures are: behind the last ones, or in the next film where those end it."""
+        if before is None:
+            return None
+        chunk, file, start = before.chunk, before.file, before.end
+        times = self._times_of(film_path(self._root, self._info, self._key, before))
+        if start and (len(times) == 0 or times[-1] < start - TOLERANCE_S):
+            chunk, file = (chunk, file + 1) if file + 1 < self._info["chunks_size"] else (chunk + 1, 0)
+            start = 0.0
+        return Place(chunk, file, start, start + length / self._info["fps"])
+
+    def problem(self, place: Place, length: int, closely: bool) -> str | None:
+        """What is wrong with the film of a place, or that it lacks pictures of these frames."""
+        path = film_path(self._root, self._info, self._key, place)
+        name = path.relative_to(self._root)
+        if problem := self._problem_of(path):
+            return f"{name} {problem}"
+        if closely:
+            times = self._times_of(path)
+            wanted = place.start + np.arange(length) / self._info["fps"]
+            after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
+            near = (
+                np.abs(times.take([after - 1, after], mode="clip") - wanted) if len(times) else np.full((2, 1), np.inf)
+            )
+            if near.min(axis=0).max() >= TOLERANCE_S + np.spacing(np.float32(place.end)):
+                return f"{name} {self._problem_of(path) or 'lacks some of the pictures'}"
+        return None
+
+    def _problem_of(self, path: Path) -> str | None:
+        if path not in self._wrong:
+            with naming(path):
+                is_there = is_listed(self._root, path.relative_to(self._root))
+                self._wrong[path] = ("is cut off" if _is_cut_off(path) else None) if is_there else "is missing"
+        return self._wrong[path]
+
+    def _times_of(self, path: Path) -> np.ndarray:
+        if path not in self._times:
+            self._times[path] = np.empty(0)
+            if self._problem_of(path) is None:
+                try:
+                    with naming(path):
+                        self._times[path] = picture_times(path)
+                except av.FFmpegError as error:
+                    self._wrong[path] = f"is no film that can be read: {error}"
+        return self._times[path]
+
+
+def picture_times(path: Path) -> np.ndarray:
+    """When the pictures of a film are shown [s], (n,) in order, from its packets.
+
+    Raises:
+        av.FFmpegError: It is no film.
+        OSError: It cannot be read now.
+    """
+    with _Remembering(path) as file:
+        try:
+            with av.open(file, "r") as container:
+                packets = container.demux(container.streams.video[0])
+                times = [float(p.pts * p.time_base) for p in packets if p.pts is not None and not p.is_discard]
+        except IndexError as error:
+            raise av.InvalidDataError(0, "it has no pictures", str(path)) from error
+        finally:
+            if file.problem is not None:
+                raise file.problem
+    return np.sort(times)
+
+
+class _Remembering(io.FileIO):
+    """A file that remembers that it could not be read: FFmpeg takes some errors for the film's end."""
+
+    problem: OSError | None = None
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        try:
+            return super().read(size if size is not None else -1) or b""
+        except OSError as error:
+            self.problem = error
+            raise
+
+
+def _is_cut_off(path: Path) -> bool:
+    """Whether not all boxes that an mp4 file is made of are there; this takes no time."""
+    size, at, kinds = path.stat().st_size, 0, set()
+    with path.open("rb") as file:
+        while at < size:
+            file.seek(at)
+            head = file.read(2 * _BOX_HEADER)
+            length = int.from_bytes(head[:4], "big")
+            if length == 1:
+                length = int.from_bytes(head[8:16], "big")
+            kinds.add(head[4:8])
+            if length < _BOX_HEADER or at + length > size:
+                return True
+            at += length
+    return b"moov" not in kinds

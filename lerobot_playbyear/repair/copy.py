@@ -1,0 +1,204 @@
+"""The repaired copy of a dataset: every episode that a survey calls whole, with what is right as it is, and the rest anew."""
+
+import math
+import shutil
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+from lerobot.datasets.compute_stats import auto_downsample_height_width, get_feature_stats, sample_indices
+from lerobot.datasets.io_utils import write_json, write_tasks
+
+from lerobot_playbyear.datasets.confines import open_picture
+from lerobot_playbyear.datasets.episode_clock import renumber_episode_starts
+from lerobot_playbyear.datasets.features import audio_keys
+from lerobot_playbyear.datasets.files import (
+    DEFAULT_DATA_PATH,
+    EPISODES_DIR,
+    INFO_PATH,
+    entries_below,
+    fits,
+    is_listed,
+    take_over,
+)
+from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_tables
+from lerobot_playbyear.datasets.settling import write_rows
+from lerobot_playbyear.datasets.statistics import Stats, add_stats, numeric_stats, row_stats, write_stats
+from lerobot_playbyear.datasets.survey import STATS_PATH, TASKS_PATH, Episode, Frames, Survey, unknown_task
+from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
+from lerobot_playbyear.datasets.video_pictures import video_pictures
+
+_REMADE = (INFO_PATH, STATS_PATH, TASKS_PATH, "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet")
+
+
+def write_copy(survey: Survey, target: Path) -> None:
+    """Writes a whole dataset.
+
+    Args:
+        survey: Of the damaged one.
+        target: An empty folder; where the file system allows, it shares the films and unchanged files of frames.
+
+    Raises:
+        ValueError: A picture or a film lies outside the dataset's folder, or a picture has another size than its feature.
+        OSError: Something cannot be read now, or written.
+    """
+    _copy_rest(survey, target)
+    renumber_episode_starts(target, {episode.number: number for number, episode in enumerate(survey.whole)})
+    rows = sorted(_write_data(survey, target), key=lambda row: row["episode_index"])
+    columns = dict.fromkeys(column for row in rows for column in row)
+    table = pa.table({column: [row.get(column) for row in rows] for column in columns})
+    write_rows(table, target / EPISODES_DIR / "chunk-000/file-000.parquet")
+    if is_listed(survey.root, TASKS_PATH) and not any(
+        each.check == "tasks" and not each.remedy for each in survey.findings
+    ):
+        shutil.copy2(survey.root / TASKS_PATH, target / TASKS_PATH)
+    else:
+        write_tasks(_tasks_table(survey), target)
+    write_stats(add_stats(None, map(row_stats, rows), audio_keys(survey.info["features"])), target)
+    n_frames = sum(row["length"] for row in rows)
+    counts = {"total_episodes": len(rows), "total_frames": n_frames, "total_tasks": len(survey.tasks)}
+    is_complete = len(rows) == len(survey.episodes)
+    splits = survey.info.get("splits") if is_complete else {"train": f"0:{len(rows)}"}
+    write_json({**survey.info, **counts, "splits": splits, "data_path": DEFAULT_DATA_PATH}, target / INFO_PATH)
+
+
+def _copy_rest(survey: Survey, target: Path) -> None:
+    """Films, a card, notes, files of other tools: all but the frames, the tables and what an unsaved episode left."""
+    for path in entries_below(survey.root):
+        name = path.relative_to(survey.root)
+        if path.is_file() and not _is_scratch(name, survey.info["features"]) and not fits(name, *_REMADE):
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            # Nobody changes a film in place; of a user's own files that is not known.
+            (take_over if name.parts[0] == "videos" else shutil.copy2)(path, target / name)
+
+
+def _is_scratch(name: Path, features: Collection[str]) -> bool:
+    """Whether a file is what was only needed while an episode was written."""
+    folder, inside = name.parts[0], name.parts[1:2]
+    return folder == "images" and bool(inside) and (inside[0] in features or inside[0].startswith("."))
+
+
+def _tasks_table(survey: Survey) -> Any:
+    """As LeRobot keeps it: a task's number in `task_index`, its text as the index. LeRobot finds a task by its place."""
+    numbers = range(max(survey.tasks, default=-1) + 1)
+    texts = [survey.tasks.get(number, unknown_task(number)) for number in numbers]
+    return pd.DataFrame({"task_index": list(numbers)}, index=pd.Index(texts, name="task"))
+
+
+class _Kept(NamedTuple):
+    """A whole episode, with its number and that of its first frame in the copy."""
+
+    episode: Episode
+    frames: Frames
+    number: int
+    first_index: int
+
+    @property
+    def stays(self) -> bool:
+        """Whether no number in its frames changes."""
+        own = (self.frames.episode, self.frames.first_index)
+        return self.frames.is_numbered and own == (self.number, self.first_index)
+
+    def numbers(self) -> dict[str, np.ndarray]:
+        """The columns of its frames that change, (n,)."""
+        index = np.arange(self.first_index, self.first_index + self.frames.length)
+        return {"episode_index": np.full(len(index), self.number), "index": index}
+
+    def table(self) -> pa.Table:
+        """Its frames."""
+        table = self.frames.file.read(self.frames.start, self.frames.start + self.frames.length)
+        for key, values in self.numbers().items():
+            table = with_values(table, key, values)
+        return table
+
+
+def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
+    """Writes the frames, file by file, each as it is where nothing in it changes. Returns the episodes' rows."""
+    by_file: dict[Path, list[_Kept]] = defaultdict(list)
+    first_index = 0
+    for number, episode in enumerate(survey.whole):
+        assert episode.frames is not None
+        by_file[episode.frames.file.path].append(_Kept(episode, episode.frames, number, first_index))
+        first_index += episode.frames.length
+    for place, (path, kept) in enumerate(by_file.items()):
+        chunk, number = divmod(place, survey.info["chunks_size"])
+        name = target / DEFAULT_DATA_PATH.format(chunk_index=chunk, file_index=number)
+        file = kept[0].frames.file
+        is_whole = not file.is_rescued and sum(one.frames.length for one in kept) == file.n_rows
+        if is_whole and all(one.stays for one in kept):
+            take_over(path, name)
+        else:
+            write_tables(name, (one.table() for one in kept), file.schema)
+        for one in kept:
+            places = {
+                "episode_index": one.number,
+                "data/chunk_index": chunk,
+                "data/file_index": number,
+                "dataset_from_index": one.first_index,
+                "dataset_to_index": one.first_index + one.frames.length,
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+            }
+            yield {**_row(survey, one), **places}
+
+
+def _row(survey: Survey, kept: _Kept) -> dict[str, Any]:
+    """An episode's row: its own, with the statistics of its new numbers, or one that is made anew."""
+    places = {name: value for key, own in kept.episode.places.items() for name, value in own.columns(key).items()}
+    row = kept.episode.row
+    if row is None:
+        texts = [survey.tasks.get(task, unknown_task(task)) for task in kept.frames.tasks]
+        stats = _stats_columns(_episode_stats(survey, kept.episode, kept.table()))
+        return {"tasks": texts, "length": kept.frames.length, **stats, **places}
+    moved = {} if kept.stays else _stats_columns(numeric_stats(kept.numbers(), survey.info["features"]))
+    return {**row, **{name: value for name, value in moved.items() if name in row}, **places}
+
+
+def _stats_columns(stats: Stats) -> dict[str, Any]:
+    return {f"stats/{key}/{name}": value.tolist() for key, own in stats.items() for name, value in own.items()}
+
+
+def _episode_stats(survey: Survey, episode: Episode, frames: pa.Table) -> Stats:
+    """The statistics of one episode, as LeRobot has them: of pictures, from as many as it samples.
+
+    Raises:
+        ValueError: A picture or a film lies outside the folder, or a picture has another size than the feature says.
+    """
+    numbers: dict[str, np.ndarray] = {}
+    stats: Stats = {}
+    root, sampled = survey.root, sample_indices(len(frames))
+    for key, feature in survey.info["features"].items():
+        shape, details = tuple(feature["shape"]), feature.get("info") or {}
+        if (
+            details.get("is_depth_map")
+            or details.get("video.is_depth_map")
+            or feature["dtype"] in ("string", "language")
+        ):
+            continue
+        if feature["dtype"] == "image":
+            pictures = []
+            for index in sampled:
+                with open_picture(frames.column(key)[index].as_py(), root, key, feature) as image:
+                    pictures.append(np.asarray(image.convert("RGB")))
+            stats[key] = _picture_stats(pictures)
+        elif feature["dtype"] == "video":
+            place = episode.places[key]
+            times = [place.start + index / survey.info["fps"] for index in sampled]
+            stats[key] = _picture_stats(
+                list(video_pictures(film_path(root, survey.info, key, place), times, TOLERANCE_S, "pyav", key, shape))
+            )
+        else:
+            values = column_to_numpy(frames.column(key))
+            numbers[key] = values.reshape(len(frames), *(() if math.prod(shape) == 1 else shape))
+    return {**numeric_stats(numbers, survey.info["features"]), **stats}
+
+
+def _picture_stats(pictures: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Of each channel, (C, 1, 1), for pixels in [0, 1], from pictures (H, W, C) uint8, as small as LeRobot looks at them."""
+    small = np.stack([auto_downsample_height_width(picture.transpose(2, 0, 1)) for picture in pictures])
+    stats = get_feature_stats(small, axis=(0, 2, 3), keepdims=True)
+    return {name: value if name == "count" else np.squeeze(value / 255.0, axis=0) for name, value in stats.items()}

@@ -1,0 +1,174 @@
+"""`playbyear-repair`: says what is wrong with a dataset, and writes a copy with every episode that is whole.
+
+The dataset itself is not changed. So nothing has to be proven before it may be dropped: what is not in the copy is still
+there. LeRobot is imported when there is a dataset.
+"""
+
+import contextlib
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import FolderLockedError, check_can_be_made, new_folder
+from lerobot_playbyear.datasets.info import check_links
+from lerobot_playbyear.datasets.journal import finish_journal, lock_dataset
+from lerobot_playbyear.datasets.survey import DatasetDamagedError, Finding, Survey, survey
+from lerobot_playbyear.repair.footers import rescue
+
+_MOST_MOVES = 20  # that are named
+
+
+@dataclass
+class RepairConfig:
+    """Options of `playbyear-repair`.
+
+    Args:
+        root: The dataset's folder.
+        output: The copy's; None: its name with `_repaired` behind it.
+        like: The folder of a dataset that was recorded with the same settings: its frame rate and features are taken.
+            Needed only where `meta/info.json` is lost.
+        dry_run: Only say what is wrong.
+    """
+
+    root: Path
+    output: Path | None = None
+    like: Path | None = None
+    dry_run: bool = False
+
+
+@dataclass(frozen=True)
+class RepairReport:
+    """What was wrong with a dataset, and what became of it.
+
+    Args:
+        survey: What was found.
+        target: The repaired copy; None where none was written.
+    """
+
+    survey: Survey
+    target: Path | None = None
+
+    @property
+    def kept(self) -> dict[int, int]:
+        """The number of every whole episode, and its number in the copy."""
+        return {episode.number: number for number, episode in enumerate(self.survey.whole)}
+
+    @property
+    def dropped(self) -> dict[int, str]:
+        """The number of every other episode, and what is wrong with it."""
+        return {episode.number: episode.reason for episode in self.survey.episodes if not episode.frames}
+
+    @property
+    def left(self) -> list[Finding]:
+        """What only a person can put right."""
+        return [finding for finding in self.survey.findings if finding.level == "error" and finding.remedy]
+
+    @property
+    def is_done(self) -> bool:
+        """Whether there is a dataset now with which nothing is wrong."""
+        return self.survey.is_sound or (self.target is not None and not self.left)
+
+    def __str__(self) -> str:
+        lines = [str(self.survey)]
+        if self.target is None:
+            return lines[0]
+        moved = [f"{old} is now {new}" for old, new in self.kept.items() if old != new]
+        if moved:
+            lines.append(
+                f"Numbered anew: {', '.join(moved[:_MOST_MOVES])}{' ...' if len(moved) > _MOST_MOVES else ''}."
+            )
+        lines.append(
+            f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is as it was."
+        )
+        if self.left:
+            lines.append(f"What is left to be done in the copy: {'. '.join(each.remedy for each in self.left)}.")
+        old, new = shlex.quote(str(self.survey.root)), shlex.quote(str(self.target))
+        aside = shlex.quote(f"{self.survey.root}_damaged")
+        lines.append(f"To put it in the dataset's place: mv {old} {aside} && mv {new} {old}")
+        return "\n".join(lines)
+
+
+def repair(cfg: RepairConfig) -> RepairReport:
+    """Looks, and unless it is a dry run writes the copy. Prints what was found.
+
+    Raises:
+        ValueError: It cannot be repaired, or it or `like` is no dataset, or the copy cannot be made.
+        OSError: `like` or the dataset cannot be read now, or the copy cannot be written.
+        MemoryError: There is not enough of it.
+    """
+    report = look(cfg.root, cfg.like) if cfg.dry_run else repair_dataset(cfg.root, cfg.output, cfg.like)
+    print(report)
+    return report
+
+
+def look(root: Path, like: Path | None = None) -> RepairReport:
+    """What a repair would keep. Arguments and errors as for `repair_dataset`."""
+    if not root.is_dir():
+        raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
+    return RepairReport(survey(root, rescue=rescue, like=like))
+
+
+def repair_dataset(root: str | Path, target: str | Path | None = None, like: Path | None = None) -> RepairReport:
+    """Writes a copy of a local dataset of ours or of LeRobot's with every whole episode, bit for bit.
+
+    A recording that was killed has lost its tables' ends, which are made anew from what is there; so are damaged or
+    deleted tables in `meta/`. Episodes of which frames or pictures are lost are not in the copy, and those after them move
+    up. What a writer of ours had begun to move into the dataset is finished first; else nothing in the dataset is changed.
+
+    Args:
+        root: The dataset's folder.
+        target: The copy's folder, which is there only when it is complete; None: beside the dataset, `<root>_repaired`.
+        like: See `RepairConfig`.
+
+    Returns:
+        What was found, and where the copy is; without damage that a copy can put right, there is none.
+
+    Raises:
+        DatasetDamagedError: It is no dataset, or no episode in it is whole.
+        OutsideError: A link leads out of its folder: the copy would hold what it leads to.
+        InputError: The copy's folder is there already, or cannot be made.
+        OSError: Something cannot be read now, or the copy cannot be written.
+        MemoryError: There is no room for something.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
+    real = root.absolute()
+    target = Path(target) if target is not None else real.with_name(f"{real.name}_repaired")
+    with _held(root):
+        report = look(root, like)
+        if not [each for each in report.survey.findings if each.level == "error" and not each.remedy]:
+            return report
+        if not report.kept:
+            raise DatasetDamagedError(f"{report}\nNo whole episode is left in {root}; no copy was written.")
+        if target.exists():
+            raise InputError(f"--output={target} is there already. Give another, or delete it.")
+        check_can_be_made(target, f"--output={target}")
+        check_links(root)
+        from lerobot_playbyear.repair.copy import write_copy
+
+        with new_folder(target) as folder:
+            write_copy(report.survey, folder)
+            again = survey(folder, thorough=False)
+            if any(each.level == "error" and not each.remedy for each in again.findings):
+                raise DatasetDamagedError(f"The copy of {root} is not sound, and was not kept. {again}")
+    return RepairReport(report.survey, target)
+
+
+@contextlib.contextmanager
+def _held(root: Path) -> Iterator[None]:
+    """Nobody writes to the dataset meanwhile; where no lock can be made, nobody can write to it."""
+    try:
+        lock = lock_dataset(root)
+    except FolderLockedError as error:
+        raise InputError(str(error)) from error
+    except OSError:
+        yield
+        return
+    try:
+        finish_journal(root)
+        yield
+    finally:
+        lock.release()
