@@ -108,6 +108,13 @@ def flip(path: Path) -> None:
     path.write_bytes(data)
 
 
+def spoil(path: Path) -> None:
+    """A block in the middle of a film that the disk lost."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 4 : len(data) // 2] = bytes(len(data) // 2 - len(data) // 4)
+    path.write_bytes(data)
+
+
 def change(path: Path, column: str, row: int, value: Any) -> None:
     """Puts another value into a table, of the column's type where it can be."""
     table = pq.read_table(path)

@@ -22,7 +22,7 @@ from lerobot_playbyear.datasets.confines import PICTURE_FORMATS
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, OutsideError, read_info
-from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, read_table
+from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, parsing, read_table
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
 
 TASKS_PATH, STATS_PATH = "meta/tasks.parquet", "meta/stats.json"
@@ -573,10 +573,14 @@ def unknown_task(number: int) -> str:
 
 def _tasks_in_table(root: Path) -> tuple[dict[int, str], str | None]:
     """The tasks' texts, and what is wrong with their table: LeRobot finds a task by its place."""
-    if not is_listed(root, TASKS_PATH):
+    data = read_listed(root, TASKS_PATH)
+    if data is None:
         return {}, "is missing"
+    import pandas as pd
+
     try:
-        table = read_table(root / TASKS_PATH).to_pandas()
+        with parsing():
+            table = pd.read_parquet(io.BytesIO(data))  # as LeRobot does
         known = dict(zip(table["task_index"].astype(int).tolist(), table.index.astype(str), strict=True))
     except (ParquetDamageError, KeyError, ValueError, TypeError) as error:
         return {}, f"cannot be read ({error})"

@@ -1,10 +1,10 @@
 """The films of a camera: which are whole, when their pictures are shown, and where each episode's pictures lie.
 
 A recorder puts one episode behind the other into a film until that is full. So where an episode's pictures are, if its row
-in `meta/episodes` is lost, follows from where those of the episode before it are. Nothing is decoded: the times stand in
-the film's packets.
+in `meta/episodes` is lost, follows from where those of the episode before it are.
 """
 
+import contextlib
 import io
 import math
 from collections.abc import Mapping, Sequence
@@ -153,17 +153,21 @@ class _Films:
 
 
 def picture_times(path: Path) -> np.ndarray:
-    """When the pictures of a film are shown [s], (n,) in order, from its packets.
+    """When the pictures of a film that can be decoded are shown [s], (n,) in order.
 
     Raises:
         av.FFmpegError: It is no film.
         OSError: It cannot be read now.
     """
+    times: list[float] = []
     with _Remembering(path) as file:
         try:
             with av.open(file, "r") as container:
-                packets = container.demux(container.streams.video[0])
-                times = [float(p.pts * p.time_base) for p in packets if p.pts is not None and not p.is_discard]
+                for packet in container.demux(container.streams.video[0]):
+                    pictures: list[Any] = []
+                    with contextlib.suppress(av.FFmpegError):  # what it held is missing from the times
+                        pictures = packet.decode()
+                    times += [each.time for each in pictures if each.time is not None and not each.is_corrupt]
         except IndexError as error:
             raise av.InvalidDataError(0, "it has no pictures", str(path)) from error
         finally:
