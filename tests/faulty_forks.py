@@ -55,8 +55,8 @@ def _told(report: Any) -> dict[str, Any]:
 def inspect(root: str) -> dict[str, Any]:
     from recording_factory import REPO_ID
 
-    from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig
-    from lerobot_playbyear.inspection.inspecting import inspect as inspect_dataset
+    from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig
+    from lerobot_playbyear.inspection.inspect import inspect as inspect_dataset
     from lerobot_playbyear.inspection.source import DatasetSource
 
     inspect_dataset(InspectConfig(dataset=InspectDatasetConfig(repo_id=REPO_ID, root=root)))
@@ -143,8 +143,7 @@ def answer_in_child(control: Control, order: dict[str, Any]) -> str:
 def main() -> None:
 
     import lerobot_playbyear.datasets.durable
-    import lerobot_playbyear.inspection.checking
-    import lerobot_playbyear.inspection.picture_checks  # noqa: F401
+    import lerobot_playbyear.inspection.inspect  # noqa: F401
 
     control = Control(os.environ["FAULT_CONTROL"])
     print(json.dumps({"ready": True}), flush=True)

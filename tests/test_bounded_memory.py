@@ -32,12 +32,7 @@ from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 from lerobot_playbyear.datasets.video_pictures import video_pictures
-from lerobot_playbyear.film.video import episode_sound
-from lerobot_playbyear.inspection import DatasetSource, check_numbers
-from lerobot_playbyear.inspection.film import FilmSound, encode
-from lerobot_playbyear.inspection.onsets import sudden_sounds
-from lerobot_playbyear.inspection.sound_checks import flat_tops, gaps, repeats
-from lerobot_playbyear.inspection.waveform import PIECE, EpisodeSound
+from lerobot_playbyear.film.dataset_film import encode
 
 FPS, RATE = 30, 48000
 BLOCK = RATE // FPS
@@ -190,43 +185,6 @@ def test_large_pictures_are_decoded_a_few_at_a_time(tmp_path):
     assert grown < n_frames * 3 * size**2 / 2  # of all of them
 
 
-def test_checking_numbers_and_sound_takes_no_memory_that_grows_with_the_episode(long_sound):
-    source = DatasetSource.open("tests/long", long_sound)
-    n_samples = LONG * BLOCK
-    verdicts: list = []
-    peak = peak_of_arrays(lambda: verdicts.extend(check_numbers(source)))
-    assert {verdict.level for verdict in verdicts if verdict.feature == MICROPHONE} == {"ok", "info"}
-    assert peak < 8 * n_samples  # as a column of 64-bit floats alone would be; 16 bytes a sample were needed
-
-
-def test_what_lies_across_two_pieces_of_a_long_sound_is_found():
-    rng = np.random.default_rng(0)
-    samples = rng.normal(0, 300, 2 * PIECE + 5000).astype(np.float32).round()
-    samples[PIECE - 30 : PIECE + 70] = 5.0  # nothing came for 2 ms
-    samples[2 * PIECE - 2 : 2 * PIECE + 2] = 3500.0  # cut
-    samples[2 * PIECE + 600 : 2 * PIECE + 1112] = samples[2 * PIECE + 88 : 2 * PIECE + 600]  # came twice
-    assert gaps(samples, 48000) == [(PIECE - 30, PIECE + 70)]
-    assert flat_tops(samples) == [(2 * PIECE - 2, 2 * PIECE + 2)]
-    assert repeats(samples, BLOCK) == [(2 * PIECE + 600, 2 * PIECE + 1112)]
-    across = samples.copy()
-    across[PIECE - 100 : PIECE + 412] = across[PIECE - 612 : PIECE - 100]
-    assert (PIECE - 100, PIECE + 412) in repeats(across, BLOCK)
-    samples[PIECE + 5 * 240 :][:2000] *= 20
-    assert len(sudden_sounds(samples, 48000)) == 1
-
-
-def test_sound_of_an_episode_is_an_array_that_is_read_where_it_is_indexed():
-    rows = np.arange(40, dtype=np.int16).reshape(10, 4)
-    column = pa.chunked_array(
-        [pa.FixedSizeListArray.from_arrays(pa.array(part.reshape(-1)), 4) for part in (rows[:3], rows[3:])]
-    )
-    sound = EpisodeSound(column.slice(1, 8), 4)
-    expected = rows[1:9].reshape(-1)
-    assert len(sound) == 32
-    for span in (slice(None), slice(3, 21), slice(8, 9), slice(5, 5), slice(30, 50), slice(-3, None)):
-        np.testing.assert_array_equal(sound[span], expected[span])
-
-
 @pytest.mark.parametrize(("old", "new"), [(44100, 48000), (48000, 16000), (11025, 48000), (16000, 16000)])
 def test_sound_that_is_resampled_in_pieces_has_no_seams(old, new):
     sound = np.random.default_rng(0).integers(-9000, 9000, (old // 2 + 77, 2)).astype(np.int16)
@@ -296,7 +254,6 @@ def test_a_long_episode_is_written_in_row_groups_that_a_reader_can_hold(tmp_path
 def test_a_dataset_with_long_episodes_is_read_as_lerobot_reads_it(tmp_path, monkeypatch, use_videos, episodes):
     make_dataset(tmp_path / "data", use_videos=use_videos, image_size=16)
     stock = EpisodeStore.load("tests/noise", str(tmp_path / "data"), episodes, device="cpu", video_backend="pyav")
-    stock_verdicts = check_numbers(DatasetSource.open("tests/noise", tmp_path / "data", episodes))
     monkeypatch.setattr(opening, "_LARGE_ROW_GROUP", 1000)
     assert isinstance(open_dataset("tests/noise", tmp_path / "data"), LongDataset)
     ours = EpisodeStore.load("tests/noise", str(tmp_path / "data"), episodes, device="cpu", video_backend="pyav")
@@ -304,18 +261,6 @@ def test_a_dataset_with_long_episodes_is_read_as_lerobot_reads_it(tmp_path, monk
     assert (ours.starts, ours.ends, ours.tasks, ours.fps) == (stock.starts, stock.ends, stock.tasks, stock.fps)
     for key in stock.keys:
         assert torch.equal(ours.column(key), stock.column(key)), key
-    assert check_numbers(DatasetSource.open("tests/noise", tmp_path / "data", episodes)) == stock_verdicts
-
-
-def test_the_sound_of_a_film_is_that_of_the_whole_episode(tmp_path):
-    blocks = np.random.default_rng(0).integers(-30000, 30000, (2, 20, 4)).astype(np.int16)
-    columns = [pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(own.reshape(-1)), 4)]) for own in blocks]
-    film = FilmSound([EpisodeSound(column, 4) for column in columns], 2.0)
-    loud = np.clip(blocks.astype(np.float32) * 2, -32768, 32767).astype(np.int16)
-    expected = episode_sound(np.moveaxis(loud, 0, -1))
-    assert film.shape == expected.shape
-    for span in (slice(None), slice(5, 17), slice(70, 90)):
-        np.testing.assert_array_equal(film[span], expected[span])
 
 
 def test_the_film_of_a_very_long_episode_is_coarser_so_that_a_browser_can_hold_it(tmp_path):

@@ -34,7 +34,7 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.journal import lock_dataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
-from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
+from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.repair import RepairReport, repair_dataset
 from lerobot_playbyear.scripts import repair as repair_command
 

@@ -19,7 +19,7 @@ from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.film.rollout_film import VideoConfig
 from lerobot_playbyear.hub.push import PushConfig
-from lerobot_playbyear.inspection.inspecting import InspectConfig
+from lerobot_playbyear.inspection.inspect import InspectConfig
 from lerobot_playbyear.microphones.finding import FindMicrophonesConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.recording.record import RecordConfig

@@ -9,9 +9,9 @@ import itertools
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,6 +21,7 @@ from PIL import Image, UnidentifiedImageError
 from lerobot_playbyear.datasets.confines import PICTURE_FORMATS
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
+from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
 from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, OutsideError, read_info
 from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, parsing, read_table
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
@@ -30,59 +31,11 @@ TASKS_PATH, STATS_PATH = "meta/tasks.parquet", "meta/stats.json"
 Rescue = Callable[[Path, pa.Schema], pq.FileMetaData | None]
 """Makes the footer of a parquet file that has lost its own, from the file and the columns that it should have."""
 
-Level = Literal["ok", "info", "warning", "error"]
-
-LEVELS: tuple[Level, ...] = ("ok", "info", "warning", "error")
-"""From what needs no attention to what makes the dataset unfit."""
-
 _TIME_TOLERANCE_S = 1e-3
-_MOST_NAMED = 8  # episodes in a line before it is cut
 
 
 class DatasetDamagedError(ValueError):
     """A dataset is damaged, or too damaged to say what it holds; the message says how, and what to do."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """The result of one check: one line for a person, figures for a program.
-
-    Args:
-        check: What was checked, a few words.
-        level: "ok", "info" (told, not judged), "warning" (worth a look) or "error" (training on it would go wrong).
-        message: One sentence with the figures that the level rests on.
-        feature: The key it is about, where it is about one.
-        episodes: The episodes it is about; empty where it is about the whole dataset.
-        figures: What was measured, by name.
-        remedy: What a person has to do about it. Of a survey's finding without one: `playbyear-repair` makes it good.
-    """
-
-    check: str
-    level: Level
-    message: str
-    feature: str | None = None
-    episodes: Sequence[int] = ()
-    figures: dict[str, Any] = field(default_factory=dict)
-    remedy: str = ""
-
-    def __str__(self) -> str:
-        return ". ".join(part for part in (self.message, self.remedy) if part)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {**asdict(self), "episodes": [int(episode) for episode in self.episodes]}
-
-
-def worst(findings: Iterable[Finding]) -> Level:
-    """The most severe level among them; "ok" without any."""
-    return max((finding.level for finding in findings), key=LEVELS.index, default="ok")
-
-
-def name_episodes(episodes: Sequence[int]) -> str:
-    """`episode 3`, or `episodes 1, 4, 7 and 12 more`."""
-    shown = ", ".join(str(episode) for episode in episodes[:_MOST_NAMED])
-    more = f" and {len(episodes) - _MOST_NAMED} more" if len(episodes) > _MOST_NAMED else ""
-    return f"episode{'s' if len(episodes) > 1 else ''} {shown}{more}"
 
 
 @dataclass(frozen=True)
@@ -163,15 +116,17 @@ class Survey:
         """Whether nothing is wrong; what is odd does not count."""
         return worst(self.findings) != "error"
 
+    @property
+    def damage(self) -> list[Finding]:
+        """What `playbyear-repair` makes good, in a copy."""
+        return [finding for finding in self.findings if finding.level == "error" and not finding.remedy]
+
     def __str__(self) -> str:
         if not self.findings:
             return f"{self.root}: {len(self.episodes)} episodes, nothing wrong."
         verdict = "nothing wrong, but" if self.is_sound else "it is damaged:"
-        lines = [
-            f"{self.root}: {len(self.whole)} whole episodes; {verdict}",
-            *(f"  - {each}" for each in self.findings),
-        ]
-        return "\n".join(lines)
+        lines = [f"{self.root}: {len(self.whole)} whole episodes; {verdict}"]
+        return "\n  - ".join([*lines, *map(str, self.findings)])
 
 
 def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None, like: Path | None = None) -> Survey:
@@ -202,7 +157,7 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
     episodes = _find_films(root, info, _match(found, rows, info), rows, thorough)
     tasks = _read_tasks(root, episodes, rows, findings)
     findings += _judge_episodes(root, info, episodes, rows)
-    findings += _judge_counts(root, info, episodes)
+    findings += _judge_counts(root, info, episodes, n_found=sum(frames.length for frames in found))
     return Survey(root, info, schema, episodes, tasks, findings)
 
 
@@ -217,12 +172,10 @@ def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[s
     if not has_data and not (root.is_dir() and is_listed(root, INFO_PATH)):
         raise DatasetDamagedError(f"{root} holds no LeRobotDataset: it has no {INFO_PATH}, and no data.")
     known = None if like is None else read_info(like)
-    remedy = (
-        f"Put it back from a copy, or let it be made anew: playbyear-repair --root={root} --like=<folder of a dataset "
-    )
+    remedy = f"Put it back from a copy, or: playbyear-repair --root={root} --like=<folder of a dataset with the same settings>"
     try:
         if not is_listed(root, INFO_PATH):
-            raise InfoError(f"{root / INFO_PATH} is missing. {remedy}that was recorded with the same settings>.")
+            raise InfoError(f"{root / INFO_PATH} is missing. {remedy}.")
         info = read_info(root)
     except (InfoError, OutsideError) as error:
         if known is None:
@@ -267,13 +220,10 @@ def _open(root: Path, path: Path, schema: pa.Schema, rescue: Rescue | None, find
             said = f"{name} has no valid end, as if the recording had been killed: it is read from its beginning"
             findings.append(_wrong("files", said))
             return DataFile(path, footer)
-        said = f"{name} cannot be read ({error})" + (", and no whole episode was found in it" if rescue else "")
-        findings.append(_wrong("files", said))
+        findings.append(_wrong("files", f"{name} cannot be read ({error})"))
         return None
     if problem := _difference(file.schema, schema):
-        remedy = (
-            f"Correct the features in {INFO_PATH}, or take them from a dataset like it with playbyear-repair --like"
-        )
+        remedy = f"Correct the features in {INFO_PATH}, or take those of a dataset like it: playbyear-repair --like"
         findings.append(_wrong("files", f"{name}: {problem}", remedy=remedy))
         return None
     return file
@@ -316,9 +266,8 @@ def _read_frames(
     if not parts:
         return
     index = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
-    breaks = (
-        (np.diff(index["episode_index"]) != 0) | (np.diff(index["frame_index"]) != 1) | (np.diff(index["row"]) != 1)
-    )
+    steps = {key: np.diff(values) for key, values in index.items()}
+    breaks = (steps["episode_index"] != 0) | (steps["frame_index"] != 1) | (steps["row"] != 1)
     for start, stop in itertools.pairwise([0, *(np.flatnonzero(breaks) + 1).tolist(), len(index["row"])]):
         own = {key: values[start:stop] for key, values in index.items()}
         late = np.abs(own["timestamp"] - own["frame_index"] / info["fps"])
@@ -344,10 +293,8 @@ def _damaged_pictures(column: pa.ChunkedArray, shape: Sequence[int]) -> Iterator
                 with Image.open(io.BytesIO(picture["bytes"]), formats=PICTURE_FORMATS) as image:
                     image.verify()
                     if (image.height, image.width) not in itertools.pairwise(shape):
-                        yield (
-                            row,
-                            f"has {image.width} x {image.height} pixels; {INFO_PATH} gives the shape {tuple(shape)}",
-                        )
+                        size = f"{image.width} x {image.height}"
+                        yield row, f"has {size} pixels; {INFO_PATH} gives the shape {tuple(shape)}"
         except UnidentifiedImageError:
             yield row, "is damaged (it is none)"
         except (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError) as error:
@@ -437,18 +384,16 @@ def _contradiction(root: Path, info: Mapping[str, Any], row: Mapping[str, Any], 
     """What an episode's row says that its frames and films do not."""
     frames = episode.frames
     assert frames is not None
-    try:
-        file = info["data_path"].format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
-        span = (row["dataset_from_index"], row["dataset_to_index"])
-    except (KeyError, ValueError, TypeError) as error:
-        return f"{error} is missing"
-    if root / file != frames.file.path:
+    end = frames.first_index + frames.length
+    said = {"length": frames.length, "dataset_from_index": frames.first_index, "dataset_to_index": end}
+    for key, place in episode.places.items():
+        said |= place.columns(key)
+    for name, value in said.items():
+        if row.get(name) != value:
+            return f"its {name} is {row.get(name)!r}; wanted {value!r}"
+    file = data_path(info, row)
+    if file is None or root / file != frames.file.path:
         return f"its frames are in {frames.file.path.relative_to(root)}, not in {file}"
-    if span != (frames.first_index, frames.first_index + frames.length):
-        there = f"{frames.first_index} to {frames.first_index + frames.length}"
-        return f"it counted frames {span[0]} to {span[1]}; they are {there}"
-    if row.get("length") != frames.length:
-        return f"its length was {row.get('length')}; it has {frames.length} frames"
     if not isinstance(row.get("tasks"), list):
         return "its tasks are missing"
     names: dict[str, set[str]] = defaultdict(set)
@@ -460,10 +405,15 @@ def _contradiction(root: Path, info: Mapping[str, Any], row: Mapping[str, Any], 
                 return f"its statistics '{key}/{name}' are no numbers"
     if len(set(map(frozenset, names.values()))) > 1:
         return "parts of its statistics are missing"
-    for key, place in episode.places.items():
-        if place_in_row(row, key) != place:
-            return f"it does not say rightly where the pictures of '{key}' are"
     return None
+
+
+def data_path(info: Mapping[str, Any], row: Mapping[str, Any]) -> str | None:
+    """Where an episode's row says that its frames are; None where it does not."""
+    try:
+        return info["data_path"].format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
+    except (KeyError, ValueError, TypeError):
+        return None
 
 
 def _are_numbers(value: Any) -> bool:
@@ -500,7 +450,7 @@ def _judge_episodes(
 # What is said of the whole dataset
 
 
-def _judge_counts(root: Path, info: Mapping[str, Any], episodes: Sequence[Episode]) -> Iterator[Finding]:
+def _judge_counts(root: Path, info: Mapping[str, Any], episodes: Sequence[Episode], n_found: int) -> Iterator[Finding]:
     n_frames = sum(episode.frames.length for episode in episodes if episode.frames)
     is_whole = all(episode.frames for episode in episodes)
     if info["total_episodes"] != len(episodes) or (is_whole and info["total_frames"] != n_frames):
@@ -509,6 +459,8 @@ def _judge_counts(root: Path, info: Mapping[str, Any], episodes: Sequence[Episod
             f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all; there are "
             f"{len(episodes)} of {n_frames}",
         )
+    if is_whole and n_found > n_frames:
+        yield _wrong("rows", f"the data files hold {n_found - n_frames} frames that belong to no episode")
     expected = 0
     for place, episode in enumerate(episodes):
         if episode.frames is None:
@@ -552,7 +504,7 @@ def _read_tasks(
         known = {task: text for task, text in texts.items() if task < n_frames}
     if nameless := sorted(set(wanted) - set(known)):
         remedy = "Put a table from a copy in its place, or correct the frames' task_index"
-        said_of = ", ".join(map(str, nameless[:_MOST_NAMED]))
+        said_of = ", ".join(map(str, nameless[:8]))
         findings.append(
             _wrong("tasks", f"{TASKS_PATH}: frames are of task {said_of}, which has no text", remedy=remedy)
         )

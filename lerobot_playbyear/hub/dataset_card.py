@@ -5,7 +5,8 @@ import json
 import logging
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,10 @@ from huggingface_hub import HfApi
 
 from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.markdown import code, text
+from lerobot_playbyear.film.dataset_film import tile
 from lerobot_playbyear.film.video import amplify, at_a_rate_of_aac, compose, episode_sound, write_film
-from lerobot_playbyear.inspection.film import tile
 from lerobot_playbyear.inspection.source import INTERVENTION, SUCCESS, DatasetSource, Episode
-from lerobot_playbyear.inspection.structure_checks import fit_microphones
+from lerobot_playbyear.inspection.structure import fit_microphones
 
 CARD = "README.md"
 FILM = "preview.mp4"
@@ -73,7 +74,7 @@ def write_dataset_card(
     Raises:
         OutsideError: A picture lies outside the dataset.
     """
-    from lerobot.datasets.utils import create_lerobot_dataset_card
+    from lerobot.datasets.utils import DatasetInfo, create_lerobot_dataset_card
 
     preview = None
     if film is None:
@@ -87,7 +88,7 @@ def write_dataset_card(
     url = f"{HfApi().endpoint}/datasets/{repo_id}/resolve/main/{FILM}" if film is not None else None
     card = create_lerobot_dataset_card(
         tags=list(dict.fromkeys([*(tags or []), *(AUDIO_TAGS if source.microphones else [])])),
-        dataset_info=source.dataset.meta.info,
+        dataset_info=DatasetInfo.from_dict(deepcopy(source.info)),
         license=license,
         repo_id=repo_id,
         dataset_description=describe_dataset(source, repo_id, url, preview),
@@ -145,7 +146,7 @@ def _facts(source: DatasetSource) -> str:
         ("Frame rate", f"{source.fps} Hz"),
         ("Cameras", "<br>".join(_camera(source, key) for key in source.cameras) or "none"),
         ("Microphones", "<br>".join(_microphone(source, key) for key in source.microphones) or "none"),
-        ("Robot", text(str(source.dataset.meta.robot_type or ""))),
+        ("Robot", text(str(source.info.get("robot_type") or ""))),
     ]
     return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows if value)])
 
@@ -202,10 +203,9 @@ def film_preview(source: DatasetSource, path: Path) -> Preview:
     episode = (solved or source.episodes)[0]
     n_frames = min(len(episode), _LONGEST_S * source.fps)
     microphones = _heard_together(source, fit_microphones(source))
-    shown = Episode(episode.index, episode.start, episode.start + n_frames)
+    shown = replace(episode, stop=episode.start + n_frames)
     blocks = [
-        np.clip(source.sound(key, shown)[:], -32768, 32767).astype(np.int16).reshape(n_frames, -1)
-        for key in microphones
+        np.clip(source.sound(key, shown), -32768, 32767).astype(np.int16).reshape(n_frames, -1) for key in microphones
     ]
     stacked = np.stack(blocks, axis=-1) if blocks else np.zeros((n_frames, 0, 0), np.int16)  # (n, S, n_microphones)
     heard, sample_rate = at_a_rate_of_aac(amplify(episode_sound(stacked)), stacked.shape[1] * source.fps)

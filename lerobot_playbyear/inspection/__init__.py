@@ -1,15 +1,18 @@
-"""Looks at a dataset with sound: checks with verdicts, and a page to see and hear it."""
+"""Looks at a dataset with sound: checks with findings, and a page to see and hear it."""
 
 from typing import TYPE_CHECKING
 
 from lerobot_playbyear import lazy_names
-from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
-from lerobot_playbyear.inspection.verdict import Verdict, worst
 
 if TYPE_CHECKING:
-    from lerobot_playbyear.inspection.checking import check_numbers
-    from lerobot_playbyear.inspection.picture_checks import PictureChecks
+    from lerobot_playbyear.datasets.findings import Finding, worst
+    from lerobot_playbyear.inspection.inspect import check_numbers
+    from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
-__all__ = ["DatasetSource", "InspectionError", "PictureChecks", "Verdict", "check_numbers", "worst"]
+__all__ = ["DatasetSource", "Finding", "InspectionError", "check_numbers", "worst"]
 
-__getattr__ = lazy_names(__name__, {"checking": ("check_numbers",), "picture_checks": ("PictureChecks",)})
+_HOMES = {
+    "inspect": ("check_numbers", "Finding", "worst"),
+    "source": ("DatasetSource", "InspectionError"),
+}
+__getattr__ = lazy_names(__name__, _HOMES)

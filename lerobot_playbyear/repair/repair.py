@@ -12,9 +12,10 @@ from pathlib import Path
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import FolderLockedError, check_can_be_made, new_folder
+from lerobot_playbyear.datasets.findings import Finding
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.journal import finish_journal, lock_dataset
-from lerobot_playbyear.datasets.survey import DatasetDamagedError, Finding, Survey, survey
+from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
 from lerobot_playbyear.repair.footers import rescue
 
 _MOST_MOVES = 20  # that are named
@@ -139,7 +140,7 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
     target = Path(target) if target is not None else real.with_name(f"{real.name}_repaired")
     with _held(root):
         report = look(root, like)
-        if not [each for each in report.survey.findings if each.level == "error" and not each.remedy]:
+        if not report.survey.damage:
             return report
         if not report.kept:
             raise DatasetDamagedError(f"{report}\nNo whole episode is left in {root}; no copy was written.")
@@ -152,7 +153,7 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
         with new_folder(target) as folder:
             write_copy(report.survey, folder)
             again = survey(folder, thorough=False)
-            if any(each.level == "error" and not each.remedy for each in again.findings):
+            if again.damage:
                 raise DatasetDamagedError(f"The copy of {root} is not sound, and was not kept. {again}")
     return RepairReport(report.survey, target)
 

@@ -13,7 +13,7 @@ The exit status is 0, 1 if a check found an error, and 2 if there is no dataset 
   --html=null                  also write a page to this file
   --picture_height=240         of the page's films [pixels], at most; less makes a smaller file
   --action_range=null          lowest and highest action allowed, like [-1,1]
-  --json=false                 print the verdicts as JSON, and nothing else
+  --json=false                 print the findings as JSON, and nothing else
 """
 
 import logging
@@ -30,16 +30,16 @@ def main() -> None:
 
 def _inspect() -> None:
     logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.inspection.inspecting import inspect
+    from lerobot_playbyear.datasets.findings import worst
+    from lerobot_playbyear.inspection.inspect import inspect
     from lerobot_playbyear.inspection.source import InspectionError
-    from lerobot_playbyear.inspection.verdict import worst
 
     try:
-        verdicts = run_alone(inspect)
+        findings = run_alone(inspect)
     except InspectionError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    sys.exit(worst(verdicts) == "error")
+    sys.exit(worst(findings) == "error")
 
 
 if __name__ == "__main__":

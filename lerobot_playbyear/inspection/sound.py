@@ -9,19 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lerobot_playbyear.inspection.source import DatasetSource, Episode
-from lerobot_playbyear.inspection.verdict import Level, Verdict, name_episodes
-from lerobot_playbyear.inspection.waveform import (
-    FULL_SCALE,
-    PIECE,
-    Runs,
-    Samples,
-    extremes,
-    mean_and_deviation,
-    merge,
-    pieces,
-    runs,
-)
+from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
+from lerobot_playbyear.inspection.source import FULL_SCALE, DatasetSource, Episode
 
 _QUIET_DBFS = -80.0  # 16-bit PCM has 3 steps of RMS there: hardly anything was heard
 _CLIPPED = 32766.0  # steps; at or beyond it a sample may have been cut
@@ -54,20 +43,20 @@ class _Spans:
             self.n_spans += len(spans)
             self.n_bad += sum(stop - start for start, stop in spans)
 
-    def verdict(self, check: str, what: str, nothing: str) -> Verdict:
+    def verdict(self, check: str, what: str, nothing: str) -> Finding:
         share = self.n_bad / self.n_samples
         figures = {"spans": self.n_spans, "share": share}
         if not self.n_spans:
-            return Verdict(check, "ok", nothing, self.key, figures=figures)
+            return Finding(check, "ok", nothing, self.key, figures=figures)
         level: Level = "error" if share > _TOLERATED_SHARE else "warning"
         message = (
             f"{self.n_spans} {what}, {1000 * self.n_bad / self.sample_rate:.3g} ms in all ({share:.2g} of the sound), in "
             f"{name_episodes(self.episodes)}; the first in {self.first}"
         )
-        return Verdict(check, level, message, self.key, self.episodes, figures)
+        return Finding(check, level, message, self.key, self.episodes, figures)
 
 
-def check_sound(source: DatasetSource, microphones: Sequence[str]) -> Iterator[Verdict]:
+def check_sound(source: DatasetSource, microphones: Sequence[str]) -> Iterator[Finding]:
     """All checks of these microphones, whose rows must be what their sample rate says."""
     for key in microphones:
         yield from _check_microphone(source, key)
@@ -78,21 +67,26 @@ def dbfs(rms_steps: float) -> float:
     return 20 * math.log10(max(rms_steps / FULL_SCALE, 1e-6))
 
 
-def flat_tops(samples: Samples) -> list[tuple[int, int]]:
+def runs(mask: np.ndarray, shortest: int = 1) -> list[tuple[int, int]]:
+    """First index, and index after the last, of every span of at least `shortest` True in a mask (n,)."""
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    return [(start, stop) for start, stop in edges.tolist() if stop - start >= shortest]
+
+
+def flat_tops(samples: np.ndarray) -> list[tuple[int, int]]:
     """Spans in which the sound was cut: at full scale, or several equal samples in a row at its own extremes.
 
     Args:
         samples: (n,) in steps.
     """
     spans = []
-    for extreme in extremes(samples):
-        if abs(extreme) >= _FLAT_TOP_MIN:
-            limit = min(abs(extreme), _CLIPPED)
-            spans += runs((np.sign(extreme) * piece >= limit for piece in pieces(samples)), _FLAT_TOP)
+    for side, extreme in ((-1, -samples.min()), (1, samples.max())):
+        if extreme >= _FLAT_TOP_MIN:
+            spans += runs(side * samples >= min(extreme, _CLIPPED), _FLAT_TOP)
     return sorted(spans)
 
 
-def gaps(samples: Samples, sample_rate: float) -> list[tuple[int, int]]:
+def gaps(samples: np.ndarray, sample_rate: float) -> list[tuple[int, int]]:
     """Spans in which live sound stands still: one exact value, with sound on both sides.
 
     Args:
@@ -101,49 +95,44 @@ def gaps(samples: Samples, sample_rate: float) -> list[tuple[int, int]]:
     """
     shortest, edge = max(round(_GAP_S * sample_rate), 8), max(round(_GAP_EDGE_S * sample_rate), 8)
     found = []
-    still = (np.diff(samples[first : first + PIECE + 1]) == 0 for first in range(0, len(samples) - 1, PIECE))
-    for start, stop in runs(still, shortest - 1):
-        start, stop = start, stop + 1  # of samples, not of differences
-        before, after = samples[max(start - edge, 0) : start], samples[stop : stop + edge]
-        is_live = min(_rms(before), _rms(after)) >= _LIVE_RMS
-        is_peak = abs(samples[start : start + 1][0]) >= _FLAT_TOP_MIN  # cut, not lost
-        if is_live and not is_peak:
+    for start, last in runs(np.diff(samples) == 0, shortest - 1):
+        stop = last + 1  # of samples, not of differences
+        is_live = min(_rms(samples[max(start - edge, 0) : start]), _rms(samples[stop : stop + edge])) >= _LIVE_RMS
+        if is_live and abs(samples[start]) < _FLAT_TOP_MIN:  # otherwise it is cut, not lost
             found.append((start, stop))
     return found
 
 
-def repeats(samples: Samples, samples_per_frame: int) -> list[tuple[int, int]]:
-    """Spans that are a sample-exact copy of the block of live sound before them.
+def repeats(samples: np.ndarray, samples_per_frame: int) -> list[tuple[int, int]]:
+    """Spans that are a sample-exact copy of the block of live sound before them; those that overlap are one.
 
     Args:
         samples: (n,) in steps.
         samples_per_frame: S, a block size to try besides those of sound drivers.
     """
-    sizes = sorted({*_BLOCK_SIZES, samples_per_frame})
-    equal = {size: Runs(size) for size in sizes if size >= _BLOCK_SIZES[0] and len(samples) >= 2 * size}
-    for first in range(0, len(samples), PIECE):
-        block = samples[first : first + PIECE + max(equal, default=0)]
-        for size, found in equal.items():
-            n = min(PIECE, len(block) - size)
-            if n > 0:
-                found.add(block[size : size + n] == block[:n])
-    copies = [(start + size, stop + size) for size, found in equal.items() for start, stop in found.finish()]
-    return merge(span for span in copies if mean_and_deviation(samples, *span)[1] >= _LIVE_RMS)
+    merged: list[tuple[int, int]] = []
+    sizes = [size for size in {*_BLOCK_SIZES, samples_per_frame} if _BLOCK_SIZES[0] <= size <= len(samples) // 2]
+    copies = [(a + size, b + size) for size in sizes for a, b in runs(samples[size:] == samples[:-size], size)]
+    for start, stop in sorted(span for span in copies if samples[slice(*span)].std(dtype=np.float64) >= _LIVE_RMS):
+        if merged and start <= merged[-1][1]:
+            merged[-1] = (merged[-1][0], max(stop, merged[-1][1]))
+        else:
+            merged.append((start, stop))
+    return merged
 
 
-def _check_microphone(source: DatasetSource, key: str) -> Iterator[Verdict]:
-    samples_per_frame = source.samples_per_frame(key)
+def _check_microphone(source: DatasetSource, key: str) -> Iterator[Finding]:
+    samples_per_frame = source.features[key]["shape"][0]
     sample_rate = float(samples_per_frame * source.fps)
     dead, quiet, offset = [], [], []
     cut, lost, repeated = (_Spans(key, sample_rate, len(source) * samples_per_frame) for _ in range(3))
     levels, peak, worst_offset = [], 0.0, 0.0
     for episode in source.episodes:
         samples = source.sound(key, episode)
-        mean, deviation = mean_and_deviation(samples)
-        levels.append(dbfs(deviation))
-        low, high = extremes(samples)
-        peak = max(peak, high, -low)
-        if not _changes(samples):
+        mean = float(samples.mean(dtype=np.float64))
+        levels.append(dbfs(float(samples.std(dtype=np.float64))))
+        peak = max(peak, float(np.abs(samples).max()))
+        if samples.min() == samples.max():
             dead.append(episode.index)
             continue
         if levels[-1] < _QUIET_DBFS:
@@ -160,29 +149,23 @@ def _check_microphone(source: DatasetSource, key: str) -> Iterator[Verdict]:
     span = f"{min(levels):.0f} to {max(levels):.0f} dBFS (RMS per episode), peak {dbfs(peak):.0f} dBFS"
     if dead:
         message = f"{name_episodes(dead)}: one and the same value throughout, the microphone was off"
-        yield Verdict("silence", "error", message, key, dead, figures)
+        yield Finding("silence", "error", message, key, dead, figures)
     if quiet:
-        yield Verdict("silence", "warning", f"{name_episodes(quiet)}: hardly any sound; {span}", key, quiet, figures)
+        yield Finding("silence", "warning", f"{name_episodes(quiet)}: hardly any sound; {span}", key, quiet, figures)
     if not dead and not quiet:
-        yield Verdict("silence", "ok", span, key, figures=figures)
+        yield Finding("silence", "ok", span, key, figures=figures)
     yield cut.verdict("clipping", "cut peaks", "no peak is cut")
     if offset:
         message = (
             f"{name_episodes(offset)}: mean up to {worst_offset:.1%} of full scale; remove it with a high-pass filter"
         )
-        yield Verdict("DC offset", "warning", message, key, offset, {"largest": worst_offset})
+        yield Finding("DC offset", "warning", message, key, offset, {"largest": worst_offset})
     else:
         message = f"mean at most {worst_offset:.2%} of full scale"
-        yield Verdict("DC offset", "ok", message, key, figures={"largest": worst_offset})
+        yield Finding("DC offset", "ok", message, key, figures={"largest": worst_offset})
     yield lost.verdict("drop-outs", "spans without a sample that changes", "no gap in live sound")
     yield repeated.verdict("repeated blocks", "spans that copy the block before", "no block came twice")
 
 
 def _rms(samples: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(samples, dtype=np.float64)))) if len(samples) else 0.0
-
-
-def _changes(samples: Samples) -> bool:
-    """Whether not all samples are one and the same value."""
-    first = samples[:1]
-    return any((piece != first).any() for piece in pieces(samples))

@@ -27,14 +27,14 @@ from PIL import Image
 from support.hub import HubServer
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.datasets import EpisodeStore, write_audio
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import at_a_rate_of_aac
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.hub.push import HubError, _files, push_dataset
-from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
+from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
 SECRET = (250, 5, 120)  # a colour that no other picture has
@@ -127,21 +127,22 @@ def rename_feature(root: Path, old: str, new: str) -> None:
     (root / "meta" / "stats.json").write_text(json.dumps({new if key == old else key: v for key, v in stats.items()}))
 
 
+def attach(root: Path, tmp_path: Path, files: str = "{episode}.wav") -> Path:
+    places = DatasetPlace("a/b", str(root)), DatasetPlace("a/c", str(tmp_path / "copy"))
+    return attach_audio(AttachAudioConfig(*places, files=files, microphone="new"))
+
+
 def looked(root: Path, tmp_path: Path) -> tuple[list, str]:
     page = tmp_path / "page.html"
     return inspect(InspectConfig(InspectDatasetConfig("a/b", str(root)), html=page)), page.read_text()
 
 
-def outsides(tmp_path: Path) -> list[str]:
-    return [str(tmp_path / "secret.png"), "../secret.png", "images/link.png"]
-
-
 @pytest.mark.parametrize("which", range(3), ids=["absolute", "parent", "link"])
-def test_a_picture_outside_the_folder_is_shown_nowhere(root, secret, tmp_path, monkeypatch, which):
+def test_a_picture_outside_the_folder_is_shown_nowhere(root, secret, hub, tmp_path, monkeypatch, which):
+    """Not by a reader, not by training, not on a page, and in no film that is pushed."""
     (root / "images").mkdir(exist_ok=True)
     (root / "images" / "link.png").symlink_to(secret)
-    name = outsides(tmp_path)[which]
-    point_to(root, name)
+    point_to(root, [str(secret), "../secret.png", "images/link.png"][which])
     monkeypatch.chdir(root / "meta")  # from where "../secret.png" is nothing: names are the dataset's
     source = DatasetSource.open("a/b", root)
     with pytest.raises(ValueError, match="outside its folder"):
@@ -154,19 +155,9 @@ def test_a_picture_outside_the_folder_is_shown_nowhere(root, secret, tmp_path, m
     else:
         (root / "images" / "link.png").unlink()
         looked(root, tmp_path)
-    verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
-    (verdict,) = [v for v in verdicts if v.check == "pictures"]
-    assert verdict.level == "error"
-    assert "outside its folder" in verdict.message
-
-
-@pytest.mark.parametrize("which", range(3), ids=["absolute", "parent", "link"])
-def test_a_picture_outside_the_folder_is_in_no_film_that_is_pushed(root, secret, hub, tmp_path, monkeypatch, which):
-    (root / "images").mkdir(exist_ok=True)
-    (root / "images" / "link.png").symlink_to(secret)
-    point_to(root, outsides(tmp_path)[which])
-    (root / "images" / "link.png").unlink() if which != 2 else None
-    monkeypatch.chdir(root)
+    findings = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
+    (finding,) = [each for each in findings if each.check == "pictures"]
+    assert (finding.level, "outside its folder" in finding.message) == ("error", True)
     with pytest.raises(HubError, match=r"Not pushed.*outside"):
         push_dataset("me/hostile", root)
     assert not hub.requests
@@ -256,9 +247,37 @@ def test_an_episode_whose_file_number_is_a_path_is_refused(videos, tmp_path):
     (videos / "videos" / CAMERA / "0").mkdir()
     (video,) = videos.rglob("*.mp4")
     video.rename(tmp_path / "secret.mp4")
-    verdicts, _ = looked(videos, tmp_path)
-    (verdict,) = [v for v in verdicts if v.check == "pictures"]
-    assert "not in its folder" in verdict.message
+    with pytest.raises(InspectionError, match=f"its pictures of '{CAMERA}' are lost"):
+        looked(videos, tmp_path)
+
+
+@pytest.mark.parametrize("what", ["statistics", "length", "more frames", "no number"])
+def test_sound_is_attached_to_no_damaged_table(root, tmp_path, what):
+    for episode in range(2):
+        write_audio(tmp_path / f"{episode}.wav", np.zeros(16000, np.int16), 16000)
+    if what == "more frames":
+        edit_column(root, "episode_index", lambda _: 1)
+    elif what == "no number":
+        edit_column(root, "frame_index", lambda number: number or None)
+    else:  # the last byte of a column's page, which has a checksum
+        (path,) = root.glob("meta/episodes/*/*.parquet")
+        pq.write_table(pq.read_table(path), path, write_page_checksum=True, use_dictionary=False)
+        group = pq.read_metadata(path).row_group(0)
+        chunks = {group.column(i).path_in_schema: group.column(i) for i in range(group.num_columns)}
+        chunk = chunks["length" if what == "length" else "stats/action/mean.list.element"]
+        data = bytearray(path.read_bytes())
+        data[chunk.data_page_offset + chunk.total_compressed_size - 1] ^= 0xFF
+        path.write_bytes(data)
+    with pytest.raises(AttachError, match=r"file-000\.parquet.*playbyear-repair --root="):
+        attach(root, tmp_path, str(tmp_path / "{episode}.wav"))
+    assert not (tmp_path / "copy").exists()
+
+
+def test_a_picture_that_is_missing_is_named(root):
+    numbers = iter(range(11))
+    edit_column(root, CAMERA, lambda picture: None if next(numbers) == 3 else picture)
+    with pytest.raises(ValueError, match=f"'{CAMERA}': a picture is missing"):
+        EpisodeStore.load("a/b", str(root))
 
 
 @pytest.mark.parametrize("name", ["videos/more/x.mp4", "notes.txt", "meta/extra"])
@@ -269,24 +288,18 @@ def test_a_link_out_of_the_folder_is_never_uploaded_or_copied(root, secret, hub,
     with pytest.raises(HubError, match=f"Not pushed.*{link}' is a link to"):
         push_dataset("me/hostile", root)
     assert not hub.requests
-    output = DatasetPlace("a/c", str(tmp_path / "copy"))
     with pytest.raises(AttachError, match="is a link to"):
-        attach_audio(AttachAudioConfig(DatasetPlace("a/b", str(root)), output, files="{episode}.wav", microphone="new"))
+        attach(root, tmp_path)
 
 
 def test_links_in_a_circle_and_pipes_hold_no_upload_up(root):
     (root / "meta" / "loop").symlink_to("..")
+    (root / "meta" / "self").symlink_to("self")
     os.mkfifo(root / "meta" / "pipe")
     check_links(root)
     names = _files(root)
     assert "meta/info.json" in names
-    assert not [name for name in names if "loop" in name or "pipe" in name]
-
-
-def test_a_link_to_itself_is_nothing_that_is_uploaded(root):
-    (root / "meta" / "self").symlink_to("self")
-    check_links(root)
-    assert "meta/self" not in _files(root)
+    assert not [name for name in names if "loop" in name or "self" in name or "pipe" in name]
 
 
 @pytest.mark.parametrize("part", ["data", "meta/episodes"])
@@ -296,9 +309,8 @@ def test_no_upload_and_no_copy_lacks_the_files_behind_a_link(root, hub, tmp_path
     with pytest.raises(HubError, match=f"Not pushed.*{part}' is a link to a folder"):
         push_dataset("me/linked", root)
     assert not hub.requests
-    output = DatasetPlace("a/c", str(tmp_path / "copy"))
     with pytest.raises(AttachError, match="is a link to a folder"):
-        attach_audio(AttachAudioConfig(DatasetPlace("a/b", str(root)), output, files="{episode}.wav", microphone="new"))
+        attach(root, tmp_path)
 
 
 def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, monkeypatch):
@@ -329,39 +341,27 @@ def test_no_page_holds_what_a_link_leads_to(videos, tmp_path, part):
     assert len(EpisodeStore.load("a/b", str(videos), device="cpu", video_backend="pyav")) == 11
 
 
-def test_a_page_is_written_through_links_that_stay_at_home(videos, tmp_path):
+def test_links_that_stay_at_home_are_read_through(videos, tmp_path):
+    """Those within the dataset, and those of the Hub's cache, whose files are links to its blobs."""
+    (tmp_path / "link").symlink_to(videos)
     (videos / "videos").rename(videos / "kept")
     (videos / "videos").symlink_to("kept")
-    (tmp_path / "link").symlink_to(videos)
-    verdicts, _ = looked(tmp_path / "link", tmp_path)
-    assert {verdict.level for verdict in verdicts if verdict.check == "pictures"} == {"ok"}
-
-
-def test_a_page_is_written_of_a_snapshot_of_the_hubs_cache(videos, tmp_path):
-    verdicts, _ = looked(as_snapshot(videos, tmp_path), tmp_path)
-    assert {verdict.level for verdict in verdicts if verdict.check == "pictures"} == {"ok"}
-
-
-def as_snapshot(root: Path, tmp_path: Path) -> Path:
-    """The dataset as the Hub's cache has it."""
+    findings, _ = looked(tmp_path / "link", tmp_path)
+    assert {finding.level for finding in findings if finding.check == "pictures"} == {"ok"}
+    (videos / "videos").unlink()
+    (videos / "kept").rename(videos / "videos")
     cache = tmp_path / "hub" / "datasets--a--b"
     snapshot = cache / "snapshots" / "abc"
     (cache / "blobs").mkdir(parents=True)
-    for number, path in enumerate([path for path in root.rglob("*") if path.is_file()]):
-        place = snapshot / path.relative_to(root)
+    for number, path in enumerate([path for path in videos.rglob("*") if path.is_file()]):
+        place = snapshot / path.relative_to(videos)
         place.parent.mkdir(parents=True, exist_ok=True)
         path.rename(cache / "blobs" / str(number))
         place.symlink_to(os.path.relpath(cache / "blobs" / str(number), place.parent))
-    return snapshot
-
-
-def test_a_snapshot_of_the_hubs_cache_may_be_links_into_the_cache(root, tmp_path):
-    snapshot = as_snapshot(root, tmp_path)
-    output = DatasetPlace("a/c", str(tmp_path / "copy"))
+    findings, _ = looked(snapshot, tmp_path)
+    assert {finding.level for finding in findings if finding.check == "pictures"} == {"ok"}
     with pytest.raises(AttachError, match="Nothing was written"):  # only the sound is missing
-        attach_audio(
-            AttachAudioConfig(DatasetPlace("a/b", str(snapshot)), output, files="{episode}.wav", microphone="new")
-        )
+        attach(snapshot, tmp_path)
 
 
 class _Markup(html.parser.HTMLParser):
@@ -424,6 +424,14 @@ def test_the_card_of_a_dataset_shows_names_as_they_are(root):
     code = re.search(r"^```python\n(.*?)^```$", card, re.DOTALL | re.MULTILINE)[1]
     names = [node.value for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Constant)]
     assert 'observation.audio.a`<img src=x>|"\n```\n# Head' in names
+
+
+def test_a_card_shows_a_sample_rate_that_is_none(root):
+    edit_info(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate="<b>abc"))
+    source = DatasetSource.open("a/b", root)
+    card = describe_dataset(source, "a/b", None, None)
+    assert "abc" in card
+    assert "<b>" not in card
 
 
 def test_the_card_of_a_policy_shows_names_as_they_are(root, hub):
@@ -504,11 +512,11 @@ def _claims(kind: str, root: Path) -> None:
 
 _OPEN = """
 import resource, sys
-from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.datasets import EpisodeStore, write_audio
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 from lerobot_playbyear.inspection.source import InspectionError
-from lerobot_playbyear.inspection.inspecting import InspectConfig, InspectDatasetConfig, inspect
+from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 
 def attempt(name, work):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,4 +1,4 @@
-"""An episode as a film with sound, in the formats that every browser plays: H.264 and AAC."""
+"""An episode of a dataset as a film with sound, in the formats that every browser plays: H.264 and AAC."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lerobot_playbyear.datasets.audio_files import Channels
 from lerobot_playbyear.film.video import at_a_rate_of_aac, write_film
-from lerobot_playbyear.inspection.waveform import EpisodeSound
 
 _SOUND_BIT_RATE = 200_000  # bits per second, of two channels
 _LOWEST_BIT_RATE = 60_000  # of the pictures
@@ -49,40 +47,12 @@ def tile(
     return [width for width, _ in sizes], frames()
 
 
-class FilmSound:
-    """The sound of a film of an episode, (n, 2 or 1) int16, computed where it is indexed.
-
-    The film shows a picture from when it was taken, so it plays the block of sound after it with it, and silence with
-    the last one.
-
-    Args:
-        sound: Of the microphones; the first two are heard, left and right, or only the first if their rates differ.
-        gain: By how much to amplify.
-    """
-
-    def __init__(self, sound: Sequence[EpisodeSound], gain: float) -> None:
-        same_rate = {each.samples_per_frame for each in sound[:2]}
-        self._heard, self._gain = sound[: 2 if len(same_rate) == 1 else 1], np.float32(gain)
-        self.shape = (len(sound[0]), len(self._heard))
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, span: slice) -> np.ndarray:
-        start, stop, _ = span.indices(len(self))
-        film = np.zeros((max(stop - start, 0), len(self._heard)), np.int16)
-        for channel, sound in enumerate(self._heard):
-            later = sound[start + sound.samples_per_frame : stop + sound.samples_per_frame]
-            film[: len(later), channel] = np.clip(later * self._gain, -32768, 32767)
-        return film
-
-
 def encode(
     path: Path,
     pictures: Iterator[np.ndarray],
     n_pictures: int,
     fps: int,
-    sound: Sequence[EpisodeSound],
+    sound: Sequence[np.ndarray],
     gain: float,
     most_bytes: int = 2**28,
 ) -> Path:
@@ -93,14 +63,20 @@ def encode(
         pictures: n pictures (H, W, 3) uint8, H and W even.
         n_pictures: n.
         fps: Frames per second [Hz].
-        sound: For each microphone what it heard; the block of frame t was heard before its picture was taken.
+        sound: For each microphone what it heard, (n * S,) in steps of 16-bit PCM; the block of frame t was heard before its
+            picture was taken. The first two are heard, or only the first if their rates differ.
         gain: By how much to amplify.
         most_bytes: About how large it may become: the film of an episode of hours is coarser, so that a browser can
             hold it.
     """
-    rate = sound[0].samples_per_frame * fps if sound else 0
-    silent: Channels = np.zeros((0, 0), np.int16)
-    samples, sample_rate = at_a_rate_of_aac(FilmSound(sound, gain) if sound else silent, rate)
+    heard = [own for own in sound[:2] if len(own) == len(sound[0])]
+    size = len(heard[0]) // n_pictures if heard else 0
+    film = np.zeros((n_pictures * size, len(heard)), np.int16)
+    for channel, own in enumerate(
+        heard
+    ):  # a picture is shown from when it was taken: the block after it is heard with it
+        film[: len(own) - size, channel] = np.clip(own[size:] * np.float32(gain), -32768, 32767)
+    samples, sample_rate = at_a_rate_of_aac(film, size * fps)
     # Key frames every second, so that stepping backwards is quick.
     options = {"crf": "23", "g": str(fps)}
     bit_rate = max(round(8 * most_bytes * fps / n_pictures) - _SOUND_BIT_RATE, _LOWEST_BIT_RATE)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from PIL import Image
 
-from lerobot_playbyear.inspection.delay import check_delay, difference
+from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
+from lerobot_playbyear.inspection.motion import check_delay, difference
 from lerobot_playbyear.inspection.source import DatasetSource, Episode
-from lerobot_playbyear.inspection.structure_checks import fit_microphones
-from lerobot_playbyear.inspection.verdict import Level, Verdict, name_episodes
+from lerobot_playbyear.inspection.structure import fit_microphones
 
 _BLANK_SPREAD = 2.0  # grey levels, standard deviation within a picture
 _LEVELS = np.arange(256.0)
@@ -69,32 +69,32 @@ class PictureChecks:
         except Exception as error:
             found.problem = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
 
-    def verdicts(self) -> Iterator[Verdict]:
+    def findings(self) -> Iterator[Finding]:
         """One line per check and camera."""
         if not self._watched:
-            yield Verdict("pictures", "info", "no camera")
+            yield Finding("pictures", "info", "no camera")
         for key, watched in self._watched.items():
             n_pictures = sum(each.n_pictures for each in watched)
             wrong = [each.episode for each in watched if each.problem]
             if wrong:
                 reason = next(each.problem for each in watched if each.problem)
                 message = f"{name_episodes(wrong)}: pictures cannot be read ({reason})"
-                yield Verdict("pictures", "error", message, key, wrong)
+                yield Finding("pictures", "error", message, key, wrong)
             else:
-                yield Verdict("pictures", "ok", f"{n_pictures:,} read", key, figures={"pictures": n_pictures})
+                yield Finding("pictures", "ok", f"{n_pictures:,} read", key, figures={"pictures": n_pictures})
             if n_pictures:
                 yield self._judge_repeats(key, watched)
                 yield _judge_blank(key, watched)
         motion = {key: [each.motion for each in watched] for key, watched in self._watched.items()}
         yield from check_delay(self._source, fit_microphones(self._source), motion)
 
-    def _judge_repeats(self, key: str, watched: list[_Watched]) -> Verdict:
+    def _judge_repeats(self, key: str, watched: list[_Watched]) -> Finding:
         n_repeated = sum(each.n_repeated for each in watched)
         share = n_repeated / max(sum(each.n_moving for each in watched), 1)
         freeze_s = max(each.longest_freeze for each in watched) / self._source.fps
         figures = {"repeated_while_moving": n_repeated, "share": share, "longest_freeze_s": freeze_s}
         if not n_repeated:
-            return Verdict("frames that repeat", "ok", "none while the arm moves", key, figures=figures)
+            return Finding("frames that repeat", "ok", "none while the arm moves", key, figures=figures)
         tolerated = _TOLERATED_SHARE[self._source.features[key]["dtype"]]
         level: Level = "error" if freeze_s >= _FREEZE_S else "warning" if share > tolerated else "ok"
         repeating = [each.episode for each in watched if each.n_repeated]
@@ -102,14 +102,14 @@ class PictureChecks:
             f"{n_repeated} pictures equal the one before while the arm moves ({share:.1%} of those), for up to "
             f"{freeze_s:.3g} s; {name_episodes(repeating)}"
         )
-        return Verdict("frames that repeat", level, message, key, repeating, figures)
+        return Finding("frames that repeat", level, message, key, repeating, figures)
 
 
-def _judge_blank(key: str, watched: list[_Watched]) -> Verdict:
+def _judge_blank(key: str, watched: list[_Watched]) -> Finding:
     blank = [each.episode for each in watched if each.n_blank]
     if blank:
-        return Verdict("blank pictures", "warning", f"{name_episodes(blank)}: pictures of one colour", key, blank)
-    return Verdict("blank pictures", "ok", "none", key)
+        return Finding("blank pictures", "warning", f"{name_episodes(blank)}: pictures of one colour", key, blank)
+    return Finding("blank pictures", "ok", "none", key)
 
 
 def _spread(picture: np.ndarray) -> float:

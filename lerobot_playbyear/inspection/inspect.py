@@ -1,0 +1,205 @@
+"""`playbyear-inspect`: all checks over a dataset, told to a person or a program, and the page."""
+
+import json
+import sys
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_playbyear.datasets.findings import Finding, summary, worst
+from lerobot_playbyear.datasets.info import OutsideError, check_links_out
+from lerobot_playbyear.inspection.motion import check_actions, check_alignment, check_interventions, check_success
+from lerobot_playbyear.inspection.pictures import PictureChecks
+from lerobot_playbyear.inspection.sound import check_sound
+from lerobot_playbyear.inspection.source import DatasetSource, InspectionError, finite
+from lerobot_playbyear.inspection.structure import (
+    check_columns,
+    check_finite_numbers,
+    check_lengths,
+    check_sample_rates,
+    check_statistics,
+    check_survey,
+    fit_microphones,
+)
+
+_COLOURS = {"ok": "32", "info": "36", "warning": "33", "error": "31;1"}
+
+
+@dataclass
+class InspectDatasetConfig:
+    """The dataset.
+
+    Args:
+        repo_id: Its name, `user/name`.
+        root: Its folder. None: LeRobot's cache, or else the Hub.
+        episodes: Only these. None: all.
+        video_backend: LeRobot's video decoder, "pyav" or "torchcodec".
+    """
+
+    repo_id: str
+    root: str | None = None
+    episodes: list[int] | None = None
+    video_backend: str = "pyav"
+
+
+@dataclass
+class InspectConfig:
+    """Options of `playbyear-inspect`.
+
+    Args:
+        dataset: What to look at.
+        json: Print the findings as JSON, and nothing else.
+        html: Also write a page to this file.
+        action_range: Lowest and highest action allowed, `[-1, 1]`; beyond it is an error. None: it is a warning where
+            the actions look normalised to [-1, 1].
+        picture_height: Of the page's films [pixels], at most; less makes a smaller file.
+    """
+
+    dataset: InspectDatasetConfig
+    json: bool = False
+    html: Path | None = None
+    action_range: list[float] | None = None
+    picture_height: int = 240
+
+
+def inspect(cfg: InspectConfig) -> list[Finding]:
+    """Checks a dataset, prints the findings, and writes the page where one is asked for.
+
+    Args:
+        cfg: The options.
+
+    Returns:
+        All findings.
+
+    Raises:
+        InspectionError: There is no dataset, or an option is out of range, or the page cannot be written, or would hold
+            what is not in the dataset's folder.
+    """
+    _check_options(cfg)
+    options = cfg.dataset
+    source = DatasetSource.open(options.repo_id, options.root, options.episodes, options.video_backend, damaged=True)
+    if cfg.html is not None:
+        _check_links(Path(source.root))
+    findings = check_numbers(source, cfg.action_range)
+    try:
+        findings = _watch_pictures(cfg, source, findings)
+    except OSError as error:
+        raise InspectionError(f"The page cannot be written to '{cfg.html}': {error}") from error
+    if cfg.json:
+        print(as_json(source, findings))
+        return findings
+    print(as_text(source, findings, colour=sys.stdout.isatty()))
+    if cfg.html is not None:
+        print(f"Page: {cfg.html} ({cfg.html.stat().st_size / 1e6:.1f} MB). Open it in a browser.")
+    return findings
+
+
+def check_numbers(source: DatasetSource, action_range: Sequence[float] | None = None) -> list[Finding]:
+    """All checks that need no picture, in the order in which a person reads them.
+
+    Args:
+        source: The dataset.
+        action_range: Lowest and highest action allowed; None: see `check_actions`.
+    """
+    microphones = fit_microphones(source)
+    return [
+        *check_survey(source),
+        *check_columns(source),
+        *check_lengths(source),
+        *check_finite_numbers(source),
+        *check_statistics(source),
+        *check_actions(source, action_range),
+        *check_interventions(source),
+        *check_success(source),
+        *check_sample_rates(source),
+        *check_sound(source, microphones),
+        *check_alignment(source, microphones),
+    ]
+
+
+def _watch_pictures(cfg: InspectConfig, source: DatasetSource, findings: list[Finding]) -> list[Finding]:
+    """Reads every picture once, for the checks and for the page."""
+    from lerobot_playbyear.inspection.page import PageWriter
+
+    checks = PictureChecks(source)
+    with PageWriter(cfg.html, source, cfg.picture_height) if cfg.html is not None else nullcontext() as page:
+        for episode in tqdm(source.episodes, desc="Looking", unit="episode", disable=None):
+            pictures: dict[str, Iterator[np.ndarray]] = {
+                camera: checks.watch(episode, camera, source.pictures(episode, camera)) for camera in source.cameras
+            }
+            if page is not None:
+                page.add(episode, pictures)
+            for stream in pictures.values():
+                deque(stream, maxlen=0)
+        findings = [*findings, *checks.findings()]
+        if page is not None:
+            page.finish(findings)
+    return findings
+
+
+def _check_links(root: Path) -> None:
+    """A page is sent to others: it holds no film, sound or number that a stranger's link leads to."""
+    try:
+        check_links_out(root)
+    except OutsideError as error:
+        raise InspectionError(
+            f"No page is written, since it would hold what a link leads to: {error} Of a dataset that lies on another disk, "
+            "let the whole folder lie there, and name it with --dataset.root. Without --html it is checked as it is."
+        ) from error
+    except OSError as error:
+        raise InspectionError(f"The dataset in '{root}' cannot be read: {error}") from error
+
+
+def _check_options(cfg: InspectConfig) -> None:
+    bounds = cfg.action_range
+    if bounds is not None and not (len(bounds) == 2 and bounds[0] < bounds[1]):
+        raise InspectionError(f"action_range={bounds}: give the lowest and the highest action, like [-1, 1].")
+    if cfg.picture_height < 16:
+        raise InspectionError(f"picture_height={cfg.picture_height}: give at least 16 pixels.")
+
+
+# What is told of it
+
+
+def as_text(source: DatasetSource, findings: Sequence[Finding], colour: bool = False) -> str:
+    """One line per finding, between a head and a summary."""
+    facts = source.facts()
+    name_width = max(len(finding.check) for finding in findings)
+    lines = [
+        _printable(f"{facts['repo_id']} in {facts['root']}"),
+        f"{facts['episodes']} episodes, {facts['frames']:,} frames, {facts['seconds']:,.1f} s at {facts['fps']} Hz; "
+        f"cameras: {_printable(_names(source.cameras))}; microphones: {_printable(_names(source.microphones))}",
+        "",
+    ]
+    for finding in findings:
+        level = f"\033[{_COLOURS[finding.level]}m{finding.level:<7}\033[0m" if colour else f"{finding.level:<7}"
+        feature = f"{finding.feature}: " if finding.feature else ""
+        lines.append(f"{level}  {finding.check:<{name_width}}  {_printable(feature + str(finding))}")
+    lines += ["", summary(findings)]
+    if source.survey.damage:
+        lines.append(f"A repaired copy: playbyear-repair --root={facts['root']}")
+    return "\n".join(lines)
+
+
+def as_json(source: DatasetSource, findings: Sequence[Finding]) -> str:
+    """The same for a program."""
+    report = {
+        "dataset": source.facts(),
+        "worst": worst(findings),
+        "verdicts": [finding.to_dict() for finding in findings],
+    }
+    return json.dumps(finite(report), indent=2, allow_nan=False)
+
+
+def _names(keys: Sequence[str]) -> str:
+    return ", ".join(key.split(".", 2)[-1] for key in keys) or "none"
+
+
+def _printable(text: str) -> str:
+    """Without the characters that command a terminal; names and messages may be a stranger's."""
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
