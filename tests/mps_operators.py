@@ -1,6 +1,6 @@
 """What Apple's GPUs (MPS) can compute: the operators that the policy may use, in every torch from 2.7 on.
 
-Made from torch's own table, `native_functions.yaml`, of 2.7.0 and of 2.11.0; `test_mps.py` holds the installed torch's
+Made from torch's own table, `native_functions.yaml`, of 2.7.0 and of 2.11.0; `test_devices.py` holds the installed torch's
 against it. A new operator goes here when both tables name a kernel for MPS.
 """
 

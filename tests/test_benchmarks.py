@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_policy_contract import make_config
+from support.policy import make_config
 
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 

@@ -12,11 +12,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from dataset_factory import MICROPHONE, make_dataset
-from lerobot.configs import PreTrainedConfig
+from dataset_factory import make_dataset
 from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
-from test_policy_contract import make_config, make_episode, make_policy, run_ending_at, step_through
+from support.policy import MICROPHONE, make_config, make_episode, make_policy, run_ending_at, step_through
 from torch import nn
 
 from lerobot_playbyear.dagger import ExpertConfig
@@ -152,28 +151,7 @@ def test_a_vision_encoder_of_another_package_learns_and_acts():
         register_vision_encoder("test_colours")(Colours)
 
 
-@pytest.mark.parametrize("option", ["vision_encoder", "audio_encoder"])
-def test_an_unknown_encoder_is_one_error_with_the_known_ones(option):
-    known = {"vision_encoder": "resnet18", "audio_encoder": "spectrogram_cnn, spectrogram_gru"}[option]
-    with pytest.raises(ValueError, match=rf"--policy\.{option}=nobody: .*there are: {known}.*lerobot_policy_"):
-        PlaybyearPolicy(make_config(**{option: "nobody"}))
-
-
-def test_an_unknown_step_and_an_encoder_without_a_size_are_refused():
-    with pytest.raises(ValueError, match=r"--policy\.audio_steps names 'nobody'.*lerobot_policy_"):
-        make_playbyear_pre_post_processors(make_config(audio_steps=("nobody",)))
+def test_an_encoder_without_a_size_is_refused():
     register_audio_encoder("test_sizeless")(lambda config: nn.Flatten())
     with pytest.raises(ValueError, match=r"test_sizeless: Flatten has no `embedding_size`"):
         PlaybyearPolicy(make_config(audio_encoder="test_sizeless"))
-
-
-def test_a_checkpoint_from_before_encoders_had_names_loads(tmp_path):
-    policy = make_policy()
-    policy.save_pretrained(tmp_path)
-    config = json.loads((tmp_path / "config.json").read_text())
-    for key in ("vision_encoder", "audio_encoder", "audio_steps"):
-        del config[key]
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    old = PlaybyearPolicy.from_pretrained(tmp_path, config=PreTrainedConfig.from_pretrained(tmp_path))
-    episode = make_episode(1, policy.config, 3)
-    assert torch.equal(step_through(old, [episode]), step_through(policy, [episode]))

@@ -13,7 +13,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_train import update_policy
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from safetensors.torch import load_file
-from test_fake_cuda import Waits, move_to_card, on_card, without_cudnn
+from support.policy import Waits, move_to_card, on_card, without_cudnn
 from test_train_command import TINY
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode

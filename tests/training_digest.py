@@ -1,13 +1,13 @@
 """A few updates of a small policy `playbyear` with its usual options, in one number: `python tests/training_digest.py`.
 
-Run it to get the digest of the machine that it runs on, for `TRAINED` in `test_candidates.py`.
+Run it to get the digest of the machine that it runs on, for `TRAINED` in `test_auxiliary.py`.
 """
 
 import hashlib
 from pathlib import Path
 
 import torch
-from test_policy_contract import make_config, make_episode, run_ending_at
+from support.policy import make_config, make_episode, run_ending_at
 
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 

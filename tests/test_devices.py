@@ -1,0 +1,518 @@
+"""Training and acting on every device, as far as it shows without one: number formats, graphics cards, Apple's GPUs.
+
+What needs a GPU is skipped where there is none.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from accelerate.state import AcceleratorState
+from dagger_factory import QUICK, command, dagger
+from dataset_factory import make_dataset
+from lerobot.configs import parser
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
+from lerobot.policies import make_pre_post_processors
+from lerobot.scripts import lerobot_train
+from lerobot.utils.import_utils import register_third_party_plugins
+from mps_operators import COMPOSITES, IN_PLACE_OF_OTHERS, KERNELS
+from safetensors import safe_open
+from safetensors.torch import load_file
+from support.policy import (
+    Waits,
+    batch_of,
+    make_config,
+    make_episode,
+    make_policy,
+    move_to_card,
+    on_card,
+    run_ending_at,
+    without_cudnn,
+)
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from lerobot_playbyear.policy.image_augmentation import Augmentation, sample
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy, RecentFrames
+from lerobot_playbyear.policy.optimization import training_dtype
+from lerobot_playbyear.training import loop
+from lerobot_playbyear.training.processes import make_accelerator
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+train = parser.wrap()(loop.train)
+both_trainers = pytest.mark.parametrize(
+    "script", [train, lerobot_train.train], ids=["playbyear-train", "lerobot-train"]
+)
+
+TINY = (
+    "--policy.type=playbyear",
+    "--policy.push_to_hub=false",
+    "--policy.image_size=16",
+    "--policy.vision_width=4",
+    "--policy.audio_window_s=0.9",
+    "--policy.n_memory_steps=2",
+    "--policy.n_supervised_steps=2",
+    "--policy.hidden_size=32",
+    "--policy.audio_noise_db=0",
+    "--num_workers=0",
+    "--batch_size=2",
+    "--log_freq=1",
+    "--seed=3",
+)
+USUAL = {"audio_noise_db": 0.0, "low_dimensional_noise": 0.03, "n_supervised_steps": 3}
+EVERYTHING = USUAL | {
+    **{"auxiliary_onset": 0.1, "auxiliary_way": 0.1, "audio_envelope_gain": 0.3, "audio_colour_db": 3.0},
+    **{"memory_displacement_gain": 10.0, "memory_readers": 2, "low_dimensional_offset": 0.1},
+}
+MODEL = "pretrained_model/model.safetensors"
+ZEROS, BILINEAR = 0, 0  # how aten counts paddings and interpolations
+
+
+@pytest.fixture(autouse=True)
+def precision_of_its_own():
+    """Accelerate keeps the first precision of a process, which is right for a command and wrong for many tests."""
+    AcceleratorState._reset_state(True)
+    yield
+    AcceleratorState._reset_state(True)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    register_third_party_plugins()
+    root = tmp_path_factory.mktemp("data") / "noise"
+    make_dataset(root, (12, 17), image_size=16)
+    return root
+
+
+def run(script, *arguments):
+    """A training script in this process, as the command line would."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["train", *map(str, arguments)])
+        script()
+
+
+# Number formats
+
+
+@pytest.mark.parametrize(
+    ("device", "asked", "use_amp", "has_bfloat16", "expected"),
+    [
+        ("cuda:0", None, True, True, "bfloat16"),
+        ("cuda:0", None, False, True, None),
+        ("cuda:0", "auto", False, False, "float16"),
+        ("cuda:0", "float32", True, True, "float32"),
+        ("cpu", None, True, False, "bfloat16"),  # as PyTorch's autocast has it
+        ("cpu", "auto", False, True, "bfloat16"),
+        ("cpu", "auto", False, False, "float32"),
+        ("mps", "auto", False, True, "float32"),
+    ],
+)
+def test_the_number_format_is_what_the_device_can_and_what_was_asked_for(
+    monkeypatch, device, asked, use_amp, has_bfloat16, expected
+):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: has_bfloat16)
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has_bfloat16}, raising=False)
+    assert training_dtype(asked, use_amp, device) == expected
+
+
+@pytest.mark.parametrize(("device", "asked"), [("cpu", "float16"), ("mps", "bfloat16")])
+def test_a_format_that_a_device_lacks_becomes_float32_with_a_word(caplog, device, asked):
+    assert training_dtype(asked, False, device) == "float32"
+    assert f"'{device}' cannot train in {asked}" in caplog.text
+
+
+@pytest.mark.parametrize(("options", "expected"), [({}, "no"), ({"dtype": "bfloat16"}, "bf16")])
+def test_the_trainers_of_this_package_take_the_format(options, expected):
+    assert make_accelerator(make_config(**options)).mixed_precision == expected
+
+
+def test_a_file_keeps_what_was_asked_for_and_not_what_one_machine_made_of_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
+    for options in ({"use_amp": True}, {"dtype": "auto"}, {"dtype": "float16"}):
+        make_config(**options).save_pretrained(tmp_path)
+        saved = json.loads((tmp_path / "config.json").read_text())
+        assert (saved["type"], saved["dtype"]) == ("playbyear", options.get("dtype"))
+
+    make_config(dtype="auto").save_pretrained(tmp_path)
+    assert PreTrainedConfig.from_pretrained(tmp_path).dtype == "bfloat16"
+    monkeypatch.setattr(torch.cpu, "get_capabilities", dict, raising=False)
+    assert PreTrainedConfig.from_pretrained(tmp_path).dtype == "float32"
+
+
+@both_trainers
+def test_both_trainers_compute_in_it_and_keep_their_weights_in_float32(script, root, tmp_path):
+    computed = set()
+
+    def note(module, inputs, output):
+        if isinstance(module, nn.Linear):
+            computed.add(output.dtype)
+
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={root}", f"--output_dir={tmp_path / 'out'}")
+    hook = nn.modules.module.register_module_forward_hook(note)
+    run(script, *TINY, *data, "--policy.device=cpu", "--policy.use_amp=true", "--steps=1")
+    hook.remove()
+    assert computed == {torch.bfloat16}
+    weights = load_file(tmp_path / "out/checkpoints/last" / MODEL).values()
+    assert all(value.dtype in (torch.float32, torch.int64) for value in weights)
+
+
+# A graphics card that is not there
+
+
+@pytest.mark.parametrize(
+    "options", [USUAL, pytest.param(EVERYTHING, marks=pytest.mark.slow)], ids=["usual", "everything"]
+)
+def test_a_training_step_traces_as_one_graph_without_a_break(options):
+    """Whatever compiles or replays it meets nothing that needs Python in between."""
+    policy = PlaybyearPolicy(make_config(**options)).train()
+    batch = run_ending_at(make_episode(1, policy.config), 5, policy.config)
+    with torch._dynamo.config.patch(allow_rnn=True):  # torch by itself leaves every LSTM out
+        explained = torch._dynamo.explain(lambda batch: policy.forward(batch)[0])(batch)
+    assert explained.break_reasons == []
+    assert (explained.graph_count, explained.graph_break_count) == (1, 0)
+
+
+def test_a_training_forward_stays_on_the_card_and_the_host_never_waits():
+    policy = PlaybyearPolicy(make_config(**EVERYTHING)).train()
+    real = run_ending_at(make_episode(1, policy.config), 5, policy.config)
+    with FakeTensorMode():
+        move_to_card(policy)
+        batch = {key: on_card(value) for key, value in real.items()}
+        with Waits() as waits, without_cudnn():
+            loss, figures = policy.forward(batch)
+        assert {value.device.type for value in (loss, *figures.values())} == {"cuda"}
+        assert waits.lines == []
+
+
+def test_acting_stays_on_the_card_and_the_host_waits_once_per_microphone():
+    """For whether its samples are between -1 and 1; the action is waited for anyway. Fake weights cannot be folded."""
+    policy = PlaybyearPolicy(make_config(**USUAL)).eval()
+    with FakeTensorMode():
+        move_to_card(policy)
+        recent = RecentFrames(policy.config)
+        features = policy.config.input_features.items()
+        with Waits() as waits, without_cudnn():
+            for _ in range(3):
+                frame = {key: torch.rand(1, *feature.shape, device="cuda") for key, feature in features}
+                encoding = policy.model.encode_frame(recent.add(frame, policy.model.prepare_images))
+                actions = policy.model.memory_head(encoding.unsqueeze(1).repeat(1, policy.config.memory_steps, 1))
+        assert actions.device.type == "cuda"
+        assert len(waits.lines) == 3
+        assert all("peak" in line for line in waits.lines)
+
+
+def test_a_tensor_left_on_the_host_is_noticed():
+    """What the other tests rest on."""
+    policy = PlaybyearPolicy(make_config(**USUAL))
+    real = run_ending_at(make_episode(1, policy.config), 30, policy.config)
+    with FakeTensorMode():
+        move_to_card(policy)
+        batch = {key: on_card(value) for key, value in real.items()}
+        batch["observation.state"] = torch.empty(batch["observation.state"].shape)
+        with pytest.raises(RuntimeError, match="device"):
+            policy.model.encode_run(batch, policy.config.n_run_frames)
+
+
+# On a GPU all weights of an LSTM lie in one buffer of cuDNN's; here the CPU gets the like of it
+
+
+def flatten(lstm):
+    """What cuDNN does as soon as an LSTM is moved to a GPU: every weight becomes a view of one buffer."""
+    weights = [weight for weight in lstm._flat_weights if weight is not None]
+    buffer = torch.cat([weight.detach().flatten() for weight in weights])
+    for weight, part in zip(weights, buffer.split([weight.numel() for weight in weights]), strict=True):
+        weight.data = part.view_as(weight)
+
+
+@pytest.fixture
+def one_buffer(monkeypatch):
+    monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
+
+
+def storages(policy):
+    return {weight.untyped_storage().data_ptr() for weight in policy.model.memory_head.lstm.parameters()}
+
+
+def test_a_policy_whose_lstm_lies_in_one_buffer_is_saved_as_any_other(tmp_path, one_buffer):
+    policy = make_policy()
+    policy.to("cpu")
+    assert len(storages(policy)) == 1
+
+    policy.save_pretrained(tmp_path)
+
+    with safe_open(tmp_path / "model.safetensors", "pt") as file:
+        assert set(file.keys()) == policy.state_dict().keys()
+        for name, value in policy.state_dict().items():
+            assert torch.equal(file.get_tensor(name), value)
+    size = sum(value.numel() * value.element_size() for value in policy.state_dict().values())
+    assert (tmp_path / "model.safetensors").stat().st_size < size + 2**15  # no weight drags the whole buffer along
+
+
+def test_a_checkpoint_is_read_into_a_policy_whose_lstm_lies_in_one_buffer(tmp_path, monkeypatch):
+    policy = make_policy()
+    policy.save_pretrained(tmp_path)
+    monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
+
+    again = PlaybyearPolicy.from_pretrained(tmp_path)
+
+    assert len(storages(again)) == 1
+    for name, value in policy.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value)
+    with torch.no_grad():
+        batch = batch_of(policy)
+        torch.testing.assert_close(again.predict_run(batch), policy.predict_run(batch), rtol=0, atol=1e-6)
+
+
+def test_the_optimizer_of_such_a_policy_is_saved_and_goes_on(tmp_path, one_buffer):
+    policy = make_policy(n_supervised_steps=2).train()
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    for _ in range(2):
+        policy.forward(batch_of(policy))[0].backward()
+        optimizer.step()
+
+    policy.save_pretrained(tmp_path)
+    save_optimizer_state(optimizer, tmp_path)
+    again = PlaybyearPolicy.from_pretrained(tmp_path).train()
+    resumed = load_optimizer_state(again.config.get_optimizer_preset().build(again.get_optim_params()), tmp_path)
+
+    for parameter, its_like in zip(policy.parameters(), again.parameters(), strict=True):
+        ours, theirs = optimizer.state[parameter], resumed.state[its_like]
+        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
+    gradients = [torch.randn_like(parameter) for parameter in policy.parameters()]
+    for each, its_optimizer in ((policy, optimizer), (again, resumed)):
+        for parameter, gradient in zip(each.parameters(), gradients, strict=True):
+            parameter.grad = gradient.clone()
+        its_optimizer.step()
+    assert all(torch.equal(a, b) for a, b in zip(policy.parameters(), again.parameters(), strict=True))
+
+
+def test_a_training_saves_its_checkpoints_and_is_resumed(root, tmp_path, monkeypatch):
+    data = ("--policy.device=cpu", "--dataset.repo_id=tests/noise", f"--dataset.root={root}")
+    run(train, *TINY, *data, "--steps=2", f"--output_dir={tmp_path / 'plain'}")
+    monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
+    run(train, *TINY, *data, "--steps=2", "--save_freq=1", f"--output_dir={tmp_path / 'out'}")
+    half = tmp_path / "out/checkpoints/000001/pretrained_model/train_config.json"
+    run(train, "--resume=true", f"--config_path={half}", f"--output_dir={tmp_path / 'resumed'}")
+
+    plain = load_file(tmp_path / "plain/checkpoints/last" / MODEL)
+    for folder in ("out", "resumed"):
+        weights = load_file(tmp_path / folder / "checkpoints/000002" / MODEL)
+        assert all(torch.equal(weights[key], value) for key, value in plain.items())
+
+
+# A card that is there
+
+
+AVAILABLE = {"cuda": torch.cuda.is_available, "mps": torch.backends.mps.is_available}
+on_devices = pytest.mark.parametrize(
+    "device",
+    [
+        pytest.param(name, marks=pytest.mark.skipif(not is_available(), reason=f"this machine has no {name}"))
+        for name, is_available in AVAILABLE.items()
+    ],
+)
+
+
+def weights_of(checkpoint: Path) -> dict[str, torch.Tensor]:
+    return load_file(checkpoint / MODEL)
+
+
+def actions_of(checkpoint: Path, device: str, n_frames: int = 4) -> torch.Tensor:
+    """What the policy of a checkpoint does on a device in an episode of noise, (n_frames, n_actions)."""
+    folder = checkpoint / "pretrained_model"
+    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=[f"--device={device}"])
+    policy = PlaybyearPolicy.from_pretrained(folder, config=config)
+    before, after = make_pre_post_processors(
+        config, str(folder), preprocessor_overrides={"device_processor": {"device": device}}
+    )
+    generator = torch.Generator().manual_seed(0)
+    policy.reset()
+    actions = []
+    for _ in range(n_frames):
+        frame = {key: torch.rand(1, *f.shape, generator=generator) for key, f in config.input_features.items()}
+        actions.append(after(policy.select_action(before(frame))))
+    return torch.cat(actions)
+
+
+@on_devices
+@pytest.mark.parametrize("dtype", ["float32", "auto", "float16"])
+@both_trainers
+def test_a_training_saves_resumes_and_acts(device, script, dtype, root, tmp_path):
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={root}", f"--policy.dtype={dtype}")
+    run(script, *TINY, *data, f"--policy.device={device}", "--steps=4", "--save_freq=2", f"--output_dir={tmp_path}/out")
+    checkpoints = tmp_path / "out/checkpoints"
+    half = checkpoints / "000002"
+    run(
+        script,
+        "--resume=true",
+        f"--config_path={half / 'pretrained_model/train_config.json'}",
+        f"--output_dir={tmp_path}/on",
+    )
+
+    last, resumed = weights_of(checkpoints / "last"), weights_of(tmp_path / "on/checkpoints/000004")
+    assert all(value.isfinite().all() for value in (*last.values(), *resumed.values()))
+    assert any(not torch.equal(value, weights_of(half)[key]) for key, value in last.items())  # it goes on learning
+    if script is train and dtype == "float32":  # which draws the same batches again; kernels on a GPU add in any order
+        for key, value in last.items():
+            torch.testing.assert_close(resumed[key], value, rtol=1e-2, atol=1e-3)
+    torch.testing.assert_close(actions_of(half, device), actions_of(half, "cpu"), rtol=0, atol=1e-2)
+
+
+@on_devices
+def test_hg_dagger_saves_and_goes_on(device, tmp_path):
+    dagger(tmp_path, *QUICK, "--episodes=1", f"--policy.device={device}")
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=2")
+
+    last = weights_of(tmp_path / "out/checkpoints/last")
+    assert all(value.isfinite().all() for value in last.values())
+    config = PreTrainedConfig.from_pretrained(tmp_path / "out/checkpoints/last/pretrained_model")
+    assert torch.device(config.device).type == device
+
+
+# Apple's GPUs: no operator, no padding and no 64-bit float that they have not; every operator is recorded on a CPU
+
+
+class Recorder(TorchDispatchMode):
+    """Notes the name of every aten operator, what grids were sampled how, and which results are 64-bit floats."""
+
+    def __init__(self):
+        super().__init__()
+        self.operators, self.samplings, self.doubles = set(), set(), set()
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        results = function(*args, **(kwargs or {}))
+        if function.namespace == "aten":
+            name = str(function).removeprefix("aten.").removesuffix(".default")
+            self.operators.add(name)
+            if name == "grid_sampler_2d":
+                self.samplings.add(tuple(args[2:4]))
+            for result in results if isinstance(results, tuple | list) else [results]:
+                if isinstance(result, Tensor) and result.dtype in (torch.float64, torch.complex128):
+                    self.doubles.add(name)
+        return results
+
+
+@contextmanager
+def recording() -> Iterator[Recorder]:
+    # oneDNN's convolutions and LSTM are the CPU's alone; without them the policy takes the way of all other devices.
+    with torch.backends.mkldnn.flags(enabled=False), Recorder() as recorder:
+        yield recorder
+
+
+@pytest.fixture(scope="module")
+def policy():
+    """With everything switched on, and with images that are shrunk."""
+    return PlaybyearPolicy(make_config(**USUAL))
+
+
+@pytest.fixture(scope="module")
+def processors(policy):
+    features = {**policy.config.input_features, **policy.config.output_features}
+    values = {"mean": 0.0, "std": 1.0, "min": -1.0, "max": 1.0}
+    stats = {key: {name: torch.full(f.shape, v) for name, v in values.items()} for key, f in features.items()}
+    return make_pre_post_processors(policy.config, dataset_stats=stats)
+
+
+@pytest.fixture(scope="module")
+def training(policy, processors):
+    """What an update does: an item that begins before its episode, whole numbers as sound, two steps of the optimizer."""
+    batch = run_ending_at(make_episode(1, policy.config), 5, policy.config)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+    with recording() as recorder:
+        for _ in range(2):
+            loss, _ = policy.forward(processors[0](dict(batch)))
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            optimizer.step()
+            optimizer.zero_grad()
+    return recorder
+
+
+@pytest.fixture(scope="module")
+def acting(policy, processors, training):
+    """What a rollout does: floats as sound, three steps of a new episode."""
+    policy.eval()
+    before, after = processors
+    observations = [{k: torch.rand(1, *f.shape) for k, f in policy.config.input_features.items()} for _ in range(3)]
+    with recording() as recorder:
+        policy.reset()
+        for observation in observations:
+            after(policy.select_action(before(observation)))
+    return recorder
+
+
+@pytest.mark.parametrize("work", ["training", "acting"])
+def test_only_operators_that_apples_gpus_have_are_used(work, request):
+    recorder = request.getfixturevalue(work)
+    assert len(recorder.operators) > 40
+    assert recorder.operators <= KERNELS | COMPOSITES.keys()
+
+
+@pytest.mark.parametrize("work", ["training", "acting"])
+def test_no_64_bit_float_is_made(work, request):
+    assert request.getfixturevalue(work).doubles == set()
+
+
+def test_grids_are_sampled_only_as_apples_gpus_can(training):
+    assert training.samplings == {(BILINEAR, ZEROS)}
+
+
+@pytest.fixture(scope="module")
+def table():
+    """The kernels that the installed torch was built of: devices by operator."""
+    package = find_spec("torchgen")
+    path = package and Path(str(package.origin)).parent / "packaged/ATen/native/native_functions.yaml"
+    if not path or not path.is_file():
+        pytest.skip("this torch comes without its table of kernels")
+    functions = yaml.load(path.read_text(), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    return {function["func"].split("(")[0]: function for function in functions}
+
+
+def devices(table, operator):
+    function = table[operator]
+    if "structured_delegate" in function:
+        return devices(table, function["structured_delegate"])
+    return {device.strip() for several in function.get("dispatch", {}) for device in several.split(",")}
+
+
+def test_the_list_agrees_with_torchs_own_table(table):
+    inner = {operator for operators in COMPOSITES.values() for operator in operators}
+    lacking = sorted(name for name in KERNELS | inner | IN_PLACE_OF_OTHERS if "MPS" not in devices(table, name))
+    assert lacking == []
+    others = {name for name in COMPOSITES if not any(d.startswith("Composite") for d in devices(table, name))}
+    assert others == set()
+
+
+def of_border(images, grid):
+    return torch.nn.functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+
+
+@pytest.mark.parametrize(("height", "width"), [(16, 16), (48, 64), (84, 84), (224, 298)])
+def test_repeated_edges_are_those_of_padding_border(height, width):
+    generator = torch.Generator().manual_seed(0)
+    images = torch.rand(4, 9, height, width, generator=generator)
+    theta = torch.randn(4, 2, 3, generator=generator)  # far over every edge
+    grid = torch.nn.functional.affine_grid(theta, [4, 1, 48, 48], align_corners=False)
+    assert (grid.abs() > 1).any()
+    torch.testing.assert_close(sample(images, grid), of_border(images, grid), rtol=0, atol=1e-5)
+
+
+def test_images_in_bfloat16_are_moved_as_exactly_as_others():
+    images = torch.rand(2, 3, 3, 84, 84).to(torch.bfloat16)
+    config = make_config(augmentation_brightness=0.0, augmentation_hue=0.0)
+    moved = []
+    for values in (images, images.float()):
+        torch.manual_seed(1)
+        moved.append(Augmentation(config)(values, 84))
+    assert moved[0].dtype == torch.bfloat16
+    torch.testing.assert_close(moved[0].float(), moved[1], rtol=0, atol=2**-7)  # their last bit, and that of colours
