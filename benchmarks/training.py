@@ -22,7 +22,7 @@ from reference import Reference, bare_resnet, make_policy, random_runs, random_w
 from torch import nn
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.precision import computes_bfloat16
+from lerobot_playbyear.policy.optimization import computes_bfloat16
 from lerobot_playbyear.training.heap import keep_freed_memory
 from lerobot_playbyear.training.presets import RECIPES
 

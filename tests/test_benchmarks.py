@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_policy_contract import make_config
-
-from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -21,11 +18,11 @@ def benchmarks_on_path(monkeypatch):
 
 def test_the_published_scheme_gives_our_actions_for_the_same_weights():
     """Encoding ten frames per window anew is slower, and not something else."""
-    from reference import Reference, random_windows
+    from reference import Reference, make_policy, random_windows
 
     torch.manual_seed(0)
     sizes = {"image_size": 224, "vision_width": 64, "hidden_size": 1024, "n_supervised_steps": 1}
-    policy = PlaybyearPolicy(make_config(**sizes, normalize_encodings=False, low_dimensional_gain=1.0)).eval()
+    policy = make_policy(**sizes, normalize_encodings=False, low_dimensional_gain=1.0).eval()
     reference = Reference().eval()
     reference.load_from(policy.model.state_dict())
     images, sound, state, _ = random_windows(2)

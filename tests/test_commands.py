@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 from draccus.argparsing import ArgumentParser
 from draccus.utils import DraccusException
-from test_independence import run_without
+from support.commands import run_without
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.scripts import command as command_module

@@ -224,7 +224,7 @@ policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (of
 policy | auxiliary_way: .inf | --policy.auxiliary_way must be at least 0
 policy | low_dimensional_offset: -0.1 | --policy.low_dimensional_offset must be at least 0 (none) and finite, got -0.1
 policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4
-policy | memory_readers: -1 | --policy.memory_readers must be at least 0 (none), got -1
+policy | memory_readers: -1 | --policy.memory_readers must be at least 0 (none) and finite, got -1
 policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memory_displacement_gain is 0: give 10
 # Environments
 task | sound: loud | sound='loud'

@@ -28,6 +28,16 @@ _COMMANDS = {
     for entry in metadata.entry_points(group="console_scripts")
     if entry.name.startswith(("playbyear-", "lerobot-"))
 }
+_BLOCKER = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {blocked!r}:
+            raise ModuleNotFoundError(f"blocked: {{name}}")
+
+sys.meta_path.insert(0, Blocker())
+"""
 _IMPORTED = ("lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval", "lerobot_env_playbyear")
 
 
@@ -100,6 +110,20 @@ class Commands:
 
     def close(self) -> None:
         self._process.communicate()
+
+
+def run_without(blocked: set[str], code: str) -> str:
+    """What a program prints in a process in which some packages cannot be imported."""
+    script = _BLOCKER.format(blocked=blocked) + code
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "MUJOCO_GL": "egl"},
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
