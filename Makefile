@@ -12,8 +12,9 @@ export HF_HUB_DISABLE_TELEMETRY ?= 1
 # Images for containers often set it: then each start compiles PyTorch and LeRobot anew, which takes longer than all else of it.
 unexport PYTHONDONTWRITEBYTECODE
 
-# In the order of their names: otherwise the longest, which are few in their files, come last and one by one.
-PYTEST = $(BIN)/pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder
+# Each process takes half of what another has left: the tests of a module stay together, and all end at the same time.
+PYTEST = $(BIN)/pytest -n $(TEST_JOBS) --dist worksteal --durations=15
+BENCHMARKS ?= training acting windows recording environment
 
 .PHONY: help install demo test test-slow test-lerobot lint bench checks adversaries lock clean
 
@@ -47,8 +48,8 @@ test-lerobot:  ## The tests with another LeRobot, in .venv-lerobot (LEROBOT=... 
 	PYTHON="$(PYTHON)" LEROBOT="$(LEROBOT)" ./tools/setup.sh
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST)
 
-bench: install  ## Measures speed and memory, beside alternatives, in a quarter of an hour
-	$(BIN)/python benchmarks/run.py
+bench: install  ## Measures speed, beside alternatives, in a quarter of an hour (BENCHMARKS=...)
+	for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
 
 checks: install  ## Plays version 1 of every task with all who cannot hear, some hours (ALL_TASKS="...")
 	for task in $(ALL_TASKS); do \

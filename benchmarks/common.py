@@ -1,4 +1,4 @@
-"""What the benchmarks share: turns of measuring, helpers in processes of their own, the table, and the file of figures."""
+"""What the benchmarks share: turns of measuring, helpers in processes of their own, datasets of noise, and the table."""
 
 import argparse
 import contextlib
@@ -10,14 +10,17 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import psutil
 
-BENCH = Path("outputs/bench.json")
+from lerobot_playbyear.datasets import audio_feature
+
 _LESS_IS_BETTER = ("ms", "s", "MiB")
 _VERSIONS = ("torch", "lerobot", "mujoco", "numpy")
 
@@ -34,8 +37,6 @@ class Row:
         theirs: The figure of that.
         limit_is: What bounds the figure on this machine.
         limit: That bound, measured in the same run.
-        wanted: What the figures ought to be, in words.
-        holds: Whether they are.
     """
 
     what: str
@@ -45,8 +46,6 @@ class Row:
     theirs: float | None = None
     limit_is: str = ""
     limit: float | None = None
-    wanted: str = ""
-    holds: bool | None = None
 
     @property
     def times_better(self) -> float | None:
@@ -55,14 +54,49 @@ class Row:
             return None
         return self.theirs / self.ours if self.unit in _LESS_IS_BETTER else self.ours / self.theirs
 
+    def __str__(self) -> str:
+        beside = f"{self.beside}: {_figure(self.theirs)}" if self.beside else ""
+        times = f"{self.times_better:.3g}" if self.times_better else ""
+        limit = f"{self.limit_is}: {_figure(self.limit)}" if self.limit_is else ""
+        return f"| {self.what} | {_figure(self.ours)} {self.unit} | {beside} | {times} | {limit} |"
 
-def parser_for(doc: str | None, turns: int | None = None) -> argparse.ArgumentParser:
-    """A command line that prints the module's docstring as help, with the number of turns where one is given."""
+
+def _figure(value: float | None) -> str:
+    if value is None:
+        return "not measured"
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def parser_for(doc: str | None, turns: int) -> argparse.ArgumentParser:
+    """A command line that prints the module's docstring as help, with the number of turns."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--output", type=Path, default=BENCH, help="JSON file that the figures are merged into")
-    if turns is not None:
-        parser.add_argument("--turns", type=int, default=turns)
+    parser.add_argument("--output", type=Path, help="JSON file for the figures")
+    parser.add_argument("--turns", type=int, default=turns)
     return parser
+
+
+def run(parser: argparse.ArgumentParser, measure: Callable[[argparse.Namespace], Sequence[Row]]) -> None:
+    """What a benchmark does: measures with the options of the command line, and prints the table and what ran."""
+    args, started = parser.parse_args(), machine()
+    rows = measure(args)
+    print("| what | ours | beside it | times better | limit |", "|---|---|---|---|---|", *rows, sep="\n")
+    print(", ".join(f"{name} {value}" for name, value in started.items()))
+    if args.output is not None:
+        args.output.write_text(json.dumps({"machine": started, "rows": [asdict(row) for row in rows]}, indent=1) + "\n")
+
+
+def machine() -> dict[str, object]:
+    """What runs, and whether it runs alone."""
+    info = Path("/proc/cpuinfo")
+    model = re.search(r"^model name\s*: (.*)", info.read_text(), re.MULTILINE) if info.is_file() else None
+    return {
+        "processor": model[1] if model else platform.processor() or platform.machine(),
+        "cores": os.cpu_count(),
+        "threads": os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())),
+        "python": platform.python_version(),
+        **{name: metadata.version(name) for name in _VERSIONS},
+        "load_before": round(os.getloadavg()[0], 2),
+    }
 
 
 def seconds_of(work: Callable[[], object]) -> float:
@@ -106,14 +140,8 @@ class Helper:
     """
 
     def __init__(self, *command: str, **environment: str) -> None:
-        self._process = subprocess.Popen(
-            command,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, **environment},
-        )
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        self._process = subprocess.Popen(command, env={**os.environ, **environment}, **pipes)
 
     def ask(self, question: str = "") -> None:
         """Lets it begin."""
@@ -128,11 +156,6 @@ class Helper:
                 return float(line.split()[1])
         raise RuntimeError(f"A helper did not run:\n{self._process.stderr.read()[-2000:]}")
 
-    def measure(self, question: str = "") -> float:
-        """Asks and waits."""
-        self.ask(question)
-        return self.answer()
-
     def close(self) -> None:
         """Ends it."""
         self._process.stdin.close()
@@ -145,47 +168,6 @@ def serve(work: Callable[[str], float]) -> None:
         print("answer", work(line.strip()), flush=True)
 
 
-def machine() -> dict[str, object]:
-    """What ran, and whether it ran alone."""
-    info = Path("/proc/cpuinfo")
-    model = re.search(r"^model name\s*: (.*)", info.read_text(), re.MULTILINE) if info.is_file() else None
-    return {
-        "processor": model[1] if model else platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "threads": os.environ.get("OMP_NUM_THREADS", str(os.cpu_count())),
-        "python": platform.python_version(),
-        **{name: metadata.version(name) for name in _VERSIONS},
-        "load_before": round(os.getloadavg()[0], 2),
-    }
-
-
-def report(section: str, rows: Sequence[Row], output: Path, started: dict[str, object]) -> None:
-    """Prints a benchmark's rows and merges them into the file of figures.
-
-    Args:
-        section: The benchmark's name.
-        rows: Its results.
-        output: The file.
-        started: `machine()` from before the work.
-    """
-    print("\n".join(markdown(rows)), flush=True)
-    entries = [{**asdict(row), "times_better": row.times_better} for row in rows]
-    merge({section: {"machine": started, "rows": entries}}, output)
-
-
-def run(section: str, parser: argparse.ArgumentParser, measure: Callable[[argparse.Namespace], Sequence[Row]]) -> None:
-    """What a benchmark does: measures with the options of the command line, and reports."""
-    args, started = parser.parse_args(), machine()
-    report(section, measure(args), args.output, started)
-
-
-def merge(sections: dict[str, object], output: Path) -> None:
-    """Puts sections into the file of figures; the others stay."""
-    figures = json.loads(output.read_text()) if output.is_file() else {}
-    output.parent.mkdir(parents=True, exist_ok=True)
-    output.write_text(json.dumps({**figures, **sections}, indent=1) + "\n")
-
-
 def occupied(*processes: psutil.Process) -> tuple[int, int]:
     """Bytes of memory of processes, and those of them that are no files, which the system cannot take back."""
     memories = [process.memory_info() for process in processes]
@@ -193,26 +175,56 @@ def occupied(*processes: psutil.Process) -> tuple[int, int]:
     return total, total - sum(getattr(memory, "shared", 0) for memory in memories)
 
 
-def rows_of(section: Mapping[str, object]) -> list[Row]:
-    """The rows in a section of the file of figures."""
-    entries = section["rows"]
-    assert isinstance(entries, list)
-    return [Row(**{key: value for key, value in entry.items() if key != "times_better"}) for entry in entries]
+# Datasets of noise that compresses about like a camera's and a microphone's
+
+CAMERAS = ("observation.images.front", "observation.images.wrist")
+MICROPHONES = ("observation.audio.left", "observation.audio.right")
 
 
-def markdown(rows: Sequence[Row]) -> list[str]:
-    """The table, line by line."""
-    lines = ["| what | ours | beside it | times better | limit | wanted |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        beside = f"{row.beside}: {_figure(row.theirs)}" if row.beside else ""
-        times = f"{row.times_better:.3g}" if row.times_better else ""
-        limit = f"{row.limit_is}: {_figure(row.limit)}" if row.limit_is else ""
-        wanted = row.wanted + ("" if row.holds is None else ": holds" if row.holds else ": **does not hold**")
-        lines.append(f"| {row.what} | {_figure(row.ours)} {row.unit} | {beside} | {times} | {limit} | {wanted} |")
-    return lines
+def dataset_features(
+    image_size: tuple[int, int],
+    sample_rate: int,
+    fps: int,
+    n_microphones: int = 1,
+    dtype: str = "image",
+    n_cameras: int = 1,
+) -> dict[str, dict[str, Any]]:
+    """Cameras, microphones, the arm's state and the action."""
+    camera = {"dtype": dtype, "shape": (*image_size, 3), "names": ["height", "width", "channels"]}
+    return {
+        **{key: dict(camera) for key in CAMERAS[:n_cameras]},
+        **{key: audio_feature(sample_rate, fps) for key in MICROPHONES[:n_microphones]},
+        "observation.state": {"dtype": "float32", "shape": (7,), "names": None},
+        "action": {"dtype": "float32", "shape": (4,), "names": None},
+    }
 
 
-def _figure(value: float | None) -> str:
-    if value is None:
-        return "not measured"
-    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+def frames(features: dict[str, dict[str, Any]], n: int, seed: int = 0) -> Iterator[dict[str, Any]]:
+    """The frames of an episode, as `add_frame` takes them: a scene of smooth shapes that moves, and noise."""
+    rng = np.random.default_rng(seed)
+    height, width, _ = features[CAMERAS[0]]["shape"]
+    y, x = np.mgrid[0:height, 0:width] / width
+    scene = np.stack([127 + 90 * np.sin(a * x + b * y) for a, b in ((9, 4), (3, 11), (14, 2))], axis=-1)
+    moved = [np.roll(scene, 3 * i, axis=1) + rng.normal(0, 2, scene.shape) for i in range(40)]
+    pictures = [np.clip(picture, 0, 255).astype(np.uint8) for picture in moved]
+    for i in range(n):
+        frame: dict[str, Any] = {"task": "listen"}
+        for key, feature in features.items():
+            if feature["dtype"] == "int16":
+                frame[key] = rng.normal(0, 300, feature["shape"]).astype(np.int16)
+            elif feature["dtype"] == "float32":
+                frame[key] = rng.normal(size=feature["shape"]).astype(np.float32)
+            else:
+                frame[key] = pictures[i % 40]
+        yield frame
+
+
+def record(root: Path, repo_id: str, fps: int, features: dict[str, dict[str, Any]], lengths: Sequence[int]) -> None:
+    """Writes a dataset of episodes of so many frames."""
+    from lerobot_playbyear.datasets.durable import DurableWriter
+
+    with DurableWriter(repo_id, root, fps, features) as writer:
+        for seed, length in enumerate(lengths):
+            for frame in frames(features, length, seed):
+                writer.add_frame(frame)
+            writer.save_episode()

@@ -1,110 +1,105 @@
-"""The memory that commands need for one very long episode: two hours, two cameras, two microphones of 48 kHz.
+"""The memory that commands need for one very long episode, and training for data that memory would not hold.
 
-    python benchmarks/memory.py                      # half an hour and more on two cores; needs 12 GB of disk
-    python benchmarks/memory.py --only inspect push  # these; figures of the others stay
-    python benchmarks/memory.py --table              # of the figures that are there
+    python benchmarks/memory.py                      # two hours; an hour and more on two cores; 12 GB of disk
+    python benchmarks/memory.py --store              # 50 episodes of 30 s, half an hour and 25 GB of disk
+    python benchmarks/memory.py --minutes=1 --only inspect push
 
-Each command runs in a process of its own that may not allocate more than the limit (`RLIMIT_DATA`, on Linux), while the
-memory that it and its children occupy is looked at ten times a second. That counts pages of files which are mapped,
-and which the system takes back when it needs them. A command fails its row by failing, or by exceeding the limit.
+Two cameras of 640 x 480 at 30 Hz, as video, and two microphones of 48 kHz. Each command runs in a process of its own that may
+not allocate more than the limit (`RLIMIT_DATA`, on Linux), while the memory that it and its children occupy is looked at ten
+times a second. That counts pages of files which are mapped, and which the system takes back when it needs them: the first
+figure is without them. A command that fails ends the benchmark with what it said.
 
-The episode is made once and kept in `--folder`. What is repaired is what a killed recording leaves: a data file without its
-end, and no table of episodes. The Hub is the one of the tests, on loopback, and throws large files away.
+What is repaired is what a killed recording leaves: a data file without its end, and no table of episodes. The Hub is the one of
+the tests, on loopback, and throws large files away. The dataset is made once and kept in `--folder`.
 """
 
+import argparse
 import json
 import os
 import resource
 import shutil
-import statistics
 import subprocess
 import sys
 import time
+import wave
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 import psutil
-from common import machine, merge, occupied, parser_for
+import pyarrow as pa
+import pyarrow.parquet as pq
+from common import CAMERAS, MICROPHONES, Row, dataset_features, occupied, parser_for, record, run
+from lerobot.datasets.video_utils import concatenate_video_files
 
 GIB = 2**30
-_EVERY_S = 0.1
-_KILLED_S = 6 * 3600
-_TESTS = Path(__file__).parents[1] / "tests"
+FPS, SAMPLE_RATE, SIZE = 30, 48000, (480, 640)
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a command needed.
-
-    Attributes:
-        command: Its name.
-        minutes: Of the episode.
-        peak_gib: The most that it and its children occupied.
-        own_gib: The same without pages of mapped files.
-        seconds: How long it took.
-        cpu_seconds: How long processors worked for it, which tells more on a busy machine.
-        failure: Why it failed; empty where it did not.
-        load: The mean of what the machine did meanwhile, the command included.
-    """
-
-    command: str
-    minutes: float
-    peak_gib: float
-    own_gib: float
-    seconds: float
-    cpu_seconds: float
-    failure: str
-    load: float = 0.0
-
-
-def measure(name: str, command: list[str], minutes: float, limit: int, environment: dict[str, str]) -> Result:
+def measure(name: str, command: list[str], limit: int, environment: dict[str, str]) -> Row:
     """Runs a command under the limit [bytes]."""
-    started, cpu_before = time.perf_counter(), _cpu_seconds()
-    log = Path(environment["HF_HOME"]).with_name(f"{name}.log")
-    with log.open("w") as output:
-        process = subprocess.Popen(
-            command,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            env={**os.environ, **environment},
-            preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_DATA, (limit, limit)),
-        )
-        watched = psutil.Process(process.pid)
-        sizes, loads = [(0, 0)], [os.getloadavg()[0]]
-        while process.poll() is None and time.perf_counter() - started < _KILLED_S:
-            with suppress(psutil.Error):  # one of them has just ended
-                sizes.append(occupied(watched, *watched.children(recursive=True)))
-            loads.append(os.getloadavg()[0])
-            time.sleep(_EVERY_S)
-        process.kill()
-        status = process.wait()
-    peak, own = (max(column) for column in zip(*sizes, strict=True))
-    failure = "more than the limit" if peak > limit else ""
-    if status:
-        last = (log.read_text().strip().splitlines() or [""])[-1]
-        failure = f"status {status}: {last[:200]}"
-    return Result(
-        command=name,
-        minutes=minutes,
-        peak_gib=round(peak / GIB, 2),
-        own_gib=round(own / GIB, 2),
-        seconds=round(time.perf_counter() - started),
-        cpu_seconds=round(_cpu_seconds() - cpu_before),
-        failure=failure,
-        load=round(statistics.fmean(loads), 1),
-    )
+    limited = {"preexec_fn": lambda: resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))}
+    told = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    started, sizes = time.perf_counter(), [(0, 0)]
+    process = subprocess.Popen(command, env={**os.environ, **environment}, **limited, **told)
+    watched = psutil.Process(process.pid)
+    while process.poll() is None:
+        with suppress(psutil.Error):  # one of them has just ended
+            sizes.append(occupied(watched, *watched.children(recursive=True)))
+        time.sleep(0.1)
+    if process.returncode:
+        raise RuntimeError(f"{name}: status {process.returncode}: {process.stdout.read()[-500:]}")
+    peak, own = (max(column) / 2**20 for column in zip(*sizes, strict=True))
+    name = f"{name}, {time.perf_counter() - started:,.0f} s"
+    return Row(name, own, "MiB", "with mapped files", peak, "may allocate", limit / 2**20)
 
 
-def _cpu_seconds() -> float:
-    """Of all children that have ended."""
-    times = os.times()
-    return times.children_user + times.children_system
+# One very long episode
+
+
+def make(folder: Path, minutes: int) -> None:
+    """Makes `heard` and `silent`, an episode with and without its microphones, and `0.wav`, which has both."""
+    for name, n_microphones in (("heard", 2), ("silent", 0)):
+        features = dataset_features(SIZE, SAMPLE_RATE, FPS, n_microphones, "video", len(CAMERAS))
+        record(folder / name, f"benchmark/{name}", FPS, features, [60 * FPS])
+        lengthen(folder / name, minutes)
+    sound = np.random.default_rng(0).normal(0, 300, (60 * SAMPLE_RATE, len(MICROPHONES))).astype(np.int16)
+    with wave.open(str(folder / "0.wav"), "wb") as file:
+        file.setparams((len(MICROPHONES), 2, SAMPLE_RATE, 0, "NONE", ""))
+        for _ in range(minutes):
+            file.writeframes(sound.tobytes())
+
+
+def lengthen(root: Path, times: int) -> None:
+    """Makes the only episode of a dataset so many times as long: its rows and its pictures are repeated."""
+    info = json.loads((root / "meta/info.json").read_text())
+    info["total_frames"] *= times
+    n = info["total_frames"]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    (path,) = root.glob("data/*/*.parquet")
+    columns = {"index": np.arange(n), "frame_index": np.arange(n), "timestamp": (np.arange(n) / FPS).astype(np.float32)}
+    rewrite(path, times, columns)
+    for video in root.glob("videos/*/*/*.mp4"):
+        minute = video.rename(video.with_name("minute.mp4"))
+        concatenate_video_files([minute] * times, video)
+        minute.unlink()
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    ends = {f"videos/{key}/to_timestamp": np.array([n / FPS]) for key in CAMERAS}
+    rewrite(path, 1, {"length": np.array([n]), "dataset_to_index": np.array([n]), **ends})
+
+
+def rewrite(path: Path, times: int, columns: dict[str, np.ndarray]) -> None:
+    """Repeats the rows of a table, as one row group, with other values in some columns."""
+    table = pa.concat_tables([pq.read_table(path)] * times)
+    for name, values in columns.items():
+        place = table.column_names.index(name)
+        table = table.set_column(place, table.schema.field(place), pa.array(values))
+    pq.write_table(table, path, row_group_size=len(table), compression="snappy")
 
 
 def inspect(folder: Path) -> list[str]:
-    return _module("inspect", *_named("dataset", "benchmark/heard", folder / "episode" / "heard"), "--json")
+    return ["inspect", *_named("dataset", folder / "heard"), "--json"]
 
 
 def page(folder: Path) -> list[str]:
@@ -112,120 +107,102 @@ def page(folder: Path) -> list[str]:
 
 
 def repair(folder: Path) -> list[str]:
-    """Of a copy that shares the videos and lacks what a killed recording lacks."""
-    heard, root = folder / "episode" / "heard", folder / "killed"
-    shutil.rmtree(root, ignore_errors=True)
-    shutil.copytree(heard, root, copy_function=os.link)
+    """Of a copy that lacks what a killed recording lacks."""
+    root = folder / "killed"
+    for old in folder.glob("killed*"):
+        shutil.rmtree(old)
+    shutil.copytree(folder / "heard", root)
     shutil.rmtree(root / "meta" / "episodes")
     (data,) = root.glob("data/*/*.parquet")
-    data.unlink()
-    shutil.copyfile(heard / data.relative_to(root), data)
     os.truncate(data, data.stat().st_size - 8)
-    return _module("repair", f"--root={root}")
+    return ["repair", f"--root={root}"]
 
 
 def attach(folder: Path) -> list[str]:
     shutil.rmtree(folder / "attached", ignore_errors=True)
-    silent = _named("dataset", "benchmark/silent", folder / "episode" / "silent")
-    attached = _named("output", "benchmark/attached", folder / "attached")
-    files = f"--files={folder}/episode/sound/{{episode}}.wav"
-    return _module("attach_audio", *silent, *attached, files, "--microphone=left,right")
+    places = (*_named("dataset", folder / "silent"), *_named("output", folder / "attached"))
+    return ["attach_audio", *places, f"--files={folder}/{{episode}}.wav", "--microphone=left,right", "--pad=true"]
 
 
 def push(folder: Path) -> list[str]:
-    return _module("push", *_named("dataset", "tester/heard", folder / "episode" / "heard"))
+    return ["push", *_named("dataset", folder / "heard")]
 
 
 COMMANDS: dict[str, Callable[[Path], list[str]]] = {
-    "playbyear-inspect": inspect,
-    "playbyear-repair": repair,
-    "playbyear-attach-audio": attach,
-    "playbyear-push": push,
-    "playbyear-inspect --html": page,
+    prepare.__name__: prepare for prepare in (inspect, repair, attach, push, page)
 }
 
 
-def _named(kind: str, repo_id: str, root: Path) -> list[str]:
-    return [f"--{kind}.repo_id={repo_id}", f"--{kind}.root={root}"]
-
-
-def _module(name: str, *options: str) -> list[str]:
-    return [sys.executable, "-m", f"lerobot_playbyear.scripts.{name}", *options]
+def _named(kind: str, root: Path) -> list[str]:
+    return [f"--{kind}.repo_id=tester/{root.name}", f"--{kind}.root={root}"]
 
 
 @contextmanager
 def hub() -> Iterator[dict[str, str]]:
     """The Hub of the tests; what makes a client come to it."""
-    sys.path.insert(0, str(_TESTS))
-    from support import hub as hub_server
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    from support.hub import Answer, HubServer
 
-    class Forgetful(hub_server.HubServer):
-        def store(self, request: "hub_server._Handler", oid: str) -> hub_server.Answer:
+    class Forgetful(HubServer):
+        def store(self, request: object, oid: str) -> Answer:
             self.objects[oid] = b""
-            return hub_server.Answer()
-
-        def verify(self, request: "hub_server._Handler") -> hub_server.Answer:
-            return hub_server.Answer({})
+            return Answer()
 
     with Forgetful() as server:
         yield server.environment()
 
 
-def run(folder: Path, minutes: float, limit: int, only: list[str] | None, output: Path) -> list[Result]:
+def long_episode(folder: Path, minutes: int, limit: int, only: list[str]) -> list[Row]:
     """Makes the episode where it is not there, and measures the commands."""
-    episode = folder / "episode"
-    marker = episode / "minutes"
-    if not marker.is_file() or float(marker.read_text()) != minutes:
-        from long_episode import make
-
-        shutil.rmtree(episode, ignore_errors=True)
-        print(f"making {minutes:g} minutes", flush=True)
-        make(episode, minutes)
-    results = []
+    if not (folder / "0.wav").is_file():
+        make(folder, minutes)
     with hub() as environment:
-        for name, prepare in COMMANDS.items():
-            if only is not None and prepare.__name__ not in only:
-                continue
-            home = folder / "home"
-            shutil.rmtree(home, ignore_errors=True)
-            command, started = prepare(folder), machine()
-            results.append(measure(name, command, minutes, limit, {**environment, "HF_HOME": str(home)}))
-            kept = json.loads(output.read_text()).get("memory", {}) if output.is_file() else {}
-            merge({"memory": {**kept, name: {"machine": started, **asdict(results[-1])}}}, output)
-            print(table(results)[-1], flush=True)
-    return results
+        home = {**environment, "HF_HOME": str(folder / "home")}
+        commands = {name: COMMANDS[name](folder) for name in only}
+        module = (sys.executable, "-m")
+        return [
+            measure(
+                f"{name}, {minutes} minutes", [*module, f"lerobot_playbyear.scripts.{command}", *options], limit, home
+            )
+            for name, (command, *options) in commands.items()
+        ]
 
 
-def table(results: list[Result]) -> list[str]:
-    """Markdown, line by line."""
-    lines = [
-        "| command | peak memory [GiB] | without mapped files [GiB] | time [s] | of a processor [s] |",
-        "|---|---|---|---|---|",
+# Data larger than memory
+
+
+def store(folder: Path, limit: int) -> list[Row]:
+    """Makes the store on disk, and trains from it."""
+    root, episodes = folder / "data", [30 * FPS] * 50
+    if not root.exists():
+        features = dataset_features(SIZE, SAMPLE_RATE, FPS, 2, "video", len(CAMERAS))
+        record(root, "tester/data", FPS, features, episodes)
+    for made in ("store", "train"):
+        shutil.rmtree(folder / made, ignore_errors=True)
+    train = [
+        *(sys.executable, "-m", "lerobot_playbyear.scripts.train", "--policy.type=playbyear", "--policy.device=cpu"),
+        *(f"--policy.fps={FPS}", "--policy.image_size=224", "--policy.vision_width=16", "--policy.push_to_hub=false"),
+        *(*_named("dataset", root), "--store=disk", f"--store.cache={folder / 'store'}", "--batch_size=1"),
     ]
-    for result in results:
-        failure = f" **failed**: {result.failure}" if result.failure else ""
-        lines.append(
-            f"| `{result.command}` | {result.peak_gib:.2f}{failure} | {result.own_gib:.2f} | {result.seconds:,.0f} "
-            f"| {result.cpu_seconds:,.0f} |"
-        )
-    return lines
+    pictures = sum(episodes) * len(CAMERAS) * SIZE[0] * SIZE[1] * 3 / GIB
+    home = {"HF_HOME": str(folder / "home")}
+    return [
+        measure(name, [*train, f"--steps={steps}", f"--output_dir={folder}/train/{steps}"], limit, home)
+        for name, steps in ((f"a store of {pictures:.0f} GiB of pictures, one update", 1), ("20 updates from it", 20))
+    ]
 
 
-def main() -> int:
-    parser = parser_for(__doc__)
-    parser.add_argument("--folder", type=Path, default=Path("outputs/memory"), help="for the episode and the copies")
-    parser.add_argument("--minutes", type=float, default=120, help="of the episode")
-    parser.add_argument("--limit", type=float, default=4, help="[GiB]")
-    parser.add_argument("--only", nargs="*", choices=[prepare.__name__ for prepare in COMMANDS.values()])
-    parser.add_argument("--table", action="store_true", help="measure nothing")
-    args = parser.parse_args()
-    if not args.table:
-        run(args.folder.absolute(), args.minutes, round(args.limit * GIB), args.only, args.output)
-    kept = json.loads(args.output.read_text())["memory"].values()
-    results = [Result(**{key: value for key, value in each.items() if key != "machine"}) for each in kept]
-    print("\n".join(table(results)))
-    return sum(bool(result.failure) for result in results)
+def benchmark(args: argparse.Namespace) -> list[Row]:
+    limit, folder = round(args.limit * GIB), args.folder.absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    return store(folder, limit) if args.store else long_episode(folder, args.minutes, limit, args.only)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    parser = parser_for(__doc__, turns=1)
+    parser.add_argument("--folder", type=Path, default=Path("outputs/memory"), help="for the episode and the copies")
+    parser.add_argument("--minutes", type=int, default=120, help="of the episode")
+    parser.add_argument("--limit", type=float, default=4, help="[GiB]")
+    parser.add_argument("--only", nargs="*", choices=COMMANDS, default=list(COMMANDS))
+    parser.add_argument("--store", action="store_true", help="measure training from a store on the disk instead")
+    run(parser, benchmark)

@@ -1,63 +1,45 @@
-"""Frames per second that recording can take, beside stock LeRobot; with `--paced`, whether it keeps up, and the room it takes.
+"""What recording takes: frames per second beside stock LeRobot, waits at a robot's pace, and a microphone's picture.
 
     python benchmarks/recording.py
-    python benchmarks/recording.py --paced
 
 Frames of one camera and one microphone are added as fast as they are taken, and the episode is saved: by
 `DurableWriter`, after which it survives a power cut, and by `LeRobotDataset` alone, in turns. The limit is compressing the
-pictures. With `--paced` frames come at the rate of the robot instead, for a minute each: the longest time that `add_frame`
-takes is the longest that a frame waits for the disk, and the next one is late if that is longer than a frame.
+pictures. Then frames of a robot come at its rate: the longest time that `add_frame` takes is the longest that a frame waits for
+the disk, and the next one is late if that is longer than a frame.
+
+A microphone's picture is drawn as its camera draws it: new columns of the spectrogram, the strip, the timecode. Beside it,
+the whole spectrogram drawn from nothing. Its error is what LeRobot's video encoder makes of it at its defaults, in grey
+levels, of 255, between keyframes and in them.
 """
 
+import argparse
 import io
-import os
 import tempfile
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import datasets
 import numpy as np
-from common import Row, in_turns, machine, medians, parser_for, report, seconds_of
+from common import CAMERAS, Row, dataset_features, frames, in_turns, medians, parser_for, run, seconds_of
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
-from scenes import CAMERAS, dataset_features, frames
 
-from lerobot_playbyear.datasets import audio_feature
+from lerobot_playbyear.audio.rolling_spectrogram import RollingSpectrogram
+from lerobot_playbyear.audio.sample_strip import Strip, n_kept, n_rows, read_timecode, write_strip, write_timecode
 from lerobot_playbyear.datasets.durable import DurableWriter
 
-SECONDS = 20  # of a paced episode
-N_EPISODES = 3
-_ROOM_RATE = 48000  # Hz
+FPS, N_FRAMES = 20, 200
+ROBOT_FPS, SECONDS = 30, 60  # at a robot's pace
+SIZE, N_PICTURES, KEY = 224, 400, "observation.images.mic"
 
 
-class Case(NamedTuple):
-    """A robot's sensors."""
-
-    name: str
-    fps: int
-    features: dict[str, dict[str, Any]]
-
-
-_ROBOT = ((480, 640), 48000, 30, 2)  # pixels, Hz, Hz, microphones
-_FILMED = dataset_features(*_ROBOT, "video")
-SIMULATION = Case("84 px pictures, one 16 kHz microphone", 20, dataset_features((84, 84), 16000, 20))
-PACED = (
-    Case("20 Hz, 84x84 pictures, one microphone", 20, dataset_features((84, 84), 48000, 20)),
-    Case("30 Hz, 640x480 pictures, two microphones", 30, dataset_features(*_ROBOT)),
-    Case("30 Hz, 640x480 video, two microphones", 30, _FILMED),
-)
-
-
-def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
-    """As fast as it goes: ours, stock, and compression alone."""
-    features, fps = SIMULATION.features, SIMULATION.fps
-    episode = list(frames(features, n_frames))
+def as_fast_as_it_goes(folder: Path, turns: int) -> Row:
+    """Ours, stock, and compression alone."""
+    features = dataset_features((84, 84), 16000, FPS)
+    episode = list(frames(features, N_FRAMES))
     options = {"image_writer_threads": 4, "video_backend": "pyav"}
-    stock = LeRobotDataset.create("benchmark/stock", fps, features, root=folder / "stock", **options)
+    stock = LeRobotDataset.create("benchmark/stock", FPS, features, root=folder / "stock", **options)
 
     def write(writer: DurableWriter | LeRobotDataset) -> None:
         for frame in episode:
@@ -68,90 +50,102 @@ def measure(folder: Path, n_frames: int, turns: int) -> list[Row]:
         for frame in episode:
             Image.fromarray(frame[CAMERAS[0]]).save(io.BytesIO(), format="PNG", compress_level=1)
 
-    with DurableWriter("benchmark/ours", folder / "ours", fps, features) as ours:
+    with DurableWriter("benchmark/ours", folder / "ours", FPS, features) as ours:
         works = {"ours": lambda: write(ours), "stock": lambda: write(stock), "limit": compress}
-        seconds = medians(in_turns(works, turns))
+        rates = {name: N_FRAMES / took for name, took in medians(in_turns(works, turns)).items()}
     stock.finalize()
-    rates = {name: n_frames / value for name, value in seconds.items()}
-    return [
-        Row(
-            f"recording, {SIMULATION.name}, saved for good",
-            rates["ours"],
-            "frames/s",
-            "stock LeRobotDataset, which a crash can cost the session",
-            rates["stock"],
-            "compressing the pictures",
-            rates["limit"],
-            f"at least {fps}",
-            rates["ours"] >= fps,
-        )
-    ]
+    beside = ("stock LeRobotDataset, which a crash can cost the session", rates["stock"])
+    name = "recording, 84 px pictures, one 16 kHz microphone, saved for good"
+    return Row(name, rates["ours"], "frames/s", *beside, "compressing the pictures", rates["limit"])
 
 
-def measure_paced(case: Case, root: Path) -> None:
-    waits, saves = [], []
-    is_filmed = case.features[CAMERAS[0]]["dtype"] == "video"
-    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast") if is_filmed else None
-    with DurableWriter("benchmark/recording", root, case.fps, case.features, rgb_encoder=encoder) as writer:
-        for episode in range(N_EPISODES):
-            begun = time.perf_counter()
-            for i, frame in enumerate(frames(case.features, SECONDS * case.fps, episode)):
-                time.sleep(max(0.0, begun + i / case.fps - time.perf_counter()))
-                waits.append(seconds_of(partial(writer.add_frame, frame)))
-            saves.append(seconds_of(writer.save_episode))
-    late = sum(wait > 1 / case.fps for wait in waits)
-    print(
-        f"{case.name}: {len(waits)} frames, {late} late; longest wait {1e3 * max(waits):.1f} ms "
-        f"(99 %: {1e3 * np.quantile(waits, 0.99):.1f} ms; a frame is {1e3 / case.fps:.0f} ms); "
-        f"save_episode of {SECONDS} s: {np.mean(saves):.1f} s, at most {max(saves):.1f} s"
-    )
+def at_a_robots_pace(folder: Path) -> list[Row]:
+    """A camera's video of 640 x 480 and two microphones of 48 kHz."""
+    waits, features = [], dataset_features((480, 640), 48000, ROBOT_FPS, 2, "video")
+    encoder = RGBEncoderConfig(vcodec="h264", preset="veryfast")
+    with DurableWriter("benchmark/robot", folder / "robot", ROBOT_FPS, features, rgb_encoder=encoder) as writer:
+        begun = time.perf_counter()
+        for i, frame in enumerate(frames(features, SECONDS * ROBOT_FPS)):
+            time.sleep(max(0.0, begun + i / ROBOT_FPS - time.perf_counter()))
+            waits.append(seconds_of(partial(writer.add_frame, frame)))
+        saving = seconds_of(writer.save_episode)
+    late = sum(wait > 1 / ROBOT_FPS for wait in waits)
+    name = f"{ROBOT_FPS} Hz, 640x480 video, two microphones: {late} of {len(waits)} frames late, longest wait"
+    limit = {"limit_is": "a frame", "limit": 1e3 / ROBOT_FPS}
+    return [Row(name, 1e3 * max(waits), "ms", **limit), Row(f"saving the {SECONDS} s", saving, "s")]
 
 
-def measure_room(folder: Path) -> None:
-    n, rng = _ROOM_RATE // 20, np.random.default_rng(0)
-    own = {
-        "observation.audio.gripper": audio_feature(_ROOM_RATE, 20),
-        "action": {"dtype": "float32", "shape": (4,), "names": None},
-    }
-    sounds: dict[str, Callable[[], np.ndarray]] = {
-        "noise at full scale": lambda: rng.integers(-32768, 32768, n),
-        "a quiet room (noise of 100 of 32,768)": lambda: rng.normal(0, 100, n),
-        "silence": lambda: np.zeros(n),
-    }
-    for number, (name, sound) in enumerate(sounds.items()):
-        root = folder / str(number)
-        sizes = []
-        with DurableWriter("benchmark/room", root, 20, own) as writer:
-            for _ in range(10):
-                for _ in range(5 * 20):
-                    block = sound().astype(np.int16)
-                    action = rng.normal(size=4).astype(np.float32)
-                    writer.add_frame({"observation.audio.gripper": block, "action": action, "task": "listen"})
-                writer.save_episode()
-                sizes.append(sum(path.stat().st_size for path in (root / "meta").rglob("*") if path.is_file()))
-        data = sum(path.stat().st_size for path in (root / "data").rglob("*.parquet"))
-        print(
-            f"{name}: {data / (10 * 5 * _ROOM_RATE):.3f} bytes per sample; metadata {sizes[0] / 1e3:.0f} kB with the "
-            f"first episode, {(sizes[-1] - sizes[0]) / 9e3:.1f} kB for each further one"
-        )
+class Drawn:
+    """A microphone's pictures of a sound, step by step."""
+
+    def __init__(self, rate: int) -> None:
+        self.sound, self.rate, self.counter = contacts(rate), rate, 3 * rate
+        self.rows = n_rows(rate, SIZE)
+        self.spectrogram = self.new()
+
+    def new(self) -> RollingSpectrogram:
+        return RollingSpectrogram(self.rate, SIZE - self.rows, SIZE, -90, -20)
+
+    def next(self) -> np.ndarray:
+        self.counter += round(1.005 * self.rate / FPS)
+        if self.counter > len(self.sound):
+            self.counter = 3 * self.rate + self.counter % 97
+        grey = self.spectrogram.draw(self.counter, lambda start, stop: self.sound[start:stop])
+        picture = np.zeros((SIZE, SIZE, 3), np.uint8)
+        picture[: len(grey)] = grey[:, :, None]
+        kept = self.sound[self.counter - n_kept(self.rate) : self.counter]
+        write_strip(picture, Strip(7, self.counter, self.rate, kept, -90, -20))
+        write_timecode(picture, 7, self.counter)
+        return picture
+
+    def whole(self) -> None:
+        self.new().draw(self.counter, lambda start, stop: self.sound[start:stop])
 
 
-def main() -> None:
-    os.environ.setdefault("SVT_LOG", "1")
-    datasets.disable_progress_bars()
-    parser = parser_for(__doc__, turns=5)
-    parser.add_argument("--paced", action="store_true", help="at the rate of the robot instead; takes 5 minutes")
-    parser.add_argument("--frames", type=int, default=200, help="of an episode")
-    args = parser.parse_args()
-    started = machine()
-    with tempfile.TemporaryDirectory() as folder:
-        if not args.paced:
-            report("recording", measure(Path(folder), args.frames, args.turns), args.output, started)
-            return
-        for number, case in enumerate(PACED):
-            measure_paced(case, Path(folder) / f"case{number}")
-        measure_room(Path(folder))
+def contacts(rate: int, seconds: int = 30) -> np.ndarray:
+    """A quiet room with knocks, some loud and some faint, (n,) int16."""
+    rng, n = np.random.default_rng(0), seconds * rate
+    wave, time_s = rng.normal(0, 8, n), np.arange(rate // 4) / rate
+    for at in rng.uniform(0, seconds - 1, 2 * seconds):
+        knock = np.exp(-time_s / 0.03) * np.sin(2 * np.pi * rng.uniform(300, 5000) * time_s)
+        wave[round(at * rate) :][: len(knock)] += 10 ** rng.uniform(2, 4) * knock
+    return np.clip(np.rint(wave), -32768, 32767).astype(np.int16)
+
+
+def encoded(drawn: Drawn, root: Path) -> Row:
+    """How many timecodes are wrong after encoding, and the spectrogram's error."""
+    camera = {"dtype": "video", "shape": (SIZE, SIZE, 3), "names": ["height", "width", "channels"]}
+    features = {KEY: camera, "action": {"dtype": "float32", "shape": (1,), "names": None}}
+    dataset = LeRobotDataset.create("benchmark/film", FPS, features, root=root)
+    pictures, counters = [], []
+    for _ in range(N_PICTURES):
+        pictures.append(drawn.next())
+        counters.append(drawn.counter)
+        dataset.add_frame({"action": np.zeros(1, np.float32), KEY: pictures[-1], "task": "listen"})
+    dataset.save_episode()
+    dataset.finalize()
+    film = LeRobotDataset("benchmark/film", root=root, video_backend="pyav", return_uint8=True)
+    decoded = [film[i][KEY].permute(1, 2, 0).numpy() for i in range(N_PICTURES)]
+    wrong = sum(read_timecode(picture) != (7, counter) for picture, counter in zip(decoded, counters, strict=True))
+    inside = slice(64, SIZE - drawn.rows)
+    drawn_and_seen = zip(pictures, decoded, strict=True)
+    errors = [np.abs(a[inside, :, 0].astype(int) - b[inside].mean(axis=-1)).mean() for a, b in drawn_and_seen]
+    name = f"{drawn.rate} Hz: error between keyframes, {wrong} of {N_PICTURES} timecodes wrong"
+    return Row(name, float(np.mean(errors[1::2])), "grey levels", "in keyframes", float(np.mean(errors[::2])))
+
+
+def measure(args: argparse.Namespace) -> list[Row]:
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        rows = [as_fast_as_it_goes(folder, args.turns), *at_a_robots_pace(folder)]
+        for rate in (16000, 48000):
+            drawn = Drawn(rate)
+            seconds = medians(in_turns({"next": drawn.next, "whole": drawn.whole}, 20 * args.turns, 5))
+            beside = ("the whole spectrogram", 1e3 * seconds["whole"])
+            rows.append(Row(f"{rate} Hz: a microphone's picture", 1e3 * seconds["next"], "ms", *beside))
+            rows.append(encoded(Drawn(rate), folder / str(rate)))
+    return rows
 
 
 if __name__ == "__main__":
-    main()
+    run(parser_for(__doc__, turns=5), measure)

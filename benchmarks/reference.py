@@ -1,4 +1,4 @@
-"""The published scheme, written plainly: what our training and acting are compared with.
+"""The published scheme, written plainly: what our training and acting are compared with; and our policy on the same noise.
 
 Du et al., "Play it by Ear" (RSS 2022): every training window of ten frames is encoded anew, all ten frames of it, to
 supervise one action; so is the window behind every control step. The sizes are the paper's, and its augmentation is a
@@ -11,11 +11,15 @@ import random
 from collections.abc import Mapping
 
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor, nn
 from torch.nn import functional
 from torchvision.models import resnet18
 from torchvision.transforms import v2
 from torchvision.transforms.v2 import functional as image_functional
+
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 MEMORY_STEPS, FRAME_STACK, IMAGE_SIZE = 10, 3, 224
 SAMPLE_RATE, FPS, SECONDS = 16000, 20, 2
@@ -122,3 +126,53 @@ def random_windows(n: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def _mlp(n_in: int, n_out: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(n_in, 1024), nn.ReLU(), nn.Linear(1024, 1024), nn.ReLU(), nn.Linear(1024, n_out))
+
+
+# Our policy
+
+CAMERA, MICROPHONE, STATE = "observation.images.front", "observation.audio.gripper", "observation.state"
+SAMPLES, PIXELS = 800, 84  # of a frame: 16 kHz at 20 Hz, and the simulation's pictures
+
+
+def make_policy(n_microphones: int = 1, sample_rate: int = 16000, fps: int = 20, **options) -> PlaybyearPolicy:
+    """A new policy on the simulation's observations, of the paper's sizes where the options do not say otherwise."""
+    sound = PolicyFeature(FeatureType.STATE, (sample_rate // fps,))
+    inputs = {
+        CAMERA: PolicyFeature(FeatureType.VISUAL, (3, PIXELS, PIXELS)),
+        **{MICROPHONE + str(i or ""): sound for i in range(n_microphones)},
+        STATE: PolicyFeature(FeatureType.STATE, (7,)),
+    }
+    features = {"input_features": inputs, "output_features": {"action": PolicyFeature(FeatureType.ACTION, (4,))}}
+    rates = {"sample_rate": sample_rate, "fps": fps}
+    return PlaybyearPolicy(PlaybyearConfig(**features, **rates, device="cpu", push_to_hub=False, **options))
+
+
+def bare_resnet(n_frames: int, image_size: int) -> tuple[nn.Module, Tensor]:
+    """The vision encoder's ResNet alone, and frames that are already as it reads them."""
+    policy = make_policy(use_audio=False)
+    encoder = policy.model.vision[CAMERA.removeprefix("observation.").replace(".", "_")]
+    frames = torch.rand(n_frames, 9, image_size, image_size).contiguous(memory_format=torch.channels_last)
+    return encoder.network, frames
+
+
+def random_runs(config: PlaybyearConfig, n: int) -> dict[str, Tensor]:
+    """A training batch of n runs of noise, as `EpisodeStore` gives it: bytes and 16-bit sound."""
+    batch = {STATE: torch.randn(n, config.n_run_frames, 7)}
+    for key in config.camera_keys:
+        batch[key] = torch.randint(0, 256, (n, config.n_image_frames, 3, PIXELS, PIXELS), dtype=torch.uint8)
+    for key in config.audio_keys:
+        batch[key] = (500 * torch.randn(n, config.n_audio_frames, *config.feature_shape(key))).to(torch.int16)
+    batch["action"] = torch.rand(n, config.n_supervised_steps, 4) * 2 - 1
+    return batch
+
+
+def random_observations(n: int) -> list[dict[str, Tensor]]:
+    """Observations of n control steps, noise, as LeRobot hands them to `select_action`."""
+    return [
+        {
+            CAMERA: torch.rand(1, 3, PIXELS, PIXELS),
+            MICROPHONE: 0.02 * torch.randn(1, SAMPLES),
+            STATE: torch.randn(1, 7),
+        }
+        for _ in range(n)
+    ]

@@ -2,20 +2,19 @@
 
 import gc
 import logging
-from functools import cache
+import os
+from pathlib import Path
 
 import pytest
+from support.commands import Commands, remember_docstrings
+from support.shared import ENV, TINY, once, run_in_process
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _options_are_documented_once():
     """draccus searches the sources for the help of all 2,000 options whenever a command starts: here several hundred times."""
-    from draccus.wrappers import docstring
-
     logging.getLogger("draccus").setLevel(logging.INFO)  # else as many lines of what it decodes are kept for each test
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(docstring, "get_attribute_docstring", cache(docstring.get_attribute_docstring))
-        yield
+    remember_docstrings()
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +28,53 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(n_threads)
+
+
+@pytest.fixture(scope="session")
+def shared(tmp_path_factory) -> Path:
+    """A folder that all processes of this run of the tests share; see `once`."""
+    folder = tmp_path_factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+
+@pytest.fixture(scope="session")
+def noise(shared) -> Path:
+    """A dataset of noise with sound, 20 Hz and pictures of 16 pixels: episodes of 12, 17 and 9 frames. Copy it to change it."""
+    from dataset_factory import make_dataset
+
+    return once(shared, "noise", lambda root: make_dataset(root, image_size=16))
+
+
+@pytest.fixture(scope="session")
+def recorded(shared) -> Path:
+    """A dataset of two episodes of the expert in `ENV`. Copy it to change it."""
+    from lerobot_playbyear.scripts.record import main
+
+    def record(root: Path) -> None:
+        data = ("--dataset.repo_id=tests/demos", f"--dataset.root={root}", "--dataset.num_episodes=2")
+        assert run_in_process(main, *ENV, *data, "--num_workers=0") is None
+
+    return once(shared, "recorded", record)
+
+
+@pytest.fixture(scope="session")
+def trained(recorded, shared) -> Path:
+    """A checkpoint, `pretrained_model`, of the policy `TINY` after two updates on `recorded`: it does nothing well."""
+    from lerobot_playbyear.scripts.train import main
+
+    def train(folder: Path) -> None:
+        data = ("--dataset.repo_id=tests/demos", f"--dataset.root={recorded}")
+        assert run_in_process(main, *TINY, *data, "--steps=2", f"--output_dir={folder}") is None
+
+    return once(shared, "trained", train) / "checkpoints/000002/pretrained_model"
+
+
+@pytest.fixture(scope="session")
+def commands(tmp_path_factory):
+    """Runs commands as they are typed, each in a process of its own; see `support/commands.py`."""
+    runner = Commands(tmp_path_factory.mktemp("commands"))
+    yield runner
+    runner.close()
 
 
 def pytest_collection_finish():

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gym_playbyear.arena import TABLE_TOP, loose_box
-from gym_playbyear.options import OptionError, make_definition
+from gym_playbyear.options import make_definition
 from gym_playbyear.rules import Solved
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.task_env import TaskEnv
@@ -83,25 +83,6 @@ def test_rates_are_the_tasks():
     env.close()
 
 
-def place_one_of_two(env, options) -> dict:
-    here, away = ("a", "b") if options["is_a"] else ("b", "a")
-    env.put(here, (0.0, 0.1, TABLE_TOP + 0.02), yaw=0.0)
-    env.take_away(away)
-    return {}
-
-
-def test_a_thing_may_be_left_out_of_an_episode():
-    env = TaskEnv(replace(task(block("a"), block("b")), place=place_one_of_two), sound="none")
-    for is_a in (True, False):
-        env.begin_episode(seed=0, options={"is_a": is_a})
-        here, away = (env.a_position, env.b_position) if is_a else (env.b_position, env.a_position)
-        for _ in range(20):
-            env.advance(STAY)
-        assert here[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
-        assert env.contact_forces["a-table" if is_a else "b-table"] > 0.3
-        np.testing.assert_allclose(away, env.b_position if is_a else env.a_position, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("prop", "message"),
     [
@@ -157,26 +138,6 @@ def test_forces_of_the_hands_parts_are_known_of_loose_things_alone():
         env.hand_forces("wall")
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        (
-            "OccludedGrasp-v1",
-            {"cube_positon": (0, 0.1)},
-            "cube_positon=.*the task's options of reset are cube_position, cube_",
-        ),
-        ("OccludedGrasp-v1", {"cube_position": (0, 0.9)}, "cube_position=.*on the table, nearer than 0.4 m"),
-        ("OccludedPickPlace-v1", {"bin_position": 0.1}, "bin_position=.*give x and y"),
-        ("TellApart-v1", {"pouch_position": (np.nan, 0)}, "pouch_position"),
-        ("KeyBag-Easy-v1", {"botom": 0.1}, "botom=0.1 .*bottom, contents_position"),
-    ],
-)
-def test_a_misspelt_option_of_reset_and_an_impossible_place_are_refused(name, options, message):
-    env = TaskEnv(name, sound="none")
-    with pytest.raises(OptionError, match=message):
-        env.begin_episode(seed=0, options=options)
-
-
 def test_a_material_of_what_is_not_there_is_refused():
     def place(env, options) -> dict:
         env.materials["aa"] = "glass"
@@ -187,22 +148,7 @@ def test_a_material_of_what_is_not_there_is_refused():
         env.begin_episode(seed=0)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"), [({"horizon": 0}, "horizon=0 .*at least 1"), ({"task": lambda: 3}, "an int|a int")]
-)
-def test_what_is_no_task_and_no_time_is_refused(options, message):
-    with pytest.raises(OptionError, match=message):
-        TaskEnv(**{"task": task(block("a")), "sound": "none", **options})
-
-
-def test_unknown_things_of_an_episode_are_no_attributes():
-    env = TaskEnv(task(block("a")), sound="none")
-    with pytest.raises(AttributeError, match="bin_position"):
-        _ = env.bin_position
-
-
-@pytest.mark.parametrize("n_environments", [6, pytest.param(40, marks=pytest.mark.slow)])
-def test_environments_that_are_closed_leave_nothing_open(n_environments):
+def test_environments_that_are_closed_leave_nothing_open():
     def n_open() -> int:
         return len(os.listdir("/proc/self/fd"))
 
@@ -213,6 +159,6 @@ def test_environments_that_are_closed_leave_nothing_open(n_environments):
 
     use()
     before = n_open()
-    for _ in range(n_environments):
+    for _ in range(6):
         use()
     assert n_open() == before

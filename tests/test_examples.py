@@ -1,47 +1,146 @@
 """The examples run as they are printed."""
 
+import json
 import os
+import re
+import runpy
 import subprocess
 import sys
-import wave
+from fractions import Fraction
 from pathlib import Path
 
+import av
+import numpy as np
 import pytest
 from dataset_factory import make_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from lerobot_playbyear.datasets import episode_waveform, read_audio
+from lerobot_playbyear.datasets.repair import check_dataset
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
 
-def run(*command: str | Path) -> str:
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    result = subprocess.run(
-        [str(part) for part in command], capture_output=True, text=True, env={**os.environ, "PATH": path}, check=False
-    )
-    assert result.returncode == 0, result.stderr[-3000:]
-    return result.stdout
+@pytest.fixture
+def run(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLES)  # as where `python examples/...` is called
+
+    def call(name: str, *arguments: str | Path) -> None:
+        monkeypatch.setattr(sys, "argv", [name, *map(str, arguments)])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+
+    return call
 
 
-def test_plain_gymnasium_hears_the_touch():
-    printed = run(sys.executable, EXAMPLES / "play_in_gymnasium.py")
+def load(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("me/example", root=root, video_backend="pyav")
+
+
+def test_the_main_job_with_lerobots_own_commands(commands, tmp_path):
+    """bash says which commands the script runs, and they are run."""
+    programs, said = tmp_path / "programs", tmp_path / "said"
+    programs.mkdir()
+    for name in ("playbyear-record", "lerobot-train", "lerobot-eval"):
+        tell = f"import json, sys; print(json.dumps(['{name}', *sys.argv[1:]]), file=open('{said}', 'a'))"
+        (programs / name).write_text(f'#!/bin/bash\n{sys.executable} -c "{tell}" "$@"\n')
+        (programs / name).chmod(0o755)
+    environment = {**os.environ, "PATH": f"{programs}:{os.environ['PATH']}"}
+    subprocess.run(["bash", EXAMPLES / "by_hand.sh", tmp_path], check=True, env=environment)
+
+    for line in said.read_text().splitlines():
+        result = commands.run(*json.loads(line))
+        assert result.status == 0, result.output[-3000:]
+
+    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
+
+
+def test_plain_gymnasium_hears_the_touch(run, capsys):
+    run("play_in_gymnasium.py")
+    printed = capsys.readouterr().out
     assert "Solved after" in printed
     assert "sweep" in printed
 
 
-def test_a_dataset_is_heard_as_wav(tmp_path):
-    make_dataset(tmp_path / "noise", (12,), image_size=16)
-    run(
-        sys.executable,
-        EXAMPLES / "listen_to_dataset.py",
-        "--repo_id=local/noise",
-        f"--root={tmp_path / 'noise'}",
-        f"--output_dir={tmp_path}",
-    )
-    with wave.open(str(tmp_path / "episode_0_gripper.wav")) as file:
-        assert file.getframerate() == 16000
-        assert file.getnframes() == 12 * 800
+def test_an_environment_of_ones_own_is_recorded_and_two_recordings_merge(run, tmp_path, capsys):
+    run("record_own_environment.py", f"--root={tmp_path / 'one'}", "--episodes=1")
+    run("record_own_environment.py", f"--root={tmp_path / 'one'}", "--episodes=2")  # goes on
+    run("record_own_environment.py", f"--root={tmp_path / 'two'}", "--episodes=1")
+    assert "Episode 1 is safe." in capsys.readouterr().out
+
+    merged = tmp_path / "merged"
+    run("merge_recordings.py", "--roots", tmp_path / "one", tmp_path / "two", f"--root={merged}", "--repo_id=me/both")
+
+    assert "3 episodes" in capsys.readouterr().out
+    assert check_dataset(merged).is_sound
+    for episode, (root, its) in enumerate([("one", 0), ("one", 1), ("two", 0)]):
+        waveform, rate = episode_waveform(load(merged), episode, "observation.audio.finger")
+        np.testing.assert_array_equal(
+            waveform, episode_waveform(load(tmp_path / root), its, "observation.audio.finger")[0]
+        )
+        assert rate == 16000
+    assert np.abs(waveform).max() > 4000  # it knocked
 
 
-@pytest.mark.timeout(900)
-def test_the_main_job_with_lerobots_own_commands(tmp_path):
-    run("bash", EXAMPLES / "by_hand.sh", tmp_path)
-    assert (tmp_path / "eval" / "eval_info.json").exists()
+def test_a_dataset_is_heard_in_ten_lines(run, tmp_path):
+    run("record_own_environment.py", f"--root={tmp_path / 'one'}", "--episodes=1")
+    where = ["--repo_id=me/knock", f"--root={tmp_path / 'one'}", f"--output_dir={tmp_path}"]
+    run("listen_to_dataset.py", *where)
+    samples, _ = read_audio(tmp_path / "episode_0_finger.wav")
+    waveform, _ = episode_waveform(load(tmp_path / "one"), 0, "observation.audio.finger")
+    np.testing.assert_array_equal(samples[:, 0], waveform)
+
+
+def write_film(path: Path, n_frames: int, fps: int, flash: int, sample_rate: int = 48000) -> None:
+    """A film of `n_frames` with a flash and a click at the same time."""
+    with av.open(str(path), "w") as film:
+        video = film.add_stream("libx264", rate=fps)
+        video.width = video.height = 96
+        audio = film.add_stream("aac", rate=sample_rate, layout="stereo")
+        for i in range(n_frames):
+            picture = np.full((96, 96, 3), 255 if i == flash else 30, np.uint8)
+            film.mux(video.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
+        film.mux(video.encode(None))
+        sound = np.zeros((n_frames * sample_rate // fps, 2), np.int16)
+        click = round(flash / fps * sample_rate)
+        sound[click - 100 : click] = 20000
+        frame = av.AudioFrame.from_ndarray(sound.reshape(1, -1), "s16", "stereo")
+        frame.sample_rate, frame.pts, frame.time_base = sample_rate, 0, Fraction(1, sample_rate)
+        film.mux(audio.encode(frame))
+        film.mux(audio.encode(None))
+
+
+def test_a_folder_of_films_becomes_a_dataset(run, tmp_path, capsys):
+    films = tmp_path / "films"
+    films.mkdir()
+    write_film(films / "a.mp4", 60, 30, flash=30)
+    write_film(films / "b.mp4", 45, 30, flash=15)
+    for name, n_frames in (("a", 40), ("b", 30)):
+        np.savetxt(films / f"{name}.csv", np.arange(2 * n_frames).reshape(n_frames, 2), delimiter=",")
+    root = tmp_path / "dataset"
+
+    run("videos_to_dataset.py", f"--films={films}", f"--root={root}", "--task=Knock.")
+
+    assert "b.mp4: episode 1, 1.5 s" in capsys.readouterr().out
+    dataset = load(root)
+    assert [int(length) for length in dataset.meta.episodes["length"]] == [40, 30]
+    assert check_dataset(root).is_sound
+    for episode, flash in ((0, 20), (1, 10)):
+        first = dataset.meta.episodes[episode]["dataset_from_index"]
+        items = [dataset[first + i] for i in range(dataset.meta.episodes[episode]["length"])]
+        assert max(range(len(items)), key=lambda i: items[i]["observation.images.camera"].mean()) == flash
+        loudness = [np.abs(item["observation.audio.camera"].numpy().astype(int)).max() for item in items]
+        assert int(np.argmax(loudness)) == flash  # heard by the time of the picture
+        np.testing.assert_array_equal(items[3]["action"].numpy(), [6, 7])
+
+
+def test_the_pages_programs_run(tmp_path, monkeypatch):
+    """Every Python block of docs/dataset.md, in a folder that holds the dataset of `make demo`."""
+    monkeypatch.chdir(tmp_path)
+    make_dataset(tmp_path / "outputs/demo/dataset", (12,), image_size=16, repo_id="demo/occluded")
+    page = (EXAMPLES.parent / "docs" / "dataset.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
+    assert len(blocks) == 4
+    for block in blocks:
+        exec(compile(block, "docs/dataset.md", "exec"), {})
+    assert read_audio("episode_0.flac")[0].shape == (12 * 800, 1)
+    assert load(tmp_path / "outputs/knocks").num_frames == 60

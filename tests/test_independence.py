@@ -1,32 +1,6 @@
 """The two distributions do without each other: tasks without torch and LeRobot, the policy without MuJoCo."""
 
-import os
-import subprocess
-import sys
-
-_BLOCKER = """
-import sys
-
-class Blocker:
-    def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {blocked!r}:
-            raise ModuleNotFoundError(f"blocked: {{name}}")
-
-sys.meta_path.insert(0, Blocker())
-"""
-
-
-def run_without(blocked: set[str], code: str) -> str:
-    script = _BLOCKER.format(blocked=blocked) + code
-    result = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "MUJOCO_GL": "egl"},
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    return result.stdout
+from support.commands import run_without
 
 
 def test_the_tasksrun_without_torch_and_lerobot():

@@ -133,7 +133,9 @@ def test_a_picture_carries_its_samples_and_one_wrong_bit_is_noticed(rate, tmp_pa
     assert read_strip(np.zeros((224, 224, 3), np.uint8)) is None
 
 
-@pytest.mark.parametrize("options", [{}, {"streaming_encoding": True}], ids=["after", "streaming"])
+@pytest.mark.parametrize(
+    "options", [{}, {"streaming_encoding": True, "encoder_queue_maxsize": 150}], ids=["after", "streaming"]
+)
 def test_timecodes_survive_lerobots_video_encoder_at_its_defaults(options, tmp_path):
     session, counters = Session(tmp_path, sound(8)), counters_of(150)
     root = recorded(tmp_path / "heard", session, [counters], video=True, **options)

@@ -166,8 +166,6 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
     Raises:
         HubError: There is no whole dataset in the folder, somebody writes to it, or it could not be uploaded.
     """
-    from lerobot.datasets import CODEBASE_VERSION
-
     folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
     check_name("dataset.repo_id", repo_id, needs_user=True)
     options.check()
@@ -184,6 +182,8 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
             raise HubError(f"Not pushed. {error}") from error
 
         def upload() -> str:
+            from lerobot.datasets import CODEBASE_VERSION
+
             _check_unchanged(folder, before)
             repository = _create(repo_id, "dataset", options.private)
             # LeRobot reads every file in data/: one that is no longer there must go.

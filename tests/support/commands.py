@@ -5,6 +5,7 @@ Each command has its own arguments, environment, output and exit status. What is
 """
 
 import contextlib
+import gc
 import importlib
 import json
 import os
@@ -17,6 +18,7 @@ import threading
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,16 @@ _COMMANDS = {
     for entry in metadata.entry_points(group="console_scripts")
     if entry.name.startswith(("playbyear-", "lerobot-"))
 }
+_BLOCKER = """
+import sys
+
+class Blocker:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {blocked!r}:
+            raise ModuleNotFoundError(f"blocked: {{name}}")
+
+sys.meta_path.insert(0, Blocker())
+"""
 _IMPORTED = ("lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval", "lerobot_env_playbyear")
 
 
@@ -100,6 +112,20 @@ class Commands:
         self._process.communicate()
 
 
+def run_without(blocked: set[str], code: str) -> str:
+    """What a program prints in a process in which some packages cannot be imported."""
+    script = _BLOCKER.format(blocked=blocked) + code
+    result = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "MUJOCO_GL": "egl"},
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
 def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
     while not done.wait(0.005):
         if when():
@@ -118,6 +144,7 @@ def _serve() -> None:
             importlib.import_module(module)
     if "HF_ENDPOINT" in os.environ:
         _check_cards_there()
+    _read_options()
     for line in sys.stdin:
         job = json.loads(line)
         pid = os.fork()
@@ -134,6 +161,29 @@ def _check_cards_there() -> None:
     RepoCard.validate = lambda card, repo_type=None: HfApi()._validate_yaml(
         str(card), repo_type=repo_type or card.repo_type
     )
+
+
+def _read_options() -> None:
+    """What a command takes longest for: draccus searches the sources for the help of all 2,000 options."""
+    from draccus.argparsing import ArgumentParser
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+    from list_options import CONFIGS  # type: ignore[import-not-found]
+
+    remember_docstrings()
+    register_third_party_plugins()
+    for config in CONFIGS.values():
+        ArgumentParser(config)
+    gc.collect()
+    gc.freeze()
+
+
+def remember_docstrings() -> None:
+    """Searches the sources for the help of an option once, and not whenever a command is run in this process."""
+    from draccus.wrappers import docstring
+
+    docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
 
 
 def _run(job: dict[str, Any]) -> None:

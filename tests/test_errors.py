@@ -1,0 +1,404 @@
+"""What is refused: in one line, before any work, with the option, its value and what would work.
+
+A row is a command that works, changed by some options (`-name` takes one away), and what its message says, between bars. What
+stands in braces is made when the first row names it. A command that refuses leaves nothing in `{out}`. The second table is of
+what is refused to whoever calls the package: a function below, its arguments, and the same.
+"""
+
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from dataset_factory import MICROPHONE, dataset_features, make_dataset
+from lerobot.datasets import LeRobotDataset
+from support.shared import ENV, TINY
+
+from gym_playbyear.task_env import TaskEnv
+from lerobot_playbyear.datasets import write_audio
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+
+BASE = {
+    "record": f"playbyear-record {' '.join(ENV)} --dataset.repo_id=t/new --dataset.root={{out}}/new --num_workers=0",
+    "train": f"playbyear-train {' '.join(TINY)} --dataset.repo_id=t/noise --dataset.root={{noise}} --steps=1 "
+    "--output_dir={out}/train",
+    "dagger": f"playbyear-dagger {' '.join(ENV)} --policy.path={{policy}} --demos.repo_id=tests/demos "
+    "--demos.root={demos} --interventions.repo_id=t/corrections --interventions.root={out}/corrections --eval_every=0 "
+    "--batch_size=4 --warmup_episodes=1 --updates_per_episode=2 --output_dir={out}/dagger",
+    "learn": "playbyear-dagger --policy.path={policy} --demos.repo_id=tests/demos --demos.root={demos} "
+    "--interventions.repo_id=t/corrections --interventions.root={demos} --episodes=0 --updates=2 --batch_size=4 "
+    "--output_dir={out}/dagger",
+    "attach-audio": "playbyear-attach-audio --dataset.repo_id=t/silent --dataset.root={silent} --output.repo_id=t/heard "
+    "--output.root={out}/heard --files={sounds}/{{episode:03d}}.wav --microphone=gripper --offset=0.25",
+    "session": "playbyear-attach-audio --dataset.repo_id=t/silent --dataset.root={silent} --output.repo_id=t/heard "
+    "--output.root={out}/heard --session={sounds}/day.wav --clock={sounds}/starts.csv --microphone=gripper",
+    "attach-spectrogram": "playbyear-attach-spectrogram --dataset.repo_id=t/noise --dataset.root={noise} "
+    "--output.repo_id=t/seen --output.root={out}/seen --seconds=0.5",
+    "inspect": "playbyear-inspect --dataset.repo_id=t/noise --dataset.root={noise}",
+    "repair": "playbyear-repair --root={noise}",
+    "push": "playbyear-push --dataset.repo_id=me/set --dataset.root={noise}",
+    "push policy": "playbyear-push --policy.path={policy} --policy.repo_id=me/policy",
+    "video": f"playbyear-video {' '.join(ENV)} --output={{out}}/film.mp4",
+    "find-microphones": "playbyear-find-microphones",
+}
+
+COMMANDS = """
+# Told from the command line alone
+train | --bach_size=3 | --bach_size is no option; did you mean --batch_size?
+train | --datset.root=x | did you mean --dataset.root?
+train | --policy.image_sise=3 | did you mean --policy.image_size?
+train | --steps=many | --steps=many: wanted a whole number
+train | --dataset.eval_split=long | --dataset.eval_split=long: wanted a number
+train | --resume=perhaps | --resume=perhaps: wanted true or false
+train | --steps | --steps needs a value
+train | cpu | 'cpu' is no option
+train | -dataset.repo_id | --dataset.repo_id is needed
+record | -env.type | --env.type is needed
+repair | --dry-run=true | did you mean --dry_run?
+# Places
+record | --dataset.root={noise} | {noise} already holds a dataset | resume=true
+record | --dataset.root={full} --resume=true | {full} is not empty and holds no dataset
+record | --dataset.root={file}/new | Cannot write | {file}
+record | --dataset.root={noise} --resume=true | {noise} does not fit | seed is absent there | choose another root
+train | --output_dir={full} | {full} already exists | resume
+train | --output_dir={file}/run | --output_dir={file}/run cannot be written: Not a directory | wanted
+train | --dataset.root={truncated} | file-000.parquet' is truncated | playbyear-repair --root={truncated}
+dagger | --output_dir={file} | --output_dir={file} cannot be written | wanted
+dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagger
+dagger | --output_dir={full} --resume=true | {full} holds files, but no run of playbyear-dagger
+dagger | --interventions.root={demos} | --demos and --interventions are the same dataset | of their own
+dagger | --interventions.root={out}/dagger | --output_dir={out}/dagger lies in the folder of --interventions
+attach-audio | --output.root={file}/heard | --output.root={file}/heard cannot be written: Not a directory | wanted
+attach-audio | --output.root={noise} | {noise} | is there already
+attach-audio | --dataset.root={out}/no | There is no dataset in {out}/no
+attach-spectrogram | --output.root={demos} | {demos} | is there already
+attach-spectrogram | --dataset.root={out}/no | There is no dataset in {out}/no
+inspect | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no' | Check --dataset.root
+inspect | --dataset.root={full} | it has no meta/info.json
+inspect | --dataset.root={truncated} | {truncated} | file-000.parquet | playbyear-repair --root={truncated}
+inspect | --html={file}/page.html | The page cannot be written | {file}
+repair | --root={out}/no | {out}/no holds no LeRobotDataset
+repair | --like={full} | {full}/meta/info.json
+push | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no'
+push policy | --policy.path={noise} | there is no checkpoint with config.json | {noise}
+video | --output={out}/film | --output={out}/film: films are mp4 | ends with .mp4
+video | --output={folder_mp4} | --output={folder_mp4}: that is a folder; give the name of a file
+video | --output={file}/film.mp4 | {file}/film.mp4 cannot be written: Not a directory
+# Names on the Hub
+record | --dataset.push_to_hub=true --dataset.repo_id=t/no+name | repo_id='t/no+name'
+train | --policy.push_to_hub=true | 'repo_id' argument missing
+train | --policy.push_to_hub=true --policy.repo_id=me/no+name | policy.repo_id='me/no+name' cannot be pushed
+dagger | --policy.push_to_hub=true | --policy.push_to_hub=true needs a name: give --policy.repo_id
+dagger | --policy.push_to_hub=true --policy.repo_id=me/no+name | repo_id='me/no+name' cannot be pushed
+push | -dataset.repo_id -dataset.root | Give either --dataset.repo_id
+push | --policy.path={policy} | Give either --dataset.repo_id
+push | -dataset.repo_id | needs --dataset.repo_id, the dataset's name on the Hub
+push | --dataset.repo_id=nameless | 'nameless' | give it as user/name
+push | --dataset.repo_id=me/no+name | dataset.repo_id='me/no+name' cannot be pushed: Repo id
+push | --preview={noise}/meta/info.json | {noise}/meta/info.json | cards show mp4
+push policy | -policy.repo_id | needs --policy.repo_id, the policy's name on the Hub
+push policy | --policy.repo_id=me/no+name | policy.repo_id='me/no+name' cannot be pushed: Repo id
+# Environments
+record | --env.task=Nope-v1 | `env.task`: 'Nope-v1' | OccludedGrasp-v1 | KeyBag-Hard-v1
+record | --env.sound=loud | `env.sound`: 'loud' | waveform, contact_force, none
+record | --env.sample_rate=16001 | `env.sample_rate`: 16001 | a multiple of 20
+record | --env.fps=30 | `env.fps`: 30 | give 20, or leave it out
+record | --env.microphones=[] | env.microphones | at least one
+record | --env.microphones=[ceiling] | does not start | ceiling | gripper
+record | --env.visualization_width=100 | `env.visualization_width`: 100 | square
+record | --env.image_size=4 | `env.image_size`: 4 | 8 or more
+record | --env.noise_level=-1 | `env.noise_level`: -1.0 | 0 (silent) or more
+record | --env.render_mode=video | `env.render_mode`: 'video' | rgb_array, human
+record | --env.episode_length=0 | `env.episode_length`: 0 | 1 or more
+record | --env.room_noise_level=8 | `env.room_noise_level`: 8.0 | name a WAV file with --env.room_noise
+record | --env.room_noise={out}/no.wav | env.room_noise | {out}/no.wav | no such file
+record | --env.microphone_response=vinyl | `env.microphone_response`: 'vinyl' | flat, phone, dull, boomy
+record | --env.sound=none --env.microphone_response=phone | env.microphone_response | no sound
+record | --env.attempts_file={full} | attempts_file | {full} | it is a folder, give a file
+record | '--env.task_options={{colour: blue}}' | {'colour': 'blue'} | OccludedGrasp-v1 has no such option
+record | --env.task=TellApart-v1 '--env.task_options={{contents: gravel}}' | gravel | screws, peanuts
+record | --env.spectrogram={out}/no | {out}/no | cannot be read
+record | --env.spectrogram={noise} | {noise} | names no pictures of sound
+# Recording
+record | --dataset.rgb_encoder.vcodec=h264 | --dataset.rgb_encoder | give --dataset.video=true
+record | --expert.type=test | --expert.type | test | scripted
+record | --expert.type=teleop --expert.speed=0 | speed=0
+record | --expert.type=teleop --expert.gripper_cooldown_s=-1 | gripper_cooldown_s=-1
+record | --expert.type=teleop --expert.steps_per_second=0 | steps_per_second=0
+record | --expert.type=teleop --expert.takeover_key=f1 | takeover_key='f1' | a letter, a digit
+record | --expert.type=teleop --expert.takeover_key=e | takeover_key='e' means something else
+record | --expert.type=teleop --expert.takeover=press | takeover='press' | give hold or toggle
+record | --expert.type=teleop | No window can be opened (DISPLAY='')
+# Training
+train | --preset=tpu | --preset=tpu is not known | cpu | gpu | paper
+train | --preset=paper --policy.type=act | --preset=paper is for --policy.type=playbyear, not for act
+train | --store=tape | --store=tape is not known: wanted one of memory, disk, auto
+train | --dataset.streaming=true | --dataset.streaming does not work | --store=disk
+train | --dataset.image_transforms.enable=true | --dataset.image_transforms.enable does not work | lerobot-train
+train | --dataset.root={slow} | 10 frames per second | configured for 20 | --policy.fps=10
+train | --dataset.root={deaf} | observation.audio | --policy.use_audio=false
+train | --policy.sample_rate=48001 | sample_rate / fps = 48001 / 20
+train | --policy.audio_window_s=0.5 | audio_window_s | too few for 4 convolutions
+train | --policy.audio_encoder=nobody | --policy.audio_encoder=nobody | spectrogram_cnn | lerobot_policy_
+train | --policy.vision_encoder=nobody | --policy.vision_encoder=nobody | resnet18 | lerobot_policy_
+train | --policy.audio_steps=[nobody] | --policy.audio_steps names 'nobody' | lerobot_policy_
+train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
+# Corrections
+dagger | -env.type -env.task -env.image_size | give --env.type and --env.task, or --episodes=0 --updates=N
+dagger | -policy.path | HG-DAgger improves a trained policy: give | --policy.path
+dagger | --batch_size=5 | --batch_size=5 must be even
+dagger | --warmup_episodes=0 | --warmup_episodes=0: give at least 1
+dagger | --learning_rate=0 | --learning_rate=0.0 must be above 0
+dagger | --updates=5 | --updates is for --episodes=0
+dagger | --episodes=0 | give --updates
+dagger | --eval_every=1 --eval.n_episodes=0 | --eval.n_episodes=0: give at least 1, or --eval_every=0
+dagger | --skip_s=-1 | --skip_s=-1.0: give 0 or more seconds
+dagger | --new_weights=true | --new_weights=true: a policy that knows nothing cannot be corrected
+dagger | --method.type=redo --skip_s=1 | --skip_s=1 | --method.type=redo the expert chooses every frame
+dagger | --method.type=robot_gated --method.intervention_share=1.5 | intervention_share=1.5: give a share
+dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
+dagger | --expert.type=scripted --expert.person=true --expert.tremor=-1 | --expert.tremor=-1 | give 0 or more
+dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --policy.path
+dagger | --env.sample_rate=8000 | 'observation.audio.gripper' is int16 (800,) at 16000 Hz there | --env.*
+dagger | --env.image_size=20 | 'observation.images.front' is picture (16, 16, 3) there and picture (20
+dagger | --env.sound=none | 'observation.audio.gripper' is int16 | there and absent here
+dagger | --env.microphones=[ceiling] | does not start | ceiling
+dagger | --demos.root={slow} | has 10 frames per second, and the policy is configured for 20
+dagger | --demos.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
+dagger | --demos.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)
+dagger | --demos.root={five_actions} | 'action' has shape (5,) | trained with (4,)
+dagger | --demos.root={deaf} | observation.audio.gripper
+dagger | --demos.root={24_pixels} | 'observation.images.front' has shape (24, 24, 3)
+learn | --interventions.root={untagged} | wanted 'intervention', bool (1,), and there is no such feature
+learn | --interventions.root={uncorrected} | None of the 5 frames | has 'intervention' set
+learn | --interventions.root={empty} | {empty} | is empty
+learn | --interventions.root={six_joints} | 'observation.state' is float32 (7,) there and float32 (6,)
+# Sound that is attached
+attach-audio | --files=nowhere/{{episode}}.wav | episode 0, nowhere/0.wav: There is no sound file | episode 1,
+attach-audio | --files=sound.wav | --files=sound.wav | {episode}
+attach-audio | --offset=3 | episode 0, | it lasts 0.850 s; 12 frames | Correct the offset
+attach-audio | --microphone=left,right | 1 channels, and --microphone names 2
+attach-audio | --channel=4 | there is no --channel=4
+attach-audio | --offsets={out}/no.json | {out}/no.json | is no list of numbers
+attach-audio | --files={sounds}/odd/{{episode:03d}}.wav | 11025 samples per second | 20 | --sample_rate=11020
+attach-audio | --dataset.root={noise} | 'observation.audio.gripper' is in the dataset already
+attach-audio | --session={sounds}/day.wav | both are given. Give one
+session | -session | is for --files and one --session
+session | --session={out}/no.wav | There is no sound file | {out}/no.wav
+session | -clock | playbyear_clock.json. Give --clock=times.csv
+session | --marks=1.0 | '1.0' is no mark; wanted seconds in the sound file = seconds on the clock
+session | --marks=1=5,2=5 | the same time on the clock
+session | --marks=10=1,20=5 | 2.5000 seconds of sound in a second of the clock
+session | --microphone=left,right | 1 channels, and --microphone names 2
+attach-spectrogram | --microphones=[nose] | --microphones names 'nose'; the dataset has gripper
+attach-spectrogram | --microphones=[] | --microphones names none
+attach-spectrogram | --name=front | 'observation.images.front' is in the dataset already
+attach-spectrogram | --seconds=3 | 60 frames do not fit into 16 columns | at most 0.80
+attach-spectrogram | --seconds=0 | --seconds=0 | above 0
+attach-spectrogram | --height=3 | --height=3 | 8 to 4096 pixels
+attach-spectrogram | --low_db=10 --high_db=-10 | --low_db=10 | the second above the first
+attach-spectrogram | --crf=10 | --crf | for --video=true
+attach-spectrogram | --dataset.root={deaf} | 't/noise' has no sound in columns | playbyear-attach-audio
+# Films, inspection, microphones
+video | --seed=-1 | seed=-1: give 0 or more
+video | --attempts=0 | attempts=0: give at least 1
+video | --baseline=deaf | no blind baseline 'deaf'; there are: | search
+video | --policy.path={policy} --baseline=search | --baseline=search: it acts without a policy
+inspect | --action_range=[1,-1] | action_range=[1.0, -1.0]
+find-microphones | --seconds=0 | seconds=0
+"""
+
+CALLS = """
+# The policy's configuration
+policy | fps: 0 | fps must be at least 1, got 0
+policy | dtype: half | --policy.dtype must be one of auto, float32, bfloat16, float16, got 'half'
+policy | action_range: 0.0 | --policy.action_range must be above 0 and finite, got 0
+policy | audio_colour_db: -1.0 | --policy.audio_colour_db must be at least 0 dB
+policy | audio_noise_files: here | audio_noise_files=here | how loud | --policy.audio_noise_db=24
+policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (off) and finite, got -1.0
+policy | auxiliary_way: .inf | --policy.auxiliary_way must be at least 0
+policy | low_dimensional_offset: -0.1 | --policy.low_dimensional_offset must be at least 0 (none) and finite, got -0.1
+policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4
+policy | memory_readers: -1 | --policy.memory_readers must be at least 0 (none) and finite, got -1
+policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memory_displacement_gain is 0: give 10
+# Environments
+task | sound: loud | sound='loud'
+task | sample_rate: 16001 | 16001
+task | image_size: 2 | image_size=2
+task | horizon: 0 | horizon=0 | at least 1
+task | microphones: [hat] | 'hat' | name at least one of gripper
+task | cube_material: jelly | cube_material='jelly' is not known
+task | room: {noise: no.wav} | room_noise='no.wav' | no such file
+task | room: {noise_level: -1.0} | room_noise_level=-1.0
+task | room: {response: vinyl} | response='vinyl' | flat, phone, dull, boomy
+reset | OccludedGrasp-v1, {cube_positon: [0, 0.1]} | cube_positon= | the task's options of reset are cube_position
+reset | OccludedGrasp-v1, {cube_position: [0, 0.9]} | cube_position= | on the table, nearer than 0.4 m
+reset | OccludedPickPlace-v1, {bin_position: 0.1} | bin_position= | give x and y
+reset | TellApart-v1, {pouch_position: [.nan, 0]} | pouch_position
+reset | TellApart-v1, {contents: gravel} | contents='gravel' is not known: choose one of screws, peanuts
+reset | KeyBag-Easy-v1, {botom: 0.1} | botom=0.1 | bottom, contents_position
+# Features of a microphone that is recorded, of 80 samples at 1600 Hz and 20 frames per second
+feature | info: {} | does not say its sample rate
+feature | info: null | does not say its sample rate
+feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz
+feature | info: {sample_rate: '1600'} | sample_rate '1600' | whole number of Hz
+feature | info: {sample_rate: true} | sample_rate True | whole number of Hz
+feature | info: {sample_rate: -1600} | positive integer
+feature | info: {sample_rate: 1601} | a frame must hold a whole number of samples
+feature | info: {sample_rate: 3200} | has shape (80,) | must be (160,)
+feature | dtype: int32 | dtype 'int32'; wanted 'int16'
+feature | dtype: string | dtype 'string'; wanted 'int16'
+feature | shape: [80, 2] | every microphone is its own key
+feature | shape: [80, 1] | wanted (80,)
+feature | shape: [] | must be (80,)
+action | dtype: float33 | 'action' has dtype 'float33'
+action | shape: [0] | 'action' has shape (0,)
+action | shape: null | 'action' has shape None
+action | dtype: null | 'action' has dtype None
+# A microphone's options
+microphone | file: null | nothing: give one of device, file and tone_hz
+microphone | tone_hz: 440.0 | file and tone_hz: give one
+microphone | sample_rate: 0 | sample_rate=0
+microphone | channel: -1 | channel=-1
+microphone | gain_db: .nan | gain_db=nan
+microphone | low_db: -10.0 | low_db=-10.0
+microphone | high_db: .inf | high_db=inf
+microphone | width: 90 | width=96
+microphone | width: 225 | both even
+"""
+
+
+def reset(task: str, options: dict) -> None:
+    TaskEnv(task, sound="none").reset(seed=0, options=options)
+
+
+def record(features: dict) -> None:
+    DurableWriter("t/new", "never", 20, features)
+
+
+SOUND = {"dtype": "int16", "shape": [80], "names": None, "info": {"sample_rate": 1600, "encoding": "pcm_s16"}}
+ACTION = {"dtype": "float32", "shape": [4], "names": None}
+FUNCTIONS: dict[str, Callable] = {
+    "policy": PlaybyearConfig,
+    "task": lambda **options: TaskEnv("OccludedGrasp-v1", **options),
+    "reset": reset,
+    "feature": lambda **changes: record({MICROPHONE: tuples(SOUND | changes), "action": tuples(ACTION)}),
+    "action": lambda **changes: record({"action": tuples(ACTION | changes)}),
+    "microphone": lambda **changes: MicrophoneCameraConfig(**{"file": "x.wav", "sample_rate": 16000, **changes}),
+}
+
+
+def tuples(feature: dict) -> dict:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in feature.items()}
+
+
+def with_noise(**features: object) -> Callable[[Path], object]:
+    """Makes a dataset of five frames of noise."""
+    fps = features.get("fps", 20)
+    options = dataset_features(**{"image_size": 16, **features})
+    return lambda root: make_dataset(root, (5,), fps, features=options)
+
+
+def without(*keys: str) -> dict[str, dict]:
+    return {key: feature for key, feature in dataset_features(image_size=16).items() if key not in keys}
+
+
+def uncorrected(root: Path) -> None:
+    features = dataset_features(image_size=16)
+    dataset = LeRobotDataset.create("t/uncorrected", 20, features, root=root, use_videos=False)
+    for _ in range(5):
+        zeros = {
+            key: np.zeros(feature["shape"], feature["dtype"].replace("image", "uint8"))
+            for key, feature in features.items()
+        }
+        dataset.add_frame({**zeros, "task": "Wait."})
+    dataset.save_episode()
+    dataset.finalize()
+
+
+def truncated(root: Path) -> None:
+    make_dataset(root, (5,), image_size=16)
+    (path,) = (root / "data").glob("*/*.parquet")
+    path.write_bytes(path.read_bytes()[:-50])
+
+
+def sounds(folder: Path) -> None:
+    """Of `silent`: a file for each episode, at two rates, and one of the session with times of its episodes."""
+    for episode, length in enumerate((12, 17)):
+        for rate, place in ((16000, folder), (11025, folder / "odd")):
+            write_audio(place / f"{episode:03d}.wav", np.ones((round((0.25 + length / 20) * rate), 1), np.int16), rate)
+    write_audio(folder / "day.wav", np.zeros((16000 * 5, 1), np.int16), 16000)
+    (folder / "starts.csv").write_text("0,1\n1,2\n")
+
+
+MAKERS: dict[str, Callable[[Path], object]] = {
+    "full": lambda folder: (folder.mkdir(), (folder / "thesis.tex").touch()),
+    "file": Path.touch,
+    "folder_mp4": Path.mkdir,
+    "silent": lambda root: make_dataset(root, (12, 17), features=without(MICROPHONE)),
+    "slow": with_noise(fps=10),
+    "48_kHz": with_noise(sample_rate=48000),
+    "six_joints": with_noise(state_size=6),
+    "five_actions": with_noise(action_size=5),
+    "24_pixels": with_noise(image_size=24),
+    "deaf": with_noise(microphones=()),
+    "untagged": lambda root: make_dataset(root, (5,), features=without("intervention")),
+    "uncorrected": uncorrected,
+    "empty": lambda root: LeRobotDataset.create("t/empty", 20, without(), root=root, use_videos=False).finalize(),
+    "truncated": truncated,
+    "sounds": sounds,
+}
+
+
+class Places(dict):
+    """Where what rows name in braces is; made when it is named first."""
+
+    def __missing__(self, name: str) -> Path:
+        place = self["made"] / name.replace("_", ".")
+        MAKERS[name](place)
+        self[name] = place
+        return place
+
+
+@pytest.fixture(scope="module")
+def places(noise, recorded, trained, tmp_path_factory):
+    return Places(made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained)
+
+
+def rows_of(table: str) -> list:
+    rows = [tuple(row.split(" | ")) for row in table.strip().splitlines() if not row.startswith("#")]
+    return [pytest.param(which, what, said, id=f"{which}, {what}") for which, what, *said in rows]
+
+
+@pytest.mark.parametrize(("base", "changes", "said"), rows_of(COMMANDS))
+def test_a_refusal_names_the_option_the_value_and_what_works(base, changes, said, commands, places, tmp_path):
+    places["out"] = tmp_path
+    command, *options = shlex.split(BASE[base].format_map(places))
+    given = {option.partition("=")[0]: option for option in options}
+    for change in shlex.split(changes.format_map(places)):
+        if re.match("-[a-z]", change):
+            del given[f"-{change}"]
+        else:
+            given[change.partition("=")[0]] = change
+    result = commands.run(command, *given.values(), environment={"DISPLAY": "", "WAYLAND_DISPLAY": ""})
+    message = result.output[result.output.find("error: ") :]
+    for text in said:
+        assert re.sub(r"\{(\w+)\}", lambda name: str(places.get(name[1], name[0])), text) in message
+    assert result.status > 0
+    assert "Traceback" not in message
+    assert not list(tmp_path.iterdir()), "something was written"
+
+
+@pytest.mark.parametrize(("function", "arguments", "said"), rows_of(CALLS))
+def test_whoever_calls_the_package_is_told_too(function, arguments, said):
+    given = yaml.safe_load(f"[{arguments}]" if function == "reset" else f"{{{arguments}}}")
+    with pytest.raises(Exception) as refused:  # noqa: PT011  (what is asserted is what it says)
+        FUNCTIONS[function](*given) if isinstance(given, list) else FUNCTIONS[function](**given)
+    for text in said:
+        assert text in str(refused.value)
+    assert not Path("never").exists()
