@@ -17,7 +17,7 @@ from lerobot.teleoperators.keyboard import (
     KeyboardTeleopConfig,
 )
 
-from gym_playbyear.arm import ArmConfig, CartesianController
+from gym_playbyear.panda import CartesianController, Panda
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
 from lerobot_playbyear.dagger.config import DatasetSource
@@ -135,9 +135,9 @@ def test_directions_that_are_none_are_refused(directions):
 
 def test_the_gripper_is_told_what_the_arm_carries_out():
     """Whatever is wished, following the arm's own rule leaves both in the same state."""
-    controller = CartesianController(ArmConfig(), control_hz=20)
+    controller = CartesianController(Panda(), control_hz=20)
     controller.reset(np.array([-0.12, 0.0, 0.98]))
-    gripper, rng = Gripper(round(ArmConfig().gripper_cooldown * 20)), np.random.default_rng(0)
+    gripper, rng = Gripper(round(Panda().gripper_cooldown * 20)), np.random.default_rng(0)
     n_changes = n_ignored = 0
     for _ in range(400):
         close, was_closed = bool(rng.random() < 0.5), gripper.is_closed
@@ -231,11 +231,11 @@ def test_a_message_that_was_cut_off_is_none():
 
 def test_only_the_newest_is_shown_and_a_picture_until_there_is_another():
     picture, newest = np.zeros((2, 2, 3), np.uint8), Newest()
-    newest.put(Status(step=1), picture)
-    newest.put(Status(step=2), None)
+    newest.set_pose(Status(step=1), picture)
+    newest.set_pose(Status(step=2), None)
     assert newest.take() == (Status(step=2), picture)
     assert newest.take() is None
-    newest.put(Status(step=3), None)
+    newest.set_pose(Status(step=3), None)
     assert newest.take() == (Status(step=3), None)
 
 
