@@ -1,9 +1,55 @@
-"""What all gates of a scripted expert share: who acts in this step, and until which of its stages a correction lasts."""
+"""What the scripts share: motions, pauses and noise; and who acts in a step, the expert or a policy, and for how long."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+from gym_playbyear.panda import ACTION_SCALE
+
+
+class Script:
+    """What scripts share that know the task's true state: a phase, pauses, noise, steps towards a goal.
+
+    Args:
+        env: The unwrapped environment, after `reset`.
+
+    Attributes:
+        phase: What it is doing.
+        rng: Where its speeds, pauses and noise come from.
+    """
+
+    GAIN = 0.5  # share of the remaining distance covered per step
+    NOISE = 0.0025  # m: uniform, either way, added to every displacement
+    phase: str
+
+    def __init__(self, env: Any):
+        self.env = env
+        self.rng: np.random.Generator = env.expert_rng
+        self._wait = 0  # steps of a pause that are left
+
+    def _action(self, displacement: np.ndarray, closes: bool) -> np.ndarray:
+        """The action (4,) that moves the hand so far [m]."""
+        return np.append(np.clip(displacement / ACTION_SCALE, -1, 1), 1.0 if closes else -1.0).astype(np.float32)
+
+    def _noise(self) -> np.ndarray:
+        return self.rng.uniform(-self.NOISE, self.NOISE, 3)
+
+    def _has_waited(self) -> bool:
+        """Whether the pause is over; if not, this is one step of it."""
+        if self._wait == 0:
+            return True
+        self._wait -= 1
+        return False
+
+    def _near(self, goal: np.ndarray, tolerance: float) -> bool:
+        return bool(np.linalg.norm(goal - self.env.eef_position) < tolerance + self.NOISE)
+
+    def _step_towards(self, goal: np.ndarray, max_step: float) -> np.ndarray:
+        """(3,) a part of the way to a point, at most so long [m]."""
+        displacement = self.GAIN * (goal - self.env.eef_position)
+        length = float(np.linalg.norm(displacement))
+        return displacement * min(1.0, max_step / length) if length > 0 else displacement
 
 
 class StagedGate:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gym_playbyear.experts.base import StagedGate
+from gym_playbyear.experts.base import Script, StagedGate
 from gym_playbyear.panda import ACTION_SCALE, TIP_BELOW_HAND
 from gym_playbyear.tasks.arena import TABLE_TOP
 from gym_playbyear.tasks.bag import BAG, BAG_MIDDLE, CONTENTS, RIM, bottom_height, middle_of
@@ -35,7 +35,7 @@ def has_two_ears(env: Any) -> bool:
     return set(FINGERS) <= set(env.microphones)
 
 
-class BagExpert:
+class BagExpert(Script):
     """Finds what is in the bag by touch, grasps it and lifts it out.
 
     Args:
@@ -62,13 +62,12 @@ class BagExpert:
     OUT = 0.055  # the hand above the rim, at the end
 
     def __init__(self, env):
-        self.env = env
-        self.rng: np.random.Generator = env.expert_rng
+        super().__init__(env)
         draw = self.rng.uniform
         self.fast, self.slow, self.search_step = (draw(*limits) for limits in (self.FAST, self.SLOW, self.SEARCH_STEP))
         self.entry: np.ndarray = BAG_MIDDLE + draw(-self.AIM, self.AIM, 2)
         self.turn = int(self.rng.choice(env.definition.numbers.sides))  # where it looks for the things first
-        self.phase, self._wait, self._closed_for = "enter", 0, 0
+        self.phase, self._closed_for = "enter", 0
         self._aim, self._way = self.entry, list[float]()
         self._touched_at = float(env.eef_position[2])  # height of the hand at the last touch [m, world]
         self._bottom: float | None = None  # and where it felt the bag's bottom
@@ -95,7 +94,7 @@ class BagExpert:
             displacement *= step / length
         if goal is not None and self.phase != "hold":
             displacement = displacement + self.rng.uniform(-1, 1, 3) * self.NOISE
-        return np.append(np.clip(displacement / ACTION_SCALE, -1, 1), 1.0 if close else -1.0).astype(np.float32)
+        return self._action(displacement, close)
 
     # One method per phase: it returns where to (3,) [m, world], or None to stay, how fast, and whether the fingers shall close.
 
@@ -233,13 +232,6 @@ class BagExpert:
         if self._wait == 0 and self.rng.random() < self.PAUSE_PROBABILITY:
             self._wait = int(self.rng.integers(*self.PAUSE, endpoint=True))
         return not self._has_waited()
-
-    def _has_waited(self) -> bool:
-        """Whether the pause is over; if not, this is one step of it."""
-        if self._wait == 0:
-            return True
-        self._wait -= 1
-        return False
 
 
 class TallThingsExpert(BagExpert):

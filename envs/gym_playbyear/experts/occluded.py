@@ -8,11 +8,12 @@ is when the sound comes.
 
 import numpy as np
 
+from gym_playbyear.experts.base import Script
 from gym_playbyear.panda import ACTION_SCALE, FINGER_THICKNESS
 from gym_playbyear.tasks.arena import CUBE_HALF_SIZE, LINE_X, TABLE_TOP
 
 
-class GraspExpert:
+class GraspExpert(Script):
     """Grasps the hidden cube by touch, lifts it and holds it still.
 
     The hand comes down where it is above the cube and not on the way there, and it shows that only the touch tells where that
@@ -29,10 +30,8 @@ class GraspExpert:
     HIGHER = (0.0, 0.012)  # by which sweeps, and hops, are higher than that
     TRAVEL_HEIGHT = 0.12
     MARGIN = 0.015  # between finger and the nearest possible cube at the start of the sweep
-    GAIN = 0.5  # share of the remaining distance covered per step
     MAX_STEP = 0.02
     TOLERANCE = 0.004
-    NOISE = 0.0025  # uniform, either way, added to every displacement
     CONTACT_FORCE = 0.2  # N
     SQUEEZE_FORCE = 20.0  # N, both fingers together: they hold
     SWEEP_STEP = (0.005, 0.008)
@@ -49,11 +48,9 @@ class GraspExpert:
     HOLD_HEIGHT = 0.085  # above the table, where it holds still
 
     def __init__(self, env):
-        self.env = env
-        self.rng: np.random.Generator = env.expert_rng
+        super().__init__(env)
         self.contact_y = np.nan  # where the hand was when it felt the cube
         self.lift_drift: np.ndarray = np.zeros(2)
-        self._wait = 0
         self._begin()
 
     def _begin(self) -> None:
@@ -91,11 +88,10 @@ class GraspExpert:
             displacement, close = np.zeros(3), False
         else:
             displacement, close = getattr(self, f"_{self.phase}")()
-        move = (displacement + self._noise()) / ACTION_SCALE
-        return np.append(np.clip(move, -1, 1), 1.0 if close else -1.0).astype(np.float32)
+        return self._action(displacement + self._noise(), close)
 
     def _noise(self) -> np.ndarray:
-        return np.zeros(3) if self.phase == "hold" else self.rng.uniform(-self.NOISE, self.NOISE, 3)
+        return np.zeros(3) if self.phase == "hold" else super()._noise()
 
     # One method per phase: it returns the displacement (3,) [m] and whether the fingers shall close.
 
@@ -197,25 +193,12 @@ class GraspExpert:
             self.phase = next_phase
         return self._towards(goal), False
 
-    def _has_waited(self) -> bool:
-        """Whether the pause is over; if not, this is one step of it."""
-        if self._wait == 0:
-            return True
-        self._wait -= 1
-        return False
-
     def _on_line(self, y: float, height: float) -> np.ndarray:
         """A point on the line of the sweep, so high above the table (3,) [m, world frame]."""
         return np.array([LINE_X, y, TABLE_TOP + height])
 
-    def _near(self, goal: np.ndarray, tolerance: float) -> bool:
-        return bool(np.linalg.norm(goal - self.env.eef_position) < tolerance + self.NOISE)
-
     def _towards(self, goal: np.ndarray, max_step: float | None = None) -> np.ndarray:
-        displacement = self.GAIN * (goal - self.env.eef_position)
-        length = float(np.linalg.norm(displacement))
-        limit = max_step or self.MAX_STEP
-        return displacement * min(1.0, limit / length) if length > 0 else displacement
+        return self._step_towards(goal, max_step or self.MAX_STEP)
 
 
 class PickPlaceExpert(GraspExpert):

@@ -7,11 +7,11 @@ two seconds sees in what part of the task it is.
 
 import numpy as np
 
-from gym_playbyear.panda import ACTION_SCALE
+from gym_playbyear.experts.base import Script
 from gym_playbyear.tasks.arena import TABLE_TOP
 
 
-class PouchExpert:
+class PouchExpert(Script):
     """Lifts the pouch, drops it and waits; then lifts it again or leaves it.
 
     Args:
@@ -29,8 +29,7 @@ class PouchExpert:
     REST = ((-0.12, -0.02), (0.20, 0.28), (0.92, 1.0))  # where a hand goes that leaves the pouch
 
     def __init__(self, env):
-        self.env = env
-        self.rng: np.random.Generator = env.expert_rng
+        super().__init__(env)
         self.was_dropped = False
         self._begin()
 
@@ -46,9 +45,7 @@ class PouchExpert:
         """The action (4,) in [-1, 1] for the environment's present state."""
         displacement, close = getattr(self, f"_{self.phase}")()
         still = self.phase in ("keep", "rest")
-        noise = np.zeros(3) if still else self.rng.uniform(-self.NOISE, self.NOISE, 3)
-        move = (displacement + noise) / ACTION_SCALE
-        return np.append(np.clip(move, -1, 1), 1.0 if close else -1.0).astype(np.float32)
+        return self._action(displacement + (np.zeros(3) if still else self._noise()), close)
 
     def wants_to_lift(self) -> bool:
         """Whether to lift the pouch again; asked once, when it was dropped and listened to."""
@@ -121,21 +118,9 @@ class PouchExpert:
     def _holds(self) -> bool:
         return bool(self.env.finger_positions.sum() > self.HOLDING)
 
-    def _has_waited(self) -> bool:
-        """Whether the pause is over; if not, this is one step of it."""
-        if self._wait == 0:
-            return True
-        self._wait -= 1
-        return False
-
     def _over_pouch(self, height: float) -> np.ndarray:
         """A point above the pouch, so high above the table (3,) [m, world frame]."""
         return np.array([*self.env.position("pouch")[:2], TABLE_TOP + height])
 
-    def _near(self, goal: np.ndarray, tolerance: float) -> bool:
-        return bool(np.linalg.norm(goal - self.env.eef_position) < tolerance + self.NOISE)
-
     def _towards(self, goal: np.ndarray) -> np.ndarray:
-        displacement = self.GAIN * (goal - self.env.eef_position)
-        length = float(np.linalg.norm(displacement))
-        return displacement * min(1.0, self.step / length) if length > 0 else displacement
+        return self._step_towards(goal, self.step)
