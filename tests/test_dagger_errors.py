@@ -115,7 +115,7 @@ def test_without_an_environment_or_a_policy(tmp_path):
 
 
 def test_an_environment_without_a_gate(tmp_path, monkeypatch):
-    from gym_playbyear.task_env import TaskEnv
+    from gym_playbyear.environment import TaskEnv
 
     wanted = r"needs an environment with `intervention_gate\(\)`.*own_expert.py"
     monkeypatch.setattr(TaskEnv, "intervention_gate", None)

@@ -17,7 +17,7 @@ from dataset_factory import MICROPHONE, dataset_features, make_dataset
 from lerobot.datasets import LeRobotDataset
 from support.shared import ENV, TINY
 
-from gym_playbyear.task_env import TaskEnv
+from gym_playbyear.environment import TaskEnv
 from lerobot_playbyear.datasets import write_audio
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig

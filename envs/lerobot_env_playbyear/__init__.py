@@ -3,8 +3,7 @@
 LeRobot's scripts find this package by its name and import it; nothing needs to be imported by hand.
 """
 
-from lerobot_env_playbyear.config import PlaybyearEnvConfig
-from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
+from lerobot_env_playbyear.config import PcmToFloatProcessorStep, PlaybyearEnvConfig
 
 __version__ = "0.1.0"
 

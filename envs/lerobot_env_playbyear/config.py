@@ -7,28 +7,55 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+import torch
 from draccus.utils import DecodingError
 from gymnasium.vector import AutoresetMode
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
-from lerobot.processor import PolicyProcessorPipeline
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
+from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE, OBS_STR
 
 from gym_playbyear import register_tasks
-from gym_playbyear.options import OptionError, make_definition
-from gym_playbyear.plugins import PluginError
+from gym_playbyear.environment import SOUND_MODES
+from gym_playbyear.registry import OptionError, PluginError, make_definition
 from gym_playbyear.room import RESPONSES
 from gym_playbyear.task import Task
 from lerobot_env_playbyear.attempts import with_attempts_file
-from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 
 if TYPE_CHECKING:  # of the other distribution, which is needed for these pictures alone
     from lerobot_playbyear.audio.sound_picture import SoundPicture
 
-SOUND_MODES = ("waveform", "contact_force", "none")
 RENDER_MODES = ("rgb_array", "human")
 _STATE_DIM, _ACTION_DIM, _FORCE_DIM = 7, 4, 6
+OBS_AUDIO_PREFIX = OBS_PREFIX + "audio."
+PCM_FULL_SCALE = 32768.0  # int16: samples are in [-32768, 32767]
+
+
+@dataclass
+@ProcessorStepRegistry.register(name="playbyear_pcm_to_float")
+class PcmToFloatProcessorStep(ObservationProcessorStep):
+    """Scales the PCM of an environment's microphones from int16's range to [-1, 1].
+
+    The environment gives `audio.<mic>` as int16 at full scale; LeRobot's `preprocess_observation` makes floats of it
+    without scaling them. This step divides every `observation.audio.<mic>`, (B, S) float32 or integer, by 32768, so
+    that floats are in [-1, 1] again wherever a policy sees them. It runs once per step, in `lerobot-eval` and in
+    `lerobot-train`'s evaluation, both of which ask the environment's configuration for it.
+
+    For environments of other people the policy's distribution has the same step, `playbyear_pcm16_to_float`; neither of the
+    two distributions needs the other.
+    """
+
+    def observation(self, observation: dict) -> dict:
+        for key, value in observation.items():
+            if key.startswith(OBS_AUDIO_PREFIX):
+                observation[key] = torch.as_tensor(value).to(torch.float32) / PCM_FULL_SCALE  # (B, S)
+        return observation
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
 
 
 @EnvConfig.register_subclass("playbyear")
