@@ -86,7 +86,7 @@ def test_what_can_be_told_from_options_and_files_is_told_before_lerobot_is_impor
         assert "exit: error: Not pushed. " in push
         assert "exit: error: " in attach
     repair, train = answers(("playbyear-repair", "--root=/no/such"), ("playbyear-train", DATA, "--preset=tpu"))
-    assert "exit: error: /no/such holds no LeRobotDataset" in repair
+    assert "/no/such holds no LeRobotDataset" in repair
     assert "exit: error: --preset=tpu is not known" in train
 
 

@@ -131,7 +131,7 @@ record | --expert.type=teleop --expert.speed=0 | speed=0
 record | --expert.type=teleop --expert.gripper_cooldown_s=-1 | gripper_cooldown_s=-1
 record | --expert.type=teleop --expert.steps_per_second=0 | steps_per_second=0
 record | --expert.type=teleop --expert.takeover_key=f1 | takeover_key='f1' | a letter, a digit
-record | --expert.type=teleop --expert.takeover_key=e | takeover_key='e' means something else
+record | --expert.type=teleop --expert.takeover_key=e | takeover_key='e': it means something else
 record | --expert.type=teleop --expert.takeover=press | takeover='press' | give hold or toggle
 record | --expert.type=teleop | No window can be opened (DISPLAY='')
 # Training
@@ -218,9 +218,9 @@ CALLS = """
 policy | fps: 0 | fps must be at least 1, got 0
 policy | dtype: half | --policy.dtype must be one of auto, float32, bfloat16, float16, got 'half'
 policy | action_range: 0.0 | --policy.action_range must be above 0 and finite, got 0
-policy | audio_colour_db: -1.0 | --policy.audio_colour_db must be at least 0 dB
+policy | audio_colour_db: -1.0 | --policy.audio_colour_db must be at least 0 (none)
 policy | audio_noise_files: here | audio_noise_files=here | how loud | --policy.audio_noise_db=24
-policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (off) and finite, got -1.0
+policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (none) and finite, got -1.0
 policy | auxiliary_way: .inf | --policy.auxiliary_way must be at least 0
 policy | low_dimensional_offset: -0.1 | --policy.low_dimensional_offset must be at least 0 (none) and finite, got -0.1
 policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4

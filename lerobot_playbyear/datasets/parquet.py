@@ -228,6 +228,8 @@ def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
     Raises:
         ValueError: If rows are missing or of different lengths.
     """
+    if column.null_count:
+        raise ValueError(f"{column.null_count} of {len(column)} rows are missing")
     parts = [_flat(chunk) for chunk in column.chunks]
     flat = np.concatenate(parts) if parts else np.empty(0)
     if not _is_list(column.type):
