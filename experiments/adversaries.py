@@ -31,7 +31,7 @@ from experiments.recurrent_player import (
     play_episode,
     save_checkpoint,
 )
-from gym_playbyear.adversaries.players import EXPERT
+from gym_playbyear.check.report import EXPERT
 
 DEMONSTRATION_SEED = 10000
 TRIAL_SEED = 20000  # of the episodes that the curve is measured on

@@ -10,7 +10,7 @@ import argparse
 import gymnasium as gym
 import numpy as np
 
-from gym_playbyear.bag_contents import CONTENTS, CONTENTS_KINDS
+from gym_playbyear.tasks.bag import CONTENTS, CONTENTS_KINDS
 
 _TASK, _FIRST_SEED = "gym_playbyear:gym_playbyear/KeyBag-Easy-v1", 2000
 _HEARD_FROM = 500.0  # Hz: below are hum and rumble
@@ -21,10 +21,10 @@ def successes(contents: str, n_episodes: int, script: str | None = None) -> floa
     env = gym.make(_TASK, sound="none", contents=contents).unwrapped
     solved = 0
     for seed in range(_FIRST_SEED, _FIRST_SEED + n_episodes):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         player, done, info = env.blind_baselines()[script] if script else env.scripted_expert(), False, {}
         while not done:
-            _, terminated, truncated, info = env.advance(player.act())
+            _, terminated, truncated, info = env.step_physics(player.act())
             done = terminated or truncated
         solved += info["is_success"]
     return solved / n_episodes

@@ -33,7 +33,7 @@ from experiments.protocol import (
     shown,
 )
 from experiments.training import Job, evaluate, side_by_side, train
-from gym_playbyear.cube import CUBE_MATERIALS
+from gym_playbyear.tasks.occluded import CUBE_MATERIALS
 
 N_DEMONSTRATIONS_TRIED = (3, 5, 10, 20, 50, 100)
 ROOM_SEED = 7

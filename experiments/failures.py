@@ -20,7 +20,7 @@ import numpy as np
 from lerobot.utils.random_utils import set_seed
 
 from experiments.landings import CUBES, HopRecorder, asked_for, parser_of
-from gym_playbyear.occluded_pick_place import PLACE_TOLERANCE
+from gym_playbyear.tasks.occluded import PLACE_TOLERANCE
 from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.play import Actor, play
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
@@ -40,12 +40,12 @@ class FailureRecorder(HopRecorder):
         self._cubes: list[tuple[float, float, float]] = []
         self._held: list[bool] = []
         result = super().reset(**options)
-        self._first_z = float(self.env.unwrapped.cube_position[2])  # type: ignore[attr-defined]
+        self._first_z = float(self.env.unwrapped.position("cube")[2])  # type: ignore[attr-defined]
         return result
 
     def step(self, action: Any) -> Any:
         result, world = super().step(action), self.env.unwrapped
-        self._cubes.append(tuple(world.cube_position))  # type: ignore[attr-defined]
+        self._cubes.append(tuple(world.position("cube")))  # type: ignore[attr-defined]
         self._held.append(world.contact_forces["gripper-cube"] > 0)  # type: ignore[attr-defined]
         return result
 

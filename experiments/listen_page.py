@@ -111,10 +111,10 @@ def film(scene: Scene, output: Path) -> np.ndarray:
 
 
 def _solves(env, seed: int) -> bool:
-    env.begin_episode(seed=seed)
+    env.reset_physics(seed=seed)
     expert, done, info = env.scripted_expert(), False, {}
     while not done:
-        _, terminated, truncated, info = env.advance(expert.act())
+        _, terminated, truncated, info = env.step_physics(expert.act())
         done = terminated or truncated
     return bool(info["is_success"])
 

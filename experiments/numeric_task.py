@@ -12,8 +12,8 @@ import numpy as np
 from gymnasium import spaces
 
 from experiments.numeric_terms import N_SHOWN, N_TRUTH, terms_of
-from gym_playbyear.adversaries.view import DeafTask, DeafView
-from gym_playbyear.arm import ACTION_SCALE
+from gym_playbyear.check.deaf import DeafTask, DeafView
+from gym_playbyear.panda import ACTION_SCALE
 
 N_HEARD = 4
 N_PLAYER = 17 + N_SHOWN + N_HEARD

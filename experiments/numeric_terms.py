@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from gym_playbyear.adversaries.view import DeafTask
-from gym_playbyear.arena import TABLE_TOP
-from gym_playbyear.bag import BAG, RIM, bottom_height
-from gym_playbyear.bag_contents import CONTENTS, middle_of
-from gym_playbyear.bag_experts import finger_forces, has_two_ears
+from gym_playbyear.check.deaf import DeafTask
+from gym_playbyear.experts.key_bag import finger_forces, has_two_ears
+from gym_playbyear.tasks.arena import LINE_X, TABLE_TOP
+from gym_playbyear.tasks.bag import BAG, CONTENTS, RIM, bottom_height, middle_of
+from gym_playbyear.tasks.tell_apart import AWAY
 
 N_SHOWN = 10
 N_TRUTH = 8
@@ -49,7 +49,7 @@ class Terms:
 
     def middle(self, shown: dict[str, np.ndarray]) -> np.ndarray:
         """(3,) a point that the camera shows, from which the hand's place is counted [m, world]."""
-        return np.array([self.task.facts.line_x, np.mean(shown["hidden_range"]), TABLE_TOP + 0.05])
+        return np.array([LINE_X, np.mean(shown["hidden_range"]), TABLE_TOP + 0.05])
 
     def shown(self, shown: dict[str, np.ndarray], hand: np.ndarray) -> list[float]:
         """At most `N_SHOWN` numbers of about unit size: what the camera shows, and the hand's height where it matters."""
@@ -170,7 +170,7 @@ class PouchTerms(Terms):
         rattle = max(
             force for pair, force in forces.items() if pair.startswith(self.pieces) or f"-{self.pieces}" in pair
         )
-        return np.array([rattle if self.env.contents == _SCREWS else 0.0, forces["gripper-pouch"]])
+        return np.array([rattle if self.env.secrets["contents"] == _SCREWS else 0.0, forces["gripper-pouch"]])
 
     def holds(self, closes: bool) -> bool:
         near = np.linalg.norm(self.place() - self.env.eef_position) < 0.035
@@ -178,13 +178,13 @@ class PouchTerms(Terms):
 
     def truth(self, closes: bool) -> list[float]:
         known = super().truth(closes)
-        return [*known[:4], float(self._was_dropped()), known[5], 1.0 if self.env.contents == _SCREWS else -1.0]
+        return [*known[:4], float(self._was_dropped()), known[5], 1.0 if self.env.secrets["contents"] == _SCREWS else -1.0]
 
     def worth(self, shown: dict[str, np.ndarray], closes: bool) -> float:
         """Over the pouch, around it, holds it, lifts it; 4 once it was dropped, and then the same again or away from it."""
         place, hand = self.place(), self.env.eef_position
-        if self._was_dropped() and self.env.contents != _SCREWS:
-            away = float(np.linalg.norm(place - hand)) / self.env.variant.away
+        if self._was_dropped() and self.env.secrets["contents"] != _SCREWS:
+            away = float(np.linalg.norm(place - hand)) / AWAY
             return 4.0 + 2.0 * min(away, 1.2)
         worth = 4.0 if self._was_dropped() else 0.0
         worth += 0.5 * self._approach(place, hand, TABLE_TOP + self.grasp_height)
@@ -193,7 +193,7 @@ class PouchTerms(Terms):
         return worth
 
     def _was_dropped(self) -> bool:
-        return bool(self.env.success_rule.course.was_dropped)
+        return bool(self.env._success.course.was_dropped)
 
 
 def terms_of(task: DeafTask) -> Terms:

@@ -16,8 +16,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from experiments.numeric_task import N_PLAYER, NumericTask
-from gym_playbyear.adversaries.players import EXPERT, deaf_scripts
-from gym_playbyear.arm import ACTION_SCALE
+from gym_playbyear.check.report import EXPERT, deaf_scripts
+from gym_playbyear.panda import ACTION_SCALE
 
 _BATCH = 16  # demonstrations
 
@@ -76,7 +76,7 @@ class RecurrentPlayer(RecurrentActorCriticPolicy):
 
 
 def demonstrations(env: NumericTask, teacher: str, seeds: range) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Solved episodes of a teacher, in the learner's terms.
+    """Success episodes of a teacher, in the learner's terms.
 
     Args:
         env: The task in numbers.
@@ -103,7 +103,7 @@ def demonstrations(env: NumericTask, teacher: str, seeds: range) -> list[tuple[n
             env.begin_action()
             for _ in range(env.repeat):
                 taken.append(expert.act() if expert else script.act(env.view))
-                done, info = env.advance(taken[-1])
+                done, info = env.step_physics(taken[-1])
                 if done:
                     break
             move = np.mean([action[:3] for action in taken], axis=0) * ACTION_SCALE / env.step_size

@@ -16,7 +16,7 @@ import numpy as np
 
 import gym_playbyear  # noqa: F401  registers the tasks
 from experiments.protocol import EVALUATION_SEEDS, RESULTS, command_line, save
-from gym_playbyear.occluded_pick_place import BIN_Y, BIN_Y_RANGE
+from gym_playbyear.tasks.occluded import BIN_Y, BIN_Y_RANGE
 
 STUDY = "sightless"
 TASKS = ("OccludedGrasp-v1", "OccludedPickPlace-v1")
@@ -41,14 +41,14 @@ class Mistold:
 
 def guess(env: Any, rng: np.random.Generator) -> dict[str, Any]:
     """What another episode's picture shows."""
-    env.begin_episode(seed=int(rng.choice(_OTHER_EPISODES)))
+    env.reset_physics(seed=int(rng.choice(_OTHER_EPISODES)))
     return {name: env.shown[name] for name in SHOWN if name in env.shown}
 
 
 def everywhere(env: Any, _: np.random.Generator) -> dict[str, Any]:
     """All places of the cube, and the middle of those of the tray."""
-    middle = np.array([0.0, BIN_Y - BIN_Y_RANGE / 2, env.bin_position[2]]) if "bin_position" in env.shown else None
-    return {"hidden_range": env.variant.cube_y} | ({} if middle is None else {"bin_position": middle})
+    middle = np.array([0.0, BIN_Y - BIN_Y_RANGE / 2, env.position("bin")[2]]) if "bin_position" in env.shown else None
+    return {"hidden_range": env.definition.numbers.cube_y} | ({} if middle is None else {"bin_position": middle})
 
 
 SCRIPTS = {"guess": guess, "everywhere": everywhere}
@@ -60,13 +60,13 @@ def attempts(task: str, script: str, seeds: range) -> list[str]:
     task_env: Any = env.unwrapped
     rng, ends = np.random.default_rng(0), []
     for seed in seeds:
-        task_env.begin_episode(seed=seed)
+        task_env.reset_physics(seed=seed)
         told = SCRIPTS[script](task_env, rng)
-        task_env.begin_episode(seed=seed)
+        task_env.reset_physics(seed=seed)
         expert = task_env.definition.expert(Mistold(task_env, told))
         done = False
         while not done:
-            _, terminated, truncated, info = task_env.advance(expert.act())
+            _, terminated, truncated, info = task_env.step_physics(expert.act())
             done = terminated or truncated
         ends.append(info["end"])
     env.close()

@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.protocol import command_line
 from experiments.sound_scenes import Scene, box_on_table, box_pulled, listen, two_fingers
-from gym_playbyear.sound_v2 import Bending
+from gym_playbyear.sound import Bending
 
 _RATE = 16000
 _LOUDER = 8.0  # so that a listener hears without turning up the volume; the page says so

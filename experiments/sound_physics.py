@@ -16,7 +16,7 @@ import numpy as np
 
 from experiments.protocol import RESULTS, command_line
 from experiments.sound_scenes import CONTROL_HZ, Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
-from gym_playbyear.sound_v2 import ContactSynth
+from gym_playbyear.sound import Synthesizer
 
 _STEPS = (0.002, 0.001)  # s: the physics steps that are compared
 _TOLERANCE_DB, _TOLERANCE = 1.5, 0.10
@@ -169,7 +169,7 @@ def cost() -> str:
     contacts, still = scene.contacts(0.6), np.zeros(scene.n_substeps)
     for count in (1, 2):
         ears = dict(list(scene.ears.items())[:count])
-        synth = ContactSynth(scene.pairs, list(ears), 16000, CONTROL_HZ, scene.model.opt.timestep)
+        synth = Synthesizer(scene.pairs, list(ears), 16000, CONTROL_HZ, scene.model.opt.timestep)
         times = []
         for _ in range(20):
             start = time.thread_time()

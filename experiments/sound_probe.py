@@ -6,8 +6,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from gym_playbyear.arena import CUBE_HALF_SIZE, TABLE_TOP
-from gym_playbyear.arm import FINGER_THICKNESS
+from gym_playbyear.panda import FINGER_THICKNESS
+from gym_playbyear.tasks.arena import CUBE_HALF_SIZE, TABLE_TOP
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.script import Script
 
@@ -62,7 +62,7 @@ class SoundProbe(gym.Wrapper):
         super().__init__(env)
         self._mode, self._donors = mode, donors
         self._task: Any = env.unwrapped
-        self._reach = self._task.variant.arm.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
+        self._reach = self._task.definition.arm.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         if seed is None:
@@ -74,7 +74,7 @@ class SoundProbe(gym.Wrapper):
         self._actions: list[np.ndarray] = []
         self._y: list[float] = []  # of the hand, after each of them
         if self._mode != "muted":
-            lower, upper = self._task.variant.cube_y
+            lower, upper = self._task.definition.numbers.cube_y
             y = lower + (upper - lower) / 4 * float(self._rng.integers(1, 5)) - _FAR_END
             options = {**(options or {}), "cube_position": (0.0, y)}
         return self.env.reset(seed=seed, options=options)
@@ -112,7 +112,7 @@ class SoundProbe(gym.Wrapper):
         touched = self._task.contact_forces["gripper-cube"] > 0
         if self._mode == "muted":
             return touched and self._is_sweeping()
-        way = float(self._task.cube_position[1]) - self._y[-1] - self._reach
+        way = float(self._task.position("cube")[1]) - self._y[-1] - self._reach
         if touched or way < _FREE_WAY or not self._is_sweeping():
             return False
         self._wait -= 1

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from gym_playbyear.contact_kinematics import ContactReader, Contacts, SoundingPair, add_sensors
-from gym_playbyear.sound_v2 import Bending, ContactSynth
+from gym_playbyear.contacts import ContactPair, ContactReader, Contacts, add_sensors
+from gym_playbyear.sound import Bending, Synthesizer
 
 CONTROL_HZ = 20
 HALF = 0.02  # m, of the box
@@ -29,7 +29,7 @@ class Scene:
     """
 
     model: mujoco.MjModel
-    pairs: list[SoundingPair]
+    pairs: list[ContactPair]
     ears: dict[str, np.ndarray] = field(default_factory=lambda: {"table": np.array([0.1, 0.0, 0.0])})
 
     def __post_init__(self) -> None:
@@ -50,10 +50,10 @@ class Scene:
             steps.append(self.reader.read(sensors[0]))
         return steps
 
-    def synth(self, sample_rate: int = 16000, **options) -> ContactSynth:
+    def synth(self, sample_rate: int = 16000, **options) -> Synthesizer:
         """A synthesiser for this scene; nothing is random and there is no background, unless `options` say so."""
         options = {"noise_level": 0.0, "randomise": False, **options}
-        return ContactSynth(self.pairs, list(self.ears), sample_rate, CONTROL_HZ, self.model.opt.timestep, **options)
+        return Synthesizer(self.pairs, list(self.ears), sample_rate, CONTROL_HZ, self.model.opt.timestep, **options)
 
 
 def box_on_table(
@@ -66,7 +66,7 @@ def box_on_table(
     box = spec.worldbody.add_body(name="box", pos=[0, 0, HALF])
     box.add_joint(type=_FREE)
     box.add_geom(type=_BOX, size=[HALF] * 3, mass=mass, friction=[0.01, 0.005, 0.0001], solref=[softness, 1])
-    scene = _scene(spec, [SoundingPair(("box", "table"), materials)])
+    scene = _scene(spec, [ContactPair(("box", "table"), materials)])
     scene.data.qpos[2] += 0.03 * speed if speed else -1e-4
     scene.data.qvel[2] = -speed
     scene.model.opt.gravity[2] *= not speed  # it arrives as fast as it left
@@ -89,7 +89,7 @@ def box_pulled(
             name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name, gainprm=[gain, *[0.0] * 9],
             biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=[*bias, *[0.0] * 7],
         )  # fmt: skip
-    scene = _scene(spec, [SoundingPair(("box", "table"), materials)])
+    scene = _scene(spec, [ContactPair(("box", "table"), materials)])
     scene.data.ctrl[:] = (speed, -force)
     return scene
 
@@ -110,13 +110,13 @@ def two_fingers(
             biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=[0.0, 0.0, -100.0, *[0.0] * 7], forcerange=[-20, 20],
             forcelimited=mujoco.mjtLimited.mjLIMITED_TRUE,
         )  # fmt: skip
-    pairs = [SoundingPair(("left_finger", "right_finger"), (materials[0], materials[0]), stop="left_finger")]
+    pairs = [ContactPair(("left_finger", "right_finger"), (materials[0], materials[0]), stop="left_finger")]
     if box:
         body = spec.worldbody.add_body(name="box", pos=[0, shift, HALF])
         body.add_joint(type=_FREE)
         body.add_geom(type=_BOX, size=[HALF] * 3, density=2000, contype=2, conaffinity=3, solref=[0.005, 1])
-        pairs += [SoundingPair((f"{side}_finger", "box"), materials) for side in ("left", "right")]
-        pairs.append(SoundingPair(("box", "table"), (materials[1], "table")))
+        pairs += [ContactPair((f"{side}_finger", "box"), materials) for side in ("left", "right")]
+        pairs.append(ContactPair(("box", "table"), (materials[1], "table")))
     scene = _scene(spec, pairs)
     scene.ears = {"left_finger": np.array([0, 0.03, 0.06]), "right_finger": np.array([0, -0.03, 0.06])}
     scene.data.qpos[:2] = 0.0275
@@ -127,7 +127,7 @@ def two_fingers(
 
 
 def listen(
-    scene: Scene, steps: list[Contacts], synth: ContactSynth | None = None, seed: int = 0,
+    scene: Scene, steps: list[Contacts], synth: Synthesizer | None = None, seed: int = 0,
     finger_speed: float | list[np.ndarray] = 0.0, bending: dict[str, Bending] | None = None,
 ) -> dict[str, np.ndarray]:  # fmt: skip
     """What each microphone hears of some control steps, int16; the fingers' speed [m/s] is one, or of every physics step."""
@@ -168,6 +168,6 @@ def _table(spec: mujoco.MjSpec, softness: float) -> None:
     table.add_geom(type=_PLANE, size=[2, 2, 0.1], friction=[0.4, 0.005, 0.0001], solref=[softness, 1])
 
 
-def _scene(spec: mujoco.MjSpec, pairs: list[SoundingPair]) -> Scene:
+def _scene(spec: mujoco.MjSpec, pairs: list[ContactPair]) -> Scene:
     add_sensors(spec, pairs)
     return Scene(spec.compile(), pairs)

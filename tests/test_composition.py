@@ -9,11 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from gym_playbyear.arena import TABLE_TOP, loose_box
-from gym_playbyear.options import OptionError, make_definition
-from gym_playbyear.rules import Solved
+from gym_playbyear.environment import TaskEnv
+from gym_playbyear.registry import OptionError, make_definition
 from gym_playbyear.task import Prop, Task
-from gym_playbyear.task_env import TaskEnv
+from gym_playbyear.tasks.arena import TABLE_TOP, loose_box
+from gym_playbyear.terminations import Success
 
 STAY = np.array([0, 0, 0, -1.0])
 
@@ -24,7 +24,7 @@ def never(env) -> bool:
 
 def put_on_table(env, options) -> dict:
     for number, prop in enumerate(prop for prop in env.definition.props if prop.loose):
-        env.put(prop.name, (0.0, 0.1, TABLE_TOP + 0.03 + 0.05 * number), yaw=0.0)
+        env.set_pose(prop.name, (0.0, 0.1, TABLE_TOP + 0.03 + 0.05 * number), yaw=0.0)
     return {}
 
 
@@ -36,13 +36,19 @@ def task(*props: Prop, **traits) -> Task:
     """A table with some things on it."""
     cube_task = make_definition("OccludedGrasp-v1", {})
     return replace(
-        cube_task, props=props, place=put_on_table, success=Solved(never), ends=(), felt=None, numbers=None, **traits
+        cube_task,
+        props=props,
+        initialize_episode=put_on_table,
+        success=Success(never),
+        terminations=(),
+        force_proxy_of=None,
+        **traits,
     )
 
 
 def test_which_contacts_are_measured_follows_from_the_parts():
     env = TaskEnv(task(block("a"), block("b")), sound="none")
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     pairs = [("gripper", "a"), ("gripper", "b"), ("a", "b"), ("gripper", "table"), ("a", "table"), ("b", "table")]
     assert list(env.pairs) == pairs
     assert list(env.contact_forces) == ["-".join(pair) for pair in pairs]
@@ -52,10 +58,10 @@ def test_which_contacts_are_measured_follows_from_the_parts():
 def test_loose_things_may_lie_on_each_other(bits):
     body = '<body name="{0}"><freejoint name="{0}"/><geom type="box" size=".02 .02 .02" mass=".1" {1}/></body>'
     env = TaskEnv(task(*(Prop(name, body.format(name, bits), "cube", loose=True) for name in "ab")), sound="none")
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     for _ in range(10):
-        env.advance(STAY)
-    assert env.b_position[2] > env.a_position[2] + 0.035
+        env.step_physics(STAY)
+    assert env.position("b")[2] > env.position("a")[2] + 0.035
     assert env.contact_forces["a-b"] > 0.5
 
 
@@ -65,10 +71,10 @@ def test_a_prop_may_be_an_mjspec():
     body.add_freejoint(name="ball")
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0, 0], density=500)
     env = pickle.loads(pickle.dumps(TaskEnv(task(Prop("ball", spec, "cube", loose=True)), sound="none")))
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     for _ in range(10):
-        env.advance(STAY)
-    assert env.ball_position[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
+        env.step_physics(STAY)
+    assert env.position("ball")[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
 
 
 def test_rates_are_the_tasks():
@@ -77,29 +83,10 @@ def test_rates_are_the_tasks():
     assert observation["audio.gripper"].shape == (9600,)
     assert env.metadata["render_fps"] == 5
     before = env.data.time
-    flags = [env.advance(STAY)[2] for _ in range(7)]
+    flags = [env.step_physics(STAY)[2] for _ in range(7)]
     assert env.data.time - before == pytest.approx(7 / 5)
     assert flags == [False] * 6 + [True]
     env.close()
-
-
-def place_one_of_two(env, options) -> dict:
-    here, away = ("a", "b") if options["is_a"] else ("b", "a")
-    env.put(here, (0.0, 0.1, TABLE_TOP + 0.02), yaw=0.0)
-    env.take_away(away)
-    return {}
-
-
-def test_a_thing_may_be_left_out_of_an_episode():
-    env = TaskEnv(replace(task(block("a"), block("b")), place=place_one_of_two), sound="none")
-    for is_a in (True, False):
-        env.begin_episode(seed=0, options={"is_a": is_a})
-        here, away = (env.a_position, env.b_position) if is_a else (env.b_position, env.a_position)
-        for _ in range(20):
-            env.advance(STAY)
-        assert here[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
-        assert env.contact_forces["a-table" if is_a else "b-table"] > 0.3
-        np.testing.assert_allclose(away, env.b_position if is_a else env.a_position, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -116,11 +103,11 @@ def test_a_prop_that_lacks_its_name_is_refused(prop, message):
 
 @pytest.mark.parametrize(("seconds", "n_steps"), [(0.0, 1), (0.5, 10)])
 def test_a_condition_alone_has_to_last_as_long_as_is_said(seconds, n_steps):
-    wanted = replace(task(block("a")), success=Solved(lambda env: env.n_asked() != 3, seconds=seconds))
+    wanted = replace(task(block("a")), success=Success(lambda env: env.n_asked() != 3, seconds=seconds))
     env = TaskEnv(wanted, sound="none")
     env.n_asked = iter(range(100)).__next__
-    env.begin_episode(seed=0)
-    ends = [env.advance(STAY)[1] for _ in range(n_steps + 4)]
+    env.reset_physics(seed=0)
+    ends = [env.step_physics(STAY)[1] for _ in range(n_steps + 4)]
     first = 1 if seconds == 0 else 4 + n_steps  # the fourth step breaks the row
     assert ends.index(True) + 1 == first
 
@@ -130,20 +117,19 @@ WALL = '<body name="wall"><geom name="wall" type="box" size="0.01 0.1 0.1" pos="
 
 def turn_the_wall_at_times(env, options) -> dict:
     if env.np_random.random() < 0.5:
-        env.put("wall", (0.1, 0.0, 0.0), yaw=0.5)
-        env.take_away("a")
+        env.set_pose("wall", (0.1, 0.0, 0.0), yaw=0.5)
     return {}
 
 
 def test_no_episode_depends_on_the_one_before():
-    made = replace(task(block("a"), Prop("wall", WALL, "table")), place=turn_the_wall_at_times)
+    made = replace(task(block("a"), Prop("wall", WALL, "table")), initialize_episode=turn_the_wall_at_times)
     worn, scenes = TaskEnv(made, sound="none"), set()
     for seed in range(6):
-        worn.begin_episode(seed=seed)
+        worn.reset_physics(seed=seed)
         fresh = TaskEnv(made, sound="none")
-        fresh.begin_episode(seed=seed)
-        for array, of_fresh in zip(worn._places(), fresh._places(), strict=True):
-            np.testing.assert_array_equal(array, of_fresh)
+        fresh.reset_physics(seed=seed)
+        np.testing.assert_array_equal(worn.model.body_pos, fresh.model.body_pos)
+        np.testing.assert_array_equal(worn.model.body_quat, fresh.model.body_quat)
         np.testing.assert_array_equal(worn.data.qpos, fresh.data.qpos)
         scenes.add(float(worn.model.body("wall").quat[0]))
     assert len(scenes) == 2
@@ -151,7 +137,7 @@ def test_no_episode_depends_on_the_one_before():
 
 def test_forces_of_the_hands_parts_are_known_of_loose_things_alone():
     env = TaskEnv(task(block("a"), Prop("wall", WALL, "table")), sound="none")
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     assert env.hand_forces("a").shape[1:] == (len(env.definition.arm.touching), 3)
     with pytest.raises(ValueError, match=r"loose things with a material alone \(a\), 'wall' is none"):
         env.hand_forces("wall")
@@ -174,7 +160,7 @@ def test_forces_of_the_hands_parts_are_known_of_loose_things_alone():
 def test_a_misspelt_option_of_reset_and_an_impossible_place_are_refused(name, options, message):
     env = TaskEnv(name, sound="none")
     with pytest.raises(OptionError, match=message):
-        env.begin_episode(seed=0, options=options)
+        env.reset_physics(seed=0, options=options)
 
 
 def test_a_material_of_what_is_not_there_is_refused():
@@ -182,9 +168,9 @@ def test_a_material_of_what_is_not_there_is_refused():
         env.materials["aa"] = "glass"
         return put_on_table(env, options)
 
-    env = TaskEnv(replace(task(block("a")), place=place), image_size=8)
-    with pytest.raises(ValueError, match=r"materials names \['aa'\], .*there are a, gripper, table"):
-        env.begin_episode(seed=0)
+    env = TaskEnv(replace(task(block("a")), initialize_episode=place), image_size=8)
+    with pytest.raises(ValueError, match=r"materials names \['aa'\], .*there are a, hand, left_finger, link5"):
+        env.reset_physics(seed=0)
 
 
 @pytest.mark.parametrize(
@@ -193,12 +179,6 @@ def test_a_material_of_what_is_not_there_is_refused():
 def test_what_is_no_task_and_no_time_is_refused(options, message):
     with pytest.raises(OptionError, match=message):
         TaskEnv(**{"task": task(block("a")), "sound": "none", **options})
-
-
-def test_unknown_things_of_an_episode_are_no_attributes():
-    env = TaskEnv(task(block("a")), sound="none")
-    with pytest.raises(AttributeError, match="bin_position"):
-        _ = env.bin_position
 
 
 @pytest.mark.parametrize("n_environments", [6, pytest.param(40, marks=pytest.mark.slow)])

@@ -17,7 +17,7 @@ from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
 from gym_playbyear import ALL_TASKS
-from gym_playbyear.options import make_definition
+from gym_playbyear.registry import make_definition
 from lerobot_env_playbyear import PcmToFloatProcessorStep, PlaybyearEnvConfig
 from lerobot_playbyear.recording.record import RecordConfig
 

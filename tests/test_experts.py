@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from gym_playbyear.experts import EXACT_EXPERT
+from gym_playbyear.experts.occluded import GraspExpert
 
 
 def searches(task: str, seeds: range) -> list[dict[str, float]]:
@@ -20,7 +20,7 @@ def searches(task: str, seeds: range) -> list[dict[str, float]]:
                 heights.append(task_env.eef_position[2])
             steps += expert.phase in ("dwell", "rise", "hover", "hop")
             env.step(expert.act())
-        beside = abs(task_env.cube_position[1] - task_env.eef_position[1])
+        beside = abs(task_env.position("cube")[1] - task_env.eef_position[1])
         told.append({"beside": beside, "steps": steps, "height": np.median(heights)})
     env.close()
     return told
@@ -46,7 +46,7 @@ def test_it_draws_back_from_the_cube_by_another_way_in_every_search(task):
     for _ in range(50):
         expert._begin()
         ways.append(expert.back_off)
-    low, high = EXACT_EXPERT.back_off
+    low, high = GraspExpert.BACK_OFF
     assert low <= min(ways) < low + 0.003
     assert high - 0.003 < max(ways) <= high
     env.close()
@@ -63,11 +63,11 @@ def test_its_hops_miss_the_cube_on_both_sides_and_are_mended(task):
         while expert.phase != "hop":
             env.step(expert.act())
         while expert.phase == "hop" and expert.hop_error:
-            error, beside = expert.hop_error, task_env.eef_position[1] - task_env.cube_position[1]
+            error, beside = expert.hop_error, task_env.eef_position[1] - task_env.position("cube")[1]
             env.step(expert.act())
         missed.append(error)
         assert abs(beside - error) < 0.004
-    low, high = EXACT_EXPERT.hop_error
+    low, high = GraspExpert.HOP_ERROR
     assert min(missed) < low / 2
     assert max(missed) > high / 2
     env.close()

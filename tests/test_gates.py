@@ -1,15 +1,11 @@
 """The scripted expert beside a policy: when it takes over, what it rescues, when it hands back."""
 
-from dataclasses import replace
-
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from gym_playbyear import TASKS
-from gym_playbyear.experts import GraspExpert
-from gym_playbyear.gate_config import GateConfig
-from gym_playbyear.gates import InterventionGate
+from gym_playbyear.experts.occluded_gate import EMPTY_OPENING, GRASP_HEIGHT, MISSED_HEIGHT, InterventionGate
 
 STAY = np.array([0.0, 0.0, 0.0, -1.0])
 
@@ -57,7 +53,7 @@ def roll_out(env, seed: int, name: str):
         by_expert.append(gate.wants_control(action))
         if gate.reason is not None and gate.reason != before:
             reasons.append(gate.reason)
-        _, terminated, truncated, info = task_env.advance(gate.act() if by_expert[-1] else action)
+        _, terminated, truncated, info = task_env.step_physics(gate.act() if by_expert[-1] else action)
         done = terminated or truncated
     return info["is_success"], np.array(by_expert), reasons
 
@@ -105,7 +101,7 @@ def test_the_expert_hands_back_when_it_has_found_the_cube_and_when_it_holds_it()
         by_expert = gate.wants_control(STAY)
         if before is not None and gate.reason != before:
             stages.append(gate.expert.phase)
-        _, terminated, truncated, _ = task_env.advance(gate.act() if by_expert else STAY)
+        _, terminated, truncated, _ = task_env.step_physics(gate.act() if by_expert else STAY)
         done = terminated or truncated
     env.close()
     assert stages[0] in ("dwell", "rise")
@@ -117,27 +113,33 @@ def until(env, gate, expert, phase: str) -> None:
     while expert.phase != phase:
         action = expert.act()
         gate.wants_control(action)
-        env.unwrapped.advance(action)
+        env.unwrapped.step_physics(action)
 
 
-def at_phase(task: str, phase: str, seed: int = 1, config: GateConfig | None = None, **options):
+@pytest.fixture
+def patient(monkeypatch):
+    """The gate does not mind a hand that stands still."""
+    monkeypatch.setattr(occluded_gate, "STILL_STEPS", 100)
+
+
+def at_phase(task: str, phase: str, seed: int = 1, **options):
     env = make(task, **options)
     env.reset(seed=seed)
     expert = env.unwrapped.scripted_expert()
-    gate = InterventionGate(env.unwrapped, env.unwrapped.scripted_expert(), config)
+    gate = InterventionGate(env.unwrapped, env.unwrapped.scripted_expert())
     until(env, gate, expert, phase)
     assert gate.reason is None
     return env, gate
 
 
 @pytest.mark.parametrize(("task", "phase"), [("OccludedGrasp-v1", "lift"), ("OccludedPickPlace-v1", "carry")])
-def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(task, phase):
-    env, gate = at_phase(task, phase, config=GateConfig(still_steps=100), horizon=350)
+def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(task, phase, patient):
+    env, gate = at_phase(task, phase, horizon=350)
     hold, let_go = np.array([0, 0, 0, 1.0]), np.array([0, 0, 0, -1.0])
     assert not env.unwrapped.gripper_obeys
     assert not gate.wants_control(let_go)  # nothing happens yet: the fingers have just closed
     while not env.unwrapped.gripper_obeys:
-        env.unwrapped.advance(hold)
+        env.unwrapped.step_physics(hold)
         assert not gate.wants_control(hold)
     assert gate.wants_control(let_go)
     assert (gate.reason, gate.expert.phase) == ("opens", phase)
@@ -146,7 +148,7 @@ def test_before_it_lets_go_of_the_cube_the_expert_goes_on_where_the_policy_is(ta
 
 def carried(drift, n_steps=60, **options):
     """Pick and Place, version 1: a policy that carries the cube, moves by `drift` on the way, and the gate that watches."""
-    env, gate = at_phase("OccludedPickPlace-v1", "carry", config=GateConfig(still_steps=100), **options)
+    env, gate = at_phase("OccludedPickPlace-v1", "carry", **options)
     play(env, gate, np.array([*drift, 1.0]), n_steps)
     return env, gate
 
@@ -154,12 +156,12 @@ def carried(drift, n_steps=60, **options):
 @pytest.mark.parametrize("drift", [(0, -0.3, 0), (0, -0.3, -0.025)])
 def test_a_cube_that_would_be_put_down_beside_the_tray_is_carried_back_and_then_to_the_tray(drift):
     env, gate = carried(drift)
-    tray = env.unwrapped.bin_position
+    tray = env.unwrapped.position("bin")
     assert (gate.reason, gate.expert.phase) == ("misplaces", "bring_back")
     ways, done, info = [], False, {}
     while not done:
-        ways.append(env.unwrapped.cube_position[1] - tray[1])
-        _, terminated, truncated, info = env.unwrapped.advance(gate.act())
+        ways.append(env.unwrapped.position("cube")[1] - tray[1])
+        _, terminated, truncated, info = env.unwrapped.step_physics(gate.act())
         done = terminated or truncated
         assert gate.wants_control(STAY) or done
     assert info["is_success"]
@@ -168,15 +170,15 @@ def test_a_cube_that_would_be_put_down_beside_the_tray_is_carried_back_and_then_
     env.close()
 
 
-def test_a_label_where_the_cube_would_be_put_down_leads_to_the_tray():
-    env, gate = at_phase("OccludedPickPlace-v1", "carry", config=GateConfig(still_steps=100))
+def test_a_label_where_the_cube_would_be_put_down_leads_to_the_tray(patient):
+    env, gate = at_phase("OccludedPickPlace-v1", "carry")
     forward, lets_go = np.array([0, -0.3, 0, 1.0]), np.array([0, -0.3, 0, -1.0])
     for _ in range(40):
         gate.wants_control(lets_go if env.unwrapped.gripper_obeys else forward)
-        left = env.unwrapped.cube_position[1] - env.unwrapped.bin_position[1]
+        left = env.unwrapped.position("cube")[1] - env.unwrapped.position("bin")[1]
         label = gate.label()
         assert label[1] * left < 0.2 * abs(left)  # never back, even in the first step of a mistake
-        env.unwrapped.advance(forward)
+        env.unwrapped.step_physics(forward)
     env.close()
 
 
@@ -185,7 +187,7 @@ def play(env, gate, action, n_steps: int) -> int:
     for step in range(n_steps):
         if gate.wants_control(action):
             return step
-        env.unwrapped.advance(action)
+        env.unwrapped.step_physics(action)
     raise AssertionError(f"nobody took over in {n_steps} steps")
 
 
@@ -196,7 +198,7 @@ def finish(env, gate) -> bool:
         task_env = env.unwrapped
         up = np.array([0, 0, 0.3 if task_env.eef_position[2] < 0.88 else 0.0, 1.0])
         up = up if task_env.contact_forces["gripper-cube"] > 20 else STAY
-        _, terminated, truncated, info = env.unwrapped.advance(gate.act() if gate.wants_control(up) else up)
+        _, terminated, truncated, info = env.unwrapped.step_physics(gate.act() if gate.wants_control(up) else up)
         done = terminated or truncated
     return info["is_success"]
 
@@ -204,12 +206,12 @@ def finish(env, gate) -> bool:
 def test_a_hand_that_is_about_to_land_on_the_cube_searches_anew():
     env, gate = at_phase("OccludedGrasp-v1", "descend", horizon=350)
     task_env = env.unwrapped
-    while task_env.eef_position[1] < task_env.cube_position[1] + 0.02:  # a hop that is 2 cm too long
-        task_env.advance(np.array([0, 0.15, 0.1, -1.0]))
+    while task_env.eef_position[1] < task_env.position("cube")[1] + 0.02:  # a hop that is 2 cm too long
+        task_env.step_physics(np.array([0, 0.15, 0.1, -1.0]))
         assert not gate.wants_control(STAY)
     play(env, gate, np.array([0, 0, -0.2, -1.0]), 30)
     assert (gate.reason, gate.expert.phase) == ("lands", "retreat")
-    assert task_env.eef_position[2] > 0.8 + GateConfig().grasp_height
+    assert task_env.eef_position[2] > 0.8 + GRASP_HEIGHT
     assert finish(env, gate)
     env.close()
 
@@ -219,7 +221,7 @@ def test_fingers_that_closed_on_nothing_bring_the_expert():
     taken_after = play(env, gate, np.array([0, 0, 0, 1.0]), 20)
     assert gate.reason == "empty"
     assert taken_after > 3
-    assert env.unwrapped.finger_positions.sum() < GateConfig().empty_opening
+    assert env.unwrapped.finger_positions.sum() < EMPTY_OPENING
     env.close()
 
 
@@ -229,7 +231,7 @@ def test_a_hand_that_pushes_on_after_the_touch_is_stopped_in_time():
     taken_over, terminated = [], False
     for _ in range(20):
         taken_over.append(gate.wants_control(push))
-        _, terminated, _, _ = env.unwrapped.advance(gate.act() if taken_over[-1] else push)
+        _, terminated, _, _ = env.unwrapped.step_physics(gate.act() if taken_over[-1] else push)
         if taken_over[-1]:
             break
     assert gate.reason == "pushes"
@@ -238,13 +240,13 @@ def test_a_hand_that_pushes_on_after_the_touch_is_stopped_in_time():
     env.close()
 
 
-def test_a_dropped_cube_brings_the_expert():
-    env, gate = at_phase("OccludedPickPlace-v1", "carry", config=GateConfig(still_steps=100))
+def test_a_dropped_cube_brings_the_expert(patient):
+    env, gate = at_phase("OccludedPickPlace-v1", "carry")
     close, open_ = np.array([0, 0, 0, 1.0]), np.array([0, 0, 0, -1.0])
     for _ in range(60):  # the gate hears of a policy that holds on, and the hand lets go
         if gate.wants_control(close):
             break
-        env.unwrapped.advance(open_)
+        env.unwrapped.step_physics(open_)
     assert gate.reason == "dropped"
     env.close()
 
@@ -255,23 +257,10 @@ def test_a_hand_that_rises_without_the_cube_brings_the_expert():
     for _ in range(10):
         if gate.wants_control(up):
             break
-        env.unwrapped.advance(up)
+        env.unwrapped.step_physics(up)
     assert gate.reason == "missed"
-    assert env.unwrapped.eef_position[2] > 0.8 + GateConfig().missed_height
+    assert env.unwrapped.eef_position[2] > 0.8 + MISSED_HEIGHT
     env.close()
-
-
-def test_thresholds_are_settings():
-    patient = replace(GateConfig(), still_steps=60, slack_steps=-100)
-    for config, expected in ((GateConfig(), True), (patient, False)):
-        env = make("OccludedGrasp-v1")
-        env.reset(seed=0)
-        gate = InterventionGate(env.unwrapped, GraspExpert(env.unwrapped), config)
-        for _ in range(30):
-            gate.wants_control(STAY)
-            env.unwrapped.advance(STAY)
-        assert (gate.reason == "still") is expected
-        env.close()
 
 
 def test_the_same_seed_gives_the_same_interventions():
@@ -311,7 +300,7 @@ def test_labels_solve_the_task_from_wherever_the_policy_went(task, n):
             gate.wants_control(action)
             label = gate.label()
             assert gate.reason is None
-            _, terminated, truncated, info = task_env.advance(action if step < n + 10 else label)
+            _, terminated, truncated, info = task_env.step_physics(action if step < n + 10 else label)
             done, step = terminated or truncated, step + 1
         solved += info["is_success"]
     env.close()
@@ -330,7 +319,7 @@ def test_an_expert_that_was_asked_stays_until_it_is_told():
         if n == 10:
             assert not acts[-1]  # nothing was wrong
             gate.take_over()
-        _, terminated, truncated, info = task_env.advance(gate.act() if n >= 10 else action)
+        _, terminated, truncated, info = task_env.step_physics(gate.act() if n >= 10 else action)
         done, n = terminated or truncated, n + 1
     env.close()
     assert all(acts[11:])

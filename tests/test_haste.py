@@ -12,8 +12,8 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 
 from experiments.protocol import RESULTS, Result, load, load_results
 from experiments.training import told_of_attempts
-from gym_playbyear.haste import ClosedUnheard
-from gym_playbyear.task_env import TaskEnv
+from gym_playbyear.environment import TaskEnv
+from gym_playbyear.terminations import ClosedUnheard
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_env_playbyear.attempts import AttemptsFile
 
@@ -27,7 +27,7 @@ def make(task: str, **options):
 def finish(env, script) -> dict:
     over = False
     while not over:
-        _, terminated, truncated, info = env.advance(script.act())
+        _, terminated, truncated, info = env.step_physics(script.act())
         over = terminated or truncated
     return info
 
@@ -36,7 +36,7 @@ def finish(env, script) -> dict:
 def test_experts_hear_first(task):
     env = make(task)
     for seed in range(2):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         info = finish(env, env.scripted_expert())
         assert info["is_success"]
         assert info["acted_early"] is False
@@ -46,14 +46,14 @@ def after(env, *commands: tuple[float, int, float]) -> dict:
     """What the last step says of some steps: (sideways [5 cm], how many, gripper)."""
     for sideways, n_steps, grip in commands:
         for _ in range(n_steps):
-            *_, info = env.advance(np.array([0, sideways, 0, grip]))
+            *_, info = env.step_physics(np.array([0, sideways, 0, grip]))
     return info
 
 
 def test_a_hand_that_closes_in_the_air_was_early_and_one_that_stays_open_was_not():
     for commands, early in ((((0, 10, OPEN), (0, 10, CLOSE)), True), (((0, 20, OPEN),), False)):
         env = make("OccludedGrasp-v1", horizon=20)
-        env.begin_episode(seed=3)
+        env.reset_physics(seed=3)
         told = {"is_success": False, "end": "time", "acted_early": early, "n_closings": int(early)}
         assert after(env, *commands) == told
 
@@ -78,16 +78,16 @@ def test_what_a_task_kept_secret_stands_in_the_file_as_numbers(tmp_path):
 
 def test_every_closing_counts_once():
     env = make("OccludedGrasp-v1", horizon=250)
-    env.begin_episode(seed=3)
+    env.reset_physics(seed=3)
     assert after(env, (0, 20, OPEN), (0, 60, CLOSE), (0, 60, OPEN), (0, 60, CLOSE), (0, 50, OPEN))["n_closings"] == 2
-    env.begin_episode(seed=3)
+    env.reset_physics(seed=3)
     assert finish(env, env.scripted_expert())["n_closings"] == 1
 
 
 def test_only_the_first_closing_counts():
     """A grasp that missed after the touch is followed by another one: it was not early, nor does hearing later excuse."""
     env = make("OccludedGrasp-v1")
-    env.begin_episode(seed=3)
+    env.reset_physics(seed=3)
     watch = ClosedUnheard("cube")
 
     class World:
@@ -112,25 +112,25 @@ def test_only_the_first_closing_counts():
 @pytest.mark.parametrize(("sideways", "early"), [(0.0, False), (0.6, True)])
 def test_a_hand_that_moves_on_while_the_pouch_falls_was_early(sideways, early):
     env = make("TellApart-v1")
-    env.begin_episode(seed=1)
+    env.reset_physics(seed=1)
     script = env.scripted_expert()
     while not script.was_dropped:
-        env.advance(script.act())
+        env.step_physics(script.act())
     with_hand_open = script.act()
     with_hand_open[1] += sideways
     for _ in range(4):
-        env.advance(np.clip(with_hand_open, -1, 1))
-    assert env._haste._is_decided
-    assert env._haste.acted_early is early
-    assert copy.deepcopy(env)._haste.acted_early is early
-    env.begin_episode(seed=2)
-    assert env._haste.acted_early is False
+        env.step_physics(np.clip(with_hand_open, -1, 1))
+    assert env._early_action._is_decided
+    assert env._early_action.acted_early is early
+    assert copy.deepcopy(env)._early_action.acted_early is early
+    env.reset_physics(seed=2)
+    assert env._early_action.acted_early is False
 
 
 def test_a_task_made_of_another_one_without_the_thing_does_not_ask():
-    task = replace(make("OccludedGrasp-v1").definition, haste=ClosedUnheard("pouch"), horizon=2)
+    task = replace(make("OccludedGrasp-v1").definition, early_action=ClosedUnheard("pouch"), horizon=2)
     env = TaskEnv(task)
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     assert after(env, (0, 2, CLOSE)) == {"is_success": False, "end": "time"}
 
 

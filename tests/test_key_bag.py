@@ -4,9 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from gym_playbyear.bag import BAG, HALF_SIZE, RIM
-from gym_playbyear.bag_contents import CONTENTS, CONTENTS_KINDS, middle_of, points_of
-from gym_playbyear.bag_experts import BagExpert
+from gym_playbyear.experts.key_bag import BagExpert
+from gym_playbyear.tasks.bag import BAG, CONTENTS, CONTENTS_KINDS, HALF_SIZE, RIM, middle_of, points_of
 from lerobot_env_playbyear import PlaybyearEnvConfig
 
 EASY, HARD = "KeyBag-Easy-v1", "KeyBag-Hard-v1"
@@ -19,10 +18,10 @@ def make(task: str, **options):
 
 def play(env, seed: int):
     """The expert's episode without observations: how it ended, and its number of steps."""
-    env.begin_episode(seed=seed)
+    env.reset_physics(seed=seed)
     expert, steps, done = env.scripted_expert(), 0, False
     while not done:
-        _, terminated, truncated, info = env.advance(expert.act())
+        _, terminated, truncated, info = env.step_physics(expert.act())
         steps, done = steps + 1, terminated or truncated
     return info, steps
 
@@ -51,7 +50,7 @@ def test_whatever_lies_in_the_bag_is_below_what_the_camera_sees(kind):
     eye = env.model.camera("front").pos
     x, y = HALF_SIZE
     for seed in range(2):
-        env.begin_episode(seed=seed, options={"bottom": env.variant.bottom[1]})
+        env.reset_physics(seed=seed, options={"bottom": env.definition.numbers.bottom[1]})
         points = points_of(env)
         assert (np.abs(points[:, 0]) < x).all()
         assert (np.abs(points[:, 1]) < y).all()
@@ -79,7 +78,7 @@ def test_what_is_too_long_for_the_fingers_lies_across_them():
     env = make(EASY, sound="none", contents="pens")
     extents = []
     for seed in range(6):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         extents.append(np.ptp(points_of(env)[:, :2], axis=0))
     assert (np.array(extents)[:, 0] > np.array(extents)[:, 1]).all()  # fingers open along y
 
@@ -91,10 +90,10 @@ def test_what_ends_an_attempt():
         ("groped", {}, [(0, 0, 0, 1), (0, 0, 0, -1)]),
         ("time", {}, [(0, 0, 0, -1)]),
     ):
-        env.begin_episode(seed=0, options={"contents_position": (0.04, 0.09), **options})
+        env.reset_physics(seed=0, options={"contents_position": (0.04, 0.09), **options})
         done, steps = False, 0
         while not done:
-            _, terminated, truncated, info = env.advance(actions[steps // 11 % len(actions)])
+            _, terminated, truncated, info = env.step_physics(actions[steps // 11 % len(actions)])
             steps, done = steps + 1, terminated or truncated
         assert info["end"] == expected
 
@@ -103,7 +102,7 @@ def test_walls_bend_visibly_and_crackle():
     env = make(EASY, noise_level=0.0, hidden_object=False)
     picture = env.reset(seed=0, options={"bottom": 0.03})[0]["pixels"]["front"].astype(int)
     for _ in range(8):
-        env.advance(np.array([0, 0, -0.4, -1.0]))
+        env.step_physics(np.array([0, 0, -0.4, -1.0]))
     still = env.step(STILL)[0]["audio.gripper"]
     louder, bent = 0.0, 0.0
     for _ in range(6):
@@ -184,7 +183,7 @@ class Felt:
     """An environment of which one gets what the hand feels, and what is the same in every episode."""
 
     FELT = ("contact_forces", "hand_forces", "eef_position", "finger_positions")
-    KNOWN = ("expert_rng", "variant", "definition", "microphones")
+    KNOWN = ("expert_rng", "definition", "microphones")
 
     def __init__(self, env):
         self._env = env
@@ -198,10 +197,10 @@ class Felt:
 def test_the_expert_acts_on_what_it_felt_alone(task):
     env, solved = make(task, sound="none"), 0
     for seed in range(4):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         expert, done = BagExpert(Felt(env)), False
         while not done:
-            _, terminated, truncated, info = env.advance(expert.act())
+            _, terminated, truncated, info = env.step_physics(expert.act())
             done = terminated or truncated
         solved += info["is_success"]
     assert solved >= 3
@@ -249,11 +248,11 @@ def test_a_bad_policy_is_corrected():
     env = make(EASY, sound="none")
     rescued = 0
     for seed in range(4):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         gate, done, info = env.intervention_gate(), False, {}
         while not done:
             action = gate.act() if gate.wants_control(STILL) else STILL
-            _, terminated, truncated, info = env.advance(action)
+            _, terminated, truncated, info = env.step_physics(action)
             done = terminated or truncated
         rescued += info["is_success"]
     assert rescued >= 1
@@ -264,17 +263,17 @@ def test_who_lands_on_the_keys_and_goes_on_is_led_beside_them():
     env = make(HARD, sound="none")
     rescued = 0
     for seed in range(4):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         policy, gate, done, info = env.scripted_expert(), env.intervention_gate(), False, {}
         while not done:
-            if env.finger_positions.sum() < 0.9 * env.variant.arm.max_opening:
+            if env.finger_positions.sum() < 0.9 * env.definition.arm.max_opening:
                 action = np.array([0, 0, 0.4, 1.0]) if env.eef_position[2] < RIM + 0.05 else np.array([0, 0, 0, 1.0])
             elif policy.phase in ("enter", "descend"):
                 action = policy.act()
             else:
                 action = np.array([0, 0, -0.08, -1.0])
             action = gate.act() if gate.wants_control(action) else action
-            _, terminated, truncated, info = env.advance(action)
+            _, terminated, truncated, info = env.step_physics(action)
             done = terminated or truncated
         rescued += info["is_success"] and info["n_closings"] == 1  # beside them, at once
     assert rescued >= 3
@@ -282,12 +281,12 @@ def test_who_lands_on_the_keys_and_goes_on_is_led_beside_them():
 
 def test_a_policy_as_good_as_the_expert_is_left_alone():
     env = make(EASY, sound="none")
-    env.begin_episode(seed=2)
+    env.reset_physics(seed=2)
     policy, gate, by_expert, done = env.scripted_expert(), env.intervention_gate(), [], False
     while not done:
         action = policy.act()
         by_expert.append(gate.wants_control(action))
-        _, terminated, truncated, _ = env.advance(gate.act() if by_expert[-1] else action)
+        _, terminated, truncated, _ = env.step_physics(gate.act() if by_expert[-1] else action)
         done = terminated or truncated
     assert np.mean(by_expert) < 0.2
 

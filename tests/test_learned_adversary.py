@@ -8,7 +8,7 @@ import pytest
 from experiments import adversary_table
 from experiments.numeric_task import N_HEARD, N_PLAYER, NumericTask
 from experiments.protocol import save
-from gym_playbyear.bag_experts import finger_forces
+from gym_playbyear.experts.key_bag import finger_forces
 
 EASY, HARD, POUCH = "KeyBag-Easy-v1", "KeyBag-Hard-v1", "TellApart-v1"
 

@@ -1,18 +1,15 @@
 """How people see the tasks: the same motion in better clothes, and nothing of it in physics or in the policy's pictures."""
 
 import copy
-from dataclasses import replace
 
 import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
 
-from gym_playbyear.arena import TABLE_TOP
-from gym_playbyear.arm import ArmConfig
-from gym_playbyear.looks import PeopleView, Stage
-from gym_playbyear.task_env import TaskEnv
-from gym_playbyear.tell_apart import tell_apart
+from gym_playbyear.environment import TaskEnv
+from gym_playbyear.rendering import PeopleScene, PeopleView
+from gym_playbyear.tasks.arena import TABLE_TOP
 
 TASKS = ("OccludedGrasp-v1", "OccludedPickPlace-v1", "TellApart-v1", "KeyBag-Hard-v1")
 
@@ -25,12 +22,12 @@ def make(task: str, **options) -> TaskEnv:
 @pytest.mark.parametrize("task", TASKS)
 def test_everything_is_seen_where_it_is(task):
     env = make(task)
-    stage = Stage(env.definition, 64)
+    stage = PeopleScene(env.definition, 64)
     for seed in (0, 1):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         expert = env.scripted_expert()
         for _ in range(15):
-            env.advance(expert.act())
+            env.step_physics(expert.act())
         stage.follow(env.model, env.data)
         np.testing.assert_array_equal(stage.data.xpos, env.data.xpos)
         np.testing.assert_array_equal(stage.data.xquat, env.data.xquat)
@@ -40,7 +37,7 @@ def test_everything_is_seen_where_it_is(task):
 def test_the_simulation_and_the_policys_scene_hold_none_of_it(task):
     env = make(task)
     assert (env.model.nmesh, env.model.nmat, env.model.ntex) == (0, 0, 1)  # one texture: the sky
-    stage = Stage(env.definition, 64).model
+    stage = PeopleScene(env.definition, 64).model
     assert stage.nmesh > 15
     added = stage.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     assert not (stage.geom_contype[added] | stage.geom_conaffinity[added]).any()
@@ -64,7 +61,7 @@ def test_who_watches_changes_nothing():
 def test_a_wall_ends_at_the_table():
     for task in ("OccludedGrasp-v1", "OccludedPickPlace-v1"):
         env = make(task)
-        model = Stage(env.definition, 64).model
+        model = PeopleScene(env.definition, 64).model
         wall = model.geom("wall")
         low = model.body("wall").pos[2] + wall.pos[2] - wall.size[2]
         assert low == pytest.approx(TABLE_TOP)
@@ -80,7 +77,7 @@ def red(picture: np.ndarray) -> int:
 def test_people_see_the_cube_behind_the_wall_unless_it_is_not_there():
     for hidden_object, is_seen in ((True, True), (False, False)):
         env = make("OccludedGrasp-v1", hidden_object=hidden_object)
-        env.begin_episode(seed=0, options={"cube_position": (0.0, -0.2)})
+        env.reset_physics(seed=0, options={"cube_position": (0.0, -0.2)})
         assert (red(env.render()) > 10) == is_seen
         env.close()
 
@@ -88,7 +85,7 @@ def test_people_see_the_cube_behind_the_wall_unless_it_is_not_there():
 def test_fingers_are_seen_to_end_where_they_touch():
     """A grip on a thing must not look like one in it, or beside it: within a millimetre."""
     env = make("OccludedGrasp-v1")
-    model = Stage(env.definition, 64).model
+    model = PeopleScene(env.definition, 64).model
     for name, sign in (("left_finger", 1), ("right_finger", -1)):
         touching = model.geom(name)
         lowest = touching.pos[2] + touching.size[2]
@@ -107,7 +104,7 @@ def test_fingers_are_seen_to_end_where_they_touch():
 
 def test_a_copy_looks_the_same_and_draws_for_itself():
     env = make("TellApart-v1")
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     picture = env.render()
     other = copy.deepcopy(env)
     env.close()
@@ -115,24 +112,9 @@ def test_a_copy_looks_the_same_and_draws_for_itself():
     other.close()
 
 
-class PlainArm(ArmConfig):
-    """An arm of somebody else, who has not thought of looks."""
-
-    dress = None
-
-
-def test_an_arm_without_clothes_is_shown_as_it_is():
-    task = replace(tell_apart(), arm=PlainArm(max_opening=0.056))
-    assert [Stage(each, 64).model.geom("hand").rgba[3] for each in (task, tell_apart())] == [1, 0]
-    env = TaskEnv(task, sound="none", render_mode="rgb_array", render_size=64)
-    env.begin_episode(seed=0)
-    assert env.render().std() > 20
-    env.close()
-
-
 def test_two_pictures_of_the_same_moment_are_the_same():
     env = make("KeyBag-Easy-v1")
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     first = env.render()
     view = PeopleView(env.definition, 120, True)
     np.testing.assert_array_equal(view.picture(env.model, env.data), first)

@@ -16,10 +16,9 @@ from lerobot.scripts import lerobot_eval
 from lerobot.utils.import_utils import register_third_party_plugins
 
 import gym_playbyear
-from gym_playbyear.materials_v2 import material
-from gym_playbyear.options import make_definition
-from gym_playbyear.plugins import PluginError
-from gym_playbyear.task_env import TaskEnv
+from gym_playbyear.environment import TaskEnv
+from gym_playbyear.registry import PluginError, make_definition
+from gym_playbyear.sound.materials import material
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.recording.record import RecordConfig
 from lerobot_playbyear.scripts import record, train
@@ -30,7 +29,7 @@ ENV = ["--env.type=playbyear", "--env.task=StopAtTheTin-v1", "--env.image_size=1
 
 
 _EARS = """
-from gym_playbyear.sound_v2_paths import Microphone
+from gym_playbyear.sound.microphones import Microphone
 BASE = Microphone({"table": 0.7, "link1": 1.0}, hum=3.0)
 """
 
@@ -136,7 +135,9 @@ def test_a_material_that_is_none_says_so():
     assert len(material("tin_can").frequencies) == 4
     with pytest.raises(ValueError, match=r"Material 'marble' is not known: choose one of bag, .*tin_can"):
         material("marble")
-    with pytest.raises(ValueError, match=r"'no_material' of .*materials is a .*; wanted a .*materials_v2\.Material"):
+    with pytest.raises(
+        ValueError, match=r"'no_material' of .*materials is a .*; wanted a .*sound\.materials\.Material"
+    ):
         material("no_material")
 
 

@@ -15,9 +15,9 @@ from lerobot.envs.configs import EnvConfig  # noqa: F401  (registers LeRobot's o
 from scipy import signal
 from scipy.io import wavfile
 
-from gym_playbyear.options import OptionError
+from gym_playbyear.registry import OptionError
 from gym_playbyear.room import _recording
-from gym_playbyear.sound_v2 import BACKGROUND_RMS
+from gym_playbyear.sound import BACKGROUND_RMS
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.policy.sound_augmentation import RecordedNoise
 

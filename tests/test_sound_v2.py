@@ -11,26 +11,26 @@ from scipy import signal
 
 from experiments import sound_physics
 from experiments.sound_scenes import Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
-from gym_playbyear.contact_kinematics import ContactReader, Contacts, SoundingPair, add_sensors, read_contacts
-from gym_playbyear.materials_v2 import GLASS, MATERIALS, STEEL, bar, cup, plate
-from gym_playbyear.sound_v2 import MICROPHONES, Bending, ContactSynth
-from gym_playbyear.sound_v2_background import Noise
-from gym_playbyear.sound_v2_blows import hertz_duration, pulse_spectrum
-from gym_playbyear.sound_v2_friction import _band_filter
+from gym_playbyear.contacts import ContactPair, ContactReader, Contacts, add_sensors
+from gym_playbyear.sound import Bending, Synthesizer
+from gym_playbyear.sound.excitation import _band_filter, hertz_duration, pulse_spectrum
+from gym_playbyear.sound.materials import GLASS, MATERIALS, STEEL, bar, cup, plate
+from gym_playbyear.sound.microphones import MICROPHONES
+from gym_playbyear.sound.synthesizer import Noise
 
 PAIRS = [
-    SoundingPair(("left_finger", "cube"), ("gripper", "cube")),
-    SoundingPair(("right_finger", "cube"), ("gripper", "cube")),
-    SoundingPair(("cube", "table"), ("cube", "table")),
-    SoundingPair(("left_finger", "bag"), ("gripper", "bag")),
+    ContactPair(("left_finger", "cube"), ("gripper", "cube")),
+    ContactPair(("right_finger", "cube"), ("gripper", "cube")),
+    ContactPair(("cube", "table"), ("cube", "table")),
+    ContactPair(("left_finger", "bag"), ("gripper", "bag")),
 ]
 LEFT, RIGHT, RESTING, BAG = range(len(PAIRS))
 EARS = {"gripper": (0, 0, 0.1), "left_finger": (0, 0.03, 0.05), "right_finger": (0, -0.03, 0.05),
         "table": (0.3, 0, 0), "room": (1.0, 0, 1.0)}  # fmt: skip
 
 
-def synth(microphones=("gripper",), sample_rate=16000, control_hz=20, dt=0.002, seed=0, **options) -> ContactSynth:
-    made = ContactSynth(PAIRS, microphones, sample_rate, control_hz, dt, **{"noise_level": 0.0, **options})
+def synth(microphones=("gripper",), sample_rate=16000, control_hz=20, dt=0.002, seed=0, **options) -> Synthesizer:
+    made = Synthesizer(PAIRS, microphones, sample_rate, control_hz, dt, **{"noise_level": 0.0, **options})
     made.reset(np.random.default_rng(seed))
     return made
 
@@ -58,7 +58,7 @@ def part(contacts: Contacts, steps: slice) -> Contacts:
     return Contacts(**{name: value if name == "mass" else value[steps] for name, value in values.items()})
 
 
-def hear(made: ContactSynth, contacts: Contacts, finger_speed=0.0, bending=None) -> dict[str, np.ndarray]:
+def hear(made: Synthesizer, contacts: Contacts, finger_speed=0.0, bending=None) -> dict[str, np.ndarray]:
     n = made.n_substeps
     still, fingers = np.zeros(n), np.full(n, finger_speed)
     positions = {name: np.array(EARS[name]) for name in made.microphones}
@@ -160,12 +160,12 @@ def test_a_reader_and_its_copy_read_the_same():
     data = np.random.default_rng(0).uniform(size=(25, scene.model.nsensordata))
     for a, b in zip(
         dataclasses.astuple(reader.read(data)),
-        dataclasses.astuple(read_contacts(scene.model, data, scene.pairs)),
+        dataclasses.astuple(scene.reader.read(data)),
         strict=True,
     ):
         np.testing.assert_array_equal(a, b)
     names = [scene.model.sensor(i).name for i in range(scene.model.nsensor)]
-    assert all(name.startswith("sound:") for name in names)
+    assert all(name.startswith("contact:") for name in names)
 
 
 def test_a_body_with_all_that_hangs_on_it_is_one_side():
@@ -174,7 +174,7 @@ def test_a_body_with_all_that_hangs_on_it_is_one_side():
     hand = spec.worldbody.add_body(name="hand", pos=[0, 0, 0.049])
     hand.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
     hand.add_body(name="finger", pos=[0, 0, -0.03]).add_geom(size=[0.02, 0, 0])
-    pairs = [SoundingPair(("hand", "table"), ("gripper", "table"), subtrees=(True, False))]
+    pairs = [ContactPair(("hand", "table"), ("gripper", "table"), subtrees=(True, False))]
     add_sensors(spec, pairs)
     scene = Scene(spec.compile(), pairs)
     assert scene.contacts(0.1)[0].normal_force.any()
@@ -183,9 +183,9 @@ def test_a_body_with_all_that_hangs_on_it_is_one_side():
 @pytest.mark.parametrize(
     ("pairs", "message"),
     [
-        ([SoundingPair(("box", "table"), ("cube", "table"))] * 2, r"same bodies: box\|table"),
-        ([SoundingPair(("box", "moon"), ("cube", "table"))], "'moon'"),
-        ([SoundingPair(("box", "table"), ("cube", "table"), stop="hinge")], "'hinge'"),
+        ([ContactPair(("box", "table"), ("cube", "table"))] * 2, r"same bodies: box\|table"),
+        ([ContactPair(("box", "moon"), ("cube", "table"))], "'moon'"),
+        ([ContactPair(("box", "table"), ("cube", "table"), stop="hinge")], "'hinge'"),
     ],
 )
 def test_unusable_pairs_are_refused(pairs, message):
@@ -264,8 +264,8 @@ def test_randomised_noise_has_another_tilt_in_every_episode():
 def touched_things(seeds):
     """Log spectrograms of a touch at random time and speed in random episodes, and what was touched."""
     things = ("cube", "wall", "table")
-    pairs = [SoundingPair(("gripper", thing), ("gripper", thing)) for thing in things]
-    made = ContactSynth(pairs, ("gripper",), 16000, 20, 0.002)
+    pairs = [ContactPair(("gripper", thing), ("gripper", thing)) for thing in things]
+    made = Synthesizer(pairs, ("gripper",), 16000, 20, 0.002)
     features, labels = [], []
     for seed in seeds:
         rng = np.random.default_rng([9, seed])
@@ -378,7 +378,7 @@ def test_a_finger_that_holds_the_cube_hears_it_land():
 
 
 def test_a_sound_in_the_air_arrives_later_the_farther_it_comes():
-    made = ContactSynth(PAIRS, ("room",), 48000, 20, 0.002, 0.0, randomise=False)
+    made = Synthesizer(PAIRS, ("room",), 48000, 20, 0.002, 0.0, randomise=False)
     onsets = []
     for distance in (0.5, 1.5):
         made.reset(np.random.default_rng(0))
@@ -389,7 +389,7 @@ def test_a_sound_in_the_air_arrives_later_the_farther_it_comes():
 
 
 def test_a_blow_that_arrives_in_the_next_step_is_heard_there():
-    made = ContactSynth(PAIRS, ("room",), 16000, 100, 0.002, 0.0, randomise=False)
+    made = Synthesizer(PAIRS, ("room",), 16000, 100, 0.002, 0.0, randomise=False)
     contacts, ear = touch(nothing(0.01), RESTING, 0.008, speed=0.5), {"room": np.array([3.0, 0, 0])}
     blocks = [
         made.step(each, np.zeros(5), np.zeros(5), ear)["room"] for each in (contacts, nothing(0.01), nothing(0.01))
@@ -463,13 +463,13 @@ def test_every_material_is_whole():
         ({"microphones": ("ceiling",)}, "ceiling.*gripper"),
         ({"microphones": ()}, "at least one"),
         ({"noise_level": -1.0}, "noise_level is -1.0"),
-        ({"pairs": [SoundingPair(("a", "b"), ("cube", "jelly"))]}, "'jelly'"),
+        ({"pairs": [ContactPair(("a", "b"), ("cube", "jelly"))]}, "'jelly'"),
     ],
 )
 def test_unusable_options_are_refused(changes, message):
     usual = {"pairs": PAIRS, "microphones": ("gripper",), "sample_rate": 16000, "control_hz": 20, "physics_dt": 0.002}
     with pytest.raises(ValueError, match=message):
-        ContactSynth(**(usual | changes))
+        Synthesizer(**(usual | changes))
 
 
 def test_wrong_or_diverged_contacts_are_refused():

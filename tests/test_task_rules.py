@@ -22,7 +22,7 @@ def go(env, goal, grip: float, *, speed: float = 0.02, n_steps: int = 60) -> dic
         if np.linalg.norm(way) < 0.003:
             break
         move = way * min(1.0, speed / np.linalg.norm(way)) / 0.05
-        _, terminated, truncated, info = env.advance(np.append(move, grip))
+        _, terminated, truncated, info = env.step_physics(np.append(move, grip))
         if terminated or truncated:
             break
     return info
@@ -30,7 +30,7 @@ def go(env, goal, grip: float, *, speed: float = 0.02, n_steps: int = 60) -> dic
 
 def wait(env, grip: float, n_steps: int) -> dict:
     for _ in range(n_steps):
-        _, terminated, truncated, info = env.advance(np.array([0, 0, 0, grip]))
+        _, terminated, truncated, info = env.step_physics(np.array([0, 0, 0, grip]))
         if terminated or truncated:
             break
     return info
@@ -38,7 +38,7 @@ def wait(env, grip: float, n_steps: int) -> dict:
 
 def begin(task: str, seed: int = 0, **options):
     env = make(task, **options)
-    env.begin_episode(seed=seed, options={"cube_position": (0.0, 0.2), "cube_yaw": 0.0})
+    env.reset_physics(seed=seed, options={"cube_position": (0.0, 0.2), "cube_yaw": 0.0})
     return env
 
 
@@ -85,11 +85,11 @@ def test_a_cube_that_is_up_for_less_than_half_a_second_is_not_held():
     go(env, over(env, 0.0, 0.022), OPEN)
     wait(env, CLOSE, 15)
     go(env, over(env, 0.0, 0.06), CLOSE)
-    assert env.cube_position[2] > 0.84
-    assert not env.advance(np.array([0, 0, 0, CLOSE]))[3]["is_success"]
+    assert env.position("cube")[2] > 0.84
+    assert not env.step_physics(np.array([0, 0, 0, CLOSE]))[3]["is_success"]
     n_steps, info = 0, {"is_success": False}
     while not info["is_success"]:
-        info = env.advance(np.array([0, 0, 0, CLOSE]))[3]
+        info = env.step_physics(np.array([0, 0, 0, CLOSE]))[3]
         n_steps += 1
     assert 5 <= n_steps <= 11
     assert info["end"] == "success"
@@ -106,10 +106,10 @@ def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
     env = make(task)
     ends = []
     for seed in range(10):
-        env.begin_episode(seed=seed)
+        env.reset_physics(seed=seed)
         expert = env.scripted_expert()
         while expert.phase != "hop":
-            env.advance(expert.act())
+            env.step_physics(expert.act())
         wait(env, CLOSE, 15)  # above the cube: nothing is between the fingers
         corrector = env.intervention_gate().expert
         corrector.begin_at("retreat")
@@ -117,7 +117,7 @@ def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
         while not done:
             if corrector.phase == "lower" and env.finger_positions.sum() < 0.05:
                 corrector.phase = "approach"  # until the fingers obey and open
-            _, terminated, truncated, info = env.advance(corrector.act())
+            _, terminated, truncated, info = env.step_physics(corrector.act())
             done = terminated or truncated
         ends.append(info["end"])
     env.close()

@@ -6,9 +6,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from gym_playbyear.options import OptionError
-from gym_playbyear.pouch import CONTENTS, HALF_SIZE, PIECES
-from gym_playbyear.tell_apart_scripts import BlindPouch
+from gym_playbyear.experts.blind import BlindPouch
+from gym_playbyear.registry import OptionError
+from gym_playbyear.tasks.tell_apart import CONTENTS, HALF_SIZE, PIECES
 
 OPEN, CLOSE = -1.0, 1.0
 
@@ -22,7 +22,7 @@ def finish(env, script) -> tuple[list[np.ndarray], dict]:
     actions, done = [], False
     while not done:
         actions.append(script.act())
-        _, terminated, truncated, info = env.advance(actions[-1])
+        _, terminated, truncated, info = env.step_physics(actions[-1])
         done = terminated or truncated
     return actions, info
 
@@ -30,8 +30,8 @@ def finish(env, script) -> tuple[list[np.ndarray], dict]:
 def go(env, height: float, grip: float, n_steps: int) -> dict:
     """Moves the hand over the pouch, so high above the table [m]."""
     for _ in range(n_steps):
-        way = [*env.pouch_position[:2], 0.8 + height] - env.eef_position
-        _, _, _, info = env.advance(np.append(np.clip(way / 0.05, -0.7, 0.7), grip))
+        way = [*env.position("pouch")[:2], 0.8 + height] - env.eef_position
+        _, _, _, info = env.step_physics(np.append(np.clip(way / 0.05, -0.7, 0.7), grip))
     return info
 
 
@@ -98,7 +98,7 @@ def test_only_the_rattle_differs():
 def test_the_expert_lifts_screws_and_leaves_peanuts(contents):
     env = make()
     for seed in range(2):
-        env.begin_episode(seed=seed, options={"contents": contents})
+        env.reset_physics(seed=seed, options={"contents": contents})
         expert = env.scripted_expert()
         _, info = finish(env, expert)
         assert info == {"is_success": True, "end": "success", "contents": contents, "acted_early": False}
@@ -109,10 +109,10 @@ def test_the_expert_lifts_screws_and_leaves_peanuts(contents):
 def test_what_is_done_after_the_drop_decides(contents):
     """A copy of the episode does the other thing; nothing of it reaches the original."""
     env = make(contents=contents)
-    env.begin_episode(seed=1)
+    env.reset_physics(seed=1)
     script = env.blind_baselines()["lift"]
     while not script.was_dropped:
-        env.advance(script.act())
+        env.step_physics(script.act())
     other, other_script = copy.deepcopy((env, script))
     other_script.strategy = "leave"
     ends = {one.strategy: finish(world, one)[1] for world, one in ((other, other_script), (env, script))}
@@ -123,9 +123,9 @@ def test_what_is_done_after_the_drop_decides(contents):
 
 def test_leaving_without_having_lifted_and_dropped_counts_for_nothing():
     env = make(contents="peanuts", horizon=30)
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     for _ in range(30):
-        _, terminated, truncated, info = env.advance(np.array([0, 0, 0, OPEN]))
+        _, terminated, truncated, info = env.step_physics(np.array([0, 0, 0, OPEN]))
         assert not terminated
     assert truncated
     assert info["end"] == "time"
@@ -133,26 +133,26 @@ def test_leaving_without_having_lifted_and_dropped_counts_for_nothing():
 
 def test_a_pouch_that_is_set_down_was_not_dropped():
     env = make(contents="peanuts")
-    env.begin_episode(seed=0)
+    env.reset_physics(seed=0)
     for height, grip, n_steps in ((0.1, OPEN, 10), (0.024, OPEN, 5), (0.024, CLOSE, 4), (0.1, CLOSE, 8)):
         go(env, height, grip, n_steps)
-    assert env.pouch_position[2] > 0.86
+    assert env.position("pouch")[2] > 0.86
     for height, grip, n_steps in ((0.024, CLOSE, 6), (0.024, OPEN, 5), (0.24, OPEN, 20)):
         info = go(env, height, grip, n_steps)
-    assert env.pouch_position[2] < 0.83
+    assert env.position("pouch")[2] < 0.83
     assert info == {"is_success": False}
 
 
 def test_the_pieces_stay_inside_when_the_pouch_is_shaken_and_dropped():
     env, rng = make(), np.random.default_rng(0)
-    env.begin_episode(seed=2)
+    env.reset_physics(seed=2)
     expert = env.scripted_expert()
     while expert.phase != "carry":
-        env.advance(expert.act())
+        env.step_physics(expert.act())
     for step in range(30):
-        env.advance(np.append(rng.choice([-1.0, 1.0], 3), CLOSE if step < 20 else OPEN))
+        env.step_physics(np.append(rng.choice([-1.0, 1.0], 3), CLOSE if step < 20 else OPEN))
     for name in PIECES:
-        offset = env.data.body("pouch").xmat.reshape(3, 3).T @ (env.position(name) - env.pouch_position)
+        offset = env.data.body("pouch").xmat.reshape(3, 3).T @ (env.position(name) - env.position("pouch"))
         assert (np.abs(offset) < HALF_SIZE).all()
 
 
@@ -162,9 +162,9 @@ def test_what_is_in_it_is_a_coin_toss_that_changes_nothing_else():
     for options in ({}, {"contents": "screws"}, {"contents": "peanuts"}):
         for seed in range(200):
             env._np_random = np.random.default_rng(seed)
-            env.definition.place(env, options)
+            env.definition.initialize_episode(env, options)
             drawn.append(env.secrets["contents"])
-            places.append((*env.pouch_position[:2], env.np_random.integers(2**63)))
+            places.append((*env.position("pouch")[:2], env.np_random.integers(2**63)))
     assert 80 < drawn[:200].count("screws") < 120
     assert set(drawn[200:400]) == {"screws"}
     assert places[:200] == places[200:400] == places[400:]

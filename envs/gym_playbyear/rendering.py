@@ -1,4 +1,4 @@
-"""Pictures of the scene: the policy's camera, a larger view for people, and a window."""
+"""Pictures of the scene: the policy's cameras, and a second scene for people, off screen or in a window."""
 
 import atexit
 import copy
@@ -9,6 +9,10 @@ import glfw
 import mujoco
 import mujoco.viewer
 import numpy as np
+
+from gym_playbyear.scene import PEOPLE_CAMERA, compose
+from gym_playbyear.task import Task
+from gym_playbyear.visuals import add_visuals
 
 
 class GLUnavailableError(RuntimeError):
@@ -80,3 +84,66 @@ class Window:
         for thread in self._threads:
             thread.join(timeout=5)
         atexit.unregister(self.close)
+
+
+class PeopleView:
+    """Pictures and a window for people; opened when they are first asked for.
+
+    Args:
+        task: The task.
+        size: Height and width of the picture [pixels].
+        hidden_object: As for `compose`.
+    """
+
+    def __init__(self, task: Task, size: int, hidden_object: bool):
+        self._scene = PeopleScene(task, size, hidden_object)
+        self._size = size
+        self._renderer: SceneRenderer | None = None
+        self._window: Window | None = None
+
+    def picture(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """The simulation's state as a picture (size, size, 3) uint8."""
+        self._scene.follow(model, data)
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self._scene.model, self._size, shadows=True)
+        return self._renderer.render(self._scene.data, PEOPLE_CAMERA.name)
+
+    def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Shows the simulation's state in a window."""
+        self._scene.follow(model, data)
+        if self._window is None:
+            self._window = Window(self._scene.model, self._scene.data)
+        self._window.update()
+
+    def close(self) -> None:
+        """Closes window and OpenGL."""
+        for resource in (self._renderer, self._window):
+            if resource is not None:
+                resource.close()
+
+
+class PeopleScene:
+    """A task's scene for people: the same motion, with shapes and light for the eye. Physics, and what the policy's cameras
+    see, know nothing of it.
+
+    Args:
+        task: The task.
+        size: Height and width of the picture [pixels].
+        hidden_object: As for `compose`.
+
+    Attributes:
+        model, data: To draw from, after `follow`.
+    """
+
+    def __init__(self, task: Task, size: int, hidden_object: bool = True):
+        spec = compose(task, size, hidden_object)
+        add_visuals(spec, task)
+        self.model = spec.compile()
+        self.data = mujoco.MjData(self.model)
+
+    def follow(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Puts everything where it is in the simulation."""
+        self.model.body_pos[:], self.model.body_quat[:] = model.body_pos, model.body_quat
+        self.data.qpos[:] = data.qpos
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_camlight(self.model, self.data)

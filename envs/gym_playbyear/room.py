@@ -1,20 +1,15 @@
 """A task heard in another room, or by another microphone: what does a policy make of sound that it did not train with?"""
 
-from collections.abc import Mapping
 from functools import cache
 from math import gcd
 from pathlib import Path
-from typing import Any
 
-import mujoco
 import numpy as np
 from scipy import signal
 from scipy.io import wavfile
 
-from gym_playbyear.ears import Moment
-from gym_playbyear.ears_v2 import MaterialEars
-from gym_playbyear.options import OptionError, check_option
-from gym_playbyear.sound_v2 import BACKGROUND_RMS, pcm16
+from gym_playbyear.registry import OptionError, check_option
+from gym_playbyear.sound.synthesizer import BACKGROUND_RMS, pcm16
 
 RESPONSES: dict[str, tuple[str, float | tuple[float, float], float]] = {
     "flat": ("none", 0.0, 0.0),
@@ -27,10 +22,9 @@ lets through is added to the sound; 0 puts it in the sound's place."""
 
 
 class Room:
-    """Ears in a room where a recording plays, and behind a microphone of another frequency response.
+    """A room where a recording plays, and a microphone of another frequency response.
 
     Args:
-        ears: What hears the task.
         microphones: Their names; each hears the recording from another place in it.
         sample_rate: Samples per second.
         noise: A WAV file; it repeats. None: a silent room.
@@ -43,7 +37,6 @@ class Room:
 
     def __init__(
         self,
-        ears: MaterialEars,
         microphones: tuple[str, ...],
         sample_rate: int,
         noise: str | None = None,
@@ -53,29 +46,22 @@ class Room:
         check_option("response", response, RESPONSES)
         if not 0.0 <= noise_level < np.inf:
             raise OptionError("room_noise_level", noise_level, "give 0 (silent) or more")
-        self._ears, self._microphones = ears, microphones
+        self._microphones = microphones
         recording = np.zeros(1, np.float32) if noise is None else _recording(str(noise), sample_rate)
         self._recording = noise_level * BACKGROUND_RMS * recording
         kind, corner, self._added = RESPONSES[response]
         self._filter = None if response == "flat" else signal.butter(1, corner, kind, fs=sample_rate, output="sos")
         self.reset(np.random.default_rng(0))
 
-    def choose(self, materials: Mapping[str, str]) -> None:
-        self._ears.choose(materials)
-
-    def add_sensors(self, spec: mujoco.MjSpec) -> None:
-        self._ears.add_sensors(spec)
-
     def reset(self, rng: np.random.Generator) -> None:
         """An episode begins, somewhere in the recording."""
-        self._ears.reset(rng)
         (own,) = rng.spawn(1)
         self._places = own.integers(len(self._recording), size=len(self._microphones))
         n_sections = 0 if self._filter is None else len(self._filter)
         self._state = np.zeros((n_sections, len(self._microphones), 2))
 
-    def step(self, model: mujoco.MjModel, moment: Moment) -> dict[str, np.ndarray]:
-        heard = self._ears.step(model, moment)
+    def hear(self, heard: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What is heard there, int16, of what each microphone would hear without it, of one control step."""
         wave = np.stack([heard[name] for name in self._microphones]) / 32767.0  # (microphones, S)
         span = np.arange(wave.shape[1])
         wave += self._recording[(self._places[:, None] + span) % len(self._recording)]
@@ -84,11 +70,6 @@ class Room:
             passed, self._state = signal.sosfilt(self._filter, wave, zi=self._state)
             wave = wave + self._added * passed if self._added else passed
         return dict(zip(self._microphones, pcm16(wave), strict=True))
-
-
-def in_room(ears: MaterialEars, microphones: tuple[str, ...], sample_rate: int, room: Mapping[str, Any]) -> Any:
-    """The ears themselves, or, with options of `Room`, in a room."""
-    return Room(ears, microphones, sample_rate, **room) if room else ears
 
 
 @cache

@@ -2,79 +2,15 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from gym_playbyear.haste import Haste
-from gym_playbyear.proprioception import SensorNoise
-from gym_playbyear.rules import Rule, Solved
+from gym_playbyear.panda import Panda, SensorNoise
+from gym_playbyear.terminations import EarlyAction, Success, Termination
 
 PHYSICS_DT = 0.002  # s
-
-
-class Controller(Protocol):
-    """Turns actions into the servo targets of one control step. It has a state, and is copied with its environment.
-
-    Attributes:
-        n_substeps: Physics steps in a control step.
-        gripper_obeys: Whether a change of the gripper's command takes effect in the next step.
-    """
-
-    n_substeps: int
-
-    @property
-    def gripper_obeys(self) -> bool: ...
-
-    def reset(self, position: np.ndarray) -> np.ndarray:
-        """Puts the tool at a point (3,) [m, world], fingers open. Returns the positions of the arm's joints and fingers."""
-        ...
-
-    def hold(self) -> np.ndarray:
-        """(nu,) the servo targets that keep the arm where it is told to be."""
-        ...
-
-    def command(self, action: np.ndarray, measured: np.ndarray) -> np.ndarray:
-        """(n_substeps, nu) servo targets for an action, while the tool is at `measured` (3,) [m, world]."""
-        ...
-
-
-class Arm(Protocol):
-    """An arm with a hand; its joints, then its fingers, come first in the model.
-
-    One that also has `dress(spec)` may change how people see it (`gym_playbyear.looks`).
-
-    Attributes:
-        base: Where it stands (3,) [m, world]; `agent_pos` counts from there.
-        max_opening: Between the open fingers [m].
-        n_joints: Of the arm; two finger joints follow.
-        root: Body from which on outward all counts as "gripper" where contacts are named.
-        touching: The parts of the hand, bodies, whose contacts with loose things are measured one by one.
-        tool: Site between the fingertips.
-        links: Bodies of the hand by what is mounted there: `gripper`, `left_finger`, `right_finger`.
-    """
-
-    @property
-    def base(self) -> tuple[float, float, float]: ...
-    @property
-    def max_opening(self) -> float: ...
-    @property
-    def n_joints(self) -> int: ...
-    @property
-    def root(self) -> str: ...
-    @property
-    def touching(self) -> tuple[str, ...]: ...
-    @property
-    def tool(self) -> str: ...
-    @property
-    def links(self) -> Mapping[str, str]: ...
-
-    def spec(self) -> mujoco.MjSpec:
-        """The arm alone, with its actuators."""
-        ...
-
-    def controller(self, control_hz: int, physics_dt: float) -> Controller: ...
 
 
 @dataclass(frozen=True)
@@ -82,19 +18,19 @@ class Prop:
     """A thing in the scene.
 
     Attributes:
-        name: Of its outermost body. Contacts (`gripper-can`), `env.position("can")` and `env.can_position` go by it.
+        name: Of its outermost body. Contacts (`gripper-can`) and `env.position("can")` go by it.
         spec: That body as MJCF, `<body name=...>...</body>` or a whole `<mujoco>`, or as an `MjSpec` (kept as MJCF, so that
             tasks can be copied). Angles are in radians unless the `<mujoco>` says otherwise. Geoms that leave `contype` and
             `conaffinity` alone touch what a thing of this kind touches; zero for both means that one only sees them.
-        material: Name in `materials_v2.ALL_MATERIALS`. None: its contacts make no sound and are not measured.
+        material: Name in `sound.materials.ALL_MATERIALS`. None: its contacts make no sound and are not measured.
         loudness: Factor on its own share of a contact's sound.
         loose: It moves freely, by a free joint that has the prop's name, and may touch whatever is there.
         hidden: What no camera sees and hearing has to find. With `hidden_object=False` the hand passes through it.
         inside: Name of the prop that it is shut in: it touches nothing but that and what else is in there.
         jingles: It has parts, bodies within that one, which are heard when they knock against each other.
         bends: Joints within it whose motion crackles, each with a factor from its speed to that of bending in rad/s.
-        looks: `looks(spec, body)` gives its body, in the scene that only people see, shapes for the eye
-            (`gym_playbyear.looks_shapes`). None: people see its geoms.
+        visuals: `visuals(spec, body)` gives its body, in the scene that only people see, shapes for the eye
+            (`gym_playbyear.visuals`). None: people see its geoms.
     """
 
     name: str
@@ -106,7 +42,7 @@ class Prop:
     inside: str | None = None
     jingles: bool = False
     bends: tuple[tuple[str, float], ...] = ()
-    looks: Callable[[mujoco.MjSpec, mujoco.MjsBody], None] | None = None
+    visuals: Callable[[mujoco.MjSpec, mujoco.MjsBody], None] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.spec, mujoco.MjSpec):
@@ -130,7 +66,7 @@ class Camera:
 class Task:
     """A task, complete. `TaskEnv` plays it; a function that returns one may take options of its own (`contents="bottle"`).
 
-    `env` stands for the environment: see `TaskEnv` and `PrivilegedState` for what functions and scripts may ask it.
+    `env` stands for the environment: see `TaskEnv` for what functions and scripts may ask it.
 
     Attributes:
         name: With its version, such as `OccludedGrasp-v1`; observed as `env.task`.
@@ -138,19 +74,19 @@ class Task:
         arm: The arm.
         arena: What all stands on; a prop that is not loose.
         props: What else is there. Which contacts are measured and heard follows from arena and props.
-        place: `place(env, options)` begins an episode: it draws places from `env.np_random`, sets them with `env.put`, and
-            returns what the camera shows of the episode, in numbers by name (`hidden_range`, ...). They become attributes of
-            `env`. What only sound tells it puts into `env.secrets`, and what props are made of this time into `env.materials`.
-        success: The rule that the task is solved.
-        ends: Rules by which an attempt fails, in order; their names appear in `info["end"]`.
+        initialize_episode: `initialize_episode(env, options)` draws places from `env.np_random`, sets them with `env.set_pose`,
+            and returns what the camera shows of the episode, in numbers by name (`hidden_range`, ...): `env.shown`. What only
+            sound tells it puts into `env.secrets`, and what props are made of this time into `env.materials`.
+        success: When the task is solved.
+        terminations: By what an attempt fails, in order; their names appear in `info["end"]`.
         expert: `expert(env)` makes the scripted expert: `act()` gives the next action.
         horizon: Steps after which an attempt is cut off.
-        haste: What tells whether an attempt acted before it had heard anything (`info["acted_early"]`).
+        early_action: What tells whether an attempt acted before it had heard anything (`info["acted_early"]`).
         gate: `gate(env, expert)` makes the intervention gate; None: there is none.
         blind: Scripts without any sense of contact, by name; each is `script(env)`.
         deaf: Scripts that feel with the arm and do not hear, by name; each is `script(facts, rng)`, see
-            `gym_playbyear.adversaries`. Tasks whose camera shows a `hidden_range` have ours without naming any.
-        sees: `sees(env)`: what the camera shows of the moment, in numbers by name, besides what `place` returned.
+            `gym_playbyear.check`. Tasks whose camera shows a `hidden_range` have ours without naming any.
+        sees: `sees(env)`: what the camera shows of the moment, in numbers by name, besides `env.shown`.
         twins: Options of two worlds in which nothing differs but what only sound tells.
         control_hz, sample_rate: Steps, and samples of a microphone, per second.
         physics_dt: Duration of a physics step [s].
@@ -158,22 +94,22 @@ class Task:
         cameras: What the policy sees through; a square picture each.
         start, start_spread: Where the tool is before an episode [m, world], and how far it may be off along each axis.
         sensors: What is wrong with what the arm measures of itself.
-        felt: Prop whose contact force stands in for sound with `sound="contact_force"`.
-        numbers: The task's own numbers, for its functions and scripts: `env.variant`.
-        limits: What the task promises of those who play it, where that differs from other tasks (`env.check_limits`).
+        force_proxy_of: Prop whose contact force stands in for sound with `sound="contact_force"`.
+        numbers: The task's own numbers, for its functions and scripts.
+        limits: What the task promises of those who play it, where that differs from `check.Limits`.
     """
 
     name: str
     description: str
-    arm: Arm
+    arm: Panda
     arena: Prop
     props: tuple[Prop, ...]
-    place: Callable[[Any, dict[str, Any]], dict[str, Any]]
-    success: Solved
+    initialize_episode: Callable[[Any, dict[str, Any]], dict[str, Any]]
+    success: Success
     expert: Callable[[Any], Any]
     horizon: int
-    ends: tuple[Rule, ...] = ()
-    haste: Haste = field(default_factory=Haste)
+    terminations: tuple[Termination, ...] = ()
+    early_action: EarlyAction = field(default_factory=EarlyAction)
     gate: Callable[[Any, Any], Any] | None = None
     blind: Mapping[str, Callable[[Any], Any]] = field(default_factory=dict)
     deaf: Mapping[str, Callable[[Any, np.random.Generator], Any]] = field(default_factory=dict)
@@ -187,6 +123,6 @@ class Task:
     start: tuple[float, float, float] = (-0.12, 0.0, 0.98)
     start_spread: float = 0.02
     sensors: SensorNoise = field(default_factory=SensorNoise)
-    felt: str | None = None
+    force_proxy_of: str | None = None
     numbers: Any = None
     limits: Mapping[str, float] = field(default_factory=dict)

@@ -16,8 +16,8 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE, OBS_STR
 
 from gym_playbyear import register_tasks
-from gym_playbyear.options import OptionError, make_definition
-from gym_playbyear.plugins import PluginError
+from gym_playbyear.environment import SOUND_MODES
+from gym_playbyear.registry import OptionError, PluginError, make_definition
 from gym_playbyear.room import RESPONSES
 from gym_playbyear.task import Task
 from lerobot_env_playbyear.attempts import with_attempts_file
@@ -26,7 +26,6 @@ from lerobot_env_playbyear.processors import PcmToFloatProcessorStep
 if TYPE_CHECKING:  # of the other distribution, which is needed for these pictures alone
     from lerobot_playbyear.audio.sound_picture import SoundPicture
 
-SOUND_MODES = ("waveform", "contact_force", "none")
 RENDER_MODES = ("rgb_array", "human")
 _STATE_DIM, _ACTION_DIM, _FORCE_DIM = 7, 4, 6
 

@@ -9,11 +9,11 @@
 
 import numpy as np
 
-from gym_playbyear.arena import FRONT_CAMERA, TABLE, TABLE_TOP, WALL_COLOUR, box
-from gym_playbyear.arm import ACTION_SCALE, ArmConfig
-from gym_playbyear.materials_v2 import TINPLATE, cup, ringing
-from gym_playbyear.rules import Shoved, Solved
+from gym_playbyear.panda import ACTION_SCALE, Panda
+from gym_playbyear.sound.materials import TINPLATE, cup, ringing
 from gym_playbyear.task import Prop, Task
+from gym_playbyear.tasks.arena import FRONT_CAMERA, TABLE, TABLE_TOP, WALL_COLOUR, box
+from gym_playbyear.terminations import Shoved, Success
 
 RADIUS, HALF_HEIGHT = 0.025, 0.025  # m
 TIN_CAN = ringing(TINPLATE, cup(TINPLATE, RADIUS, 0.0003, (2, 3, 4, 5)), support=30.0)
@@ -33,13 +33,13 @@ def stop_at_the_tin() -> Task:
     return Task(
         name="StopAtTheTin-v1",
         description="Find the tin behind the wall by sound, and stop there.",
-        arm=ArmConfig(),
+        arm=Panda(),
         arena=TABLE,
         props=(box("wall", (0.02, 0.4, 0.3), (0.2, 0.0, 0.775), WALL_COLOUR, material="wall"), TIN),
         cameras=(FRONT_CAMERA,),
-        place=place,
-        success=Solved(is_near, "tin", seconds=0.5, tolerance=0.003),
-        ends=(Shoved("tin", distance=0.03),),
+        initialize_episode=place,
+        success=Success(is_near, "tin", seconds=0.5, tolerance=0.003),
+        terminations=(Shoved("tin", distance=0.03),),
         expert=Expert,
         horizon=200,
         start=(0.0, -0.25, 0.9),
@@ -48,13 +48,13 @@ def stop_at_the_tin() -> Task:
 
 def place(env, options) -> dict:
     """Stands the tin somewhere in its range; what the camera shows of the episode is that range."""
-    env.put("tin", (0.0, env.np_random.uniform(*RANGE), TABLE_TOP + HALF_HEIGHT))
+    env.set_pose("tin", (0.0, env.np_random.uniform(*RANGE), TABLE_TOP + HALF_HEIGHT))
     return {"hidden_range": RANGE}
 
 
 def gap(env) -> float:
     """Between finger and tin [m]."""
-    return float(env.tin_position[1] - env.eef_position[1]) - env.definition.arm.max_opening / 2 - 0.01 - RADIUS
+    return float(env.position("tin")[1] - env.eef_position[1]) - env.definition.arm.max_opening / 2 - 0.01 - RADIUS
 
 
 def is_near(env) -> bool:

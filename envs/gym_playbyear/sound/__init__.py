@@ -1,0 +1,6 @@
+"""The sound of contact: what microphones hear of what touches."""
+
+from gym_playbyear.sound.excitation import Bending
+from gym_playbyear.sound.synthesizer import BACKGROUND_RMS, Synthesizer
+
+__all__ = ["BACKGROUND_RMS", "Bending", "Synthesizer"]
