@@ -178,7 +178,12 @@ class PouchTerms(Terms):
 
     def truth(self, closes: bool) -> list[float]:
         known = super().truth(closes)
-        return [*known[:4], float(self._was_dropped()), known[5], 1.0 if self.env.secrets["contents"] == _SCREWS else -1.0]
+        return [
+            *known[:4],
+            float(self._was_dropped()),
+            known[5],
+            1.0 if self.env.secrets["contents"] == _SCREWS else -1.0,
+        ]
 
     def worth(self, shown: dict[str, np.ndarray], closes: bool) -> float:
         """Over the pouch, around it, holds it, lifts it; 4 once it was dropped, and then the same again or away from it."""

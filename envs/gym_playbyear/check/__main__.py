@@ -23,9 +23,7 @@ def main() -> int:
     parser.add_argument("task", help="such as OccludedGrasp-v1")
     parser.add_argument("--episodes", type=int, default=100, help="of each player and of the twin test (default: 100)")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"of the first episode (default: {FIRST_SEED})")
-    parser.add_argument(
-        "--players", nargs="+", help=f"only these: {', '.join(KINDS)}, or names of scripts"
-    )
+    parser.add_argument("--players", nargs="+", help=f"only these: {', '.join(KINDS)}, or names of scripts")
     parser.add_argument("--no-twin", action="store_true", help="do not compare twin worlds")
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side (default: 1)")
     parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
