@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from gym_playbyear import TASKS
+from gym_playbyear.experts import occluded_gate
 from gym_playbyear.experts.occluded_gate import EMPTY_OPENING, GRASP_HEIGHT, MISSED_HEIGHT, InterventionGate
 
 STAY = np.array([0.0, 0.0, 0.0, -1.0])
