@@ -16,7 +16,8 @@ BEGIN, END = "<!-- table of adversaries -->\n", "<!-- end of the table -->\n"
 NOT_RUN, NOT_THERE = "not run", ""
 _LEARNED = {"deaf": "learned, deaf", "hears": "learned, hears"}
 _CLASSIFIER = "logistic regression"
-_FORMER = {"tap_gentle", "tap_feather", "tap_along", "tap_across", "shove", "bat", "nudge_beside"} | {
+_FORMER = ["tap_gentle", "tap_feather", "tap_along", "tap_across", "shove", "bat", "nudge_beside"]
+_FORMER += ["poke", "gather", "survive"]
     "poke",
     "gather",
     "survive",
