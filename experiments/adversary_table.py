@@ -16,12 +16,18 @@ BEGIN, END = "<!-- table of adversaries -->\n", "<!-- end of the table -->\n"
 NOT_RUN, NOT_THERE = "not run", ""
 _LEARNED = {"deaf": "learned, deaf", "hears": "learned, hears"}
 _CLASSIFIER = "logistic regression"
-_FORMER = ["tap_gentle", "tap_feather", "tap_along", "tap_across", "shove", "bat", "nudge_beside"]
-_FORMER += ["poke", "gather", "survive"]
+_FORMER = (
+    "tap_gentle",
+    "tap_feather",
+    "tap_along",
+    "tap_across",
+    "shove",
+    "bat",
+    "nudge_beside",
     "poke",
     "gather",
     "survive",
-}
+)
 """Scripts that never led, and are not played any more; the committed results have them."""
 
 
