@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from accelerate import Accelerator
     from huggingface_hub import ModelCard
     from lerobot.configs import PreTrainedConfig
-    from lerobot.datasets import LeRobotDatasetMetadata
     from lerobot.teleoperators.gamepad import GamepadTeleop
     from lerobot.teleoperators.keyboard import KeyboardTeleop
     from lerobot.utils.logging_utils import MetricsTracker
@@ -157,11 +156,6 @@ def card_writer(policy: Any, config: "PreTrainedConfig") -> "Callable[..., Model
         return card
 
     return write
-
-
-def forget_unsaved_rows(meta: "LeRobotDatasetMetadata") -> None:
-    """Of episodes that LeRobot has not written yet; it would write them when it closes the dataset."""
-    meta._metadata_buffer.clear()
 
 
 def held_keys(teleop: "KeyboardTeleop") -> dict[Any, bool]:

@@ -30,7 +30,6 @@ from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, Datas
 from lerobot_playbyear.datasets import EpisodeStore, write_audio
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.survey import survey
-from lerobot_playbyear.datasets.video_pictures import video_pictures
 from lerobot_playbyear.film.video import at_a_rate_of_aac
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.hub.push import HubError, _files, push_dataset
@@ -201,8 +200,6 @@ def test_a_film_of_another_size_is_refused_before_it_is_decoded(videos):
     said = rf"'{CAMERA}': .*file-000.mp4' have 1920 x 1080 pixels; .*\(16, 16, 3\)"
     with pytest.raises(ValueError, match=said):
         EpisodeStore.load("a/b", str(videos), device="cpu", video_backend="pyav")
-    with pytest.raises(ValueError, match=said):  # by LeRobot's decoder
-        next(video_pictures(path, [0.1, 0.0], 1e-3, "pyav", CAMERA, (16, 16, 3)))
     verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))
     (verdict,) = [v for v in verdicts if v.check == "pictures"]
     assert verdict.level == "error"

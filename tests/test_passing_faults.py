@@ -13,7 +13,7 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from recording_factory import FPS, REPO_ID, RICH_FEATURES, differences, episode_frames, load
 
-from lerobot_playbyear.datasets import settling
+from lerobot_playbyear.datasets import episode_files
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.repair import repair_dataset
 
@@ -38,8 +38,8 @@ def originals(tmp_path_factory) -> dict[str, Path]:
         pytest.MonkeyPatch.context() as patch,
         DurableWriter(REPO_ID, folder / "ours", FPS, RICH_FEATURES, rgb_encoder=ENCODER) as writer,
     ):
-        patch.setattr(settling, "_SMALL_DATA_BYTES", 20_000)
-        patch.setattr(settling, "_SMALL_TABLE_BYTES", 30_000)
+        patch.setattr(episode_files, "SMALL_DATA_BYTES", 20_000)
+        patch.setattr(episode_files, "SMALL_TABLE_BYTES", 30_000)
         for number in range(N_EPISODES):
             for frame in episode_frames(number, RICH_FEATURES):
                 writer.add_frame(frame)

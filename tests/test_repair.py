@@ -28,7 +28,7 @@ from recording_factory import (
     load,
 )
 
-from lerobot_playbyear.datasets import settling
+from lerobot_playbyear.datasets import episode_files
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.info import OutsideError
@@ -69,7 +69,7 @@ def originals(tmp_path_factory) -> dict[str, tuple[Path, dict[str, Any]]]:
     """Datasets to be damaged: of ours in several files and in one, of LeRobot's, and one that was killed."""
     folder = tmp_path_factory.mktemp("originals")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(settling, "_SMALL_DATA_BYTES", 20_000)
+        patch.setattr(episode_files, "SMALL_DATA_BYTES", 20_000)
         write_ours(folder / "ours", RICH_FEATURES)
     write_ours(folder / "one file", FEATURES)
     dataset = write_lerobots(folder / "lerobot", RICH_FEATURES)

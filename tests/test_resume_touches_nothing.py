@@ -12,10 +12,9 @@ import pytest
 from lerobot.configs.video import RGBEncoderConfig
 from recording_factory import FEATURES, FPS, REPO_ID, differences, episode_frames, load
 
-from lerobot_playbyear.datasets import settling
-from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
+from lerobot_playbyear.datasets import episode_files
+from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, has_dataset
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.datasets.existing import has_dataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.repair import repair_dataset
@@ -33,7 +32,7 @@ def original(tmp_path_factory) -> Path:
     """Each episode in a file of its own."""
     root = tmp_path_factory.mktemp("original") / "dataset"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(settling, "_SMALL_DATA_BYTES", 0)
+        patch.setattr(episode_files, "SMALL_DATA_BYTES", 0)
         with writer(root) as target:
             for number in range(N_EPISODES):
                 for frame in episode_frames(number, FEATURES):

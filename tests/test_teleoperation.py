@@ -27,8 +27,7 @@ from lerobot_playbyear.dagger.methods.robot_gated import Asked, RobotGatedConfig
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play as play_episode
-from lerobot_playbyear.recording.demonstrations import Nobody
-from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.recording.record import Nobody, RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator
 from lerobot_playbyear.teleoperation.controls import (
     CLOSE,

@@ -3,8 +3,6 @@
 LeRobot is imported when the dataset's files have been looked at.
 """
 
-import os
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -16,39 +14,23 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 from lerobot_playbyear.datasets.files import (
     EPISODES_DIR,
-    HF_LEROBOT_HOME,
     INFO_PATH,
     check_can_be_made,
-    flush,
-    flush_all,
     list_files,
+    new_folder,
+    scratch_folder,
 )
 from lerobot_playbyear.datasets.info import check_links
-from lerobot_playbyear.datasets.opening import open_dataset
 from lerobot_playbyear.datasets.parquet import ParquetDamageError
+from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
 
 if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDataset
-
     from lerobot_playbyear.audio.attached_sound import EpisodesSound
-    from lerobot_playbyear.datasets.long_dataset import LongDataset
+    from lerobot_playbyear.datasets.reader import DatasetReader
 
 
 class AttachError(InputError):
     """Sound cannot be attached; nothing was written."""
-
-
-@dataclass
-class DatasetPlace:
-    """A dataset's name and place.
-
-    Args:
-        repo_id: Its name, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
-    """
-
-    repo_id: str
-    root: str | None = None
 
 
 @dataclass
@@ -110,10 +92,10 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         InputError: The copy's folder cannot be made, before any sound is read.
         OSError: The copy cannot be written.
     """
-    root = Path(cfg.dataset.root) if cfg.dataset.root else HF_LEROBOT_HOME / cfg.dataset.repo_id
+    root = cfg.dataset.folder
     has_own_files = cfg.files is None and cfg.session is None and has_audio_files(root)
     _check_source(cfg, has_own_files)
-    target = new_folder(cfg.output)
+    target = output_folder(cfg.output)
     if has_own_files:
         return _attach_own_files(cfg, root, target)
     dataset = open_for_copy(cfg.dataset)
@@ -121,7 +103,6 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
     from lerobot_playbyear.audio.attached_sound import read_sound
     from lerobot_playbyear.audio.camera_sound import read_camera_sound, write_with_cameras
     from lerobot_playbyear.audio.session_sound import read_session
-    from lerobot_playbyear.datasets.long_dataset import scratch_folder
 
     with scratch_folder() as scratch:
         if _is_in_dataset(cfg):
@@ -139,7 +120,6 @@ def _attach_own_files(cfg: AttachAudioConfig, root: Path, target: Path) -> Path:
     layout = read_layout(cfg.dataset.repo_id, root, cfg.offset)
     from lerobot_playbyear.audio.attached_copy import write_with_sound
     from lerobot_playbyear.audio.audio_import import read_tracks_sound
-    from lerobot_playbyear.datasets.long_dataset import scratch_folder
 
     with scratch_folder() as scratch:
         sounds = read_tracks_sound(layout, cfg, Path(scratch))
@@ -170,35 +150,28 @@ def write_new_dataset(root: Path, target: Path, write: Callable[[Path, Path], No
         AttachError: A table of the other is damaged.
         OSError: Something cannot be read or written.
     """
-    unfinished = target.absolute().with_name(f".{target.name}.attaching")
-    shutil.rmtree(unfinished, ignore_errors=True)  # of one that was killed
     try:
-        unfinished.mkdir(parents=True)
-        write(root, unfinished)
-        flush_all(unfinished)
-        os.rename(unfinished, target)
-        flush(target.absolute().parent)
+        with new_folder(target) as unfinished:
+            write(root, unfinished)
     except ParquetDamageError as error:
         raise AttachError(f"{error} Repair it first: playbyear-repair --root={root}") from error
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def new_folder(place: DatasetPlace) -> Path:
+def output_folder(place: DatasetPlace) -> Path:
     """Where a new dataset is to be written.
 
     Raises:
         AttachError: Something is there already.
         InputError: It cannot be made.
     """
-    target = Path(place.root) if place.root else HF_LEROBOT_HOME / place.repo_id
+    target = place.folder
     if target.exists():
         raise AttachError(f"{target} is there already. Choose another --output.root, or delete it.")
     check_can_be_made(target, f"--output.root={target}")
     return target
 
 
-def open_for_copy(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
+def open_for_copy(place: DatasetPlace) -> DatasetReader:
     """Opens a dataset of which a copy is to be made: no link leads out of it, and its tables of episodes are whole.
 
     Raises:
@@ -207,7 +180,7 @@ def open_for_copy(place: DatasetPlace) -> "LeRobotDataset | LongDataset":
     if place.root is not None and not (Path(place.root) / INFO_PATH).is_file():
         raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
     try:
-        dataset = open_dataset(place.repo_id, place.root, video_backend="pyav")
+        dataset = DatasetReader(place.repo_id, place.root)
         from lerobot_playbyear.audio.attached_copy import read_named_table
 
         check_links(Path(dataset.root))  # the copy would hold what they lead to
@@ -245,7 +218,7 @@ def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
             raise AttachError(f"--{name}={getattr(cfg, name)} is for --session. Leave it out.")
 
 
-def _keys(cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset") -> list[str]:
+def _keys(cfg: AttachAudioConfig, dataset: DatasetReader) -> list[str]:
     names = [name.strip() for name in ("microphone" if cfg.microphone is None else cfg.microphone).split(",")]
     keys = [name if name.startswith(AUDIO_PREFIX) else AUDIO_PREFIX + name for name in names]
     for key in keys:

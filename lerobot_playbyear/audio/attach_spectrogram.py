@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear.audio.attach import DatasetPlace, new_folder, open_for_copy, write_new_dataset
+from lerobot_playbyear.audio.attach import DatasetPlace, open_for_copy, output_folder, write_new_dataset
 from lerobot_playbyear.audio.sound_picture import picture_feature
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
 
 if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDataset
-
-    from lerobot_playbyear.datasets.long_dataset import LongDataset
+    from lerobot_playbyear.datasets.reader import DatasetReader
 
 _PICTURES = ("image", "video")
 _USUAL_SIZE = (84, 84)
@@ -88,7 +86,7 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
         InputError: The dataset cannot be read or has no sound, an option does not fit, or there is a folder already.
         OSError: The copy cannot be written.
     """
-    target = new_folder(cfg.output)
+    target = output_folder(cfg.output)
     if not cfg.video:
         for name in ("vcodec", "crf"):
             if getattr(cfg, name) is not None:
@@ -98,7 +96,7 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
     from lerobot_playbyear.audio.attached_copy import write_changed
     from lerobot_playbyear.audio.attached_pictures import EpisodePictures, fit_levels
     from lerobot_playbyear.audio.picture_storage import images_change, make_encoder, video_change
-    from lerobot_playbyear.datasets.long_dataset import scratch_folder
+    from lerobot_playbyear.datasets.files import scratch_folder
 
     with scratch_folder() as scratch, errors_of_input():
         encoder = make_encoder(cfg.vcodec, cfg.crf) if cfg.video else None
@@ -117,12 +115,12 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
             f"{how.low_db:g} to {how.high_db:g} dB"
         )
     print(
-        f"\nDataset: {target} ({dataset.num_episodes} episodes). To roll out what it taught: --env.spectrogram={target}"
+        f"\nDataset: {target} ({len(dataset.episodes)} episodes). To roll out what it taught: --env.spectrogram={target}"
     )
     return target
 
 
-def _plan(cfg: AttachSpectrogramConfig, dataset: "LeRobotDataset | LongDataset") -> list[PicturePlan]:
+def _plan(cfg: AttachSpectrogramConfig, dataset: "DatasetReader") -> list[PicturePlan]:
     features, fps = dataset.meta.features, dataset.fps
     try:
         rates = check_audio_features(features, fps)

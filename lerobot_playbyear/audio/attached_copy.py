@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attached_sound import EpisodesSound
 from lerobot_playbyear.audio.audio_layout import AUDIO_FOLDER
-from lerobot_playbyear.datasets.features import audio_feature, audio_keys
+from lerobot_playbyear.datasets.features import audio_feature
 from lerobot_playbyear.datasets.info import read_info
 from lerobot_playbyear.datasets.parquet import (
     ParquetDamageError,
@@ -26,10 +26,10 @@ from lerobot_playbyear.datasets.parquet import (
     open_checked,
     read_row_groups,
     read_table,
+    write_rows,
     write_tables,
 )
-from lerobot_playbyear.datasets.settling import write_rows
-from lerobot_playbyear.datasets.statistics import Stats, add_stats, with_sound_stats, write_stats
+from lerobot_playbyear.datasets.statistics import Stats, add_stats, with_stats, write_stats
 
 _SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
 
@@ -137,7 +137,7 @@ def write_changed(root: Path, target: Path, change: DatasetChange) -> None:
         elif name != Path(INFO_PATH):
             shutil.copyfile(path, target / name)
     known = {key: stats for key, stats in (load_stats(root) or {}).items() if key not in change.removed}
-    write_stats({**known, **add_stats(None, change.stats, audio_keys(change.added))}, target)
+    write_stats({**known, **add_stats(None, change.stats)}, target)
     info = {**info, "features": features, **change.info}
     kept = {name: value for name, value in info.items() if name not in change.info or value is not None}
     (target / INFO_PATH).write_text(json.dumps(kept, indent=4, ensure_ascii=False), encoding="utf-8")
@@ -208,7 +208,7 @@ def _write_rows(source: Path, target: Path, change: DatasetChange) -> None:
             raise ParquetDamageError(f"{source} is damaged: it names episode {episode} of {len(change.stats)}.")
     prefixes = tuple(f"{folder}/{key}/" for key in change.removed for folder in ("stats", AUDIO_FOLDER))
     rows = rows.select([name for name in rows.column_names if not name.startswith(prefixes)])
-    rows = with_sound_stats(rows, [change.stats[episode] for episode in episodes])
+    rows = with_stats(rows, [change.stats[episode] for episode in episodes])
     for name, values in change.episode_columns.items():
         rows = rows.append_column(name, pa.array([values[episode] for episode in episodes]))
     write_rows(rows.replace_schema_metadata(None), target)

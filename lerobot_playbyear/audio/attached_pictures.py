@@ -4,26 +4,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from lerobot.datasets import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramError, PicturePlan
 from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture
-from lerobot_playbyear.datasets.long_dataset import LongDataset
-from lerobot_playbyear.datasets.parquet import PIECE_BYTES, column_to_numpy, episode_bounds
-from lerobot_playbyear.datasets.statistics import Stats, channel_stats
-from lerobot_playbyear.datasets.tensors import read_rows
+from lerobot_playbyear.datasets.parquet import PIECE_BYTES
+from lerobot_playbyear.datasets.reader import DatasetReader, EpisodeRows
+from lerobot_playbyear.datasets.statistics import Stats, picture_stats
 
-_FRAMES_AT_ONCE = 256
 _STEP_DB = 0.1  # of the histogram of levels
 _LOUDEST_DB = 20.0  # a square wave at full scale has 2
 _QUIET_SHARE = 0.01
 _LEAST_RANGE_DB = 20.0  # so that the noise of a dataset in which nothing happens stays grey
 
 
-def fit_levels(
-    dataset: LeRobotDataset | LongDataset, plan: PicturePlan, given: tuple[float | None, float | None]
-) -> SoundPicture:
+def fit_levels(dataset: DatasetReader, plan: PicturePlan, given: tuple[float | None, float | None]) -> SoundPicture:
     """How one microphone's pictures are made, once all of its sound has been heard.
 
     Args:
@@ -35,7 +30,7 @@ def fit_levels(
         AttachSpectrogramError: There is nothing but silence, or the levels do not go together.
     """
     how = SoundPicture(
-        plan.microphone, plan.feature, plan.sample_rate, int(dataset.fps), plan.height, plan.width, plan.columns_per_frame,
+        plan.microphone, plan.feature, plan.sample_rate, dataset.fps, plan.height, plan.width, plan.columns_per_frame,
         FLOOR_DB, _LOUDEST_DB, before_episode=(0,) * plan.height,
     )  # fmt: skip
     edges = np.arange(FLOOR_DB, _LOUDEST_DB + _STEP_DB / 2, _STEP_DB)
@@ -67,7 +62,7 @@ def fit_levels(
     median = edges[(np.cumsum(counts, axis=1) < halves).sum(axis=1)]  # (height,)
     usual = np.rint(255 * np.clip((median - low) / (high - low), 0, 1)).astype(int)
     return SoundPicture(
-        plan.microphone, plan.feature, plan.sample_rate, int(dataset.fps), plan.height, plan.width, plan.columns_per_frame,
+        plan.microphone, plan.feature, plan.sample_rate, dataset.fps, plan.height, plan.width, plan.columns_per_frame,
         low, high, tuple(usual.tolist()),
     )  # fmt: skip
 
@@ -84,9 +79,9 @@ class EpisodePictures:
         ValueError: A row is missing, or the episodes are not in their order.
     """
 
-    def __init__(self, dataset: LeRobotDataset | LongDataset, how: SoundPicture, scratch: Path) -> None:
+    def __init__(self, dataset: DatasetReader, how: SoundPicture, scratch: Path) -> None:
         self.how = how
-        self._bounds = _bounds(dataset)
+        self._episodes = _episodes(dataset)
         shape = (len(dataset), how.columns_per_frame, how.height)
         self._columns = np.memmap(scratch / how.feature, np.uint8, "w+", shape=shape)
         frames = tqdm(_contexts(dataset, how), "Drawing", len(dataset), unit="frame", delay=1)
@@ -96,7 +91,7 @@ class EpisodePictures:
     @property
     def n_frames(self) -> list[int]:
         """Of each episode."""
-        return [end - start for start, end in self._bounds]
+        return [len(episode) for episode in self._episodes]
 
     @property
     def rows_at_once(self) -> int:
@@ -109,52 +104,35 @@ class EpisodePictures:
         Raises:
             ValueError: There are no such frames.
         """
-        n_frames = self.n_frames[episode] if 0 <= episode < len(self._bounds) else 0
+        n_frames = self.n_frames[episode] if 0 <= episode < len(self._episodes) else 0
         if not 0 <= start < stop <= n_frames:
             raise ValueError(
                 f"it holds frames {start} to {stop - 1} of episode {episode}, for which meta/episodes counts {n_frames}"
             )
-        first = self._bounds[episode][0]
+        first = self._episodes[episode].start
         for frame in range(start, stop):
             seen = self._columns[first + max(frame + 1 - self.how.n_frames, 0) : first + frame + 1]
             yield self.how.picture(seen.reshape(-1, self.how.height))
 
     def stats(self, episode: int) -> Stats:
         """An episode's statistics, of all of its pictures."""
-        n_frames = self.n_frames[episode]
-
-        def pieces() -> Iterator[np.ndarray]:
-            for start in range(0, n_frames, self.rows_at_once):
-                stop = min(start + self.rows_at_once, n_frames)
-                yield np.stack(list(self.pictures(episode, start, stop))).transpose(0, 3, 1, 2)
-
-        return {self.how.feature: channel_stats(pieces, n_frames)}
+        return {self.how.feature: picture_stats(self.pictures(episode, 0, self.n_frames[episode]))}
 
 
-def _bounds(dataset: LeRobotDataset | LongDataset) -> list[tuple[int, int]]:
-    """First row, and row after the last, of every episode."""
-    numbers = column_to_numpy(dataset.hf_dataset.data.column("episode_index"))
-    bounds = list(zip(*episode_bounds(numbers), strict=True))
-    if [int(numbers[start]) for start, _ in bounds] != list(range(dataset.num_episodes)):
+def _episodes(dataset: DatasetReader) -> list[EpisodeRows]:
+    """All episodes, in their order."""
+    if [episode.index for episode in dataset.episodes] != list(range(dataset.meta.total_episodes)):
         raise AttachSpectrogramError(
-            f"The data files do not hold episodes 0 to {dataset.num_episodes - 1} in this order. Repair the dataset first: "
-            f"playbyear-repair --root={dataset.root}"
+            f"The data files do not hold episodes 0 to {dataset.meta.total_episodes - 1} in this order. Repair the dataset "
+            f"first: playbyear-repair --root={dataset.root}"
         )
-    return bounds
+    return dataset.episodes
 
 
-def _contexts(dataset: LeRobotDataset | LongDataset, how: SoundPicture) -> Iterator[tuple[np.ndarray, int]]:
+def _contexts(dataset: DatasetReader, how: SoundPicture) -> Iterator[tuple[np.ndarray, int]]:
     """For every frame the samples that its columns depend on, (context,), and how many of them belong to its episode."""
-    for start, end in _bounds(dataset):
-        tail = np.empty(0, np.int16)
-        n_heard = 0
-        for first in range(start, end, _FRAMES_AT_ONCE):
-            rows = read_rows(dataset, how.microphone, first, min(_FRAMES_AT_ONCE, end - first))
-            wave = np.concatenate(
-                [np.zeros(how.context - len(tail), rows.dtype), tail.astype(rows.dtype), rows.reshape(-1)]
-            )
-            for frame in range(len(rows)):
-                n_heard += how.samples_per_frame
-                stop = how.context + (frame + 1) * how.samples_per_frame
-                yield wave[stop - how.context : stop], min(n_heard, how.context)
-            tail = wave[-how.context :]
+    for episode in _episodes(dataset):
+        sound = dataset.sound(how.microphone, episode)
+        sound = np.concatenate([np.zeros(how.context, sound.dtype), sound])
+        for n_heard in range(how.samples_per_frame, (len(episode) + 1) * how.samples_per_frame, how.samples_per_frame):
+            yield sound[n_heard : n_heard + how.context], min(n_heard, how.context)

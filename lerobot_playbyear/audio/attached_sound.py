@@ -1,21 +1,19 @@
 """The files of sound that a dataset gets: decoded once, checked against its episodes, and read where they are indexed."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from lerobot.datasets import LeRobotDataset
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
 from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resampled, audio_pieces
-from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.parquet import PIECE_BYTES, numpy_to_column
-from lerobot_playbyear.datasets.statistics import Stats, repeated_stats
+from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.datasets.statistics import Stats, sound_stats
 
 
 class SpooledFile:
@@ -82,26 +80,16 @@ class EpisodesSound:
 
     def stats(self, episode: int) -> Stats:
         """An episode's statistics."""
-        n_frames = len(self.episodes[episode]) // self.samples_per_frame
-
-        def pieces(column: int) -> Iterator[np.ndarray]:
-            for start in range(0, n_frames, self.rows_at_once):
-                yield self.blocks(episode, start, min(start + self.rows_at_once, n_frames))[..., column]
-
-        return {
-            key: repeated_stats(partial(pieces, column), n_frames, self.samples_per_frame)
-            for column, key in enumerate(self.keys)
-        }
+        blocks = self.blocks(episode, 0, len(self.episodes[episode]) // self.samples_per_frame)
+        return {key: sound_stats(blocks[..., column]) for column, key in enumerate(self.keys)}
 
 
 _MOST_ERRORS = 10  # that are listed
 
 
-def read_sound(
-    cfg: AttachAudioConfig, dataset: LeRobotDataset | LongDataset, keys: list[str], scratch: Path
-) -> EpisodesSound:
+def read_sound(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], scratch: Path) -> EpisodesSound:
     """Decodes all files, so that what is wrong with them is known before anything is written."""
-    offsets = offsets_of(cfg, dataset.num_episodes)
+    offsets = offsets_of(cfg, len(dataset.episodes))
     pattern = str(cfg.files)
     lengths = [int(length) for length in dataset.meta.episodes["length"]]
     errors: list[str] = []

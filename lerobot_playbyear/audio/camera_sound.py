@@ -1,8 +1,6 @@
 """The sound of microphones that were recorded as cameras: from a dataset's pictures, and from the files of their sessions."""
 
-import itertools
 import logging
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,14 +21,11 @@ from lerobot_playbyear.audio.session_files import SESSIONS, SessionSound, find_s
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.features import IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
-from lerobot_playbyear.datasets.parquet import column_to_numpy, numpy_to_column
+from lerobot_playbyear.datasets.parquet import numpy_to_column
 from lerobot_playbyear.datasets.statistics import Stats, numeric_stats
-from lerobot_playbyear.datasets.tensors import image_pieces, video_pieces
 
 if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDataset
-
-    from lerobot_playbyear.datasets.long_dataset import LongDataset
+    from lerobot_playbyear.datasets.reader import DatasetReader
 
 INTERVENTION = "intervention"
 """LeRobot's column of the frames that a person corrected."""
@@ -84,9 +79,7 @@ class IsFirstColumn:
         return numeric_stats({IS_FIRST: self._is_first[episode][:, None]}, {IS_FIRST: IS_FIRST_FEATURE})
 
 
-def read_camera_sound(
-    cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", scratch: Path
-) -> MicrophoneSound:
+def read_camera_sound(cfg: AttachAudioConfig, dataset: "DatasetReader", scratch: Path) -> MicrophoneSound:
     """Reads the sound of all microphones, so that what is wrong is known before anything is written.
 
     Args:
@@ -116,14 +109,13 @@ def read_camera_sound(
     return found
 
 
-def _by_person(dataset: "LeRobotDataset | LongDataset", lengths: Sequence[int]) -> list[np.ndarray]:
+def _by_person(dataset: "DatasetReader", lengths: Sequence[int]) -> list[np.ndarray]:
     """Which frames of each episode are corrections, (n,) bool: LeRobot's rollout resets the policy at every hand-back, however
     short the pause."""
     feature = dataset.meta.features.get(INTERVENTION)
     if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
         return [np.zeros(length, bool) for length in lengths]
-    flags = column_to_numpy(dataset.hf_dataset.data.column(INTERVENTION)).reshape(-1).astype(bool)
-    return np.split(flags, np.cumsum(lengths)[:-1])
+    return [dataset.values(INTERVENTION, episode).astype(bool) for episode in dataset.episodes]
 
 
 def write_with_cameras(root: Path, target: Path, found: MicrophoneSound, fps: int) -> None:
@@ -144,9 +136,7 @@ def write_with_cameras(root: Path, target: Path, found: MicrophoneSound, fps: in
 class _MicrophoneReader:
     """Reads one microphone."""
 
-    def __init__(
-        self, cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", key: str, scratch: Path
-    ) -> None:
+    def __init__(self, cfg: AttachAudioConfig, dataset: "DatasetReader", key: str, scratch: Path) -> None:
         self._dataset, self._key, self._scratch = dataset, key, scratch
         # A stranger's pictures may name a session of this machine's own, and so its voices: they get those that are named.
         self._is_foreign = _came_from_the_hub(Path(dataset.root))
@@ -164,11 +154,9 @@ class _MicrophoneReader:
         self._scratch.mkdir(parents=True)
         paths: list[Path] = []
         is_first: list[np.ndarray] = []
-        pictures = itertools.chain.from_iterable(_pictures(self._dataset, self._key))
-        for length in tqdm(self._dataset.meta.episodes["length"], desc=f"Reading {self._key}", unit="episode"):
-            path, own = self._scratch / str(len(paths)), itertools.islice(pictures, length)
-            is_first.append(self._read_episode(len(paths), own, path))
-            deque(own, maxlen=0)  # of an episode that could not be read
+        for episode in tqdm(self._dataset.episodes, desc=f"Reading {self._key}", unit="episode"):
+            path, pictures = self._scratch / str(len(paths)), self._dataset.pictures(self._key, episode)
+            is_first.append(self._read_episode(len(paths), pictures, path))
             paths.append(path)
         raise_all([f"{self._key}, {_listed(episodes)}: {error}" for error, episodes in self._errors.items()])
         self._check_pace()
@@ -311,13 +299,6 @@ def _known(frames: Iterator["_Frame | None"], size: Callable[["_Frame"], int]) -
         raise ValueError("none of its timecodes can be read: are these a microphone's pictures, in their own size?")
     for i in range(n_unknown):
         yield _Frame(last.session, last.counter + (i + 1) * size(last), was_read=False)
-
-
-def _pictures(dataset: "LeRobotDataset | LongDataset", key: str) -> Iterator[np.ndarray]:
-    """A feature's pictures in pieces, (n, H, W, C) uint8."""
-    is_video = dataset.meta.features[key]["dtype"] == "video"
-    for piece in video_pieces(dataset, key, video_backend="pyav") if is_video else image_pieces(dataset, key):
-        yield piece.transpose(0, 2, 3, 1)
 
 
 def _came_from_the_hub(root: Path) -> bool:

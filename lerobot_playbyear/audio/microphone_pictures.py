@@ -9,11 +9,10 @@ from PIL import Image
 
 from lerobot_playbyear.audio.sample_strip import read_timecode
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
-from lerobot_playbyear.datasets.confines import open_picture
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, MICROPHONE
 from lerobot_playbyear.datasets.info import file_inside
 from lerobot_playbyear.datasets.parquet import open_checked, row_group_parts
-from lerobot_playbyear.datasets.video_pictures import video_pictures
+from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
@@ -46,7 +45,7 @@ def _first_pictures(meta: "LeRobotDatasetMetadata", key: str) -> Iterator[np.nda
             first_s = float(meta.episodes[0][f"videos/{key}/from_timestamp"])
             times = [first_s + i / meta.fps for i in range(min(n, int(meta.episodes[0]["length"])))]
             path = file_inside(root, meta.get_video_file_path(0, key))
-            yield from video_pictures(path, times, 1e-4, "pyav", key, feature["shape"])
+            yield from video_pictures(path, times, 1e-4, key, feature["shape"])
             return
         with open_checked(file_inside(root, meta.get_data_file_path(0))) as file:
             rows = next(row_group_parts(file, 0, [key])).slice(0, n).column(key).to_pylist()

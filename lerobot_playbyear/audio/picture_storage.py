@@ -15,10 +15,9 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attached_copy import DatasetChange
 from lerobot_playbyear.audio.attached_pictures import EpisodePictures
+from lerobot_playbyear.datasets.files import scratch_folder
 from lerobot_playbyear.datasets.info import read_info
-from lerobot_playbyear.datasets.long_dataset import scratch_folder
 from lerobot_playbyear.datasets.statistics import Stats
-from lerobot_playbyear.datasets.video_seal import seal
 
 _COMPRESS_LEVEL = 3  # of 9: for noise both smaller and faster than the usual 6
 
@@ -87,8 +86,6 @@ def video_change(
             for name, value in place.items():
                 rows.setdefault(f"videos/{key}/{name}", []).append(value)
         added[key] = _feature(own, "video", get_video_info(paths[0], video_encoder=encoder))
-        for path in paths:
-            seal(path)
     return DatasetChange(added, _stats(pictures), episode_columns=rows, info={"video_path": template})
 
 

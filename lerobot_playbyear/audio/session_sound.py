@@ -12,14 +12,10 @@ from lerobot_playbyear.datasets.audio_files import AudioFileError, Cut, Resample
 from lerobot_playbyear.datasets.episode_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts
 
 if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDataset
-
-    from lerobot_playbyear.datasets.long_dataset import LongDataset
+    from lerobot_playbyear.datasets.reader import DatasetReader
 
 
-def read_session(
-    cfg: AttachAudioConfig, dataset: "LeRobotDataset | LongDataset", keys: list[str], scratch: Path
-) -> EpisodesSound:
+def read_session(cfg: AttachAudioConfig, dataset: "DatasetReader", keys: list[str], scratch: Path) -> EpisodesSound:
     """Decodes the recording, so that what is wrong with it is known before anything is written.
 
     Args:

@@ -1,48 +1,64 @@
 """Writing LeRobotDatasets so that a saved episode survives whatever happens next.
 
 LeRobot writes the footers of its parquet files when a recording ends: a process killed before that leaves files that
-nothing can read. `DurableWriter` writes each episode with LeRobot's own public calls into a small dataset beside the
-real one and then moves the finished files over, so that the dataset on disk is complete at every moment.
+nothing can read. `DurableWriter` keeps the episode in progress in memory, its pictures compressed. `save_episode` writes
+the files that the dataset shall have with it beside the dataset, in LeRobot's layout and with LeRobot's functions for
+schema, statistics and video, and then moves them into place, so that the dataset on disk is complete at every moment.
 """
 
 import contextlib
-import json
 import logging
+import os
+import shlex
 import shutil
+from collections.abc import Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lerobot.configs.video import RGBEncoderConfig
-from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+import numpy as np
+import PIL.Image
+from lerobot.configs import RGBEncoderConfig, infer_depth_unit, rgb_encoder_defaults
+from lerobot.datasets import CODEBASE_VERSION
+from lerobot.datasets.feature_utils import create_empty_dataset_info
+from lerobot.datasets.image_writer import image_array_to_pil_image
+from lerobot.datasets.io_utils import load_info
+from lerobot.datasets.utils import DatasetInfo
+from lerobot.utils.constants import DEFAULT_FEATURES
+from torch import Tensor
 
-from lerobot_playbyear.datasets.episode_checks import IncompleteEpisodeError, LostFramesError
-from lerobot_playbyear.datasets.errors import DatasetWriteError
-from lerobot_playbyear.datasets.existing import check_compatible, check_root, check_undamaged, has_dataset
-from lerobot_playbyear.datasets.features import check_features
-from lerobot_playbyear.datasets.files import FolderLock
-from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, lock_dataset, publish
-from lerobot_playbyear.datasets.settling import INFO, settle_episode
-from lerobot_playbyear.datasets.staging import Staging, remove_leftovers
+from lerobot_playbyear.datasets.episode_files import stage_episode
+from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
+from lerobot_playbyear.datasets.features import check_features, check_frame, differences, is_depth
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
+from lerobot_playbyear.datasets.free_memory import available_memory
+from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
+from lerobot_playbyear.datasets.pictures import encode_picture
+from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 
 logger = logging.getLogger(__name__)
 
 _LOW_DISK_BYTES = 64 * 2**20
+_UNCOMPRESSED = 32  # frames whose pictures may wait to be compressed
+_SAVING = 2  # saving takes so many times the memory of the episode besides
+_SPARE_BYTES = 256 * 2**20
 
 
 class DurableWriter:
     """Appends episodes to a LeRobotDataset v3.0; each is on disk for good when `save_episode` returns.
 
-    Protocol: LeRobot writes the episode, all but its sound, into a dataset inside the root's scratch folder and closes
-    its files; of these and the sound the files are made that the dataset shall hold; a journal
-    is written (from here on the episode counts); they are moved into place one by one,
-    `meta/info.json` last; the journal is removed. After a crash the next writer finishes the moves of a journal it
-    finds and throws other staged files away. The dataset loads with plain LeRobot between any two of these steps.
-    Files and folders are synchronised with the disk before they are referred to, so that this holds for a power cut.
+    Protocol: the files that the dataset shall have with the episode are written into its scratch folder; a journal is
+    written (from here on the episode counts); they are moved into place one by one, `meta/info.json` last; the journal
+    is removed. After a crash the next writer finishes the moves of a journal it finds and throws other staged files away.
+    The dataset loads with plain LeRobot between any two of these steps. Files and folders are synchronised with the disk
+    before they are referred to, so that this holds for a power cut.
 
-    A save that fails keeps the episode: make room, and call `save_episode` again.
+    The episode in progress is in memory. A save that fails keeps it: make room, and call `save_episode` again. An
+    episode that the memory could not hold while it is saved is refused frame by frame; what is there can be saved.
 
-    A dataset with any other damage is refused, and nothing in it is touched: to repair it may cost episodes, and is for
+    A dataset with any damage is refused, and nothing in it is touched: to repair it may cost episodes, and is for
     `playbyear-repair`.
 
     Args:
@@ -59,7 +75,8 @@ class DurableWriter:
         FileExistsError: `root` holds a dataset, or other files, and `resume` is off.
         ValueError: Nothing can be recorded with these features; or the dataset in `root` has another fps, other
             features or another robot. The message names them.
-        DatasetWriteError: `root` cannot be read or written, or another process is writing to it.
+        DatasetWriteError: `root` cannot be read or written.
+        FolderLockedError: Another process is writing to it.
         DatasetDamagedError: The dataset in `root` is damaged; the message says how, and what to do.
         JournalError: What the dataset's scratch folder says is to be moved lies outside the dataset.
     """
@@ -80,34 +97,25 @@ class DurableWriter:
         self.repo_id = repo_id
         self.root = Path(root)
         self.features = features
-        self._create_options: dict[str, Any] = {
-            "fps": fps,
-            "features": deepcopy(features),
-            "robot_type": robot_type,
-            "use_videos": any(feature["dtype"] == "video" for feature in features.values()),
-        }
-        self._write_options: dict[str, Any] = {
-            "video_backend": "pyav",
-            "image_writer_threads": image_writer_threads,
-            "rgb_encoder": rgb_encoder,
-        }
-        self._n_episodes = self._n_frames = 0
-        self._episode: Staging | None = None
+        self._encoder = rgb_encoder or rgb_encoder_defaults()
         self._lock: FolderLock | None = None
+        self._pool = ThreadPoolExecutor(image_writer_threads) if image_writer_threads else None
+        self._forget_episode()
         try:
             check_root(self.root, resume=resume)
             self._lock = lock_dataset(self.root)
             finish_journal(self.root)
             if has_dataset(self.root):
                 check_undamaged(self.root)
-                check_compatible(LeRobotDatasetMetadata(self.repo_id, root=self.root), fps, features, robot_type)
-            self._count()
-            if remove_leftovers(self.root):
+                self._info = load_info(self.root)
+                _check_compatible(self.root, self._info, fps, features, robot_type)
+            else:
+                self._info = _new_info(fps, features, robot_type)
+            if remove_staged(self.root):
                 logger.warning(
                     f"{self.root}: an episode that had not been saved was removed; the {self.num_episodes} episodes "
                     "before it are complete."
                 )
-            self._staging  # noqa: B018  (so that what goes wrong with it goes wrong now)
         except BaseException as error:
             if self._lock is not None:
                 self._lock.release()
@@ -117,13 +125,19 @@ class DurableWriter:
 
     @property
     def num_episodes(self) -> int:
-        """Episodes on disk."""
-        return self._n_episodes
+        """Episodes that were saved."""
+        return self._info.total_episodes
 
     @property
     def num_frames(self) -> int:
-        """Frames on disk, without those of the episode in progress."""
-        return self._n_frames
+        """Their frames, without those of the episode in progress."""
+        return self._info.total_frames
+
+    @property
+    def longest_episode(self) -> int:
+        """About how many frames an episode can have with the memory that is free, if its pictures were not compressed."""
+        frame_bytes = sum(_largest_bytes(feature) for feature in self.features.values())
+        return max(int((available_memory() - _SPARE_BYTES) / ((1 + _SAVING) * frame_bytes)), 0)
 
     def add_frame(self, frame: dict[str, Any]) -> None:
         """Adds one frame to the episode in progress. After an error it is not part of it, and the episode goes on.
@@ -133,46 +147,39 @@ class DurableWriter:
 
         Raises:
             ValueError: The frame does not fit the features, or its sound is none.
-            DatasetWriteError: The disk does not take it; or the episode before is not saved yet.
+            DatasetWriteError: There is not enough memory to save an episode with it; or the episode before is not saved
+                yet.
         """
-        try:
-            staging = self._staging
-            if staging.is_complete:
-                raise DatasetWriteError(
-                    f"Episode {staging.index} is not saved yet: call save_episode again, or give it up with "
-                    "discard_episode.",
-                    can_be_repeated=True,
-                )
-            staging.add_frame(frame)
-        except DatasetWriteError:
-            raise
-        except (OSError, RuntimeError) as error:
-            raise DatasetWriteError(self._describe_failure(self.num_episodes, error)) from error
+        if self._is_complete:
+            raise DatasetWriteError(
+                f"Episode {self.num_episodes} is not saved yet: call save_episode again, or give it up with "
+                "discard_episode."
+            )
+        values = {key: _as_array(value) for key, value in frame.items()}
+        check_frame(values, self._info.features)
+        self._check_memory()
+        kept = {key: self._kept(key, value) for key, value in values.items()}
+        self._frames.append(kept)
+        if len(self._frames) > _UNCOMPRESSED:
+            self._finish_frame(self._frames[-1 - _UNCOMPRESSED])
 
     def save_episode(self) -> int:
         """Writes the episode in progress. Returns its index.
 
         Raises:
-            DatasetWriteError: It could not be written (disk full, permissions). The dataset is as it was before. Where
-                the error's `can_be_repeated` is true, so is the episode: call this again once the cause is gone.
+            DatasetWriteError: It could not be written (disk full, permissions). The dataset is as it was before, and the
+                episode is still there: call this again once the cause is gone.
         """
-        if self._episode is None or self._episode.length == 0:
-            raise DatasetWriteError(f"Episode {self.num_episodes} has no frames: add some before it is saved.")
-        episode = self._episode
+        index = self.num_episodes
+        if not self._frames:
+            raise DatasetWriteError(f"Episode {index} has no frames: add some before it is saved.")
+        self._is_complete = True
         try:
-            self._save(episode)
-        except LostFramesError as error:
-            self._drop_staging()
-            raise DatasetWriteError(self._describe_failure(episode.index, error)) from error
+            self._save(index)
         except Exception as error:
-            raise DatasetWriteError(self._describe_failure(episode.index, error), can_be_repeated=True) from error
-        finally:
-            with contextlib.suppress(OSError):
-                self._count()
-        self._episode = None
-        with contextlib.suppress(OSError):  # the next frame tries again, and says why it cannot
-            self._staging  # noqa: B018
-        return episode.index
+            raise DatasetWriteError(self._describe_failure(index, error)) from error
+        self._forget_episode()
+        return index
 
     def discard_episode(self) -> None:
         """Forgets the episode in progress.
@@ -182,22 +189,21 @@ class DurableWriter:
         """
         if (self.root / JOURNAL).exists():
             raise DatasetWriteError(
-                f"Episode {self.num_episodes} is complete on disk already: call save_episode again.",
-                can_be_repeated=True,
+                f"Episode {self.num_episodes} is complete on disk already: call save_episode again."
             )
-        if self._episode is not None and self._episode.is_complete:
-            self._drop_staging()
-        else:
-            self._staging.discard()
+        self._forget_episode()
 
     def close(self) -> None:
-        """Drops an episode in progress and removes what was needed only for writing. Safe to call twice."""
+        """Drops an episode in progress. Safe to call twice."""
         if self._lock is None:
             return
-        self._drop_staging()
-        with contextlib.suppress(OSError):  # the next writer tries again
-            finish_journal(self.root)
-            remove_leftovers(self.root)
+        if self._is_complete:
+            with contextlib.suppress(OSError):  # the next writer tries again
+                finish_journal(self.root)
+                remove_staged(self.root)
+        self._forget_episode()
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
         self._lock.release()
         self._lock = None
 
@@ -207,43 +213,68 @@ class DurableWriter:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _save(self, episode: Staging) -> None:
+    def _kept(self, key: str, value: Any) -> Any:
+        """What is kept of a value until it is saved: a copy, for whoever made it may use its memory again."""
+        feature = self._info.features.get(key)
+        if feature is None or feature["dtype"] not in ("image", "video"):
+            return value.copy() if isinstance(value, np.ndarray) else value
+        try:
+            picture = image_array_to_pil_image(value).copy()
+        except (ValueError, NotImplementedError, TypeError) as error:
+            raise InputError(f"'{key}': {error}") from error
+        if is_depth(feature):
+            feature["info"].setdefault("depth_unit", infer_depth_unit(value.dtype))
+        encode = partial(encode_picture, picture, is_depth(feature), 1 if feature["dtype"] == "video" else 6)
+        if self._pool is not None:
+            return self._pool.submit(encode)
+        return encode()
+
+    def _finish_frame(self, frame: dict[str, Any]) -> None:
+        """Waits until the pictures of a frame are compressed."""
+        for key, value in frame.items():
+            if isinstance(value, Future):
+                frame[key] = value.result()
+        self._n_bytes += sum(len(value) for value in frame.values() if isinstance(value, bytes))
+        self._n_bytes += sum(value.nbytes for value in frame.values() if isinstance(value, np.ndarray))
+
+    def _check_memory(self) -> None:
+        n_frames = len(self._frames)
+        if n_frames % _UNCOMPRESSED == 0 and available_memory() < _SAVING * self._n_bytes + _SPARE_BYTES:
+            raise DatasetWriteError(
+                f"Episode {self.num_episodes} has {n_frames} frames ({n_frames / self._info.fps:.0f} s, "
+                f"{self._n_bytes / 2**30:.1f} GB), and with more the memory that is free would not do to save it. Save it "
+                "now, or give it up with discard_episode; record shorter episodes, or smaller pictures."
+            )
+
+    def _save(self, index: int) -> None:
         """Does what is left to be done of a save; after a failure, or an interrupt, it can be called again."""
-        self._count()
-        if (self.root / JOURNAL).exists():
-            finish_journal(self.root)
-        elif self.num_episodes == episode.index:
-            settle_episode(self.root, episode, episode.save())
+        finish_journal(self.root)
+        info = self._info_on_disk()
+        if info.total_episodes == index:
+            for frame in self._frames[-_UNCOMPRESSED:]:
+                self._finish_frame(frame)
+            info.features = deepcopy(self._info.features)
+            stage_episode(self.root, info, self._frames, self._encoder)
             publish(self.root)
-        elif self.num_episodes != episode.index + 1:
-            raise _another_count(self.root, self.num_episodes, episode.index)
+            info = self._info_on_disk()
+        if info.total_episodes != index + 1:
+            raise OSError(
+                f"{self.root} holds {info.total_episodes} episodes where {index} were before: something else changed it, or "
+                "its drive is gone"
+            )
+        self._info = info
 
-    def _count(self) -> None:
-        """Takes the numbers from the disk: those of LeRobot's staging dataset are ahead of it while it saves."""
-        path = self.root / INFO
-        if self._n_episodes or path.is_file():
-            info = json.loads(path.read_text())
-            self._n_episodes, self._n_frames = info["total_episodes"], info["total_frames"]
+    def _info_on_disk(self) -> DatasetInfo:
+        is_new = self.num_episodes == 0 and not (self.root / INFO_PATH).exists()
+        return deepcopy(self._info) if is_new else load_info(self.root)
 
-    @property
-    def _staging(self) -> Staging:
-        """The episode in progress; a fresh one after every episode that was saved."""
-        if self._episode is None:
-            finish_journal(self.root)
-            episode = Staging(self.repo_id, self.root, self._create_options, self._write_options)
-            if episode.index != self.num_episodes:
-                episode.drop()
-                raise _another_count(self.root, episode.index, self.num_episodes)
-            self._episode = episode
-        return self._episode
-
-    def _drop_staging(self) -> None:
-        if self._episode is not None:
-            self._episode.drop()
-            self._episode = None
+    def _forget_episode(self) -> None:
+        self._frames: list[dict[str, Any]] = []
+        self._n_bytes = 0
+        self._is_complete = False  # whether saving has begun, so that no frame can be added any more
 
     def _describe_failure(self, index: int, error: Exception) -> str:
-        reason = str(error) if isinstance(error, IncompleteEpisodeError) else f"{type(error).__name__}: {error}"
+        reason = f"{type(error).__name__}: {error}"
         with contextlib.suppress(OSError):
             if shutil.disk_usage(self.root).free < _LOW_DISK_BYTES:
                 reason = f"the disk is full ({reason})"
@@ -253,19 +284,98 @@ class DurableWriter:
                 "It is there as soon as save_episode is called again, or the dataset is opened with resume=true, and the "
                 "cause is gone."
             )
-        remedy = (
-            "It cannot be saved any more: record it again"
-            if isinstance(error, LostFramesError)
-            else "Once the cause is gone, call save_episode again; a program that has ended goes on with resume=true, and "
-            "records this episode again"
-        )
         return (
-            f"Episode {index} could not be written to {self.root}: {reason}. "
-            f"The {index} episodes before it are complete. {remedy}."
+            f"Episode {index} could not be written to {self.root}: {reason}. The {index} episodes before it are complete. "
+            "Once the cause is gone, call save_episode again; a program that has ended goes on with resume=true, and "
+            "records this episode again."
         )
 
 
-def _another_count(root: Path, found: int, wanted: int) -> OSError:
-    return OSError(
-        f"{root} holds {found} episodes where {wanted} were before: something else changed it, or its drive is gone"
-    )
+# What is there already
+
+
+def check_root(root: Path, *, resume: bool) -> None:
+    """Whether a dataset can be written to `root`.
+
+    Raises:
+        FileExistsError: It holds a dataset and `resume` is off, or it holds other files.
+        DatasetWriteError: It is a file.
+    """
+    if root.exists() and not root.is_dir():
+        raise DatasetWriteError(f"Cannot write a dataset to {root}: it is a file.")
+    if has_dataset(root) or (root / JOURNAL).is_file():
+        if not resume:
+            raise FileExistsError(
+                f"{root} already holds a dataset. Append to it with resume=true, or choose another root."
+            )
+    elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
+        raise FileExistsError(f"{root} is not empty and holds no dataset. Choose another root.")
+
+
+def has_dataset(root: Path) -> bool:
+    """Whether a folder holds a LeRobotDataset, however damaged.
+
+    Raises:
+        OSError: It, or a folder in it, cannot be listed: that says nothing of what it holds.
+    """
+    try:
+        os.listdir(root)
+    except FileNotFoundError:
+        return False
+    return any(list_files(root, name) for name in (INFO_PATH, "data/chunk-*/file-*", "meta/episodes/*/*"))
+
+
+def check_undamaged(root: Path) -> None:
+    """Whether a dataset can be continued as it is. Nothing is changed; a quick look, without pictures and sound.
+
+    Raises:
+        DatasetDamagedError: It is damaged; with what is wrong, and the command that repairs it.
+        DatasetWriteError: It cannot be read.
+    """
+    try:
+        found = survey(root, thorough=False)
+    except OSError as error:
+        raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
+    if not found.is_sound:
+        command = f"playbyear-repair --root={shlex.quote(str(root))}"
+        raise DatasetDamagedError(
+            f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "
+            f"again, more closely, and `{command}` writes a copy with the episodes that are whole."
+        )
+
+
+def _check_compatible(
+    root: Path, info: DatasetInfo, fps: int, features: Mapping[str, Mapping[str, Any]], robot_type: str | None
+) -> None:
+    """Whether frames of `features` at `fps`, of a robot of this type, can be appended to an existing dataset."""
+    found = [f"fps is {info.fps} there and {fps} here"] if info.fps != fps else []
+    found += differences(info.features, features)
+    if info.robot_type and robot_type and info.robot_type != robot_type:
+        found.append(f"the robot is {info.robot_type} there and {robot_type} here")
+    if found:
+        raise InputError(
+            f"The dataset in {root} does not fit what is to be appended: {'; '.join(found)}. "
+            "Record with the same settings, or choose another root."
+        )
+
+
+def _new_info(fps: int, features: Mapping[str, dict], robot_type: str | None) -> DatasetInfo:
+    own = {key: {**deepcopy(feature), "shape": tuple(feature["shape"])} for key, feature in features.items()}
+    has_films = any(feature["dtype"] == "video" for feature in features.values())
+    return create_empty_dataset_info(CODEBASE_VERSION, fps, {**own, **DEFAULT_FEATURES}, has_films, robot_type)
+
+
+def _as_array(value: Any) -> Any:
+    """A value of a frame as LeRobot's checks take it."""
+    if isinstance(value, Tensor):
+        return value.numpy()
+    return np.asarray(value) if isinstance(value, PIL.Image.Image) else value
+
+
+def _largest_bytes(feature: Mapping[str, Any]) -> int:
+    """What a value of a feature takes in memory, at most; of pictures that are noise, about."""
+    n_values = int(np.prod(feature["shape"]))
+    kind = feature["dtype"]
+    if kind in ("image", "video"):
+        return n_values
+    return n_values * np.dtype(kind).itemsize if kind not in ("string", "language") else 100

@@ -12,9 +12,9 @@ from torch import Tensor
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.opening import open_dataset
+from lerobot_playbyear.datasets.pictures import shrink
 from lerobot_playbyear.datasets.reading import INDEX_KEYS, read_dataset
 from lerobot_playbyear.datasets.rows import as_lerobot_has, sent_to, write_rows
-from lerobot_playbyear.datasets.shrinking import shrink
 
 
 class EpisodeStore:

@@ -82,6 +82,12 @@ def audio_keys(features: Iterable[str]) -> list[str]:
     return [key for key in features if key.startswith(AUDIO_PREFIX)]
 
 
+def is_depth(feature: Mapping[str, Any]) -> bool:
+    """Whether the pictures of a feature are distances."""
+    info = {**(feature.get("video_info") or {}), **(feature.get("info") or {})}
+    return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
+
+
 def check_audio_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> dict[str, int]:
     """Check every microphone of a dataset against the contract.
 
@@ -278,10 +284,12 @@ def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
             raise InputError(f"'{key}' has no {name}: give dtype, shape and names, as LeRobot's features have them.")
     shape = feature["shape"]
     sizes = shape if isinstance(shape, tuple | list) else [None]
-    if "/" in key or not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
+    if "/" in key:
         raise InputError(
-            f"'{key}' has shape {shape!r}; wanted a name without '/', and a tuple of positive whole numbers."
+            f"'{key}' has a '/' in it; LeRobot's features have names without, such as {key.replace('/', '.')!r}."
         )
+    if not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
+        raise InputError(f"'{key}' has shape {shape!r}; wanted a tuple of positive whole numbers.")
     if key.startswith(AUDIO_PREFIX) and len(shape) > 1:
         n_channels = min(shape)
         advice = (

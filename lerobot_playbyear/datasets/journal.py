@@ -6,14 +6,13 @@ moved stays inside the dataset, and no folder is followed that is a link.
 """
 
 import os
+import shutil
 from pathlib import Path
 
 from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, write_atomically
 
 SCRATCH = Path("images")
 STAGING = SCRATCH / ".staging"
-EPISODE = SCRATCH / ".episode"
-PICTURES = SCRATCH / ".pictures"
 LOCK = SCRATCH / ".lock"
 JOURNAL = SCRATCH / ".journal.json"
 
@@ -69,6 +68,16 @@ def finish_journal(root: Path) -> None:
             flush(folder)
     journal.unlink()
     flush(journal.parent)
+    shutil.rmtree(root / STAGING, ignore_errors=True)  # only folders are left in it
+
+
+def remove_staged(root: Path) -> bool:
+    """Removes what was staged of an episode and not published. Returns whether there was anything."""
+    staging = root / STAGING
+    was_there = any(path.is_file() for path in staging.rglob("*"))
+    if staging.is_dir():
+        shutil.rmtree(staging)
+    return was_there
 
 
 def lock_dataset(root: Path) -> FolderLock:
@@ -89,7 +98,7 @@ def check_scratch(root: Path) -> None:
     Raises:
         JournalError: A folder for it is a link.
     """
-    for name in (SCRATCH, STAGING, EPISODE, PICTURES):
+    for name in (SCRATCH, STAGING):
         if (root / name).is_symlink():
             raise _error(root / name, f"is a link to {os.readlink(root / name)}; wanted a folder", "Remove it")
 

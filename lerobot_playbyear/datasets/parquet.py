@@ -274,6 +274,14 @@ def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> N
             writer.write_table(table, row_group_size=_rows_within(PIECE_BYTES, table.nbytes, len(table)))
 
 
+def write_rows(rows: pa.Table, path: Path) -> None:
+    """Writes a table of episodes. Its footer carries nothing that a reader could do without: it is most of the file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(
+        rows, path, compression="snappy", write_page_checksum=True, write_statistics=False, store_schema=False
+    )
+
+
 def writer_options(schema: pa.Schema) -> dict:
     """Options of `pyarrow.parquet.ParquetWriter` for a data file."""
     leaves = [leaf for field in schema for leaf in leaf_columns(field.name, field.type)]

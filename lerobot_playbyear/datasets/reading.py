@@ -20,8 +20,8 @@ from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.identity import dataset_identity
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.parquet import episode_bounds
+from lerobot_playbyear.datasets.pictures import kept_shape, shrink
 from lerobot_playbyear.datasets.resampling import features_at, resampled_pieces
-from lerobot_playbyear.datasets.shrinking import kept_shape, shrink
 from lerobot_playbyear.datasets.tensors import image_pieces, value_pieces, video_pieces
 
 INDEX_KEYS = ("index", "episode_index", "frame_index", "task_index", "timestamp")

@@ -1,4 +1,4 @@
-"""A microphone's statistics: a few numbers per episode, in the shape that LeRobot's tools want.
+"""An episode's statistics, LeRobot's but for microphones: a few numbers, in the shape that LeRobot's tools want.
 
 LeRobot keeps minimum, maximum, mean, standard deviation and quantiles of every element of a feature, which for sound
 means per sample index: 0.1 to 0.3 MB per episode that say the same thing thousands of times, since a sample's place
@@ -9,7 +9,7 @@ repetition in a few bytes, and whoever reads it sees what LeRobot would have wri
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,77 +17,49 @@ import numpy as np
 import pyarrow as pa
 from lerobot.datasets.compute_stats import (
     DEFAULT_QUANTILES,
-    RunningQuantileStats,
     aggregate_stats,
+    auto_downsample_height_width,
     compute_episode_stats,
     get_feature_stats,
 )
 from lerobot.datasets.utils import STATS_PATH, serialize_dict
 
-from lerobot_playbyear.datasets.features import audio_keys
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_keys
 
 Stats = dict[str, dict[str, np.ndarray]]
 """Per feature and statistic, as LeRobot keeps them."""
 
-Pieces = Callable[[], Iterable[np.ndarray]]
-"""Gives an array in pieces (n, ...), from its beginning whenever it is called."""
-
 _DIGITS = 5  # significant ones
-_PIECE_SAMPLES = 2**20
-_BINS = 5000  # of LeRobot's histograms
+_FRAMES_AT_ONCE = 4096
 
 
-def sound_stats(waveform: np.ndarray) -> dict[str, np.ndarray]:
+def sound_stats(sound: np.ndarray) -> dict[str, np.ndarray]:
     """Statistics of all samples of a microphone's frames, each repeated to the shape (S,).
 
     Args:
-        waveform: (N, S), the samples of N frames; it may lie in a file.
+        sound: (N, S), the samples of N frames.
     """
-    n_frames, n_samples = waveform.shape
-    rows = max(_PIECE_SAMPLES // max(n_samples, 1), 1)
-    return repeated_stats(lambda: (waveform[i : i + rows] for i in range(0, n_frames, rows)), n_frames, n_samples)
-
-
-def repeated_stats(pieces: Pieces, n_frames: int, n_samples: int) -> dict[str, np.ndarray]:
-    """As `sound_stats`, of sound that is not in memory as a whole.
-
-    Args:
-        pieces: The sound, in pieces (n, S).
-        n_frames: N, their rows in all.
-        n_samples: S.
-    """
-    first = next(iter(pieces()))
-    if first.dtype in (np.int16, np.uint8):
-        pooled = _integer_stats(pieces, first.dtype)
-    elif len(first) == n_frames:
-        pooled = {name: float(value[0]) for name, value in get_feature_stats(_column(first), 0, False).items()}
+    n_frames, n_samples = sound.shape
+    if sound.dtype == np.int16:
+        pooled = _pcm_stats(sound)
     else:
-        pooled = _running_stats(pieces)
+        column = sound.astype(np.float64).reshape(-1, 1)
+        pooled = {name: float(value[0]) for name, value in get_feature_stats(column, 0, False).items()}
     stats = {name: np.full(n_samples, _rounded(value)) for name, value in pooled.items()}
     return {**stats, "count": np.array([n_frames])}
 
 
-def channel_stats(pieces: Pieces, n_pictures: int) -> dict[str, np.ndarray]:
+def picture_stats(pictures: Iterable[np.ndarray], is_depth: bool = False) -> dict[str, np.ndarray]:
     """Statistics of pictures as LeRobot has them: of each channel, (C, 1, 1), for pixels in [0, 1].
 
     Args:
-        pieces: The pictures, in pieces (n, C, H, W) uint8.
-        n_pictures: How many there are in all.
+        pictures: (H, W, C) each; of an episode those that LeRobot's `sample_indices` names.
+        is_depth: Whether they are distances, which keep their unit.
     """
-    first = next(iter(pieces()))
-    if len(first) == n_pictures:
-        lerobots = get_feature_stats(first, axis=(0, 2, 3), keepdims=True)
-        return {
-            name: value if name == "count" else np.squeeze(value / 255.0, axis=0) for name, value in lerobots.items()
-        }
-    n_channels = first.shape[1]
-    counts = np.zeros((n_channels, 256), np.int64)
-    for piece in pieces():
-        for channel in range(n_channels):
-            counts[channel] += np.bincount(piece[:, channel].reshape(-1), minlength=256)
-    each = [_stats_of_counts(np.arange(256), own) for own in counts]
-    stats = {name: np.array([own[name] for own in each]).reshape(-1, 1, 1) / 255.0 for name in each[0]}
-    return {**stats, "count": np.array([n_pictures])}
+    seen = np.stack([auto_downsample_height_width(picture.transpose(2, 0, 1)) for picture in pictures])
+    stats = get_feature_stats(seen, axis=(0, 2, 3), keepdims=True)
+    scale = 1.0 if is_depth else 255.0
+    return {name: value if name == "count" else np.squeeze(value / scale, axis=0) for name, value in stats.items()}
 
 
 def numeric_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Mapping[str, Any]]) -> Stats:
@@ -97,17 +69,21 @@ def numeric_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Mapp
         columns: (N, ...) per feature.
         features: LeRobot features of these columns.
     """
-    microphones = set(audio_keys(columns))
-    others = {key: value for key, value in columns.items() if key not in microphones}
+    others = {key: value for key, value in columns.items() if not key.startswith(AUDIO_PREFIX)}
     stats = compute_episode_stats(others, dict(features)) if others else {}
-    return {**stats, **{key: sound_stats(columns[key].reshape(len(columns[key]), -1)) for key in microphones}}
+    return {**stats, **{key: sound_stats(columns[key].reshape(len(columns[key]), -1)) for key in audio_keys(columns)}}
 
 
-def with_sound_stats(rows: pa.Table, sound: Sequence[Stats]) -> pa.Table:
-    """Rows of `meta/episodes`, with the statistics of each episode's microphones."""
-    for key in sound[0] if sound else ():
-        for name in sound[0][key]:
-            rows = rows.append_column(f"stats/{key}/{name}", pa.array([own[key][name].tolist() for own in sound]))
+def stats_columns(stats: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, list]:
+    """An episode's statistics as the columns of its row in `meta/episodes`."""
+    return {f"stats/{key}/{name}": value.tolist() for key, own in stats.items() for name, value in own.items()}
+
+
+def with_stats(rows: pa.Table, stats: Sequence[Stats]) -> pa.Table:
+    """Rows of `meta/episodes`, with more statistics of each episode; all of the same features."""
+    columns = [stats_columns(own) for own in stats]
+    for name in columns[0] if columns else ():
+        rows = rows.append_column(name, pa.array([own[name] for own in columns]))
     return rows
 
 
@@ -121,12 +97,12 @@ def row_stats(row: Mapping[str, Any]) -> Stats:
     return stats
 
 
-def add_stats(total: Stats | None, episodes: Iterable[Stats], microphones: Iterable[str]) -> Stats:
+def add_stats(total: Stats | None, episodes: Iterable[Stats]) -> Stats:
     """The statistics of a dataset after more episodes, aggregated by LeRobot."""
     parts = [*([total] if total else []), *episodes]
-    summed = aggregate_stats(parts) if parts else {}
-    for key in microphones:
-        for name, value in summed.get(key, {}).items():
+    summed: Stats = aggregate_stats(parts) if parts else {}
+    for key in audio_keys(summed):
+        for name, value in summed[key].items():
             if name != "count" and (value == value.flat[0]).all():
                 summed[key][name] = np.full(value.shape, _rounded(float(value.flat[0])))
     return summed
@@ -142,55 +118,22 @@ def write_stats(stats: Stats, root: Path) -> None:
     path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 
-def _integer_stats(pieces: Pieces, dtype: np.dtype) -> dict[str, float]:
-    """From how often each value occurs, which says all that there is to know."""
-    limits = np.iinfo(dtype)
-    counts = np.zeros(limits.max - limits.min + 1, np.int64)
-    for piece in pieces():
-        counts += np.bincount(piece.reshape(-1).astype(np.int32) - limits.min, minlength=len(counts))
-    return _stats_of_counts(np.arange(limits.min, limits.max + 1), counts)
-
-
-def _stats_of_counts(values: np.ndarray, counts: np.ndarray) -> dict[str, float]:
-    """What LeRobot's `get_feature_stats` says of values that occur so often.
-
-    Args:
-        values: (k,) in ascending order.
-        counts: (k,)
-    """
-    values, counts = values[counts > 0].astype(np.float64), counts[counts > 0]
-    n_values = counts.sum()
-    mean = float(values @ counts / n_values)
-    stats = {"min": values[0], "max": values[-1], "mean": mean}
-    stats["std"] = math.sqrt(np.square(values - mean) @ counts / n_values)
-    edges = np.linspace(values[0] - 1e-10, values[-1] + 1e-10, _BINS + 1)
-    below = np.cumsum(np.histogram(values, bins=edges, weights=counts)[0])
+def _pcm_stats(sound: np.ndarray) -> dict[str, float]:
+    """From how often each of the 65536 values occurs, which says all that there is to know in little memory."""
+    counts = np.zeros(2**16, np.int64)
+    for first in range(0, len(sound), _FRAMES_AT_ONCE):
+        block = sound[first : first + _FRAMES_AT_ONCE].reshape(-1).astype(np.int32)
+        counts += np.bincount(block + 2**15, minlength=2**16)
+    values = np.arange(-(2.0**15), 2.0**15)
+    n_samples = counts.sum()
+    mean = float(values @ counts / n_samples)
+    heard = values[counts > 0]
+    stats = {"min": heard[0], "max": heard[-1], "mean": mean}
+    stats["std"] = math.sqrt(np.square(values - mean) @ counts / n_samples)
+    below = np.cumsum(counts)
     for share in DEFAULT_QUANTILES:
-        stats[f"q{int(share * 100):02d}"] = _quantile(below, edges, share * n_values) if n_values > 1 else mean
+        stats[f"q{int(share * 100):02d}"] = values[np.searchsorted(below, share * n_samples)]
     return stats
-
-
-def _quantile(below: np.ndarray, edges: np.ndarray, wanted: float) -> float:
-    """The value below which `wanted` values lie, where `below` counts those below each bin's upper edge."""
-    bin_ = int(np.searchsorted(below, wanted))
-    if bin_ in (0, len(below)):
-        return float(edges[min(bin_, len(edges) - 1)])
-    inside = below[bin_] - below[bin_ - 1]
-    return float(edges[bin_] + (wanted - below[bin_ - 1]) / inside * (edges[bin_ + 1] - edges[bin_]))
-
-
-def _running_stats(pieces: Pieces) -> dict[str, float]:
-    """LeRobot's, in pieces. Its histogram is exact when it knows the range at once, so that comes first: two samples more."""
-    ranges = [(float(piece.min()), float(piece.max())) for piece in pieces()]
-    running = RunningQuantileStats()
-    running.update(np.array([[min(low for low, _ in ranges)], [max(high for _, high in ranges)]]))
-    for piece in pieces():
-        running.update(_column(piece))
-    return {name: float(value[0]) for name, value in running.get_statistics().items()}
-
-
-def _column(sound: np.ndarray) -> np.ndarray:
-    return sound.astype(np.float64).reshape(-1, 1)
 
 
 def _rounded(value: float) -> float:

@@ -18,12 +18,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
-from lerobot_playbyear.datasets.confines import PICTURE_FORMATS
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
 from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, OutsideError, read_info
 from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, parsing, read_table
+from lerobot_playbyear.datasets.pictures import PICTURE_FORMATS
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
 
 TASKS_PATH, STATS_PATH = "meta/tasks.parquet", "meta/stats.json"

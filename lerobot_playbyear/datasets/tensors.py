@@ -17,11 +17,10 @@ import numpy as np
 import pyarrow as pa
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_playbyear.datasets.confines import open_picture
 from lerobot_playbyear.datasets.info import file_inside
 from lerobot_playbyear.datasets.long_dataset import LongDataset
 from lerobot_playbyear.datasets.parquet import column_to_numpy, episode_bounds
-from lerobot_playbyear.datasets.video_pictures import video_pictures
+from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 
 _PICTURES_AT_ONCE = 32
 _ROWS_AT_ONCE = 128  # images
@@ -162,7 +161,7 @@ def video_pieces(
         path = file_inside(Path(dataset.root), dataset.meta.get_video_file_path(episode, key))
         offset = dataset.meta.episodes[episode][f"videos/{key}/from_timestamp"]
         times = [offset + float(timestamp) for timestamp in timestamps[max(start, first) : end]]
-        pictures = video_pictures(path, times, dataset.tolerance_s, video_backend, key, shape)
+        pictures = video_pictures(path, times, dataset.tolerance_s, key, shape)
         while piece := list(itertools.islice(pictures, n_at_once)):
             yield np.stack(piece).transpose(0, 3, 1, 2)
 

@@ -30,45 +30,34 @@ def save_or_ask(writer: DurableWriter, frames: Sequence[dict[str, Any]]) -> None
 
     Args:
         writer: Without an episode in progress.
-        frames: All frames of the episode. Where pictures did not reach the disk, they are written again.
+        frames: All frames of the episode.
 
     Raises:
         DatasetWriteError: It could not be written, and nobody is there to make room, or they gave it up.
     """
-    to_write, is_again = True, False
-    while True:
-        try:
-            if to_write and is_again:
-                _forget(writer)
-            for frame in frames if to_write else ():
-                writer.add_frame(frame)
-            writer.save_episode()
-            return
-        except DatasetWriteError as error:
-            to_write, is_again = not error.can_be_repeated, True
-            if not _wants_again(error, to_write):
-                with contextlib.suppress(DatasetWriteError):
-                    if to_write:  # or what got through is the beginning of the next episode
-                        _forget(writer)
-                raise
+    try:
+        for frame in frames:
+            writer.add_frame(frame)
+        while True:
+            try:
+                writer.save_episode()
+                return
+            except DatasetWriteError as error:
+                if not _wants_again(error):
+                    raise
+    except DatasetWriteError:
+        with contextlib.suppress(DatasetWriteError):  # what got through would be the beginning of the next episode
+            writer.discard_episode()
+        raise
 
 
-def _wants_again(error: DatasetWriteError, is_in_memory: bool) -> bool:
+def _wants_again(error: DatasetWriteError) -> bool:
     """Asks at the terminal whether to try again; where there is none nobody wants it."""
     if sys.stdin is None or not sys.stdin.isatty():
         return False
     print(f"\n{error}", file=sys.stderr)
-    kept = "All of it is still in memory. " if is_in_memory else ""
     try:
-        answer = input(f"{kept}Press Enter to save it again once there is room, or type q to give it up: ")
+        answer = input("Press Enter to save it again once there is room, or type q to give it up: ")
     except EOFError:
         return False
     return answer.strip().lower() != "q"
-
-
-def _forget(writer: DurableWriter) -> None:
-    """Drops what got through of an episode in progress."""
-    try:
-        writer.discard_episode()
-    except OSError as error:
-        raise DatasetWriteError(f"Cannot write to {writer.root}: {error}.") from error

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_playbyear.datasets.confines import open_picture
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
 from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, OutsideError, check_claims, check_dataset_files
 from lerobot_playbyear.datasets.parquet import column_to_numpy
+from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.survey import STATS_PATH, DatasetDamagedError, Frames, Survey, survey
 from lerobot_playbyear.datasets.survey import Episode as SurveyedEpisode
 from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
@@ -250,12 +250,10 @@ class DatasetSource:
         """
         feature, frames = self.features[camera], episode.frames
         if feature["dtype"] == "video":
-            from lerobot_playbyear.datasets.video_pictures import video_pictures
-
             place = episode.found.places[camera]
             path = film_path(self.root, self.info, camera, place)
             times = [place.start + float(time) for time in self.block("timestamp", episode)[:, 0]]
-            yield from video_pictures(path, times, TOLERANCE_S, self._video_backend, camera, feature["shape"])
+            yield from video_pictures(path, times, TOLERANCE_S, camera, feature["shape"])
             return
         column = frames.file.read(frames.start, frames.start + len(episode), [camera]).column(camera)
         for first in range(0, len(column), _PICTURES_AT_ONCE):

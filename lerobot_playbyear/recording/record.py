@@ -1,27 +1,31 @@
 """`playbyear-record`: episodes of an environment's scripted expert, or of a person, become a LeRobotDataset with sound."""
 
+import dataclasses
 import itertools
 import os
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import gymnasium as gym
+import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.durable import DurableWriter, check_root
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input
-from lerobot_playbyear.datasets.existing import check_root
-from lerobot_playbyear.episodes.environment import EnvFacts, env_spec
+from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
+from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
 from lerobot_playbyear.episodes.expert import ExpertConfig
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
+from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
 from lerobot_playbyear.hub.push import PushOptions, check_name, push_dataset, warn_without_login
-from lerobot_playbyear.recording.demonstrations import PersonRollouts, person_rollouts
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
 _POLICY_FPS = 20  # of a policy that is not told
@@ -103,9 +107,8 @@ def record(cfg: RecordConfig) -> Path:
         with errors_of_input():
             _check_options(cfg)
             check_root(root, resume=cfg.resume)
-        with _rollouts(cfg) as pool:
+        with _demonstrations(cfg) as (facts, episodes):
             with errors_of_input():
-                facts = pool.facts()
                 _check_facts(facts, cfg.env)
                 features = dataset_features(facts, cfg.dataset.video)
                 writer = DurableWriter(
@@ -118,7 +121,9 @@ def record(cfg: RecordConfig) -> Path:
                     rgb_encoder=cfg.dataset.rgb_encoder,
                 )
             with writer:
-                _record_episodes(cfg, pool, writer)
+                seconds = writer.longest_episode / facts.fps
+                print(f"With the memory that is free an episode can last about {seconds / 60:.0f} min.")
+                _record_episodes(cfg, episodes, writer)
                 summary = f"{writer.num_episodes} episodes, {writer.num_frames} frames"
     except MemoryError as error:
         raise PlaybyearError(
@@ -138,21 +143,51 @@ def record(cfg: RecordConfig) -> Path:
     return root
 
 
-def _rollouts(cfg: RecordConfig) -> AbstractContextManager[RolloutPool | PersonRollouts]:
-    """Where episodes come from."""
-    if isinstance(cfg.expert, TeleopExpertConfig):
-        return person_rollouts(cfg.env, cfg.expert)
-    return RolloutPool(env_spec(cfg.env), cfg.num_workers or 0)
+Demonstrations = Callable[[Iterable[int]], Iterator[Episode]]
+"""Gives one episode for each seed."""
 
 
-def _record_episodes(cfg: RecordConfig, pool: RolloutPool | PersonRollouts, writer: DurableWriter) -> None:
+@contextmanager
+def _demonstrations(cfg: RecordConfig) -> Iterator[tuple[EnvFacts, Demonstrations]]:
+    """What the environment looks like, and where episodes come from: a script in several processes, or a person."""
+    if not isinstance(cfg.expert, TeleopExpertConfig):
+        with RolloutPool(env_spec(cfg.env), cfg.num_workers or 0) as pool:
+            with errors_of_input():
+                facts = pool.facts()
+            yield facts, pool.episodes
+        return
+    with closing(env_spec(cfg.env).make()) as env, closing(cfg.expert.make(env, demonstrates=True)) as person:
+
+        def episodes(seeds: Iterable[int]) -> Iterator[Episode]:
+            for seed in seeds:  # what the person throws away is done again
+                while (episode := play(env, Nobody(), seed, expert=person)).verdict is Verdict.DISCARD:
+                    pass
+                yield episode
+
+        with errors_of_input():
+            facts = dataclasses.replace(env_facts(env), has_expert=True)
+        yield facts, episodes
+
+
+class Nobody:
+    """Stands where the policy stands while a person demonstrates: an actor that never moves."""
+
+    def reset(self, env: gym.Env) -> None:
+        assert env.action_space.shape is not None
+        self._action = np.zeros(env.action_space.shape, np.float32)
+
+    def act(self, observation: Observation) -> np.ndarray:
+        return self._action
+
+
+def _record_episodes(cfg: RecordConfig, demonstrations: Demonstrations, writer: DurableWriter) -> None:
     wanted = cfg.dataset.num_episodes
     first_seed = next_seed(writer.root, cfg.seed)
     attempts = successes = failures_in_a_row = 0
     with tqdm(total=wanted, initial=writer.num_episodes, unit="episode", desc="Recording") as progress:
         if writer.num_episodes >= wanted:
             return
-        for episode in pool.episodes(itertools.count(first_seed)):
+        for episode in demonstrations(itertools.count(first_seed)):
             attempts += 1
             failures_in_a_row = 0 if episode.success else failures_in_a_row + 1
             if episode.success:
@@ -160,7 +195,7 @@ def _record_episodes(cfg: RecordConfig, pool: RolloutPool | PersonRollouts, writ
                 successes += 1
                 progress.update()
             progress.set_postfix_str(f"success rate {successes / attempts:.0%} of {attempts} attempts")
-            if failures_in_a_row >= _MIN_ATTEMPTS_PER_SUCCESS and not isinstance(pool, PersonRollouts):
+            if failures_in_a_row >= _MIN_ATTEMPTS_PER_SUCCESS and isinstance(cfg.expert, ScriptedExpertConfig):
                 raise InputError(
                     f"The expert failed {failures_in_a_row} times in a row, up to seed {episode.seed}: something is "
                     f"wrong with the task's options. {writer.num_episodes} episodes are saved in {writer.root}."

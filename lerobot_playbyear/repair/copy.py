@@ -3,19 +3,17 @@
 import math
 import shutil
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
-from lerobot.datasets.compute_stats import auto_downsample_height_width, get_feature_stats, sample_indices
+from lerobot.datasets.compute_stats import sample_indices
 from lerobot.datasets.io_utils import write_json, write_tasks
 
-from lerobot_playbyear.datasets.confines import open_picture
 from lerobot_playbyear.datasets.episode_clock import renumber_episode_starts
-from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     EPISODES_DIR,
@@ -25,12 +23,19 @@ from lerobot_playbyear.datasets.files import (
     is_listed,
     take_over,
 )
-from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_tables
-from lerobot_playbyear.datasets.settling import write_rows
-from lerobot_playbyear.datasets.statistics import Stats, add_stats, numeric_stats, row_stats, write_stats
+from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_rows, write_tables
+from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
+from lerobot_playbyear.datasets.statistics import (
+    Stats,
+    add_stats,
+    numeric_stats,
+    picture_stats,
+    row_stats,
+    stats_columns,
+    write_stats,
+)
 from lerobot_playbyear.datasets.survey import STATS_PATH, TASKS_PATH, Episode, Frames, Survey, unknown_task
 from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
-from lerobot_playbyear.datasets.video_pictures import video_pictures
 
 _REMADE = (INFO_PATH, STATS_PATH, TASKS_PATH, "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet")
 
@@ -58,7 +63,7 @@ def write_copy(survey: Survey, target: Path) -> None:
         shutil.copy2(survey.root / TASKS_PATH, target / TASKS_PATH)
     else:
         write_tasks(_tasks_table(survey), target)
-    write_stats(add_stats(None, map(row_stats, rows), audio_keys(survey.info["features"])), target)
+    write_stats(add_stats(None, map(row_stats, rows)), target)
     n_frames = sum(row["length"] for row in rows)
     counts = {"total_episodes": len(rows), "total_frames": n_frames, "total_tasks": len(survey.tasks)}
     is_complete = len(rows) == len(survey.episodes)
@@ -152,14 +157,10 @@ def _row(survey: Survey, kept: _Kept) -> dict[str, Any]:
     row = kept.episode.row
     if row is None:
         texts = [survey.tasks.get(task, unknown_task(task)) for task in kept.frames.tasks]
-        stats = _stats_columns(_episode_stats(survey, kept.episode, kept.table()))
+        stats = stats_columns(_episode_stats(survey, kept.episode, kept.table()))
         return {"tasks": texts, "length": kept.frames.length, **stats, **places}
-    moved = {} if kept.stays else _stats_columns(numeric_stats(kept.numbers(), survey.info["features"]))
+    moved = {} if kept.stays else stats_columns(numeric_stats(kept.numbers(), survey.info["features"]))
     return {**row, **{name: value for name, value in moved.items() if name in row}, **places}
-
-
-def _stats_columns(stats: Stats) -> dict[str, Any]:
-    return {f"stats/{key}/{name}": value.tolist() for key, own in stats.items() for name, value in own.items()}
 
 
 def _episode_stats(survey: Survey, episode: Episode, frames: pa.Table) -> Stats:
@@ -184,21 +185,14 @@ def _episode_stats(survey: Survey, episode: Episode, frames: pa.Table) -> Stats:
             for index in sampled:
                 with open_picture(frames.column(key)[index].as_py(), root, key, feature) as image:
                     pictures.append(np.asarray(image.convert("RGB")))
-            stats[key] = _picture_stats(pictures)
+            stats[key] = picture_stats(pictures)
         elif feature["dtype"] == "video":
             place = episode.places[key]
             times = [place.start + index / survey.info["fps"] for index in sampled]
-            stats[key] = _picture_stats(
-                list(video_pictures(film_path(root, survey.info, key, place), times, TOLERANCE_S, "pyav", key, shape))
+            stats[key] = picture_stats(
+                video_pictures(film_path(root, survey.info, key, place), times, TOLERANCE_S, key, shape)
             )
         else:
             values = column_to_numpy(frames.column(key))
             numbers[key] = values.reshape(len(frames), *(() if math.prod(shape) == 1 else shape))
     return {**numeric_stats(numbers, survey.info["features"]), **stats}
-
-
-def _picture_stats(pictures: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Of each channel, (C, 1, 1), for pixels in [0, 1], from pictures (H, W, C) uint8, as small as LeRobot looks at them."""
-    small = np.stack([auto_downsample_height_width(picture.transpose(2, 0, 1)) for picture in pictures])
-    stats = get_feature_stats(small, axis=(0, 2, 3), keepdims=True)
-    return {name: value if name == "count" else np.squeeze(value / 255.0, axis=0) for name, value in stats.items()}

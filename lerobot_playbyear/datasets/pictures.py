@@ -1,0 +1,170 @@
+"""Pictures in columns and in films: opened, walked through, shrunk, and encoded."""
+
+import io
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from PIL import Image
+
+from lerobot_playbyear.datasets.info import OutsideError, real_path
+
+PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
+"""Of the pictures that are read; others have readers that start programs."""
+
+
+def has_shape(height: int, width: int, shape: Sequence[int]) -> bool:
+    """Whether a picture has the size that a feature's shape says, (C, H, W) or (H, W, C)."""
+    return (height, width) in itertools.pairwise(shape)
+
+
+def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: Mapping[str, Any]) -> Image.Image:
+    """Opens one picture of an image column; it is not decoded yet.
+
+    Args:
+        row: `bytes`, an image file, or None; and then `path`, its name in the dataset's folder. None where it is missing.
+        root: The dataset's folder.
+        key: The camera, for the message.
+        feature: Its feature.
+
+    Raises:
+        OutsideError: `path` leads out of the folder.
+        ValueError: The picture is missing, or has another size than the feature says.
+        OSError: It is no picture.
+    """
+    if row is None:
+        raise ValueError(f"'{key}': a picture is missing. Repair the dataset: playbyear-repair --root={root}")
+    data, name = row["bytes"], row["path"]
+    if data is None and (name is None or not real_path(root / name).is_relative_to(root.resolve())):
+        raise OutsideError(
+            f"'{key}': a picture is not in the dataset but in the file {name!r}, outside its folder '{root}', and is "
+            "not read. Record it again, or ask who made the dataset for one with its pictures."
+        )
+    image = Image.open(root / name if data is None else io.BytesIO(data), formats=PICTURE_FORMATS)
+    if not has_shape(image.height, image.width, feature["shape"]):
+        size = f"{image.width} x {image.height}"
+        image.close()
+        raise ValueError(
+            f"'{key}': a picture of {size} pixels; meta/info.json gives the shape {tuple(feature['shape'])}"
+        )
+    return image
+
+
+def encode_picture(picture: Image.Image, is_depth: bool, compress_level: int) -> bytes:
+    """The file that LeRobot makes of a picture: PNG, or TIFF for distances."""
+    file = io.BytesIO()
+    if is_depth:
+        picture.save(file, "TIFF", compression="raw")
+    else:
+        picture.save(file, "PNG", compress_level=compress_level)
+    return file.getvalue()
+
+
+def decode_picture(data: bytes) -> np.ndarray:
+    """The pixels of such a file, (H, W, C): of colours uint8, of distances as they were."""
+    with Image.open(io.BytesIO(data), formats=PICTURE_FORMATS) as picture:
+        pixels = np.asarray(picture if picture.format == "TIFF" else picture.convert("RGB"))
+    return pixels[..., None] if pixels.ndim == 2 else pixels
+
+
+def video_pictures(
+    path: Path, times: Sequence[float], tolerance_s: float, key: str = "", shape: Sequence[int] | None = None
+) -> Iterator[np.ndarray]:
+    """Decodes the pictures that are shown at these times, one after the other, with two of them in memory.
+
+    They are those that LeRobot's `decode_video_frames` gives with PyAV, which holds all of them.
+
+    Args:
+        path: The video.
+        times: When [s], in order.
+        tolerance_s: How far a picture's time may be from the one wanted [s], besides the rounding of LeRobot's
+            timestamps to 32 bits.
+        key: The camera, for the message.
+        shape: Its feature's; None: pictures of any size are decoded.
+
+    Returns:
+        For each time a picture, (H, W, 3) uint8.
+
+    Raises:
+        ValueError: There is no picture at one of these times; or the pictures have another size than the feature says, and
+            none of that size is taken out of the video.
+    """
+    if not times:
+        return
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        assert stream.time_base is not None
+        _check_size(path, key, shape, stream.height, stream.width)
+        container.seek(round(times[0] / stream.time_base) - 1, backward=True, any_frame=False, stream=stream)
+        frames = (frame for frame in container.decode(stream) if frame.pts is not None)
+        before = after = next(frames, None)
+        for time in times:
+            while after is not None and _time(after) < time:
+                before, after = after, next(frames, None)
+            near = [frame for frame in (before, after) if frame is not None]
+            if not near:
+                raise ValueError(f"{path} has no picture that can be decoded at {time:.4f} s or after it.")
+            frame = min(near, key=lambda frame: abs(_time(frame) - time))
+            if abs(_time(frame) - time) >= tolerance_s + float(np.spacing(np.float32(time))):
+                raise ValueError(
+                    f"{path} has no picture at {time:.4f} s (tolerance {tolerance_s:g} s); the nearest one is at "
+                    f"{_time(frame):.4f} s."
+                )
+            _check_size(path, key, shape, frame.height, frame.width)  # which may change on the way
+            yield frame.to_ndarray(format="rgb24")
+
+
+def _check_size(path: Path, key: str, shape: Sequence[int] | None, height: int, width: int) -> None:
+    if shape is not None and not has_shape(height, width, shape):
+        raise ValueError(
+            f"'{key}': the pictures of '{path}' have {width} x {height} pixels; meta/info.json gives the shape "
+            f"{tuple(shape)}. Correct the shape, or record the dataset again."
+        )
+
+
+def _time(frame: av.VideoFrame) -> float:
+    assert frame.time is not None
+    return frame.time
+
+
+def shrunk_size(height: int, width: int, image_size: int) -> tuple[int, int]:
+    """The height and width at which pictures are kept: at most `image_size` each [pixels]."""
+    return min(height, image_size), min(width, image_size)
+
+
+def kept_shape(shape: Sequence[int], image_size: int | None) -> tuple[int, int, int]:
+    """The channels, height and width of a camera's pictures where they are kept.
+
+    Args:
+        shape: Of the feature, (C, H, W) or (H, W, C).
+        image_size: Largest height and width kept [pixels]; None: as they are recorded.
+    """
+    channels, height, width = shape if shape[0] in (1, 3) else (shape[2], *shape[:2])
+    if image_size is not None:
+        height, width = shrunk_size(height, width, image_size)
+    return channels, height, width
+
+
+def shrink(pictures: np.ndarray, image_size: int) -> np.ndarray:
+    """Shrinks pictures as the policy `playbyear` does: every pixel is the weighted mean of those that it covers.
+
+    Args:
+        pictures: (n, C, H, W) uint8.
+        image_size: Largest height and width wanted [pixels].
+
+    Returns:
+        (n, C, h, w) uint8, `pictures` themselves where they are no larger. They differ from what the policy makes of the
+        recorded ones by rounding, one level of 255.
+    """
+    import torch
+    from torch.nn import functional
+
+    height, width = pictures.shape[-2:]
+    size = shrunk_size(height, width, image_size)
+    if size == (height, width):
+        return pictures
+    values = torch.from_numpy(np.ascontiguousarray(pictures.transpose(0, 2, 3, 1))).permute(0, 3, 1, 2)
+    return functional.interpolate(values, size, mode="bilinear", align_corners=False, antialias=True).numpy()

@@ -1,0 +1,360 @@
+"""LeRobot's own tools, which know nothing of sound, work on datasets that have it."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import torch
+import torchvision
+from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset, random_frame
+from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset, merge_datasets, recompute_stats
+from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
+from lerobot.scripts import lerobot_edit_dataset, lerobot_train
+from lerobot.utils.import_utils import register_third_party_plugins
+
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.datasets import EpisodeStore, audio_feature, audio_keys, episode_waveform
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.inspection import DatasetSource, check_numbers
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
+
+FPS = 20
+LENGTHS = (12, 17, 9, 14)
+
+Edit = Callable[..., None]
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> LeRobotDataset:
+    return make_dataset(tmp_path_factory.mktemp("peers") / "original", LENGTHS, image_size=16)
+
+
+@pytest.fixture
+def edit(monkeypatch) -> Edit:
+    """`lerobot-edit-dataset` with these options."""
+
+    def run(*options: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["lerobot-edit-dataset", *options])
+        lerobot_edit_dataset.main()
+
+    return run
+
+
+def load(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("tests/edited", root=root, video_backend="pyav")
+
+
+def assert_episodes(edited: LeRobotDataset, original: LeRobotDataset, episodes: list[int]) -> None:
+    """The edited dataset holds these episodes of the original, sound and all, and nothing is wrong with it."""
+    assert edited.num_episodes == len(episodes)
+    assert edited.features[MICROPHONE]["info"] == original.features[MICROPHONE]["info"]
+    for position, episode in enumerate(episodes):
+        waveform, sample_rate = episode_waveform(edited, position, MICROPHONE)
+        expected, _ = episode_waveform(original, episode, MICROPHONE)
+        assert sample_rate == 16000
+        assert waveform.dtype == np.int16
+        np.testing.assert_array_equal(waveform, expected)
+    assert EpisodeStore.from_dataset(edited).column(MICROPHONE).shape == (sum(LENGTHS[e] for e in episodes), 800)
+    wrong = [
+        verdict
+        for verdict in check_numbers(DatasetSource.open("tests/edited", edited.root))
+        if verdict.level == "error"
+    ]
+    assert wrong == []
+
+
+def bytes_per_sample(root: Path) -> float:
+    groups = [
+        metadata.row_group(i)
+        for path in root.glob("data/*/*.parquet")
+        for metadata in [pq.ParquetFile(path).metadata]
+        for i in range(metadata.num_row_groups)
+    ]
+    columns = [group.column(i) for group in groups for i in range(group.num_columns)]
+    sound = [column for column in columns if column.path_in_schema.startswith(MICROPHONE)]
+    return sum(column.total_compressed_size for column in sound) / sum(column.num_values for column in sound)
+
+
+def test_deleted_episodes_take_their_sound_with_them(edit, original, tmp_path):
+    target = f"--new_root={tmp_path / 'new'}"
+    edit(
+        "--repo_id=tests/noise",
+        f"--root={original.root}",
+        "--new_repo_id=tests/edited",
+        target,
+        "--operation.type=delete_episodes",
+        "--operation.episode_indices=[0, 2]",
+    )
+    assert_episodes(load(tmp_path / "new"), original, [1, 3])
+
+
+def test_deleting_episodes_costs_a_few_bytes(edit, tmp_path):
+    """Our sound, of a quiet room, is stored as differences; LeRobot's copy of it is not, and takes little more room."""
+    features, rng = {MICROPHONE: audio_feature(16000, FPS)}, np.random.default_rng(0)
+    with DurableWriter("tests/quiet", tmp_path / "ours", FPS, features) as writer:
+        for _ in range(2):
+            for _ in range(30):
+                writer.add_frame({MICROPHONE: rng.normal(0, 20, 800).astype(np.int16), "task": "Listen."})
+            writer.save_episode()
+    edit(
+        "--repo_id=tests/quiet",
+        f"--root={tmp_path / 'ours'}",
+        "--new_repo_id=tests/left",
+        f"--new_root={tmp_path / 'left'}",
+        "--operation.type=delete_episodes",
+        "--operation.episode_indices=[0]",
+    )
+    before, after = bytes_per_sample(tmp_path / "ours"), bytes_per_sample(tmp_path / "left")
+    assert before < 1.1
+    assert after < 1.2 * before, "more than docs/dataset.md says"
+
+
+def test_a_dataset_is_split_and_merged_again(edit, original, tmp_path):
+    edit(
+        "--repo_id=tests/noise",
+        f"--root={original.root}",
+        f"--new_root={tmp_path}",
+        "--operation.type=split",
+        '--operation.splits={"first": [0, 2], "second": [1, 3]}',
+    )
+    assert_episodes(load(tmp_path / "first"), original, [0, 2])
+    assert_episodes(load(tmp_path / "second"), original, [1, 3])
+    edit(
+        "--new_repo_id=tests/edited",
+        f"--new_root={tmp_path / 'merged'}",
+        "--operation.type=merge",
+        "--operation.repo_ids=['tests/second', 'tests/first']",
+        f"--operation.roots=['{tmp_path / 'second'}', '{tmp_path / 'first'}']",
+    )
+    assert_episodes(load(tmp_path / "merged"), original, [1, 3, 0, 2])
+
+
+def test_a_microphone_can_be_removed(edit, original, tmp_path):
+    edit(
+        "--repo_id=tests/noise",
+        f"--root={original.root}",
+        "--new_repo_id=tests/edited",
+        f"--new_root={tmp_path / 'new'}",
+        "--operation.type=remove_feature",
+        f"--operation.feature_names=['{MICROPHONE}']",
+    )
+    deaf = load(tmp_path / "new")
+    assert audio_keys(deaf.features) == []
+    assert len(deaf) == sum(LENGTHS)
+    assert MICROPHONE not in deaf.meta.stats
+
+
+# Statistics
+
+RATE, SIZE = 1600, 80
+HEARD = (60, 40)
+
+
+def write(root: Path, seed: int = 0, resume: bool = False) -> Path:
+    features = {
+        key: feature
+        for key, feature in dataset_features(FPS, RATE, 16).items()
+        if key in (MICROPHONE, "observation.state", "action")
+    }
+    rng = np.random.default_rng(seed)
+    with DurableWriter("tests/heard", root, FPS, features, resume=resume) as writer:
+        for length in HEARD:
+            for _ in range(length):
+                writer.add_frame({**random_frame(features, rng), "task": "listen"})
+            writer.save_episode()
+    return root
+
+
+def statistics_verdict(root: Path) -> str:
+    (verdict,) = [each for each in check_numbers(DatasetSource.open("tests/heard", root)) if each.check == "statistics"]
+    return f"{verdict.level}: {verdict.message}"
+
+
+@pytest.fixture(scope="module")
+def ours(tmp_path_factory) -> Path:
+    return write(tmp_path_factory.mktemp("ours") / "dataset")
+
+
+@pytest.fixture(scope="module")
+def recomputed(ours, tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("recomputed") / "dataset"
+    shutil.copytree(ours, root)
+    recompute_stats(load(root))
+    return root
+
+
+def per_element(dataset: LeRobotDataset) -> dict[str, np.ndarray]:
+    """What a checker computes that knows nothing of sound: LeRobot's statistics of every sample index."""
+    episodes = [episode_waveform(dataset, i, MICROPHONE)[0].reshape(-1, SIZE) for i in range(dataset.num_episodes)]
+    feature = {MICROPHONE: dataset.meta.features[MICROPHONE]}
+    return aggregate_stats([compute_episode_stats({MICROPHONE: each}, feature) for each in episodes])[MICROPHONE]
+
+
+def test_a_checker_that_recomputes_statistics_finds_ours_by_pooling_its_own(ours):
+    dataset = load(ours)
+    stored, found = dataset.meta.stats[MICROPHONE], per_element(dataset)
+    for name in ("min", "max", "mean", "std"):
+        assert stored[name].shape == found[name].shape == (SIZE,)
+        assert (stored[name] == stored[name][0]).all()
+    variance = (found["std"] ** 2 + (found["mean"] - found["mean"].mean()) ** 2).mean()
+    pooled = {"min": found["min"].min(), "max": found["max"].max(), "mean": found["mean"].mean(), "std": variance**0.5}
+    scale = pooled["max"] - pooled["min"]
+    for name, value in pooled.items():
+        assert stored[name][0] == pytest.approx(float(value), abs=1e-4 * float(scale)), name
+    assert (stored["min"] <= found["min"]).all()
+    assert (stored["max"] >= found["max"]).all()
+    assert statistics_verdict(ours).startswith("ok")
+
+
+def test_both_kinds_of_statistics_merge_and_go_on(ours, recomputed, tmp_path):
+    merged = merge_datasets([load(ours), load(recomputed)], "tests/heard", tmp_path / "merged")
+    assert int(merged.meta.stats[MICROPHONE]["count"][0]) == 2 * sum(HEARD)
+    assert statistics_verdict(tmp_path / "merged").startswith("ok")
+    shutil.copytree(recomputed, tmp_path / "longer")
+    write(tmp_path / "longer", seed=1, resume=True)
+    assert int(load(tmp_path / "longer").meta.stats[MICROPHONE]["count"][0]) == 2 * sum(HEARD)
+    assert statistics_verdict(tmp_path / "longer").startswith("ok")
+
+
+# Streaming
+
+DATA = {"repo_id": "tests/noise", "return_uint8": True}
+
+
+def timestamps(n_frames, *keys):
+    return {key: [i / FPS for i in range(1 - n_frames, 1)] for key in keys}
+
+
+def test_the_stream_holds_the_windows_of_the_dataset(original):
+    config = PlaybyearConfig(device="cpu")
+    observed = timestamps(len(config.observation_delta_indices), CAMERA, MICROPHONE, "observation.state")
+    windows = observed | {"action": [i / FPS for i in config.action_delta_indices]}
+    expected = LeRobotDataset(root=original.root, delta_timestamps=windows, **DATA)
+    seen = []
+    for item in StreamingLeRobotDataset(root=original.root, delta_timestamps=windows, **DATA):
+        seen.append(int(item["index"]))
+        same = expected[seen[-1]]
+        assert item.keys() == same.keys()
+        assert item[MICROPHONE].dtype == torch.int64  # as it was recorded, not yet in [-1, 1]
+        for key, value in same.items():
+            assert (
+                torch.equal(torch.as_tensor(item[key], dtype=value.dtype), value)
+                if key != "task"
+                else item[key] == value
+            )
+    assert sorted(seen) == list(range(sum(LENGTHS)))
+
+
+def test_lerobot_train_learns_from_the_stream(original, tmp_path, monkeypatch):
+    register_third_party_plugins()
+    options = [
+        *("--policy.type=playbyear", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.image_size=16"),
+        *("--policy.vision_width=8", "--policy.hidden_size=32", "--policy.audio_window_s=0.9"),
+        *(
+            "--dataset.repo_id=tests/noise",
+            f"--dataset.root={original.root}",
+            "--dataset.streaming=true",
+            "--num_workers=1",
+        ),
+        *(
+            "--dataloader_multiprocessing_context=fork",
+            "--batch_size=4",
+            "--steps=12",
+            f"--output_dir={tmp_path / 'out'}",
+        ),
+    ]
+    monkeypatch.setattr(sys, "argv", ["lerobot-train", *options])
+    lerobot_train.main()  # 12 batches of 4: the second time through the data, too
+    config = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
+    assert (config["sample_rate"], config["type"]) == (16000, "playbyear")
+
+
+# What takes minutes. Each runs LeRobot's command as a person does; what LeRobot needs besides is not installed here.
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    dataset = RecordDatasetConfig("tests/recorded", str(tmp_path_factory.mktemp("recorded") / "dataset"), 2)
+    return record(RecordConfig(PlaybyearEnvConfig(), dataset, num_workers=0))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """In place of the ImageNet weights that ACT fetches from the network when it is made."""
+    folder = tmp_path_factory.mktemp("torch")
+    path = folder / "hub" / "checkpoints" / Path(torchvision.models.ResNet18_Weights.IMAGENET1K_V1.url).name
+    path.parent.mkdir(parents=True)
+    torch.save(torchvision.models.resnet18().state_dict(), path)
+    return folder
+
+
+def run(*command: str, **environment: str) -> str:
+    """A command of this virtual environment; its output."""
+    path = str(Path(sys.executable).parent / command[0])
+    result = subprocess.run(
+        [path, *command[1:]], capture_output=True, text=True, env={**os.environ, **environment}, check=False
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout + result.stderr
+
+
+def needs(module: str, extra: str) -> pytest.MarkDecorator:
+    missing = importlib.util.find_spec(module) is None
+    return pytest.mark.skipif(missing, reason=f"needs {module}: uv pip install 'lerobot[{extra}]'")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["act", pytest.param("diffusion", marks=needs("diffusers", "diffusion"))])
+def test_lerobots_policies_train_on_it_and_act_without_special_options(policy, recorded, weights, tmp_path):
+    output = run(
+        "lerobot-train",
+        f"--policy.type={policy}",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=tests/recorded",
+        f"--dataset.root={recorded}",
+        f"--output_dir={tmp_path / 'train'}",
+        "--steps=2",
+        "--batch_size=2",
+        "--num_workers=0",
+        "--log_freq=1",
+        TORCH_HOME=str(weights),
+    )
+    assert Counter(word.split(":")[0] for word in output.split() if word.startswith("loss:"))["loss"] == 2
+    run(
+        "lerobot-eval",
+        f"--policy.path={tmp_path / 'train/checkpoints/last/pretrained_model'}",
+        "--env.type=playbyear",
+        "--env.episode_length=3",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+        TORCH_HOME=str(weights),
+    )
+    assert (tmp_path / "eval" / "eval_info.json").is_file()
+
+
+@pytest.mark.slow
+@needs("rerun", "viz")
+def test_an_episode_is_saved_for_reruns_viewer(recorded, tmp_path):
+    run(
+        "lerobot-dataset-viz",
+        "--repo-id=tests/recorded",
+        f"--root={recorded}",
+        "--episode-index=1",
+        "--save=1",
+        f"--output-dir={tmp_path}",
+        "--num-workers=0",
+    )
+    saved = (tmp_path / "tests_recorded_episode_1.rrd").read_bytes()
+    assert saved.startswith(b"RRF")
+    assert b"observation.images.front" in saved
