@@ -188,7 +188,8 @@ class Loop:
             server = SoundServer(folder, {"gripper": 1}, RATE)
             server.start()
             stack.callback(server.kill)
-            socket = stack.enter_context(simulation(folder, server.fifo("gripper"), f"--task={self.args.task}"))
+            twin = ["--twin"] if self.args.twin else []
+            socket = stack.enter_context(simulation(folder, server.fifo("gripper"), f"--task={self.args.task}", *twin))
             options = (
                 *("--robot.type=playbyear_sim", f"--robot.socket={socket}"),
                 *(f"--robot.cameras={self.args.camera}", "--play_sounds=false"),
@@ -261,6 +262,7 @@ def figures(done: Done) -> dict[str, Any]:
     return {
         "scenes": len(scenes),
         "successes": sum(each.success for each in scenes),
+        "closed": sum(each.closings > 0 for each in scenes),
         "solved_without_help": sum(each.success and not each.takeovers for each in scenes),
         "takeovers": sum(each.takeovers for each in scenes),
         "steps": steps,
@@ -293,6 +295,7 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, help="another policy's folder, instead of the one that was trained")
     parser.add_argument("--task", default="OccludedGrasp-v1")
     parser.add_argument("--camera", default=CAMERA, help="--robot.cameras, microphones among them")
+    parser.add_argument("--twin", action="store_true", help="the hand passes through the hidden object, unheard")
     parser.add_argument("--preset", default="cpu", help="of playbyear-train; empty: none")
     parser.add_argument("--demonstrations", type=int, default=50)
     parser.add_argument("--demonstration_seed", type=int, default=0, help="of the first scene")

@@ -44,6 +44,7 @@ class Outcome:
         seconds: What they took.
         takeovers: How often a person took over.
         kept: Whether it is in the dataset.
+        closings: How often the hand closed.
     """
 
     seed: int
@@ -54,6 +55,7 @@ class Outcome:
     seconds: float
     takeovers: int = 0
     kept: bool = True
+    closings: int = 0
 
 
 @dataclass
@@ -203,7 +205,12 @@ def ending(now: Mapping[str, Any]) -> str | None:
 
 def outcome(now: Mapping[str, Any], **more: Any) -> Outcome:
     """Of the scene with this status."""
-    counts = {"steps": now["n_steps"], "holds": now["n_holds"], "seconds": now["seconds"]}
+    counts = {
+        "steps": now["n_steps"],
+        "holds": now["n_holds"],
+        "seconds": now["seconds"],
+        "closings": now["n_closings"],
+    }
     return Outcome(now["seed"], now["success"], ending(now) or "time", **counts, **more)
 
 

@@ -10,6 +10,7 @@ from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
 
+from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_robot_playbyear_sim.link import Link
 
 # In the order of the environment's `action` and `agent_pos`; LeRobot hands on what ends in .pos or .vel.
@@ -168,3 +169,19 @@ class PlaybyearSimLeader(Teleoperator):
         link, self._link = self._link, None
         if link is not None:
             link.close()
+
+
+@CameraConfig.register_subclass("playbyear_sim_plain")
+@dataclass(kw_only=True)
+class PlainMicrophoneConfig(MicrophoneCameraConfig):
+    """A microphone whose picture is the spectrogram alone."""
+
+
+class PlainMicrophone(MicrophoneCamera):
+    """Shows what its picture would be without strip and timecode: to compare policies that look at it."""
+
+    def _picture(self, counter: int) -> np.ndarray:
+        grey = self._spectrogram.draw(counter, self._samples)
+        picture = np.zeros((self.height, self.width, 3), np.uint8)
+        picture[: len(grey)] = grey[:, :, None]
+        return picture

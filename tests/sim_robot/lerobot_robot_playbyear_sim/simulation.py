@@ -47,13 +47,14 @@ class Loudspeaker:
 class Simulation:
     """The task, stepped by whoever asks, in one thread."""
 
-    def __init__(self, task: str, fifo: str, image_size: int, sample_rate: int) -> None:
+    def __init__(self, task: str, fifo: str, image_size: int, sample_rate: int, hidden_object: bool = True) -> None:
         self.env = gym.make(
             f"gym_playbyear:gym_playbyear/{task}",
             disable_env_checker=True,
             image_size=image_size,
             sample_rate=sample_rate,
             render_mode="rgb_array",
+            hidden_object=hidden_object,
         ).unwrapped
         self.speaker = Loudspeaker(fifo, sample_rate) if fifo else None
         self.requests: queue.Queue = queue.Queue()
@@ -71,7 +72,7 @@ class Simulation:
         self.success = self.failed = self.wants_control = False
         self.gate, self.demonstrator = self.env.intervention_gate(), self.env.scripted_expert()
         self.scripted: dict[tuple[int, bool], list[float]] = {}
-        self.n_steps, self.last_grip, self.n_holds = 0, -1.0, 0
+        self.n_steps, self.last_grip, self.n_holds, self.n_closings = 0, -1.0, 0, 0
         self.first_step_s = self.last_step_s = 0.0
         self.next_hold, self.next_room = time.perf_counter() + 1e9, time.perf_counter()
         if self.speaker:
@@ -104,7 +105,7 @@ class Simulation:
         return {"action": self.scripted[key]}
 
     def status(self) -> dict[str, Any]:
-        names = ("success", "failed", "wants_control", "is_waiting", "n_steps", "n_holds")
+        names = ("success", "failed", "wants_control", "is_waiting", "n_steps", "n_holds", "n_closings")
         now = {name: getattr(self, name) for name in names}
         seconds = round(self.last_step_s - self.first_step_s, 3)  # what n_steps - 1 steps took
         return {**now, "seed": self._seed, "most_steps": self.env._max_episode_steps, "seconds": seconds}
@@ -156,6 +157,7 @@ class Simulation:
         self.first_step_s = self.first_step_s or self.last_step_s
         self.last_grip, self.n_steps = float(action[3]), self.n_steps + 1
         self.success = bool(info["is_success"])
+        self.n_closings = int(info.get("n_closings", 0))
         self.failed = terminated and not self.success
         self._hear()
         self.next_hold = time.perf_counter() + STEP_S + GRACE_S
@@ -195,8 +197,11 @@ def main() -> None:
     parser.add_argument("--task", default="OccludedGrasp-v1")
     parser.add_argument("--image_size", type=int, default=84)
     parser.add_argument("--sample_rate", type=int, default=16000)
+    parser.add_argument(
+        "--twin", action="store_true", help="the hand passes through the hidden object: nothing to hear"
+    )
     args = parser.parse_args()
-    simulation = Simulation(args.task, args.fifo, args.image_size, args.sample_rate)
+    simulation = Simulation(args.task, args.fifo, args.image_size, args.sample_rate, not args.twin)
     listener = Listener(args.socket, "AF_UNIX")
 
     def accept() -> None:
