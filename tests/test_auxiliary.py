@@ -9,7 +9,6 @@ from training_digest import probe, trained
 
 from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads, onsets, ways_from_onsets
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.policy.optimization import computes_512_bits
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -79,7 +78,6 @@ def test_a_checkpoint_keeps_it_all_and_one_with_heads_acts_without_them(tmp_path
         assert torch.equal(step_through(other, [episode]), step_through(policy, [episode]))
 
 
-@pytest.mark.skipif(not computes_512_bits(), reason="oneDNN has no LSTM in bfloat16 for this processor")
 def test_in_bfloat16_it_learns_the_same():
     """The preset `cpu` learns in it where the processor can; energies and targets stay exact."""
     losses = []

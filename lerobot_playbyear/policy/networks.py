@@ -17,8 +17,11 @@ from lerobot_playbyear.policy.auxiliary import make_auxiliary
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
+from lerobot_playbyear.policy.optimization import computes_512_bits
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
+
+_HAS_512_BITS = computes_512_bits()
 
 _IMAGE_MEAN, _IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 _AUDIO_KERNEL = 7
@@ -306,11 +309,18 @@ class MemoryHead(nn.Module):
             felt = windows[..., self.n_fused :]
             displacement = self.displacement_gain * (felt - felt[:, :, -1:])
             windows = torch.cat([windows[..., : self.n_fused], displacement], dim=-1)
-        outputs, _ = self.lstm(windows.flatten(0, 1))  # (B * K, H, embedding size)
+        outputs = self._remember(windows.flatten(0, 1))  # (B * K, H, embedding size)
         remembered = outputs[:, -1].unflatten(0, windows.shape[:2])
         if self.recollection is None:
             return remembered
         return remembered + self.recollection(encodings[..., : self.n_fused], windows[..., self.n_fused :])
+
+    def _remember(self, windows: Tensor) -> Tensor:
+        """(N, H, D) -> (N, H, embedding size). Not in bfloat16 where oneDNN has no LSTM in it: on CPUs without AVX-512."""
+        if windows.device.type == "cpu" and not _HAS_512_BITS:
+            with torch.autocast("cpu", enabled=False):
+                return self.lstm(windows.to(self.lstm.weight_ih_l0.dtype))[0]
+        return self.lstm(windows)[0]
 
     def act(self, memories: Tensor) -> Tensor:
         """(..., embedding size) of `recall` -> (..., n_actions)."""
