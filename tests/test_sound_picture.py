@@ -20,7 +20,7 @@ from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_edit_dataset, lerobot_eval, lerobot_train
-from test_peers import needs
+from test_lerobot_tools import needs
 from torchvision.ops import FrozenBatchNorm2d
 
 from experiments import act_start

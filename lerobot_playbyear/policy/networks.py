@@ -319,7 +319,7 @@ class MemoryHead(nn.Module):
         """(N, H, D) -> (N, H, embedding size). Not in bfloat16 where oneDNN has no LSTM in it: on CPUs without AVX-512."""
         if windows.device.type == "cpu" and not _HAS_512_BITS:
             with torch.autocast("cpu", enabled=False):
-                return self.lstm(windows.to(self.lstm.weight_ih_l0.dtype))[0]
+                return self.lstm(windows.to(next(self.lstm.parameters()).dtype))[0]
         return self.lstm(windows)[0]
 
     def act(self, memories: Tensor) -> Tensor:
