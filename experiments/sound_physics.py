@@ -3,7 +3,7 @@
     python -m experiments.sound_physics
 
 measures small MuJoCo scenes (`experiments.sound_scenes`), prints the table of docs/sound.md, and writes
-`experiments/results/sound/physics.csv`. `tests/test_sound_v2.py` asserts every row.
+`experiments/results/sound/physics.csv`. `tests/test_sound.py` asserts every row.
 """
 
 import csv

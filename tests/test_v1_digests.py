@@ -1,7 +1,7 @@
 """Version 1 of the tasks gives the bytes that it always gave: what the policy's camera shows, what is heard, and the rest.
 
 A change of physics, of the sound or of the expert changes these digests, and then results stop being comparable: it wants a
-reason in the change log, and new digests. How people see the scene is not in them (`tests/test_looks.py`).
+reason in the change log, and new digests. How people see the scene is not in them (`tests/test_visuals.py`).
 
 Where the last bits of linear algebra or of the physics differ, an episode takes another course, and renderers differ in pixels.
 Digests therefore belong to a kind of machine, which two probes tell; on another kind the test says so and is skipped.

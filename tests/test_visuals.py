@@ -1,4 +1,4 @@
-"""How people see the tasks: the same motion in better clothes, and nothing of it in physics or in the policy's pictures."""
+"""How people see the tasks: the same motion with other shapes and light; physics and the policy see none of it."""
 
 import copy
 
@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from gym_playbyear.environment import TaskEnv
-from gym_playbyear.rendering import PeopleScene, PeopleView
-from gym_playbyear.tasks.arena import TABLE_TOP
+from gym_playbyear.rendering import PeopleScene
 
 TASKS = ("OccludedGrasp-v1", "OccludedPickPlace-v1", "TellApart-v1", "KeyBag-Hard-v1")
 
@@ -58,17 +57,6 @@ def test_who_watches_changes_nothing():
     assert episode(True) == episode(False)
 
 
-def test_a_wall_ends_at_the_table():
-    for task in ("OccludedGrasp-v1", "OccludedPickPlace-v1"):
-        env = make(task)
-        model = PeopleScene(env.definition, 64).model
-        wall = model.geom("wall")
-        low = model.body("wall").pos[2] + wall.pos[2] - wall.size[2]
-        assert low == pytest.approx(TABLE_TOP)
-        high = model.body("wall").pos[2] + wall.pos[2] + wall.size[2]
-        assert high == pytest.approx(env.model.body("wall").pos[2] + env.model.geom("wall").size[2])
-
-
 def red(picture: np.ndarray) -> int:
     r, g, b = picture.astype(int).transpose(2, 0, 1)
     return int(((r > 1.8 * g) & (r > 1.8 * b) & (r > 60)).sum())
@@ -82,26 +70,6 @@ def test_people_see_the_cube_behind_the_wall_unless_it_is_not_there():
         env.close()
 
 
-def test_fingers_are_seen_to_end_where_they_touch():
-    """A grip on a thing must not look like one in it, or beside it: within a millimetre."""
-    env = make("OccludedGrasp-v1")
-    model = PeopleScene(env.definition, 64).model
-    for name, sign in (("left_finger", 1), ("right_finger", -1)):
-        touching = model.geom(name)
-        lowest = touching.pos[2] + touching.size[2]
-        for geom in np.flatnonzero(model.geom_bodyid == model.body(name).id):
-            if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
-                continue
-            mesh = model.geom_dataid[geom]
-            first = model.mesh_vertadr[mesh]
-            turn = np.zeros(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]] @ turn.reshape(3, 3).T
-            vertices = vertices + model.geom_pos[geom]
-            assert (sign * vertices[:, 1] > -0.001).all()
-            assert vertices[:, 2].max() < lowest + 0.001
-
-
 def test_a_copy_looks_the_same_and_draws_for_itself():
     env = make("TellApart-v1")
     env.reset_physics(seed=0)
@@ -110,13 +78,3 @@ def test_a_copy_looks_the_same_and_draws_for_itself():
     env.close()
     np.testing.assert_array_equal(other.render(), picture)
     other.close()
-
-
-def test_two_pictures_of_the_same_moment_are_the_same():
-    env = make("KeyBag-Easy-v1")
-    env.reset_physics(seed=0)
-    first = env.render()
-    view = PeopleView(env.definition, 120, True)
-    np.testing.assert_array_equal(view.picture(env.model, env.data), first)
-    view.close()
-    env.close()

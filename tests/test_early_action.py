@@ -7,11 +7,8 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
-from draccus.utils import DecodingError
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 
-from experiments.protocol import RESULTS, Result, load, load_results
-from experiments.training import told_of_attempts
 from gym_playbyear.environment import TaskEnv
 from gym_playbyear.terminations import ClosedUnheard
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -74,14 +71,6 @@ def test_what_a_task_kept_secret_stands_in_the_file_as_numbers(tmp_path):
     assert {key: told[key] for key in ("kind", "heavy", "where")} == {"kind": 2, "heavy": True, "where": [0.5, 0.25]}
     assert not {"env", "no"} & told.keys()
     env.close()
-
-
-def test_every_closing_counts_once():
-    env = make("OccludedGrasp-v1", horizon=250)
-    env.reset_physics(seed=3)
-    assert after(env, (0, 20, OPEN), (0, 60, CLOSE), (0, 60, OPEN), (0, 60, CLOSE), (0, 50, OPEN))["n_closings"] == 2
-    env.reset_physics(seed=3)
-    assert finish(env, env.scripted_expert())["n_closings"] == 1
 
 
 def test_only_the_first_closing_counts():
@@ -151,47 +140,3 @@ def test_every_attempt_leaves_one_line_in_the_file(tmp_path):
     assert [line["seed"] for line in lines] == [11, 12, 13, 14]
     assert lines[0].keys() == {"seed", "steps", "is_success", "end", "acted_early", "n_closings"}
     assert {(line["steps"], line["end"], line["is_success"]) for line in lines} == {(3, "time", False)}
-    early = told_of_attempts(path, "acted_early", range(11, 15))
-    assert early[1::2] == [False, False]
-    assert told_of_attempts(path, "end", range(11, 15)) == ["time"] * 4
-    assert told_of_attempts(path, "acted_early", range(10, 15)) == []
-    assert told_of_attempts(tmp_path / "nothing", "end", range(11, 15)) == []
-
-
-def test_the_file_changes_nothing_that_is_observed(tmp_path):
-    observed = []
-    for options in ({}, {"attempts_file": str(tmp_path / "a.jsonl")}):
-        config = PlaybyearEnvConfig(task="OccludedGrasp-v1", **options)
-        envs = config.create_envs(1)["playbyear"][0]
-        observation, _ = envs.reset(seed=[5], options={NEW_ROLLOUT_OPTION: True})
-        observed.append((observation, envs.step(np.zeros((1, 4), np.float32))[0]))
-        envs.close()
-    for one, other in zip(*observed, strict=True):
-        np.testing.assert_array_equal(one["pixels"]["front"], other["pixels"]["front"])
-        np.testing.assert_array_equal(one["audio.gripper"], other["audio.gripper"])
-        np.testing.assert_array_equal(one["agent_pos"], other["agent_pos"])
-
-
-def test_a_folder_is_no_file_for_attempts(tmp_path):
-    with pytest.raises(DecodingError, match=r"attempts_file.*it is a folder, give a file"):
-        PlaybyearEnvConfig(attempts_file=str(tmp_path))
-
-
-def test_results_from_before_are_read_and_new_ones_tell_the_share():
-    old = load_results("ablations/OccludedGrasp-v0-full-*.json")
-    assert old
-    assert all(result.early_rate is None and "early" not in result.summary for result in old)
-    content = load(next((RESULTS / "ablations").glob("OccludedGrasp-v0-full-*.json")))
-    new = Result(**{**content, "successes": [True, False], "acted_early": [False, True]})
-    assert (new.early_rate, new.summary) == (0.5, "50% (acted early: 50%)")
-
-
-def test_results_tell_success_with_each_of_the_contents():
-    content = load(next((RESULTS / "ablations").glob("OccludedGrasp-v0-full-*.json"))) | {
-        "successes": [True, False, True]
-    }
-    assert Result(**content).by_contents == ""
-    mixed = Result(**content, contents=["screws", "peanuts", "peanuts"])
-    assert mixed.by_contents == "peanuts 1 of 2, screws 1 of 1"
-    assert mixed.by_contents in mixed.summary
-    assert Result(**content, contents=["keys"] * 3).by_contents == ""
