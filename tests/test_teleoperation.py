@@ -17,7 +17,7 @@ from lerobot.teleoperators.keyboard import (
     KeyboardTeleopConfig,
 )
 
-from gym_playbyear.arm import ArmConfig, CartesianController
+from gym_playbyear.panda import CartesianController, Panda
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
 from lerobot_playbyear.dagger.config import DatasetSource
@@ -139,9 +139,9 @@ def test_directions_that_are_none_are_refused(directions):
 
 def test_the_gripper_is_told_what_the_arm_carries_out():
     """Whatever is wished, following the arm's own rule leaves both in the same state."""
-    controller = CartesianController(ArmConfig(), control_hz=20)
+    controller = CartesianController(Panda(), control_hz=20)
     controller.reset(np.array([-0.12, 0.0, 0.98]))
-    gripper, rng = Gripper(round(ArmConfig().gripper_cooldown * 20)), np.random.default_rng(0)
+    gripper, rng = Gripper(round(Panda().gripper_cooldown * 20)), np.random.default_rng(0)
     n_changes = n_ignored = 0
     for _ in range(400):
         close, was_closed = bool(rng.random() < 0.5), gripper.is_closed
