@@ -89,7 +89,7 @@ _MOST_ERRORS = 10  # that are listed
 
 def read_sound(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], scratch: Path) -> EpisodesSound:
     """Decodes all files, so that what is wrong with them is known before anything is written."""
-    offsets = offsets_of(cfg, len(dataset.episodes))
+    offsets = offsets_of(cfg, dataset.meta.total_episodes)
     pattern = str(cfg.files)
     lengths = [int(length) for length in dataset.meta.episodes["length"]]
     errors: list[str] = []

@@ -24,7 +24,7 @@ from lerobot_playbyear.datasets.parquet import DataFile, column_to_numpy, episod
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 
 if TYPE_CHECKING:
-    from lerobot.datasets import LeRobotDataset
+    from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
 TOLERANCE_S = 1e-4
 """How far a video's picture may be from its frame's time, as in LeRobot [s]."""
@@ -79,6 +79,7 @@ class DatasetReader:
         repo_id: Its name.
         root: Its folder; None: LeRobot's own place for `repo_id`, or else the Hub.
         episodes: Only these; None: all.
+        meta: What LeRobot has read of it already.
 
     Attributes:
         repo_id: Its name.
@@ -94,25 +95,22 @@ class DatasetReader:
         Exception: Whatever LeRobot raises where there is none, or it cannot be read.
     """
 
-    def __init__(self, repo_id: str, root: str | Path | None = None, episodes: Sequence[int] | None = None) -> None:
-        is_local = bool(check_dataset_files(repo_id, root))
-        from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+    def __init__(
+        self,
+        repo_id: str,
+        root: str | Path | None = None,
+        episodes: Sequence[int] | None = None,
+        *,
+        meta: "LeRobotDatasetMetadata | None" = None,
+    ) -> None:
+        if meta is None:
+            is_local = bool(check_dataset_files(repo_id, root))
+            from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-        if is_local:
-            self._open(LeRobotDatasetMetadata(repo_id, root), episodes)
-        else:  # it fetches what is missing
-            self._open(
-                LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).meta, episodes
-            )
-
-    @classmethod
-    def of(cls, dataset: "LeRobotDataset") -> "DatasetReader":
-        """Reads what LeRobot has opened: the same episodes of the same files."""
-        reader = cls.__new__(cls)
-        reader._open(dataset.meta, dataset.episodes)
-        return reader
-
-    def _open(self, meta: Any, episodes: Sequence[int] | None) -> None:
+            if is_local:
+                meta = LeRobotDatasetMetadata(repo_id, root)
+            else:  # it fetches what is missing
+                meta = LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).meta
         self.meta, self.repo_id, self.root = meta, meta.repo_id, Path(meta.root)
         self.fps, self.features = int(meta.fps), meta.features
         check_audio_features({key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps)
@@ -125,6 +123,11 @@ class DatasetReader:
             numbers = numbers[self._rows]
         bounds = zip(*episode_bounds(numbers), strict=True) if len(numbers) else ()
         self.episodes = [EpisodeRows(int(numbers[start]), start, stop) for start, stop in bounds]
+
+    @classmethod
+    def of(cls, dataset: "LeRobotDataset") -> "DatasetReader":
+        """Reads what LeRobot has opened: the same episodes of the same files."""
+        return cls(dataset.repo_id, dataset.root, dataset.episodes, meta=dataset.meta)
 
     def __len__(self) -> int:
         """The number of frames, N."""
