@@ -1,10 +1,13 @@
 """Keys in a bag: hidden from the camera, found by touch, heard; what ends an attempt, and what else can be in the bag."""
 
+from dataclasses import replace
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from gym_playbyear.experts.key_bag import BagExpert
+from gym_playbyear.panda import Proprioception, SensorNoise
 from gym_playbyear.tasks.bag import BAG, CONTENTS, CONTENTS_KINDS, HALF_SIZE, RIM, middle_of, points_of
 from lerobot_env_playbyear import PlaybyearEnvConfig
 
@@ -297,3 +300,19 @@ def test_lerobot_takes_the_tasks_own_rates():
     assert {key for key in config.features if "audio" in key} == {"audio.left_finger", "audio.right_finger"}
     assert config.features["audio.left_finger"].shape == (9600,)
     assert PlaybyearEnvConfig(task=EASY).features["audio.gripper"].shape == (9600,)
+
+
+def test_the_hands_measured_place_wanders_by_itself_and_draws_nothing_of_the_usual_numbers():
+    noise = SensorNoise()
+    plain = Proprioception(noise, 5)
+    wandering = Proprioception(replace(noise, wander=0.0006), 5, np.random.default_rng(1))
+    streams = np.random.default_rng(0), np.random.default_rng(0)
+    true, errors = np.array([0.5, 0, 0.2, 0.02, 0.02, 0, 0]), []
+    for _ in range(4000):
+        usual, off = plain.measure(true, streams[0]), wandering.measure(true, streams[1])
+        np.testing.assert_array_equal(usual[3:], off[3:])
+        errors.append(off[:3] - usual[:3])
+    assert 0.0005 < np.std(errors) < 0.0007
+    series = np.array(errors)[:, 2]
+    kept = np.corrcoef(series[:-1], series[1:])[0, 1]
+    assert np.exp(-0.1) - 0.06 < kept < np.exp(-0.1) + 0.04
