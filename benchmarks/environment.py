@@ -57,11 +57,10 @@ answer(lambda action: env.step(action)[2], env.reset, (env.action_dim,))
 def parts_of_a_step(env) -> dict[str, Callable[[], object]]:
     """What a step consists of, each alone."""
     hold = np.repeat(env.data.ctrl[None].copy(), env._controller.n_substeps, axis=0)
-    camera, moment = env._cameras["front"], env.moment()
     return {
-        "physics": lambda: env._advance(hold),
-        "picture": lambda: camera.render(env.data, "front"),
-        "sound": lambda: env._sound.step(env.model, moment),
+        "physics": lambda: env._roll(hold),
+        "picture": lambda: env._picture("front", 84),
+        "sound": lambda: env._listen(env._synthesizer),
         "inverse kinematics": lambda: env._controller.command(np.zeros(4), env.eef_position),
     }
 
