@@ -115,7 +115,9 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoper
             f"{option}: {error} Or take --expert.teleop.type=keyboard_window, which needs nothing."
         ) from error
     except Exception as error:  # whatever a device may say
-        raise ExpertError(f"{option} cannot be connected: {error}") from error
+        raise ExpertError(
+            f"{option} cannot be connected: {error}. --expert.teleop.type=keyboard_window needs nothing."
+        ) from error
     has_pad = not isinstance(teleop, GamepadTeleop) or has_gamepad(teleop)
     if not teleop.is_connected or not has_pad:
         teleop.disconnect() if teleop.is_connected else None
