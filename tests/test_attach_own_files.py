@@ -206,7 +206,7 @@ def test_a_link_out_of_the_dataset_is_not_followed(with_files, tmp_path):
     file = tmp_path / f"files/audio/{TABLE}/chunk-000/file-000.m4a"
     file.unlink()
     file.symlink_to(with_files / f"audio/{TABLE}/chunk-000/file-000.m4a")
-    with pytest.raises(InputError, match=r"is a link to .*outside the dataset's folder"):
+    with pytest.raises(InputError, match=r"is a link to .*outside its folder"):
         attach(tmp_path / "files", tmp_path / "columns")
 
 

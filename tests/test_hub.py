@@ -465,6 +465,22 @@ def test_a_damaged_policy_is_told_in_one_line(tmp_path, config):
     assert "\n" not in str(refused.value)
 
 
+def test_no_link_of_a_checkpoint_or_a_run_is_followed(tmp_path):
+    secret, run = tmp_path / "secret", tmp_path / "run"
+    for folder in (secret, run / "checkpoints/000001/pretrained_model"):
+        folder.mkdir(parents=True)
+        for name in ("config.json", "model.safetensors"):
+            (folder / name).write_text("{}")
+    (folder / "notes.json").symlink_to(secret / "config.json")
+    with pytest.raises(HubError, match=r"notes\.json' is a link to .*secret/config\.json'"):
+        push_policy(folder, "me/policy", PushOptions())
+    (run / "checkpoints/last").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere").mkdir()
+    secret.rename(tmp_path / "elsewhere/pretrained_model")
+    with pytest.raises(HubError, match=r"its last checkpoint is a link to .*elsewhere"):
+        push_policy(run, "me/policy", PushOptions())
+
+
 # What is known of a policy's success
 
 

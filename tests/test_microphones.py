@@ -181,7 +181,7 @@ def test_a_tap_is_heard_soon_after_it_was_played_and_always_as_late():
                 last = int(new[0])
     assert len(late) >= 18
     assert 0 <= np.median(late) < 0.05  # the server's own latency and a chunk
-    assert np.median(np.abs(late - np.median(late))) < 0.005  # a busy machine may hold the server up for some
+    assert np.percentile(np.abs(late - np.median(late)), 90) < 0.005
 
 
 def test_a_pictures_sound_is_of_its_moment_to_5_ms():

@@ -181,14 +181,14 @@ def check_links(root: Path) -> None:
 def check_links_out(root: Path) -> None:
     """As `check_links` for a page, which reads through links: those to folders within the dataset's are allowed."""
     home = root.resolve()
-    if home.parent.name == "snapshots" and home.parent.parent.name.startswith("datasets--"):
-        home = home.parent.parent  # the Hub's cache of this dataset: its files lie in blobs/
+    if home.parent.name == "snapshots" and home.parent.parent.name.startswith(("datasets--", "models--")):
+        home = home.parent.parent  # the Hub's cache of it: its files lie in blobs/
     for path in entries_below(root):
         real = real_path(path)
         if path.is_symlink() and not real.is_relative_to(home):
             raise OutsideError(
-                f"'{path}' is a link to '{real}', outside the dataset's folder. Put the file itself there if it "
-                "belongs to the dataset, or remove the link."
+                f"'{path}' is a link to '{real}', outside its folder. Put the file itself there if it belongs "
+                "there, or remove the link."
             )
 
 

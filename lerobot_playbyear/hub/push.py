@@ -24,7 +24,7 @@ from huggingface_hub.utils import validate_repo_id
 from lerobot_playbyear.compat import card_writer
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, FolderLockedError, entries_below
-from lerobot_playbyear.datasets.info import OutsideError, check_links
+from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out
 from lerobot_playbyear.datasets.journal import JournalError, lock_dataset
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.hub.dataset_card import CARD, FILM, write_dataset_card
@@ -259,6 +259,10 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
     folder = find_checkpoint(Path(path))
     options.check()
     try:
+        check_links_out(folder)
+    except OutsideError as error:
+        raise HubError(f"Not pushed. {error}") from error
+    try:
         config = PreTrainedConfig.from_pretrained(folder)
         config.repo_id, config.device = repo_id, "cpu"
         config.license = options.license or (word(config.license) if config.license else None)
@@ -298,6 +302,7 @@ def push_checkpoint(folder: Path, repo_id: str, private: bool | None = None) -> 
     from lerobot.utils.constants import CHECKPOINTS_DIR
 
     try:
+        check_links_out(folder)
         repository = _create(repo_id, "model", private)
         paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
         files = {f"{CHECKPOINTS_DIR}/{folder.name}/{path.relative_to(folder).as_posix()}": path for path in paths}
@@ -352,8 +357,13 @@ def find_checkpoint(path: Path) -> Path:
 
     wanted = (constants.CONFIG_NAME, constants.SAFETENSORS_SINGLE_FILE)
     for inside in ("", PRETRAINED_MODEL_DIR, f"{CHECKPOINTS_DIR}/{LAST_CHECKPOINT_LINK}/{PRETRAINED_MODEL_DIR}"):
-        if all((path / inside / name).is_file() for name in wanted):
-            return path / inside
+        found = path / inside
+        if all((found / name).is_file() for name in wanted):
+            if not found.resolve().is_relative_to(path.resolve()):
+                raise HubError(
+                    f"policy.path={path}: its last checkpoint is a link to {found.resolve()}. Give that folder."
+                )
+            return found
     raise HubError(
         f"policy.path={path}: there is no checkpoint with {' and '.join(wanted)}. Give the folder "
         f"`{PRETRAINED_MODEL_DIR}` of one, or the output folder of a training."
