@@ -25,11 +25,11 @@ from reference import Reference, random_windows
 from torch.utils.flop_counter import FlopCounterMode
 from training import update_of
 
-from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
+from lerobot_playbyear.training import EpisodeStore, RunSampler, run_weights
+from lerobot_playbyear.training.batches import PolicyWindows
+from lerobot_playbyear.training.command_line import apply_preset
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.parts import make_training_parts
-from lerobot_playbyear.training.presets import apply_preset
-from lerobot_playbyear.training.windows import PolicyWindows
+from lerobot_playbyear.training.learner import make_learner
 
 REPO_ID = "benchmark/gpu"
 MATRIX = {"cuda": 8192, "cpu": 512}
@@ -90,7 +90,7 @@ def updates(options: list[str], plain: bool = False) -> list[Row]:
     sys.argv[1:] = apply_preset(options)
     cfg = lerobot_parser.wrap()(_validated)()
     dataset = LeRobotDataset(REPO_ID, cfg.dataset.root)
-    parts = make_training_parts(cfg, dataset.meta)
+    parts = make_learner(cfg, dataset.meta)
     device, windows = parts.accelerator.device, PolicyWindows(parts.policy.config, dataset.meta)
     store = EpisodeStore.from_dataset(dataset, windows.keys)
     sampler = RunSampler(run_weights(store, windows.n_windows))

@@ -19,8 +19,9 @@ from lerobot.datasets import LeRobotDataset
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from lerobot_playbyear.datasets import EpisodeStore, audio_keys
+from lerobot_playbyear.datasets import audio_keys
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.training import EpisodeStore
 
 REPO_ID = "benchmark/windows"
 SAMPLE_RATE, FPS, PIXELS = 16000, 20, 84

@@ -14,9 +14,8 @@ import gymnasium as gym
 import numpy as np
 
 from experiments.landings import CUBES, asked_for, parser_of
-from lerobot_playbyear.episodes.episode import Observation
-from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
+from lerobot_playbyear.episodes.experts import ScriptedExpert
+from lerobot_playbyear.episodes.play import Observation, play
 
 TRAYS = tuple(task for task in CUBES if "PickPlace" in task)
 EDGES_MM = (-10, 10, 30, 60, 100, 200, 300, 800)

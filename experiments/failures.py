@@ -21,9 +21,8 @@ from lerobot.utils.random_utils import set_seed
 
 from experiments.landings import CUBES, HopRecorder, asked_for, parser_of
 from gym_playbyear.tasks.occluded import PLACE_TOLERANCE
-from lerobot_playbyear.episodes.episode import Episode
-from lerobot_playbyear.episodes.play import Actor, play
-from lerobot_playbyear.episodes.scripted_expert import ScriptedExpert
+from lerobot_playbyear.episodes.experts import ScriptedExpert
+from lerobot_playbyear.episodes.play import Actor, Episode, play
 from lerobot_playbyear.film.rollout_film import write_episode_film
 
 LIFTED_M = 0.01

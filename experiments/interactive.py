@@ -54,7 +54,7 @@ from experiments.protocol import (
 )
 from experiments.training import Job, evaluate
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger.figures import Totals
+from lerobot_playbyear.dagger.report import Totals
 
 STUDY = "interactive"
 BATCH_SIZE = 12

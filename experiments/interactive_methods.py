@@ -8,22 +8,15 @@ _ASKING = ("--method.type=robot_gated", "--method.intervention_share=0.45")
 METHODS: dict[str, tuple[str, ...]] = {
     "skip": (),
     "hg_dagger": ("--skip_s=0",),
-    "dagger": ("--method.type=dagger",),
     "no_handback": ("--method.type=no_handback",),
     "redo": ("--method.type=redo",),
-    "sirius": ("--method.type=weighted",),
-    "iwr": ("--method.type=weighted", "--method.paper=iwr"),
-    "robot_gated": (*_ASKING, "--method.hands_back=true"),
-    "robot_gated_no_handback": (*_ASKING, "--method.hands_back=false", "--method.redo_failed=false"),
-    "robot_gated_redo": (*_ASKING, "--method.hands_back=false", "--method.redo_failed=true"),
-    "early": ("--takeover_delay_s=-0.5",),
-    "late": ("--takeover_delay_s=0.5",),
-    "all_frames": ("--learn_from=all",),
+    "robot_gated_no_handback": (*_ASKING, "--method.redo_failed=false"),
+    "robot_gated_redo": _ASKING,
     "person": ("--expert.person=true",),
     "person_robot_gated": (*_ASKING, "--expert.person=true"),
 }
 """`skip` is `playbyear-dagger` as it is by default, `hg_dagger` learns from whole corrections, as it was published."""
-WEIGHING = ("hg_dagger", "redo", "sirius", "iwr", "all_frames")
+WEIGHING = ("hg_dagger", "redo")
 """Those that say what is learned from; the others say who acts, and what is kept."""
 COURSES = {"own": {}, "paper": {"KeyBag-Easy-v1": 12}}
 """Attempts that are kept in other tasks before the task itself; the paper's order for the bag."""

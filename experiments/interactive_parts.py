@@ -16,7 +16,7 @@ from typing import Any
 
 from experiments.protocol import N_DEMONSTRATIONS, RUNS, dataset_root, load, record, save, shown
 from experiments.training import Job, clocked, train
-from lerobot_playbyear.training.presets import preset_options
+from lerobot_playbyear.training.command_line import preset_options
 
 PAUSE_S = 10.0
 _OF_NO_WEIGHT = ("policy.path", "policy.device", "policy.push_to_hub")  # a policy is the same with another

@@ -22,7 +22,7 @@ from experiments.protocol import NEW_TASKS, TASKS, command_line
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Actor, play
-from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.episodes.pool import Script
 
 TOUCH_N = 0.2  # a touch, and not the noise of a contact [N]
 RISE_M, FALL_M = 0.03, 0.012

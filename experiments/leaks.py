@@ -19,8 +19,7 @@ from torch import nn
 from experiments.protocol import RESULTS, command_line, save
 from gym_playbyear.experts import ExpertConfig, GraspExpert
 from gym_playbyear.proprioception import NO_SENSOR_NOISE, SensorNoise
-from lerobot_playbyear.episodes.episode import Observation
-from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.play import Observation, play
 
 TASK = "OccludedGrasp-v0"
 _ASIDE = -0.15  # x of a cube that is not in the way [m]

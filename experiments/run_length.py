@@ -26,9 +26,9 @@ from experiments.protocol import (
     save,
 )
 from experiments.training import Job, train_and_evaluate
-from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.training.windows import PolicyWindows
+from lerobot_playbyear.training import EpisodeStore
+from lerobot_playbyear.training.batches import PolicyWindows
 
 STUDY = "run_length"
 N_WINDOWS = 64  # per update

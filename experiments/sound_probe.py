@@ -9,7 +9,7 @@ import numpy as np
 from gym_playbyear.panda import FINGER_THICKNESS
 from gym_playbyear.tasks.arena import CUBE_HALF_SIZE, TABLE_TOP
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.episodes.pool import Script
 
 AUDIO_KEY = "audio.gripper"
 REACTION_STEPS = 10

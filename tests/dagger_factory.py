@@ -18,7 +18,7 @@ from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict, run_dagger
 from lerobot_playbyear.dagger.config import with_saved_options
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
-from lerobot_playbyear.training.loop import train
+from lerobot_playbyear.training.train import train
 
 ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v1", "--env.image_size=16")
 QUICK = ("--expert.type=test_quick", "--env.episode_length=12")

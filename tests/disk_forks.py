@@ -1,4 +1,4 @@
-"""Processes that are killed while they fill the disk store; see `test_disk_store.py`.
+"""Processes that are killed while they fill the disk store; see `test_store.py`.
 
 Forks a child for each kill, and at last one that says whether the store holds what the dataset does.
 """
@@ -13,16 +13,15 @@ from pathlib import Path
 
 import torch
 
-from lerobot_playbyear.datasets import EpisodeStore, disk_columns
+from lerobot_playbyear.training import EpisodeStore
 
 IMAGE_SIZE = 24
 
 
 def build(root: str, cache: str, **options: object) -> EpisodeStore:
     """The dataset's store."""
-    disk_columns._SAVED_EVERY_S = 0.0
     place = {"place": "disk", "cache": Path(cache), "image_size": IMAGE_SIZE, **options}
-    return EpisodeStore.load("tests/noise", root, device="cpu", video_backend="pyav", **place)
+    return EpisodeStore.load("tests/noise", root, device="cpu", **place)
 
 
 def forked(task) -> tuple[int, float]:

@@ -96,9 +96,9 @@ def load(root: str) -> dict[str, Any]:
 def store(root: str) -> dict[str, Any]:
     from recording_factory import REPO_ID, episode_length
 
-    from lerobot_playbyear.datasets import EpisodeStore
+    from lerobot_playbyear.training import EpisodeStore
 
-    read = EpisodeStore.load(REPO_ID, root, video_backend="pyav")
+    read = EpisodeStore.load(REPO_ID, root)
     lengths = [end - start for start, end in zip(read.starts, read.ends, strict=True)]
     wrong = [] if lengths == [episode_length(number) for number in range(len(lengths))] else [f"lengths {lengths}"]
     return {"episodes": read.n_episodes, "wrong": wrong}

@@ -24,7 +24,7 @@ hub             datasets audio policy film inspection
 training        datasets audio policy hub
 teleoperation   datasets episodes
 recording       datasets episodes hub teleoperation
-dagger          datasets episodes hub training
+dagger          datasets policy episodes hub training
 scripts         datasets audio microphones repair policy episodes film inspection hub training teleoperation recording dagger
 """
 _ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}

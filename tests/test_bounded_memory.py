@@ -17,13 +17,13 @@ from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.video_utils import decode_video_frames
 from PIL import Image
 
-from lerobot_playbyear.datasets import EpisodeStore
-from lerobot_playbyear.datasets.free_memory import available_memory
+from lerobot_playbyear.training.columns import available_memory
 from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.datasets.pictures import video_pictures
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import sound_stats
 from lerobot_playbyear.film.dataset_film import encode
+from lerobot_playbyear.training import EpisodeStore
 
 FPS = 30
 

@@ -27,9 +27,10 @@ from safetensors.torch import load_file
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
-from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
-from lerobot_playbyear.dagger.loop import outcome_of
+from lerobot_playbyear.dagger.config import DaggerConfig
+from lerobot_playbyear.dagger.methods import Method
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
@@ -131,7 +132,7 @@ def test_an_expert_can_end_an_attempt(verdict, outcome):
     env.close()
     assert len(episode) == 7
     assert episode.success is (verdict is Verdict.SUCCESS)
-    assert outcome_of(episode) == outcome
+    assert Method().outcome(episode) == outcome
 
 
 # A run
@@ -215,7 +216,7 @@ def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_pat
 
 
 def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
-    cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), learning_rate=1.0, warmup_updates=4)
+    cfg = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), learning_rate=1.0, warmup_updates=4)
     cfg.episodes, cfg.warmup_episodes, cfg.updates_per_episode = 7, 3, 10
     rounds = [[cfg.rate(10 * done + number, number, 10) for number in range(10)] for done in range(6)]
     first, second, last = rounds[0], rounds[1], rounds[4]
@@ -231,7 +232,7 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
 
 
 def test_from_recorded_corrections_alone_the_rate_falls_once():
-    cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), learning_rate=1.0, warmup_updates=0)
+    cfg = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), learning_rate=1.0, warmup_updates=0)
     cfg.episodes, cfg.updates, cfg.updates_per_episode = 0, 50, 10
     rates = [cfg.rate(step, step % 10, 10) for step in range(50)]
     assert rates == sorted(rates, reverse=True)
@@ -239,7 +240,7 @@ def test_from_recorded_corrections_alone_the_rate_falls_once():
 
 
 def test_without_a_rate_the_policy_says_it():
-    cfg = DaggerConfig(DatasetSource("a/b"), DatasetSource("c/d"), policy=PlaybyearConfig(optimizer_lr=2e-3))
+    cfg = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), policy=PlaybyearConfig(optimizer_lr=2e-3))
     assert cfg.training().optimizer.lr == cfg.largest_rate == 2e-3
     cfg.learning_rate = 1e-4
     assert cfg.training().optimizer.lr == cfg.largest_rate == 1e-4

@@ -5,15 +5,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from dataset_factory import make_dataset
-from lerobot.datasets import LeRobotDataset
-from lerobot.policies.act.configuration_act import ACTConfig
 
-from lerobot_playbyear.dagger.batches import BalancedBatches, frames_learned_from, intervention_run_weights
-from lerobot_playbyear.dagger.config import DaggerConfig, DatasetSource
-from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.dagger.batches import (
+    BalancedBatches,
+    JoinedBatches,
+    frames_learned_from,
+    intervention_run_weights,
+)
+from lerobot_playbyear.dagger.config import DaggerConfig
+from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.training.windows import PolicyWindows
+from lerobot_playbyear.training import EpisodeStore
+from lerobot_playbyear.training.batches import PolicyWindows
 
 N_DEMONSTRATIONS = 1000
 """Actions of the demonstrations are below it, those of the attempts above: a window tells where it is from."""
@@ -86,14 +89,12 @@ def test_the_beginning_of_every_correction_can_be_left_out(n_windows, n_skipped)
 
 def test_by_default_corrections_are_learned_from_once_the_memory_holds_nothing_else():
     cfg = DaggerConfig(
-        DatasetSource("demos"),
-        DatasetSource("corrections"),
+        DatasetPlace("demos"),
+        DatasetPlace("corrections"),
         policy=PlaybyearConfig(n_memory_steps=3, device="cpu", push_to_hub=False),
     )
     assert cfg.n_skipped(20) == 3  # n_memory_steps
     cfg.policy.use_memory = False
-    assert cfg.n_skipped(20) == 0
-    cfg.policy = ACTConfig(device="cpu", push_to_hub=False)
     assert cfg.n_skipped(20) == 0
     cfg.skip_s = 0.42
     assert cfg.n_skipped(20) == 9
@@ -102,15 +103,6 @@ def test_by_default_corrections_are_learned_from_once_the_memory_holds_nothing_e
 def test_where_nothing_would_remain_all_is_learned_from():
     learned = frames_learned_from(store([9], "..xxx..xx"), 3)
     assert "".join("x" if frame else "." for frame in learned) == "..xxx..xx"
-
-
-def test_attempts_from_which_nothing_is_learned_are_counted():
-    """The second's only correction is short, nobody helped in the third, and the fourth begins with the expert."""
-    interventions = store([8, 6, 4, 4], "..xxxxx." + "..xx.." + "...." + "xx..")
-    for n_skipped, n_without in ((0, 0), (3, 1)):
-        batches = BalancedBatches(windows(2), store([40]), interventions, batch_size=12, n_skipped=n_skipped)
-        assert batches.n_attempts_without() == (n_without, 4)
-    assert BalancedBatches(windows(2), store([40]), None, batch_size=12).n_attempts_without() == (0, 0)
 
 
 def test_both_halves_weigh_the_same_in_the_loss():
@@ -147,7 +139,8 @@ def test_every_intervention_frame_is_learned_from_alike():
     ],
 )
 def test_runs_lie_where_the_expert_was_in_control(marks, runs):
-    weights = intervention_run_weights(store([len(marks)], marks), n_windows=4)
+    is_learned = torch.tensor([mark == "x" for mark in marks])
+    weights = intervention_run_weights(store([len(marks)], marks), 4, is_learned)
     assert {int(i): float(weights[i]) for i in weights.nonzero()} == runs
 
 
@@ -162,7 +155,7 @@ def test_an_episode_appended_while_training_goes_on_is_drawn():
         }
     ] * 6
     interventions.append_episode(new)
-    batches.set_interventions(interventions)
+    batches.take_in(interventions)
     drawn = torch.cat([supervised(batches.batch(number)) for number in range(20)])
     assert (drawn == 5000).any()
     assert ((drawn >= N_DEMONSTRATIONS) & (drawn < 5000)).any()
@@ -190,43 +183,13 @@ def test_without_a_single_correction_there_is_a_clear_error():
         BalancedBatches(windows(4), store([40]), store([14], "." * 14), 8)
 
 
-def other_policys_windows(tmp_path, action_delta_indices):
-    """What a policy of LeRobot's own is trained on: windows, demonstrations, attempts with random corrections."""
-    make_dataset(tmp_path / "demos", (12, 9), image_size=8)
-    make_dataset(tmp_path / "attempts", (15, 3), image_size=8, seed=1)
-    demos, attempts = (LeRobotDataset("a/b", root=tmp_path / name) for name in ("demos", "attempts"))
-    policy = SimpleNamespace(
-        type="other",
-        observation_delta_indices=None,
-        action_delta_indices=action_delta_indices,
-        reward_delta_indices=None,
-    )
-    policy_windows = PolicyWindows(policy, demos.meta)
-    return policy_windows, *(
-        EpisodeStore.from_dataset(dataset, policy_windows.keys, "cpu") for dataset in (demos, attempts)
-    )
-
-
-@pytest.mark.parametrize("deltas", [[0, 1, 2], [-1, 0, 1, 2, 3]], ids=["from now on", "from the last frame on"])
-def test_of_a_chunk_only_what_the_expert_chose_is_learned(tmp_path, deltas):
-    """ACT's chunks, say, and Diffusion's, which begin before the frame they are for."""
-    policy_windows, demos, attempts = other_policys_windows(tmp_path, deltas)
-    by_expert = attempts.column("intervention").flatten()
-    batches = BalancedBatches(policy_windows, demos, attempts, batch_size=8)
-    for number in range(20):
-        batch = batches.batch(number)
-        is_learned = ~batch["action_is_pad"]
-        assert batch["action"].shape == (8, len(deltas), 4)
-        assert batch["intervention"][4:].all()
-        assert len(batch["task"]) == 8
-        assert is_learned[:4].sum() == is_learned[4:].sum() > 0
-        for actions, mask in zip(batch["action"][4:], is_learned[4:], strict=True):
-            for action in actions[mask]:
-                assert by_expert[(attempts.column("action") == action).all(dim=1)].all()
-
-
-def test_single_actions_need_no_mask(tmp_path):
-    policy_windows, demos, attempts = other_policys_windows(tmp_path, None)
-    batch = BalancedBatches(policy_windows, demos, attempts, batch_size=8).batch(0)
-    assert batch["action"].shape == (8, 4)
-    assert batch["intervention"][4:].all()
+def test_what_was_shown_joins_the_demonstrations_frame_by_frame():
+    shown = store([30], "x" * 30, first=N_DEMONSTRATIONS)
+    batches = JoinedBatches(windows(4), store([40, 20]), shown, batch_size=12)
+    ends = np.concatenate([supervised(batches.batch(number)).numpy() for number in range(500)])
+    assert len(ends) == 500 * 12 * 4
+    counts = np.bincount(np.where(ends < N_DEMONSTRATIONS, ends, ends - N_DEMONSTRATIONS + 60), minlength=90)
+    assert 0.5 < counts.min() / counts.mean() < counts.max() / counts.mean() < 1.6  # ends of episodes lie in few runs
+    first, second = batches.halves(0)
+    assert (supervised(first) < N_DEMONSTRATIONS).all()
+    assert (supervised(second) >= N_DEMONSTRATIONS).all()

@@ -6,8 +6,8 @@ import pytest
 from dagger_factory import QUICK, command, dagger, metrics, state
 from test_dagger_resume import PowerCut
 
-from lerobot_playbyear.dagger.folder import RunFolder
-from lerobot_playbyear.training.parts import TrainingParts
+from lerobot_playbyear.dagger.run_folder import RunFolder
+from lerobot_playbyear.training.learner import Learner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -22,7 +22,7 @@ def gives(monkeypatch):
     def evaluate(*_):
         return {"overall": {"pc_success": rates.pop(0), "n_episodes": 1}}
 
-    monkeypatch.setattr(TrainingParts, "evaluate", evaluate)
+    monkeypatch.setattr(Learner, "evaluate", evaluate)
     return rates
 
 

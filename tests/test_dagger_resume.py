@@ -27,11 +27,11 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 
-from lerobot_playbyear.dagger import folder as folder_module
+from lerobot_playbyear.dagger import run_folder as folder_module
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.training.parts import TrainingParts
+from lerobot_playbyear.episodes.play import Verdict
+from lerobot_playbyear.training.learner import Learner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -100,7 +100,7 @@ def assert_a_power_cut_changes_nothing(folder, expected, run, after, owner=folde
     ("owner", "name", "after"),
     [
         (folder_module.RunFolder, "commit", 3),  # the attempt is on disk and not yet counted
-        pytest.param(folder_module.os, "replace", 8, marks=pytest.mark.slow),  # the checkpoint is not yet at its place
+        pytest.param(os, "rename", 0, marks=pytest.mark.slow),  # the checkpoint is not yet at its place
         pytest.param(folder_module.RunFolder, "clean", 3, marks=pytest.mark.slow),  # `last` is behind
         pytest.param(DurableWriter, "add_frame", 20, marks=pytest.mark.slow),  # while an attempt is written
         pytest.param(folder_module.RunFolder, "save_checkpoint", 1, marks=pytest.mark.slow),
@@ -268,7 +268,7 @@ def assert_complete(folder, n_episodes):
 @pytest.mark.slow
 def test_killed_in_an_evaluation_it_evaluates_again(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        cut_power(patch, TrainingParts, "evaluate", 1)
+        cut_power(patch, Learner, "evaluate", 1)
         with pytest.raises(PowerCut):
             dagger(tmp_path, *RUN, *EVALUATED)
     assert [line["round"] for line in metrics(tmp_path, "eval")] == [0]

@@ -43,8 +43,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from lerobot_playbyear.policy.image_augmentation import Augmentation, sample
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy, RecentFrames
 from lerobot_playbyear.policy.optimization import training_dtype
-from lerobot_playbyear.training import loop
-from lerobot_playbyear.training.processes import make_accelerator
+from lerobot_playbyear.training import train as loop
+from lerobot_playbyear.training.learner import make_accelerator
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -14,7 +14,7 @@ import pytest
 from accelerate.commands.launch import launch_command_parser
 
 from lerobot_playbyear.scripts.command import OPTIONS_FILE, find_mistake
-from lerobot_playbyear.training.presets import apply_preset
+from lerobot_playbyear.training.command_line import apply_preset
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

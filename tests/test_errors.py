@@ -150,6 +150,7 @@ train | --policy.audio_steps=[nobody] | --policy.audio_steps names 'nobody' | le
 train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
 # Corrections
 dagger | -env.type -env.task -env.image_size | give --env.type and --env.task, or --episodes=0 --updates=N
+dagger | --policy.audio_noise_db=20 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
 dagger | -policy.path | HG-DAgger improves a trained policy: give | --policy.path
 dagger | --batch_size=5 | --batch_size=5 must be even
 dagger | --warmup_episodes=0 | --warmup_episodes=0: give at least 1
@@ -164,9 +165,9 @@ dagger | --method.type=robot_gated --method.intervention_share=1.5 | interventio
 dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
 dagger | --expert.type=scripted --expert.person=true --expert.tremor=-1 | --expert.tremor=-1 | give 0 or more
 dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --policy.path
-dagger | --env.sample_rate=8000 | 'observation.audio.gripper' is int16 (800,) at 16000 Hz there | --env.*
-dagger | --env.image_size=20 | 'observation.images.front' is picture (16, 16, 3) there and picture (20
-dagger | --env.sound=none | 'observation.audio.gripper' is int16 | there and absent here
+dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
+dagger | --env.image_size=20 | observation.images.front is picture (16, 16, 3) there and picture (20
+dagger | --env.sound=none | observation.audio.gripper is int16 | there and absent here
 dagger | --env.microphones=[ceiling] | does not start | ceiling
 dagger | --demos.root={slow} | has 10 frames per second, and the policy is configured for 20
 dagger | --demos.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
@@ -177,7 +178,7 @@ dagger | --demos.root={24_pixels} | 'observation.images.front' has shape (24, 24
 learn | --interventions.root={untagged} | wanted 'intervention', bool (1,), and there is no such feature
 learn | --interventions.root={uncorrected} | None of the 5 frames | has 'intervention' set
 learn | --interventions.root={empty} | {empty} | is empty
-learn | --interventions.root={six_joints} | 'observation.state' is float32 (7,) there and float32 (6,)
+learn | --interventions.root={six_joints} | observation.state is float32 (7,) there and float32 (6,)
 # Sound that is attached
 attach-audio | --files=nowhere/{{episode}}.wav | episode 0, nowhere/0.wav: There is no sound file | episode 1,
 attach-audio | --files=sound.wav | --files=sound.wav | {episode}

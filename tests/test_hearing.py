@@ -17,7 +17,7 @@ from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import AudioEncoder
 from lerobot_playbyear.policy.sound_augmentation import RecordedNoise, SoundAugmentation, mix_in_noise
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
-from lerobot_playbyear.training.presets import RECIPES
+from lerobot_playbyear.training.command_line import RECIPES
 
 SEGMENT_S, HOP_S, N_BINS, WINDOW_S, RATE = 0.040, 0.035, 160, 2.0, 16000
 

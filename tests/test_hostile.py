@@ -27,7 +27,7 @@ from PIL import Image
 from support.hub import HubServer
 
 from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets import EpisodeStore, write_audio
+from lerobot_playbyear.datasets import write_audio
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.film.video import at_a_rate_of_aac
@@ -35,6 +35,7 @@ from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.hub.push import HubError, _files, push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
+from lerobot_playbyear.training import EpisodeStore
 
 SECRET = (250, 5, 120)  # a colour that no other picture has
 EVIL = (
@@ -199,7 +200,7 @@ def test_a_film_of_another_size_is_refused_before_it_is_decoded(videos):
         film.mux(stream.encode(None))
     said = rf"'{CAMERA}': .*file-000.mp4' have 1920 x 1080 pixels; .*\(16, 16, 3\)"
     with pytest.raises(ValueError, match=said):
-        EpisodeStore.load("a/b", str(videos), device="cpu", video_backend="pyav")
+        EpisodeStore.load("a/b", str(videos), device="cpu")
     verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))
     (verdict,) = [v for v in verdicts if v.check == "pictures"]
     assert verdict.level == "error"
@@ -335,7 +336,7 @@ def test_no_page_holds_what_a_link_leads_to(videos, tmp_path, part):
     assert not (tmp_path / "page.html").exists()
     verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))  # as one's own, on another disk
     assert {verdict.level for verdict in verdicts if verdict.check == "pictures"} == {"ok"}
-    assert len(EpisodeStore.load("a/b", str(videos), device="cpu", video_backend="pyav")) == 11
+    assert len(EpisodeStore.load("a/b", str(videos), device="cpu")) == 11
 
 
 def test_links_that_stay_at_home_are_read_through(videos, tmp_path):
@@ -509,7 +510,8 @@ def _claims(kind: str, root: Path) -> None:
 
 _OPEN = """
 import resource, sys
-from lerobot_playbyear.datasets import EpisodeStore, write_audio
+from lerobot_playbyear.datasets import write_audio
+from lerobot_playbyear.training import EpisodeStore
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 from lerobot_playbyear.inspection.source import InspectionError

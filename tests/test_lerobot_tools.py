@@ -22,11 +22,12 @@ from lerobot.scripts import lerobot_edit_dataset, lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.datasets import EpisodeStore, audio_feature, audio_keys, episode_waveform
+from lerobot_playbyear.datasets import audio_feature, audio_keys, episode_waveform
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.training import EpisodeStore
 
 FPS = 20
 LENGTHS = (12, 17, 9, 14)

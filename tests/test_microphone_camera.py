@@ -26,12 +26,12 @@ from lerobot_playbyear.audio.sample_strip import (
     write_timecode,
 )
 from lerobot_playbyear.audio.session_files import session_path
-from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.audio_files import write_wav
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.processor_playbyear import MicrophonePicturesToAudioStep
+from lerobot_playbyear.training import EpisodeStore
 
 RATE, FPS, SIZE = 16000, 20, 800
 KEY, PICTURE = "observation.audio.mic", "observation.images.mic"

@@ -17,7 +17,7 @@ from lerobot_playbyear.datasets import audio_feature, write_wav
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.training.loop import train
+from lerobot_playbyear.training.train import train
 
 TINY = (
     *("--policy.type=playbyear", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.image_size=16"),

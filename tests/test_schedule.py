@@ -10,9 +10,9 @@ from lerobot.configs import parser
 from lerobot.scripts import lerobot_train
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.training import loop
+from lerobot_playbyear.training import train as loop
+from lerobot_playbyear.training.command_line import apply_preset
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.presets import apply_preset
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig, ScriptedPerson
+from lerobot_playbyear.episodes.experts import ScriptedExpertConfig, ScriptedPerson
 
 FPS = 20
 

@@ -35,8 +35,8 @@ from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.episodes import frames
 from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.episodes.script import Script
-from lerobot_playbyear.episodes.sound_pictures import HeardSound, WithSoundPictures, pictures_for
+from lerobot_playbyear.episodes.pool import Script
+from lerobot_playbyear.episodes.spectrogram_env import HeardSound, WithSoundPictures, pictures_for
 from lerobot_playbyear.inspection import DatasetSource, check_numbers
 from lerobot_playbyear.recording.record import RecordConfig, record
 

@@ -3,7 +3,6 @@
 import copy
 import json
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import draccus
 import numpy as np
@@ -20,11 +19,10 @@ from lerobot.teleoperators.keyboard import (
 from gym_playbyear.panda import CartesianController, Panda
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
-from lerobot_playbyear.dagger.config import DatasetSource
-from lerobot_playbyear.dagger.loop import outcome_of
-from lerobot_playbyear.dagger.methods.beside import Staying
-from lerobot_playbyear.dagger.methods.robot_gated import Asked, RobotGatedConfig
+from lerobot_playbyear.dagger.methods import Method, Staying
+from lerobot_playbyear.dagger.robot_gated import Asked
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play as play_episode
 from lerobot_playbyear.recording.record import Nobody, RecordConfig, RecordDatasetConfig, record
@@ -387,7 +385,7 @@ def test_an_attempt_can_wait_for_the_person():
 )
 def test_an_attempt_ends_when_the_person_says_so(name, verdict, outcome):
     attempt, _ = play({5: holding("space", "up"), 9: tapping(name)})
-    assert (attempt.verdict, outcome_of(attempt), len(attempt)) == (verdict, outcome, 10)
+    assert (attempt.verdict, Method().outcome(attempt), len(attempt)) == (verdict, outcome, 10)
     assert attempt.success == (verdict is Verdict.SUCCESS)
 
 
@@ -445,20 +443,14 @@ def test_the_microphones_level_is_shown():
 
 
 class Asking:
-    """A robot that asks in steps 5 to 9, and its method at once."""
+    """The method of a robot that begins to ask in step 5."""
 
     def __init__(self):
         self.n = -1
 
-    def asking(self):
-        return self
-
-    def state_of_mind(self, policy_action):
-        return 0.0, 0.0
-
-    def asks(self, novelty, risk):
+    def asks(self, policy_action):
         self.n += 1
-        return 5 <= self.n < 10
+        return self.n == 5
 
 
 def test_the_robot_calls_and_does_not_take_over(monkeypatch):
@@ -468,10 +460,10 @@ def test_the_robot_calls_and_does_not_take_over(monkeypatch):
     shown = [status.control for status, picture in window.shown if picture is not None]
     assert not attempt.interventions.any()
     assert len(rings) == 1
-    assert [n for n, control in enumerate(shown) if control is Control.CALLED] == list(range(5, 10))
+    assert [n for n, control in enumerate(shown) if control is Control.CALLED] == list(range(5, 20))
 
 
-def test_a_person_who_was_called_acts_as_long_as_they_like():
+def test_a_person_who_was_called_acts_as_long_as_they_like_and_is_called_no_more():
     held = {7: holding("space"), 13: letting_go("space")}
     attempt, window = play(held, horizon=20, beside=lambda person: Asked(person, Asking()))
     shown = [status.control for status, picture in window.shown if picture is not None]
@@ -486,20 +478,12 @@ def test_without_a_hand_back_one_press_is_for_the_whole_attempt():
     assert shown[8:] == [Control.PERSON] * len(shown[8:])
 
 
-@pytest.mark.parametrize("option", ["hands_back=false", "redo_failed=true"])
-def test_a_person_who_is_called_cannot_be_kept(option):
-    name, value = option.split("=")
-    method = RobotGatedConfig(**{name: value == "true"}).make(SimpleNamespace())
-    with pytest.raises(ExpertError, match=rf"--method\.{option}.*--expert\.type=scripted"):
-        play({}, beside=method.beside)
-
-
 # Options
 
 
 def test_a_resumed_run_has_the_same_person(tmp_path):
     """What playbyear-dagger keeps of its options, and reads again with --resume=true."""
-    source = DatasetSource("test/none")
+    source = DatasetPlace("test/none")
     expert = TeleopExpertConfig(KeyboardEndEffectorTeleopConfig(use_gripper=False), speed=0.4)
     path = tmp_path / "dagger_config.json"
     path.write_text(json.dumps(DaggerConfig(source, source, env=PlaybyearEnvConfig(), expert=expert).options()))

@@ -18,13 +18,12 @@ from test_train_command import TINY
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from lerobot_playbyear.datasets import EpisodeStore, RunSampler, run_weights
+from lerobot_playbyear.training import EpisodeStore, RunSampler, run_weights
 from lerobot_playbyear.training.acceleration import compile_networks, fuse, prefer_channels_last
+from lerobot_playbyear.training.batches import PolicyWindows, prefetched
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.figures import Figures
-from lerobot_playbyear.training.parts import make_training_parts
-from lerobot_playbyear.training.prefetch import prefetched
-from lerobot_playbyear.training.windows import PolicyWindows
+from lerobot_playbyear.training.learner import load_training_state, make_learner
+from lerobot_playbyear.training.report import Figures
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -55,7 +54,7 @@ def make(dataset, monkeypatch, tmp_path):
 
         cfg = validated()
         torch.manual_seed(0)
-        return cfg, make_training_parts(cfg, dataset.meta)
+        return cfg, make_learner(cfg, dataset.meta)
 
     return parts
 
@@ -68,7 +67,7 @@ def batches(dataset):
         windows = PolicyWindows(parts.policy.config, dataset.meta)
         store = EpisodeStore.from_dataset(dataset, windows.keys, "cpu")
         sampler = RunSampler(run_weights(store, windows.n_windows))
-        return (windows.batch(store, sampler.draw(4)) for _ in itertools.count())
+        return (windows.batch(store, sampler.draw(4, number)) for number in itertools.count())
 
     return of
 
@@ -167,8 +166,6 @@ def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(
     assert all(value.is_contiguous(memory_format=torch.channels_last) for value in moments)
     further = learn(parts, given, 2)
 
-    from lerobot_playbyear.training.checkpoints import load_training_state
-
     cfg, resumed = make()
     resumed.policy.load_state_dict(load_file(folder / "pretrained_model" / "model.safetensors"))
     prefer_channels_last(resumed.policy, resumed.optimizer.optimizer)
@@ -200,20 +197,22 @@ def test_only_our_policy_is_compiled():
 
 
 def test_batches_come_ahead_in_order_and_a_failure_comes_with_its_batch():
-    made, threads = [], set()
+    is_ahead, threads = threading.Event(), set()
 
-    def make_batch():
-        threads.add(threading.current_thread().name)
-        made.append(len(made))
-        if made[-1] == 5:
-            raise ValueError("batch 5")
-        return {"number": made[-1]}
+    def numbers():
+        for number in range(6):
+            threads.add(threading.current_thread().name)
+            if number == 5:
+                is_ahead.set()
+                raise ValueError("batch 5")
+            yield {"number": number}
 
-    batches = prefetched(make_batch)
-    assert [next(batches)["number"] for _ in range(5)] == [0, 1, 2, 3, 4]
+    batches = prefetched(numbers())
+    assert [next(batches)["number"] for _ in range(4)] == [0, 1, 2, 3]
+    assert is_ahead.wait(10)
+    assert next(batches)["number"] == 4
     with pytest.raises(ValueError, match="batch 5"):
         next(batches)
     assert len(threads) == 1
     assert threading.current_thread().name not in threads
-    assert len(made) >= 6
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("batches")]

@@ -181,7 +181,7 @@ class PlaybyearEnvConfig(EnvConfig):
             **self.gym_kwargs,
         )
         if self.spectrogram is not None:
-            from lerobot_playbyear.episodes.sound_pictures import with_sound_pictures
+            from lerobot_playbyear.episodes.spectrogram_env import with_sound_pictures
 
             make = with_sound_pictures(make, self._sound_pictures())
         make = with_attempts_file(make, self.attempts_file)
@@ -217,7 +217,7 @@ class PlaybyearEnvConfig(EnvConfig):
             return []
         try:
             from lerobot_playbyear.datasets.errors import InputError
-            from lerobot_playbyear.episodes.sound_pictures import pictures_for
+            from lerobot_playbyear.episodes.spectrogram_env import pictures_for
         except ImportError as error:
             raise self._error("spectrogram", "install lerobot_policy_playbyear, which makes the pictures") from error
         rates = dict.fromkeys(self.microphones or [], self.sample_rate)

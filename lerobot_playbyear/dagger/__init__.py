@@ -5,9 +5,8 @@ from typing import TYPE_CHECKING
 from lerobot_playbyear import lazy_names
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
-from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
+from lerobot_playbyear.episodes.experts import Expert, ExpertConfig, ExpertError, ScriptedExpertConfig
+from lerobot_playbyear.episodes.play import Verdict
 
 if TYPE_CHECKING:
     from lerobot_playbyear.dagger.run import run_dagger

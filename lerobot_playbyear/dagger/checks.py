@@ -1,22 +1,20 @@
 """Whether policy, demonstrations, corrections and environment go together; before any work is done."""
 
+import os
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import numpy as np
-import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
-from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.expert import Expert, ExpertError
-from lerobot_playbyear.episodes.frames import INTERVENTION
-from lerobot_playbyear.training.parts import TrainingParts, check_dataset_suits
-from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
+from lerobot_playbyear.datasets.features import differences
+from lerobot_playbyear.episodes.experts import Expert, ExpertError
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.training.batches import dataset_names
+from lerobot_playbyear.training.learner import check_dataset_suits
 
 Features = Mapping[str, Mapping[str, Any]]
 
@@ -25,7 +23,7 @@ def check_places(cfg: DaggerConfig) -> None:
     """Refuse what would be found out only once data were mixed.
 
     Raises:
-        InputError: Attempts would be written among the demonstrations, or takeovers are to be late where there are none.
+        InputError: Attempts would be written among the demonstrations.
     """
     demos, interventions = (source.folder.resolve() for source in (cfg.demos, cfg.interventions))
     if cfg.is_online and demos == interventions:
@@ -42,9 +40,23 @@ def check_places(cfg: DaggerConfig) -> None:
             f"--output_dir={cfg.output_dir} lies in the folder of --interventions, {interventions}, where a dataset is to be "
             "made: give another one."
         )
-    if cfg.takeover_delay_s and not cfg.is_online:
+
+
+def check_policy(policy: PreTrainedConfig) -> None:
+    """Refuse what only `playbyear` learns from corrections.
+
+    Raises:
+        InputError: It is another policy, or several processes were started.
+    """
+    if not isinstance(policy, PlaybyearConfig):
         raise InputError(
-            f"--takeover_delay_s={cfg.takeover_delay_s}: with --episodes=0 nobody takes over; leave it out, or give --skip_s."
+            f"--policy.path is of the type '{policy.type}': playbyear-dagger corrects policies of --policy.type=playbyear. "
+            "For others collect with LeRobot's lerobot-rollout --strategy.type=dagger, and learn with lerobot-train."
+        )
+    n_processes = int(os.environ.get("WORLD_SIZE", "1"))
+    if n_processes > 1:
+        raise InputError(
+            f"{n_processes} processes were started, and playbyear-dagger works in one: start it without accelerate launch."
         )
 
 
@@ -89,30 +101,12 @@ def check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, other: Featu
     Raises:
         InputError: With every difference.
     """
-    differences = [f"fps is {demos.fps} there and {fps} here"] if demos.fps != fps else []
-    for key in (*keys, ACTION):
-        there, here = (_signature(features.get(key)) for features in (demos.features, other))
-        if there != here:
-            differences.append(f"'{key}' is {there} there and {here} here")
-    if differences:
+    found = [f"fps is {demos.fps} there and {fps} here"] if demos.fps != fps else []
+    found += differences(demos.features, other, [*keys, ACTION], pictures_as_stored=False)
+    if found:
         raise InputError(
-            f"The demonstrations '{demos.repo_id}' and {what} differ: {'; '.join(differences)}. Record with the same "
+            f"The demonstrations '{demos.repo_id}' and {what} differ: {'; '.join(found)}. Record with the same "
             "settings, or choose the environment's options (--env.*) as they were in the demonstrations."
-        )
-
-
-def check_corrections(meta: LeRobotDatasetMetadata) -> None:
-    """Refuse a dataset without the feature `intervention`.
-
-    Raises:
-        InputError: It is missing or not a bool of shape (1,).
-    """
-    feature = meta.features.get(INTERVENTION)
-    if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
-        seen = "no such feature" if feature is None else f"{feature['dtype']} {tuple(feature['shape'])}"
-        raise InputError(
-            f"The dataset '{meta.repo_id}' does not say which frames an expert chose: wanted '{INTERVENTION}', bool (1,), and "
-            f"there is {seen}. Give one that playbyear-dagger or lerobot-rollout --strategy.type=dagger wrote."
         )
 
 
@@ -133,43 +127,6 @@ def check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig) -> N
             f"Train it on its demonstrations first: playbyear-train --policy.path={policy.pretrained_path} "
             f"--policy.action_range={wanted}."
         )
-
-
-def check_actions_can_be_masked(parts: TrainingParts, windows: PolicyWindows, demonstrations: EpisodeStore) -> None:
-    """Refuse a policy that learns several actions at once and cannot leave out those that it chose by itself.
-
-    Whether it can is tried: with all actions masked by `action_is_pad`, no action may matter to the loss.
-
-    Raises:
-        InputError: It cannot; with what to do.
-    """
-    n_actions = len(windows.action_deltas)
-    if n_actions <= 1:
-        return
-    batch = windows.batch(demonstrations, torch.tensor([demonstrations.starts[0], demonstrations.ends[0] - 1]))
-    batch[f"{ACTION}_is_pad"] = torch.ones_like(batch[f"{ACTION}_is_pad"])
-    losses = []
-    for actions in (batch[ACTION], batch[ACTION] + 1):
-        set_seed(0)  # of what the loss draws
-        losses.append(parts.loss({**batch, ACTION: actions}))
-    if np.array_equal(losses[0], losses[1], equal_nan=True):  # a mean over no action may be NaN
-        return
-    config = parts.accelerator.unwrap_model(parts.policy).config
-    remedy = "Take a policy whose loss does, such as act, or one of single actions."
-    if getattr(config, "do_mask_loss_for_padding", True) is False:
-        remedy = "Give --policy.do_mask_loss_for_padding=true."
-    raise InputError(
-        f"The policy '{config.type}' learns chunks of {n_actions} actions, and its loss does not leave out those that "
-        f"'{ACTION}_is_pad' masks: what the policy itself did before and after a correction would be imitated. {remedy}"
-    )
-
-
-def _signature(feature: Mapping[str, Any] | None) -> str:
-    if feature is None:
-        return "absent"
-    kind = "picture" if feature["dtype"] in ("image", "video") else feature["dtype"]
-    rate = (feature.get("info") or {}).get("sample_rate")
-    return f"{kind} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
 
 
 def check_expert(cfg: DaggerConfig, expert: Expert) -> None:

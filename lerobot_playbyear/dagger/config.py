@@ -1,6 +1,5 @@
 """What `playbyear-dagger` can be told."""
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
@@ -11,37 +10,18 @@ import draccus
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import DatasetConfig, EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from lerobot_playbyear.dagger import robot_gated  # noqa: F401  (registers --method.type=robot_gated)
 from lerobot_playbyear.dagger.methods import HgDaggerConfig, MethodConfig
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.expert import ExpertConfig
-from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
+from lerobot_playbyear.datasets.reader import DatasetPlace
+from lerobot_playbyear.episodes.experts import ExpertConfig, ScriptedExpertConfig
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 
 CONFIG_NAME = "dagger_config.json"
 """File in the output folder with the options of the run."""
 
 _LEAST = {"warmup_episodes": 1, "max_attempts": 1}  # of the other whole numbers: 0
-
-
-@dataclass
-class DatasetSource:
-    """A dataset on disk, or for reading also on the Hub.
-
-    Attributes:
-        repo_id: Its name, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
-        video_backend: LeRobot's decoder for cameras that are stored as video.
-    """
-
-    repo_id: str
-    root: str | None = None
-    video_backend: str = "pyav"
-
-    @property
-    def folder(self) -> Path:
-        return Path(self.root) if self.root else HF_LEROBOT_HOME / self.repo_id
 
 
 @dataclass
@@ -64,13 +44,10 @@ class DaggerConfig:
         env: Where it acts, as in lerobot-eval.
         expert: Who corrects it, `--expert.type=scripted` or another registered one.
         method: How attempts are made and what is learned of them, `--method.type=hg_dagger` or another registered one.
-        takeover_delay_s: How much later than it would the expert takes over [s]. Below 0 it is earlier, the first time in an
-            attempt, which is played twice for that: only in simulation and with a script.
         skip_s: Of every correction, how long its beginning is not learned from [s]: while the policy's memory still holds its
             own last movements, it mistakes the expert's retreat for the next step of the task. Shorter corrections are not
             learned from at all, unless all are shorter; one that an episode begins with is learned from whole. None: as long
-            as the policy remembers, or 0 with methods that choose frames by themselves.
-        learn_from: "expert": of attempts only what the expert chose; "all": all frames of those that are kept.
+            as the policy remembers, or 0 with `--method.type=redo`.
         new_weights: With `episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation stays.
         episodes: Attempts that the intervention dataset shall hold in the end. 0: none are collected and no environment is
             needed, see `updates`.
@@ -88,10 +65,8 @@ class DaggerConfig:
         episode_seed: Of the first attempt; further ones take the next, but none of the evaluation's.
         max_attempts: Attempts in a row without one to keep, after which the run ends; not counting those without any help.
         eval_every: Rounds between two evaluations; there is one before the first round and one after the last. 0: none.
+            Checkpoints that were evaluated are kept, and the last one.
         eval: Size of an evaluation, as in lerobot-eval.
-        eval_videos: Episodes of each evaluation that are filmed.
-        save_every: Rounds between two checkpoints that are kept for good. Those of every `eval_every`-th round are, if there
-            is an evaluation; the last and the best always are there.
         output_dir: Folder of checkpoints, figures and options.
         resume: Go on with the run in `output_dir`, or begin it if there is none; options that are not given again stay.
         job_name: For wandb.
@@ -100,15 +75,13 @@ class DaggerConfig:
         wandb: As in lerobot-train.
     """
 
-    demos: DatasetSource
-    interventions: DatasetSource
+    demos: DatasetPlace
+    interventions: DatasetPlace
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
     expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
     method: MethodConfig = field(default_factory=HgDaggerConfig)
-    takeover_delay_s: float = 0.0
     skip_s: float | None = None
-    learn_from: str = "expert"
     new_weights: bool = False
     episodes: int = 25
     updates_per_episode: int = 100
@@ -123,8 +96,6 @@ class DaggerConfig:
     max_attempts: int = 50
     eval_every: int = 5
     eval: DaggerEvalConfig = field(default_factory=DaggerEvalConfig)
-    eval_videos: int = 0
-    save_every: int = 0
     output_dir: Path = Path("outputs/dagger")
     resume: bool = False
     job_name: str = "dagger"
@@ -174,34 +145,12 @@ class DaggerConfig:
 
     def _check_method(self) -> None:
         self.method.check()
-        if self.learn_from not in ("expert", "all"):
-            raise InputError(f"--learn_from={self.learn_from!r}: give expert or all.")
-        if self.learn_from == "all" and self.method.chooses_frames:
-            raise InputError(
-                f"--learn_from=all: --method.type={self.method.type} says by itself what is learned from; leave it out."
-            )
         if not 0 <= (self.skip_s or 0) < math.inf:
             raise InputError(f"--skip_s={self.skip_s}: give 0 or more seconds.")
-        if self.skip_s and self.method.type in ("dagger", "redo"):
+        if self.skip_s and not self.method.skips_beginnings:
             raise InputError(
                 f"--skip_s={self.skip_s}: with --method.type={self.method.type} the expert chooses every frame, and no "
                 "correction has a beginning; leave it out."
-            )
-        if self.skip_s and self.learn_from == "all":
-            raise InputError(
-                f"--skip_s={self.skip_s} and --learn_from=all contradict each other: leave out one of them."
-            )
-        if not math.isfinite(self.takeover_delay_s):
-            raise InputError(f"--takeover_delay_s={self.takeover_delay_s}: give a number of seconds.")
-        if self.takeover_delay_s and self.method.type == "redo":
-            raise InputError(
-                f"--takeover_delay_s={self.takeover_delay_s}: with --method.type=redo a takeover only ends the policy's try; "
-                "leave it out."
-            )
-        if self.takeover_delay_s and not self.method.expert_decides:
-            raise InputError(
-                f"--takeover_delay_s={self.takeover_delay_s}: with --method.type={self.method.type} the expert does not decide "
-                "when it takes over; leave it out."
             )
         if self.new_weights and self.is_online:
             raise InputError(
@@ -211,7 +160,7 @@ class DaggerConfig:
 
     def n_skipped(self, fps: float) -> int:
         """Frames at the beginning of every correction that are not learned from."""
-        if self.learn_from == "all" or (self.skip_s is None and self.method.chooses_frames):
+        if not self.method.skips_beginnings:
             return 0
         if self.skip_s is None:
             n_remembered = int(getattr(self.policy, "memory_steps", 1))
@@ -255,7 +204,7 @@ class DaggerConfig:
         optimizer = self.policy.get_optimizer_preset()
         optimizer.lr = self.largest_rate
         return PlaybyearTrainConfig(
-            dataset=DatasetConfig(self.demos.repo_id, root=self.demos.root, video_backend=self.demos.video_backend),
+            dataset=DatasetConfig(self.demos.repo_id, root=self.demos.root),
             steps=self.total_updates(),
             num_workers=0,
             env_eval_freq=0,
@@ -279,7 +228,5 @@ def with_saved_options(args: Sequence[str]) -> list[str]:
     is_resumed = (parser.parse_arg("resume", args) or "").lower() in ("true", "yes", "on")
     folder = Path(parser.parse_arg("output_dir", args) or DaggerConfig.output_dir)
     if is_resumed and parser.parse_arg("config_path", args) is None and (folder / CONFIG_NAME).is_file():
-        older = [] if "skip_s" in json.loads((folder / CONFIG_NAME).read_text()) else ["--skip_s=0"]
-        given = [] if parser.parse_arg("skip_s", args) else older  # an older version skipped nothing
-        return [f"--config_path={folder / CONFIG_NAME}", *given, *args]
+        return [f"--config_path={folder / CONFIG_NAME}", *args]
     return args

@@ -6,17 +6,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import SUCCESS
 
 from lerobot_playbyear.dagger.batches import frames_by_expert
-from lerobot_playbyear.dagger.checks import check_corrections
-from lerobot_playbyear.dagger.config import DatasetSource
-from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
+from lerobot_playbyear.datasets import check_dataset_files
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.episodes.episode import Episode
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
 from lerobot_playbyear.episodes.frames import INTERVENTION, SEED
+from lerobot_playbyear.episodes.play import Episode
 from lerobot_playbyear.episodes.saving import save_episode
+from lerobot_playbyear.training.store import EpisodeStore
 
 
 class Corrections:
@@ -29,11 +30,9 @@ class Corrections:
         store: The attempts in memory; None while there are none.
     """
 
-    def __init__(self, source: DatasetSource) -> None:
+    def __init__(self, source: DatasetPlace) -> None:
         self._source = source
         self._writer: DurableWriter | None = None
-        self._keys: list[str] | None = None
-        self._device: torch.device | None = None
         self.store: EpisodeStore | None = None
 
     @cached_property
@@ -46,7 +45,13 @@ class Corrections:
         """
         check_dataset_files(self._source.repo_id, self._source.root)
         meta = LeRobotDatasetMetadata(self._source.repo_id, root=self._source.root)
-        check_corrections(meta)
+        feature = meta.features.get(INTERVENTION)
+        if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
+            seen = "no such feature" if feature is None else f"{feature['dtype']} {tuple(feature['shape'])}"
+            raise InputError(
+                f"The dataset '{meta.repo_id}' does not say which frames an expert chose: wanted '{INTERVENTION}', bool (1,), "
+                f"and there is {seen}. Give one that playbyear-dagger or lerobot-rollout --strategy.type=dagger wrote."
+            )
         return meta
 
     def open_for_writing(self, fps: int, features: dict[str, dict[str, Any]], robot_type: str) -> None:
@@ -63,29 +68,35 @@ class Corrections:
         """
         folder = self._source.folder
         self._writer = DurableWriter(self._source.repo_id, folder, fps, features, resume=True, robot_type=robot_type)
+        self._opened_as = (fps, features, robot_type)
 
-    def read(self, keys: Sequence[str] | None, device: torch.device, image_size: int | None = None) -> None:
+    def read(self, keys: Sequence[str], device: torch.device, image_size: int | None = None) -> None:
         """Take what the dataset holds into memory; nothing while it is empty.
 
         Args:
-            keys: The features that the policy's windows are cut from; None for all.
+            keys: The features that the policy's windows are cut from.
             device: Where the store is kept.
             image_size: The size that the demonstrations' pictures were shrunk to, if they were [pixels].
 
         Raises:
             ValueError: It is damaged.
         """
-        self._keys = None if keys is None else [*keys, INTERVENTION]
-        self._device, self._image_size = device, image_size
+        self._read_as: tuple[Any, ...] = (keys, device, image_size)
         if self.n_episodes:
-            self._read()
+            self._read(*self._read_as)
 
-    def _read(self) -> None:
-        backend = self._source.video_backend
-        dataset = LeRobotDataset(self._source.repo_id, root=self._source.root, video_backend=backend)
-        further = [key for key in (SEED, SUCCESS) if key in dataset.meta.features]
-        keys = self._keys and self._keys + further
-        self.store = EpisodeStore.from_dataset(dataset, keys, self._device, backend, image_size=self._image_size)
+    def _read(self, keys: Sequence[str], device: torch.device, image_size: int | None) -> None:
+        reader = DatasetReader(self._source.repo_id, self._source.root)
+        further = [key for key in (SEED, SUCCESS) if key in reader.features]
+        wanted = [*keys, INTERVENTION, *further]
+        self.store = EpisodeStore.from_dataset(reader, wanted, device, image_size=image_size)
+
+    def another(self, source: DatasetPlace) -> "Corrections":
+        """A dataset for attempts that are no corrections, opened and read as this one is."""
+        others = Corrections(source)
+        others.open_for_writing(*self._opened_as)
+        others.read(*self._read_as)
+        return others
 
     @property
     def n_episodes(self) -> int:
@@ -101,27 +112,22 @@ class Corrections:
         assert self._writer is not None
         frames = save_episode(episode, self._writer)
         if self.store is None:
-            self._read()
+            self._read(*self._read_as)
         else:
             self.store.append_episode(frames)
 
-    def last(self) -> dict[str, Any]:
-        """Figures of the last attempt: its seed, its length and how much of it the expert chose."""
+    def last(self) -> tuple[dict[str, Any], np.ndarray]:
+        """Figures of the last attempt, and (T,) bool, which of its frames hold an action of the expert's."""
         assert self.store is not None
         start, end = self.store.starts[-1], self.store.ends[-1]
-        share = self.store.column(INTERVENTION)[start:end].float().mean()
-        seed = self.store.column(SEED)[end - 1]
-        return {"seed": int(seed), "n_frames": end - start, "intervention_share": round(float(share), 4)}
-
-    def last_by_expert(self) -> np.ndarray:
-        """(T,) bool, which frames of the last attempt hold an action of the expert's."""
-        assert self.store is not None
-        return frames_by_expert(self.store)[self.store.starts[-1] :].cpu().numpy()
-
-    def last_success(self) -> bool:
-        """Whether the last attempt solved its task."""
-        assert self.store is not None
-        return bool(self.store.column(SUCCESS)[-1].any()) if SUCCESS in self.store.keys else True
+        by_expert = frames_by_expert(self.store)[start:end].numpy()
+        figures = {
+            "seed": int(self.store.column(SEED)[end - 1]),
+            "n_frames": end - start,
+            "intervention_share": round(float(by_expert.mean()), 4),
+            "success": bool(self.store.column(SUCCESS)[-1].any()) if SUCCESS in self.store.keys else True,
+        }
+        return figures, by_expert
 
     def close(self) -> None:
         """Nothing is appended any more."""

@@ -7,34 +7,39 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.compat import get_step_identifier
-from lerobot_playbyear.dagger.attempt import Scene
-from lerobot_playbyear.dagger.batches import BalancedBatches
+from lerobot_playbyear.dagger.batches import Batches
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
-from lerobot_playbyear.dagger.figures import attempt_figures, round_figures
-from lerobot_playbyear.dagger.folder import RunFolder, RunState
-from lerobot_playbyear.dagger.methods.base import Method, outcome_of
-from lerobot_playbyear.dagger.report import Report
-from lerobot_playbyear.datasets import EpisodeStore
+from lerobot_playbyear.dagger.methods import Method
+from lerobot_playbyear.dagger.report import Report, attempt_figures, round_figures
+from lerobot_playbyear.dagger.run_folder import RunFolder, RunState
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.episode import Episode
-from lerobot_playbyear.episodes.play import Seconds
+from lerobot_playbyear.episodes.experts import Expert
+from lerobot_playbyear.episodes.play import Episode, Seconds, play
+from lerobot_playbyear.episodes.policy_actor import PolicyActor
+from lerobot_playbyear.training.batches import PolicyWindows
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.figures import Figures
-from lerobot_playbyear.training.parts import TrainingParts
-from lerobot_playbyear.training.processes import Orders
-from lerobot_playbyear.training.reach import Reach
-from lerobot_playbyear.training.report import is_due
-
-__all__ = ["Loop", "outcome_of"]
+from lerobot_playbyear.training.learner import Learner
+from lerobot_playbyear.training.report import Figures, is_due
+from lerobot_playbyear.training.store import EpisodeStore
 
 _ATTEMPT, _UPDATES, _EVALUATION = 0, 1, 2  # what random numbers are for
 _LOSS_BATCHES = 10**9  # numbers from here on are of batches that are only looked at
+
+
+@dataclass
+class Scene:
+    """Where attempts happen: the environment, the policy in it, and who corrects it, as the method has it."""
+
+    env: gym.Env
+    actor: PolicyActor
+    expert: Expert
 
 
 @dataclass
@@ -47,14 +52,12 @@ class Loop:
     Args:
         cfg, training: The options, and those of playbyear-train that follow from them.
         folder, state: Where the run is kept, and how far it is.
-        parts: What learns.
-        demonstrations: Half of each batch.
-        corrections: The other half.
+        learner: What learns.
+        windows: Cut its batches.
+        demonstrations, corrections: What is learned from.
         batches: Draws from both.
-        orders: Gives other processes their share of a batch.
-        reach: Knows which corrections the policy cannot learn.
         report: Tells how it goes.
-        scene: The environment, the policy in it, and the expert; None to learn from recorded corrections alone.
+        scene: Where attempts happen; None to learn from recorded corrections alone.
         method: How attempts are made, kept and learned from.
     """
 
@@ -62,12 +65,11 @@ class Loop:
     training: PlaybyearTrainConfig
     folder: RunFolder
     state: RunState
-    parts: TrainingParts
+    learner: Learner
+    windows: PolicyWindows
     demonstrations: EpisodeStore
     corrections: Corrections
-    batches: BalancedBatches
-    orders: Orders
-    reach: Reach
+    batches: Batches
     report: Report
     scene: Scene | None
     method: Method
@@ -78,7 +80,9 @@ class Loop:
         Raises:
             PlaybyearError: No attempt succeeds even with the expert, or something cannot be written.
         """
-        self._note_unnoted_attempt()
+        if self.scene is not None:
+            self.method.begin(self)
+            self._note_unnoted_attempt()
         self._evaluate_if_due()
         while not self._is_complete():
             start, seconds = time.perf_counter(), Seconds()
@@ -101,52 +105,55 @@ class Loop:
         state = self.state
         n_noted = (state.first_episodes or 0) + state.kept
         n_unnoted = self.corrections.n_episodes - n_noted
-        if self.scene is None or n_unnoted == 0:
+        if n_unnoted == 0:
             return
         if n_unnoted != 1 or state.kept != state.round:
             raise InputError(
                 f"The intervention dataset holds {self.corrections.n_episodes} attempts, and this run knows of {n_noted}: "
                 "something else changed it. Begin a new run in another --output_dir; it may append to the same dataset."
             )
-        figures = self.corrections.last()
-        state.attempts, state.kept, state.next_seed = state.attempts + 1, state.kept + 1, figures["seed"] + 1
+        figures, by_expert = self.corrections.last()
+        cost = self._cost(by_expert)
+        figures |= {"outcome": "kept", **cost, **self.method.recovered(cost), "recovered": True}
         state.fruitless.clear()
-        cost = self._cost(self.corrections.last_by_expert())
-        cost |= self.method.recovered_figures(cost)
-        success = self.corrections.last_success()
-        self.report.write("attempt", {**figures, "outcome": "kept", "success": success, **cost, "recovered": True})
+        self._count(figures)
         self.report.bar.update(1)
-        self.folder.commit(state)
 
     def _collect(self, seconds: Seconds) -> bool:
         """Attempts until one is kept. Returns False when there is none among `max_attempts` in which the expert might act."""
-        outcomes = self.state.fruitless
-        while len(outcomes) < self.cfg.max_attempts or self.method.owes:
+        fruitless = self.state.fruitless
+        while len(fruitless) < self.cfg.max_attempts or self.state.to_show is not None:
             self.report.doing("acting")
             spent, is_alone = Seconds(), self.method.is_alone
             episode = self._attempt(spent)
             outcome = self.method.outcome(episode)
             if outcome == "kept":
-                outcomes.clear()
-            elif not is_alone or outcome == "discarded":
-                outcomes.append(outcome)
-            if outcome == "kept":
+                fruitless.clear()
                 with spent.of("episode_saving"):
                     self.corrections.append(episode)
-                    assert self.corrections.store is not None
-                    self.batches.set_interventions(self.corrections.store)
-            self.method.note(episode, outcome)
+                assert self.corrections.store is not None
+                self.batches.take_in(self.corrections.store)
+            elif not is_alone or outcome == "discarded":
+                fruitless.append(outcome)
             self._note(episode, outcome, spent)
             seconds.add(spent)
             if outcome == "kept":
                 self.report.bar.update(1)
                 by_expert = torch.from_numpy(episode.actions[episode.interventions])
-                self.reach.warn(by_expert, f"the corrections of attempt {self.state.attempts}")
+                self.learner.warn_of_reach(by_expert, f"the corrections of attempt {self.state.attempts}")
                 return True
-        n, n_failed, n_unneeded = len(outcomes), outcomes.count("failed"), outcomes.count("unneeded")
-        n_discarded = outcomes.count("discarded")
-        outcomes.clear()  # who goes on with the run wants others
+        self._tell_why_none(list(fruitless))
+        return False
+
+    def _tell_why_none(self, outcomes: list[str]) -> None:
+        """Says why no attempt was kept.
+
+        Raises:
+            InputError: Most failed although the expert might help.
+        """
+        self.state.fruitless.clear()  # who goes on with the run wants others
         self.folder.commit(self.state)
+        n, n_failed, n_unneeded = len(outcomes), outcomes.count("failed"), outcomes.count("unneeded")
         if n_failed > n / 2:
             raise InputError(
                 f"{n_failed} of {n} attempts in a row failed in spite of the expert: it cannot rescue this policy. Begin with "
@@ -154,45 +161,52 @@ class Loop:
             )
         if n_unneeded == n:
             logging.info(f"The policy needed no help in {n} attempts in a row: there is nothing left to correct.")
-        else:
-            logging.info(
-                f"None of {n} attempts in a row could be kept: {n_unneeded} needed no help, {n_failed} failed, and "
-                f"{n_discarded} were thrown away."
-            )
-        return False
+            return
+        logging.info(
+            f"None of {n} attempts in a row could be kept: {n_unneeded} needed no help, {n_failed} failed, and "
+            f"{outcomes.count('discarded')} were thrown away."
+        )
 
     def _attempt(self, spent: Seconds) -> Episode:
+        """The next attempt: in a new scene or, where the last one failed and the method wants it shown, in that one."""
         assert self.scene is not None
-        while self.state.next_seed in self.cfg.eval_seeds:
-            self.state.next_seed += 1
-        self.method.prepare()
-        seed = self.state.next_seed
-        return self.method.recorded(self.method.attempt(self.scene, seed, self._random_seed(_ATTEMPT, seed), spent))
+        state = self.state
+        while state.next_seed in self.cfg.eval_seeds:
+            state.next_seed += 1
+        self.method.prepare(demonstrates=state.to_show is not None)
+        seed = state.next_seed if state.to_show is None else state.to_show
+        set_seed(self._random_seed(_ATTEMPT, seed))
+        return play(self.scene.env, self.scene.actor, seed, expert=self.scene.expert, seconds=spent)
 
     def _note(self, episode: Episode, outcome: str, spent: Seconds) -> None:
-        """Counts an attempt."""
-        state = self.state
-        state.attempts += 1
-        setattr(state, outcome, getattr(state, outcome) + 1)
-        state.next_seed = episode.seed + 1
+        assert episode.interventions is not None
+        self.method.note(episode, outcome)
         figures = {
             "seed": episode.seed,
-            "outcome": outcome,
-            "success": episode.success,
             "n_frames": len(episode),
             "intervention_share": round(episode.intervention_share, 4),
+            "success": episode.success,
+            "outcome": outcome,
         }
-        assert episode.interventions is not None
-        figures |= self._cost(episode.interventions) | dict(self.method.figures())
-        self.report.write("attempt", figures | _rounded(spent))
+        self._count(figures | self._cost(episode.interventions) | dict(self.method.figures()) | _rounded(spent))
+
+    def _count(self, figures: dict[str, Any]) -> None:
+        """Makes an attempt count."""
+        state, outcome = self.state, figures["outcome"]
+        state.attempts += 1
+        setattr(state, outcome, getattr(state, outcome) + 1)
+        state.next_seed = figures["seed"] + 1
+        is_to_show = outcome == "failed" and self.method.shows_failures and state.to_show is None
+        state.to_show = figures["seed"] if is_to_show else None
+        self.report.write("attempt", figures)
         self.folder.commit(state)
 
     def _cost(self, by_expert: np.ndarray) -> dict[str, Any]:
         """What an attempt cost, from the column `intervention`, (T,) bool."""
         assert self.scene is not None
         fps = self.scene.expert.clock_fps or self.demonstrations.fps
-        control = self.method.control_of(by_expert)
-        return attempt_figures(control, int(by_expert.sum()), fps, self.cfg.method.is_watched)
+        cost = attempt_figures(by_expert, fps, self.cfg.method.is_watched)
+        return cost if self.state.to_show is None else {**cost, "n_switches": 1}  # from the policy, which had failed
 
     # Learning
 
@@ -207,29 +221,27 @@ class Loop:
         n_updates = self._n_updates()
         if n_updates == 0:
             return {}
-        parts = self.parts
+        learner = self.learner
         assert self.training.optimizer is not None
-        seed, grad_clip_norm = self._random_seed(_UPDATES, self.state.round), self.training.optimizer.grad_clip_norm
-        set_seed(seed)
-        tracker = Figures(self.cfg.batch_size, self.demonstrations, parts.step)
+        grad_clip_norm = self.training.optimizer.grad_clip_norm
+        set_seed(self._random_seed(_UPDATES, self.state.round))
+        tracker = Figures(self.cfg.batch_size, self.demonstrations, learner.step)
         for number in range(n_updates):
             self.report.doing(f"learning {number + 1}/{n_updates}")
-            rate = self.cfg.rate(parts.step, number, n_updates, self.state.first_episodes or 0)
+            rate = self.cfg.rate(learner.step, number, n_updates, self.state.first_episodes or 0)
             with seconds.of("batch"):
-                batch = self.batches.batch(parts.step)
-                begins = seed if number == 0 else None
-                batch = self.orders.give(batch, rate=rate, seed=begins, grad_clip_norm=grad_clip_norm)
-            for group in parts.optimizer.param_groups:
+                batch = self.batches.batch(learner.step)
+            for group in learner.optimizer.param_groups:
                 group["lr"] = rate
             with seconds.of("update"):
-                tracker.add(parts.update(batch, grad_clip_norm))
+                tracker.add(learner.update(batch, grad_clip_norm))
             if self.scene is None:
                 self.report.bar.update(1)
         averages, _ = tracker.read()
         figures = {key: averages[key] for key in ("loss", "grad_norm")}
         with seconds.of("loss"):
             halves = self.batches.halves(_LOSS_BATCHES + self.state.round)
-            figures["loss_demonstrations"], figures["loss_interventions"] = (parts.loss(half) for half in halves)
+            figures["loss_demonstrations"], figures["loss_interventions"] = (learner.loss(half) for half in halves)
         return {"n_updates": n_updates, **figures}
 
     def _finish_round(self, start: float, seconds: Seconds, losses: dict[str, Any]) -> None:
@@ -238,12 +250,11 @@ class Loop:
         state.round += 1
         if losses:
             self.report.doing("saving")
-            name = get_step_identifier(self.parts.step, self.training.steps)
+            name = get_step_identifier(self.learner.step, self.training.steps)
             with seconds.of("checkpoint_saving"):
-                self.folder.save_checkpoint(name, lambda path: self.parts.write_checkpoint(path, self.training))
-            state.checkpoint, state.step = name, self.parts.step
-            is_evaluated = cfg.env is not None and is_due(state.round, cfg.eval_every)
-            if is_evaluated or is_due(state.round, cfg.save_every):
+                self.folder.save_checkpoint(name, lambda path: self.learner.write_checkpoint(path, self.training))
+            state.checkpoint, state.step = name, self.learner.step
+            if cfg.env is not None and is_due(state.round, cfg.eval_every):
                 state.milestones.append(name)
         total = time.perf_counter() - start
         spent = {} if self.scene is None else round_figures(self.folder.metrics(), state.round)
@@ -262,7 +273,7 @@ class Loop:
         start = time.perf_counter()
         set_seed(self._random_seed(_EVALUATION, state.round))  # of policies that act by chance
         with contextlib.redirect_stderr(io.StringIO()):  # LeRobot's own progress bars; ours goes on
-            info = self.parts.evaluate(self.training, cfg.eval_videos)
+            info = self.learner.evaluate(self.training, 0)
         state.evaluated_round, state.evaluated_step = state.round, state.step
         state.evaluated_episodes = cfg.eval.n_episodes
         state.success = float(info["overall"]["pc_success"])

@@ -1,11 +1,15 @@
-"""Telling a person, a file and W&B how a run goes."""
+"""What a run tells a person, a file and W&B: how it goes, what an expert spent, and what it brought."""
 
 import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from lerobot_playbyear.dagger.batches import stretches
 from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.dagger.figures import Totals
-from lerobot_playbyear.dagger.folder import RunFolder, RunState
+from lerobot_playbyear.dagger.run_folder import RunFolder, RunState
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.report import Progress
 
@@ -62,3 +66,95 @@ class Report(Progress):
         self._folder.append_metrics(line)
         self.totals.add(line)
         self._to_wandb(kind, {name: value for name, value in (place | figures).items() if not isinstance(value, list)})
+
+
+def attempt_figures(by_expert: np.ndarray, fps: float, is_watched: bool) -> dict[str, Any]:
+    """What one attempt cost.
+
+    Args:
+        by_expert: (T,) bool, where the expert acted.
+        fps: Steps per second of a person, or of one in a script's place.
+        is_watched: Whether a person would have to watch all of it, and not only act.
+
+    Returns:
+        `n_expert_steps`; `n_takeovers`; `takeover_steps`, the length of each; `n_switches` of control, either way; `autonomy`,
+        the share of steps in which the policy acted; `person_seconds`.
+    """
+    lengths = [int(after - first) for first, after in stretches(by_expert)]
+    n_expert_steps = int(by_expert.sum())
+    spent = len(by_expert) if is_watched else n_expert_steps
+    return {
+        "n_expert_steps": n_expert_steps,
+        "n_takeovers": len(lengths),
+        "takeover_steps": lengths,
+        "n_switches": int((np.diff(by_expert.astype(int)) != 0).sum()),
+        "autonomy": round(1 - float(by_expert.mean()), 4),
+        "person_seconds": round(spent / fps, 2),
+    }
+
+
+@dataclass
+class Totals:
+    """What all attempts of a run cost so far.
+
+    Attributes:
+        attempts, steps: Made in all.
+        expert_steps: In which the expert acted.
+        takeovers, switches: Of control.
+        person_seconds: Of a person's time.
+    """
+
+    attempts: int = 0
+    steps: int = 0
+    expert_steps: int = 0
+    takeovers: int = 0
+    switches: int = 0
+    person_seconds: float = 0.0
+
+    @classmethod
+    def of(cls, lines: Iterable[Mapping[str, Any]]) -> "Totals":
+        """Those of the lines of `metrics.jsonl` that are attempts; other lines do not matter."""
+        totals = cls()
+        for line in lines:
+            totals.add(line)
+        return totals
+
+    def add(self, line: Mapping[str, Any]) -> None:
+        """Counts one more line."""
+        if line.get("kind") != "attempt":
+            return
+        self.attempts += 1
+        self.steps += line["n_frames"]
+        self.expert_steps += line["n_expert_steps"]
+        self.takeovers += line["n_takeovers"]
+        self.switches += line["n_switches"]
+        self.person_seconds = round(self.person_seconds + line["person_seconds"], 2)
+
+    @property
+    def autonomy(self) -> float:
+        """Share of the steps in which the policy acted; 1 before the first."""
+        return 1 - self.expert_steps / self.steps if self.steps else 1.0
+
+    @property
+    def mean_takeover_steps(self) -> float:
+        """Steps of a takeover, on average; 0 without one."""
+        return self.expert_steps / self.takeovers if self.takeovers else 0.0
+
+
+def round_figures(lines: Sequence[Mapping[str, Any]], number: int) -> dict[str, Any]:
+    """What is said of a round: what the expert spent in the run so far, and in this round's attempts.
+
+    Args:
+        lines: The lines of `metrics.jsonl`.
+        number: Of the round, counted from 1. Its attempts stand in lines that count the rounds before.
+    """
+    totals = Totals.of(lines)
+    own = Totals.of(line for line in lines if line.get("round") == number - 1)
+    return {
+        "expert_steps": totals.expert_steps,
+        "takeovers": totals.takeovers,
+        "switches": totals.switches,
+        "person_seconds": totals.person_seconds,
+        "autonomy": round(own.autonomy, 4),
+        "mean_takeover_steps": round(own.mean_takeover_steps, 2),
+    }

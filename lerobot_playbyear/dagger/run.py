@@ -4,50 +4,38 @@ import logging
 import os
 import shlex
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 
+import torch
 from lerobot.configs import PreTrainedConfig, parser
-from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
 
-from lerobot_playbyear.dagger.attempt import Scene
-from lerobot_playbyear.dagger.batches import BalancedBatches, frames_by_expert
+from lerobot_playbyear.dagger.batches import frames_by_expert
 from lerobot_playbyear.dagger.checks import (
     check_action_range,
-    check_actions_can_be_masked,
     check_alike,
     check_dataset,
     check_expert,
     check_places,
+    check_policy,
 )
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
-from lerobot_playbyear.dagger.figures import Totals
-from lerobot_playbyear.dagger.folder import RunFolder, RunState
-from lerobot_playbyear.dagger.helpers import help_to_learn, is_first_process
-from lerobot_playbyear.dagger.loop import Loop
-from lerobot_playbyear.dagger.methods import Tools
-from lerobot_playbyear.dagger.methods.base import Method
-from lerobot_playbyear.dagger.methods.beside import Early, shifted
-from lerobot_playbyear.dagger.new_weights import forget_all
-from lerobot_playbyear.dagger.report import Report
-from lerobot_playbyear.dagger.same_run import differences
-from lerobot_playbyear.dagger.weighted_batches import WeightedBatches
-from lerobot_playbyear.datasets import EpisodeStore, check_dataset_files
+from lerobot_playbyear.dagger.loop import Loop, Scene
+from lerobot_playbyear.dagger.report import Report, Totals
+from lerobot_playbyear.dagger.run_folder import BEST_LINK, RunFolder, RunState
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.push import METRICS_NAME, PushOptions, check_name, push_policy, warn_without_login
-from lerobot_playbyear.training.checkpoints import BEST_LINK
+from lerobot_playbyear.training.batches import PolicyWindows, dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.loop import read_store
-from lerobot_playbyear.training.parts import make_training_parts, read_recorded_noise
-from lerobot_playbyear.training.processes import Orders, share_of
-from lerobot_playbyear.training.reach import Reach, action_names
-from lerobot_playbyear.training.windows import PolicyWindows, dataset_names
+from lerobot_playbyear.training.learner import Learner, make_learner
+from lerobot_playbyear.training.train import read_store
 
 
 def run_dagger(cfg: DaggerConfig) -> Path:
@@ -72,12 +60,8 @@ def run_dagger(cfg: DaggerConfig) -> Path:
             cfg.check()
             check_places(cfg)
             folder = RunFolder(cfg.output_dir)
-            if is_first_process():
-                stack.callback(folder.lock().release)
+            stack.enter_context(folder.locked())
             state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
-            if not is_first_process():
-                help_to_learn(cfg, _training_options(cfg, folder, state))
-                return folder.path
             loop = _make_loop(cfg, folder, state, stack)
         loop.run()
     _print_results(cfg, folder, state, loop)
@@ -104,7 +88,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
             logging.info(f"{folder.path}: the run was ended before its first attempt and begins anew.")
         state = RunState(policy_path=given, policy_overrides=overrides, first_episodes=None)
     else:
-        changed = differences(folder.path, cfg)
+        changed = folder.differences(cfg)
         if given is not None and given != _followed(state.policy_path):
             changed.append(f"--policy.path was {state.policy_path} and is {given}")
         if changed:
@@ -118,6 +102,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
         overrides = state.policy_overrides = [*state.policy_overrides, *overrides]
     cfg.policy = PreTrainedConfig.from_pretrained(source, cli_overrides=overrides)
     cfg.policy.pretrained_path = source  # type: ignore[assignment]
+    check_policy(cfg.policy)
     if overrides:
         check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
@@ -141,74 +126,69 @@ def _followed(policy: str) -> str:
 def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack) -> Loop:
     """What the run needs, checked; `stack` closes it."""
     assert cfg.policy is not None
-    check_dataset_files(cfg.demos.repo_id, cfg.demos.root)
-    demos = LeRobotDataset(cfg.demos.repo_id, root=cfg.demos.root, video_backend=cfg.demos.video_backend)
+    demos = DatasetReader(cfg.demos.repo_id, cfg.demos.root)
     check_dataset(cfg.policy, demos.meta, cfg.rename_map)
-    method = cfg.method.make(cfg)
+    method = cfg.method.make()
     stack.callback(method.close)
-    env = expert = facts = None
+    env = expert = None
     if cfg.is_online and cfg.env is not None:
         env = env_spec(cfg.env).make()
         stack.callback(env.close)
         expert = cfg.expert.make(env)
         stack.callback(expert.close)
         check_expert(cfg, expert)
-        on_time = shifted(expert, cfg.takeover_delay_s, env_facts(env).fps, env)
-        expert = method.beside(on_time)
+        expert = method.beside(expert)
     corrections = Corrections(cfg.interventions)
     stack.callback(corrections.close)
-    observed = list(dataset_names(cfg.policy, cfg.rename_map).values())
     if env is not None and cfg.env is not None:
         facts = env_facts(env)
-        features = method.features(dataset_features(facts))
-        check_alike(observed, demos.meta, features, facts.fps, f"--env.type={cfg.env.type}")
-        corrections.open_for_writing(facts.fps, features, cfg.env.type)
+        features, fps, what = dataset_features(facts), facts.fps, f"--env.type={cfg.env.type}"
     else:
-        check_alike(observed, demos.meta, corrections.meta.features, corrections.meta.fps, "the corrections")
+        features, fps, what = corrections.meta.features, corrections.meta.fps, "the corrections"
+    check_alike(dataset_names(cfg.policy, cfg.rename_map).values(), demos.meta, features, fps, what)
+
+    training = _training_options(cfg, folder, state)
+    learner = make_learner(training, demos.meta, keep_normalization=True)
+    if cfg.new_weights and state.checkpoint is None:
+        _forget_all(learner, cfg.seed)
+    if env is not None and cfg.env is not None:
+        corrections.open_for_writing(fps, features, cfg.env.type)
     if state.first_episodes is None:
         state.first_episodes = corrections.n_episodes
         state.next_seed = next_seed(cfg.interventions.folder, cfg.episode_seed) if cfg.is_online else 0
     _check_there_is_something_to_do(cfg, state, corrections)
-
-    training = _training_options(cfg, folder, state)
-    parts = make_training_parts(training, demos.meta, keep_normalization=True)
-    share_of(parts.accelerator, cfg.batch_size)
-    if cfg.new_weights and state.checkpoint is None:
-        forget_all(parts, cfg.seed)
-    orders = Orders(parts.accelerator)
-    stack.callback(orders.end)
-    read_recorded_noise(parts.accelerator.unwrap_model(parts.policy))
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = read_store(demos, windows, training)
-    check_actions_can_be_masked(parts, windows, demonstrations)
-    corrections.read(windows.keys, demonstrations.device, demonstrations.image_size)
-    reach = Reach(cfg.policy, parts.preprocessor, action_names(demos.meta.features[ACTION]))
-    reach.warn(demonstrations.column(ACTION), "the demonstrations")
+    corrections.read(windows.keys or [], demonstrations.device, demonstrations.image_size)
+    learner.warn_of_reach(demonstrations.column(ACTION), "the demonstrations")
     if corrections.store is not None:
-        reach.warn(corrections.store.column(ACTION)[frames_by_expert(corrections.store)], "the corrections")
-    batches = _make_batches(cfg, method, windows, demonstrations, corrections)
+        learner.warn_of_reach(corrections.store.column(ACTION)[frames_by_expert(corrections.store)], "the corrections")
+    batches = method.batches(cfg, windows, demonstrations, corrections.store)
 
-    method.begin(Tools(cfg, folder, state, parts, windows, demonstrations, corrections, facts))
     folder.begin(cfg, state)
     report = stack.enter_context(Report(cfg, training, folder, state))
     scene = None
     if env is not None and cfg.env is not None and expert is not None:
-        policy = parts.accelerator.unwrap_model(parts.policy)
-        actor = PolicyActor(policy, cfg.env, parts.preprocessor, parts.postprocessor, parts.accelerator.autocast)
-        scene = Scene(env, actor, expert, on_time if isinstance(on_time, Early) else None)
+        actor = PolicyActor(
+            learner.unwrapped, cfg.env, learner.preprocessor, learner.postprocessor, learner.accelerator.autocast
+        )
+        scene = Scene(env, actor, expert)
     return Loop(
-        cfg, training, folder, state, parts, demonstrations, corrections, batches, orders, reach, report, scene, method
+        cfg, training, folder, state, learner, windows, demonstrations, corrections, batches, report, scene, method
     )
 
 
-def _make_batches(
-    cfg: DaggerConfig, method: Method, windows: PolicyWindows, demonstrations: EpisodeStore, corrections: Corrections
-) -> BalancedBatches:
-    if not method.weighs_frames:
-        n_skipped = cfg.n_skipped(demonstrations.fps)
-        return BalancedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed, n_skipped)
-    learned = partial(method.learned, len(demonstrations))
-    return WeightedBatches(windows, demonstrations, corrections.store, cfg.batch_size, cfg.seed, learned)
+@torch.no_grad()
+def _forget_all(learner: Learner, seed: int) -> None:
+    """Gives a policy the weights of one that was just made; what its inputs are normalised with stays, of sound too."""
+    policy = learner.unwrapped
+    set_seed(seed)
+    fresh = type(policy)(policy.config).state_dict()
+    kept = [f"{name}." for name, module in policy.named_modules() if getattr(module, "keeps_statistics", False)]
+    weights = policy.state_dict()
+    for name, values in fresh.items():
+        if not any(name.startswith(prefix) for prefix in kept):
+            weights[name].copy_(values)
 
 
 def _training_options(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> PlaybyearTrainConfig:
@@ -243,15 +223,7 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
             f"Expert:      {totals.expert_steps} steps in {totals.takeovers} takeovers, {totals.switches} context switches, "
             f"autonomy {totals.autonomy:.0%}, {totals.person_seconds / 60:.1f} minutes of a person's time"
         )
-    n_learned, n_corrected = loop.batches.n_expert_frames()
-    skipped_s = cfg.n_skipped(loop.demonstrations.fps) / loop.demonstrations.fps
-    left_out = (
-        f"; the first {skipped_s:g} s of every correction are left out (--skip_s)" if n_learned < n_corrected else ""
-    )
-    n_without, n_attempts = loop.batches.n_attempts_without()
-    if n_without:
-        left_out += f", and with that all of {n_without} of {n_attempts} attempts, whose corrections are shorter"
-    print(f"Corrections: {n_learned} of {n_corrected} frames that the expert chose are learned from{left_out}")
+    _print_what_is_learned(cfg, loop)
     if state.success is not None:
         is_older = state.evaluated_round != state.round
         when = f", after {state.evaluated_round} of {state.round} rounds" if is_older else ""
@@ -273,6 +245,22 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
     print(f"Policy:      {policy}")
     print(f"Evaluate:    lerobot-eval --policy.path={policy}{env}")
     print(go_on)
+
+
+def _print_what_is_learned(cfg: DaggerConfig, loop: Loop) -> None:
+    store = loop.corrections.store
+    if store is None:
+        return
+    by_expert, is_learned = frames_by_expert(store), loop.batches.is_learned(store)
+    text = f"{int(is_learned.sum())} of {int(by_expert.sum())} frames that the expert chose are learned from"
+    if int(is_learned.sum()) < int(by_expert.sum()):
+        skipped_s = cfg.n_skipped(store.fps) / store.fps
+        text += f"; the first {skipped_s:g} s of every correction are left out (--skip_s)"
+    spans = [slice(start, end) for start, end in zip(store.starts, store.ends, strict=True)]
+    n_without = sum(bool(by_expert[span].any() and not is_learned[span].any()) for span in spans)
+    if n_without:
+        text += f", and with that all of {n_without} of {len(spans)} attempts, whose corrections are shorter"
+    print(f"Corrections: {text}")
 
 
 def _why_none(cfg: DaggerConfig, state: RunState) -> str:

@@ -139,10 +139,11 @@ class DataFile:
         return pa.concat_tables(tables) if tables else self._empty(columns)
 
     def _group(self, group: int, columns: list[str] | None) -> pa.Table:
-        if self._last is None or self._last[:2] != (group, columns):
+        last = self._last  # another thread may read something else meanwhile
+        if last is None or last[:2] != (group, columns):
             with open_checked(self.path, self.footer) as file:
-                self._last = (group, columns, read_row_group(file, group, columns, self.path))
-        table = self._last[2]
+                last = self._last = (group, columns, read_row_group(file, group, columns, self.path))
+        table = last[2]
         if isinstance(table, ParquetDamageError):
             raise ParquetDamageError(f"{self.path} is damaged: {table}.")
         return table

@@ -21,12 +21,10 @@ from lerobot.utils.constants import (
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.episodes.environment import EnvFacts
-from lerobot_playbyear.episodes.episode import Episode, Observation
+from lerobot_playbyear.episodes.play import Episode, Observation
 
 INTERVENTION = "intervention"
 SEED = "seed"
-EXECUTED = "executed_action"
-"""Where `action` is an expert's label of what a policy met: what the policy did."""
 
 _STATE_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
 
@@ -73,8 +71,6 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
             if features[key]["dtype"] == "float32":
                 frame[key] = np.asarray(value, np.float32)
         frame[ACTION] = episode.actions[t]
-        if episode.executed is not None:
-            frame[EXECUTED] = episode.executed[t]
         frame[INTERVENTION] = np.array([by_expert[t]], bool)
         frame[REWARD] = np.array([episode.rewards[t]], np.float32)
         frame[SUCCESS] = np.array([episode.successes[t]], bool)

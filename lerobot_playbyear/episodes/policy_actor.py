@@ -15,7 +15,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 
 from lerobot_playbyear.episodes.environment import task_description
-from lerobot_playbyear.episodes.episode import Observation
+from lerobot_playbyear.episodes.play import Observation
 
 
 class PolicyActor:

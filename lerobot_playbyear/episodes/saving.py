@@ -7,8 +7,8 @@ from typing import Any
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError
-from lerobot_playbyear.episodes.episode import Episode
 from lerobot_playbyear.episodes.frames import episode_frames
+from lerobot_playbyear.episodes.play import Episode
 
 
 def save_episode(episode: Episode, writer: DurableWriter) -> list[dict[str, Any]]:

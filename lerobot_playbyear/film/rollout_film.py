@@ -13,9 +13,8 @@ from lerobot.envs.utils import FreezeAfterEpisodeEnd
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.episodes.environment import env_spec
-from lerobot_playbyear.episodes.episode import Episode, Observation
-from lerobot_playbyear.episodes.play import Actor, play
-from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.episodes.play import Actor, Episode, Observation, play
+from lerobot_playbyear.episodes.pool import Script
 from lerobot_playbyear.film.video import amplify, at_a_rate_of_aac, compose, episode_sound, inset, write_film
 
 _AUDIO = "audio."  # how raw observations name microphones

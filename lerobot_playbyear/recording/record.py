@@ -18,13 +18,11 @@ from tqdm import tqdm
 from lerobot_playbyear.datasets.durable import DurableWriter, check_root
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input
 from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
-from lerobot_playbyear.episodes.episode import Episode, Observation, Verdict
-from lerobot_playbyear.episodes.expert import ExpertConfig
+from lerobot_playbyear.episodes.experts import ExpertConfig, ScriptedExpertConfig
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
-from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.play import Episode, Observation, Verdict, play
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.episodes.saving import save_episode
-from lerobot_playbyear.episodes.scripted_expert import ScriptedExpertConfig
 from lerobot_playbyear.hub.push import PushOptions, check_name, push_dataset, warn_without_login
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 

@@ -19,14 +19,11 @@ What goes in
   --expert.person=...          with scripted: true for a script that reacts late, trembles and errs
 
 Method
-  --method.type=...            hg_dagger (default), dagger (labels), no_handback, redo (shows
-                               all that the policy failed at), weighted (IWR, Sirius),
-                               robot_gated (the robot asks: ThriftyDAgger)
+  --method.type=...            hg_dagger (default), no_handback, redo (shows all that the
+                               policy failed at), robot_gated (the robot asks: ThriftyDAgger)
   --method.intervention_share=...   with robot_gated: of the steps in which it asks
-  --takeover_delay_s=0.0       the expert takes over later, or below 0 sooner
   --skip_s=null                of every correction so much of its beginning is not learned from;
                                else as long as the policy remembers. 0: all of it is
-  --learn_from=expert          all: of kept attempts every frame is learned from
 
 Attempts
   --interventions.repo_id=...  the dataset of attempts with corrections, made or appended to; needed
@@ -49,8 +46,6 @@ What comes out
   --output_dir=outputs/dagger  folder of checkpoints, figures and options
   --eval_every=5               rounds between two evaluations; 0: none
   --eval.n_episodes=50         episodes of an evaluation
-  --eval_videos=0              of these, how many are filmed
-  --save_every=0               rounds between two checkpoints that stay; 0: last, best and evaluated
   --wandb.enable=false         report to Weights & Biases
   --resume=false               go on with the run in --output_dir; options not given again stay
 
@@ -61,7 +56,6 @@ import sys
 
 from lerobot_playbyear.scripts.command import check_local_dataset, run_command, run_with_lerobot
 from lerobot_playbyear.training.command_line import with_long_store
-from lerobot_playbyear.training.heap import keep_freed_memory
 
 
 def main() -> None:
@@ -71,10 +65,11 @@ def main() -> None:
 
 
 def _correct() -> None:
-    keep_freed_memory()
     from lerobot_playbyear.dagger.config import DaggerConfig, with_saved_options
     from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
+    from lerobot_playbyear.training.acceleration import keep_freed_memory
 
+    keep_freed_memory()
     sys.argv[1:] = with_saved_options(with_long_store(sys.argv[1:]))
 
     def correct(cfg: DaggerConfig) -> None:

@@ -53,7 +53,6 @@ import sys
 
 from lerobot_playbyear.scripts.command import check_local_dataset, run_command, run_with_lerobot
 from lerobot_playbyear.training.command_line import with_long_store
-from lerobot_playbyear.training.heap import keep_freed_memory
 
 
 def main() -> None:
@@ -63,17 +62,19 @@ def main() -> None:
 
 
 def _train() -> None:
-    from lerobot_playbyear.training.presets import apply_preset
+    from lerobot_playbyear.training.command_line import apply_preset
 
     sys.argv[1:] = apply_preset(with_long_store(sys.argv[1:]))
-    keep_freed_memory()
+    from lerobot_playbyear.training.acceleration import keep_freed_memory
     from lerobot_playbyear.training.config import PlaybyearTrainConfig
+
+    keep_freed_memory()
 
     def train(cfg: PlaybyearTrainConfig) -> None:
         check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
-        from lerobot_playbyear.training import loop
+        from lerobot_playbyear.training.train import train as learn
 
-        loop.train(cfg)
+        learn(cfg)
 
     run_with_lerobot(train)
 

@@ -9,7 +9,7 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, make_teleope
 from lerobot.teleoperators.gamepad import GamepadTeleop
 
 from lerobot_playbyear.compat import has_gamepad, import_devices
-from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
+from lerobot_playbyear.episodes.experts import Expert, ExpertConfig, ExpertError
 from lerobot_playbyear.teleoperation.controls import (
     MOVES,
     OVERRIDE,

@@ -11,8 +11,8 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
 from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleop, KeyboardTeleop
 
 from lerobot_playbyear.compat import held_keys
-from lerobot_playbyear.episodes.episode import Verdict
-from lerobot_playbyear.episodes.expert import ExpertError
+from lerobot_playbyear.episodes.experts import ExpertError
+from lerobot_playbyear.episodes.play import Verdict
 from lerobot_playbyear.teleoperation.window import WindowKeys
 
 DELTAS = ("delta_x", "delta_y", "delta_z")

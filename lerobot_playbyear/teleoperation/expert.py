@@ -10,8 +10,8 @@ import numpy as np
 from lerobot.teleoperators import Teleoperator
 
 from lerobot_playbyear.episodes.environment import task_description
-from lerobot_playbyear.episodes.episode import Observation, Verdict
-from lerobot_playbyear.episodes.expert import Expert
+from lerobot_playbyear.episodes.experts import Expert
+from lerobot_playbyear.episodes.play import Observation, Verdict
 from lerobot_playbyear.teleoperation.controls import (
     CLOSE,
     GRIPPER,
@@ -108,7 +108,6 @@ class TeleopExpert(Expert):
     """
 
     decides: ClassVar[bool] = True
-    can_label: ClassVar[bool] = False
 
     def __init__(
         self, options: "TeleopExpertConfig", env: gym.Env, window: Window, teleop: Teleoperator, demonstrates: bool
@@ -194,11 +193,8 @@ class TeleopExpert(Expert):
     def act(self) -> np.ndarray:
         return self.mapping.vector(self._wish.action, self._gripper_command())
 
-    def take_over(self, until_told: bool = True) -> None:
-        self._stays = until_told
-
-    def hand_back(self) -> None:
-        self._stays = False
+    def take_over(self) -> None:
+        self._stays = True
 
     def call(self, is_called: bool) -> None:
         if is_called and not self._is_called and not self._acts:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_playbyear.episodes.episode import Observation
+from lerobot_playbyear.episodes.play import Observation
 
 FLOOR_DB = -80.0
 _AUDIO = "audio."  # how raw observations name microphones

@@ -96,7 +96,7 @@ class Window:
         except EOFError:
             problem = "its process ended"
         if problem:
-            from lerobot_playbyear.episodes.expert import ExpertError
+            from lerobot_playbyear.episodes.experts import ExpertError
 
             self.close()
             raise ExpertError(

@@ -41,7 +41,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
     that lerobot-train can resume what playbyear-train began, and the other way round.
 
     Attributes:
-        preset: A named set of defaults, see `lerobot_playbyear.training.presets`.
+        preset: A named set of defaults, see `lerobot_playbyear.training.command_line`.
         store: Where the dataset is kept.
         compile: Whether torch compiles the encoders and the head, which takes a minute or more before the first update. Meant
             for GPUs; what it is worth there was not measured.

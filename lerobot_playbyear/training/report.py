@@ -8,17 +8,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from accelerate import PartialState
+import torch
+from accelerate import Accelerator, PartialState
+from lerobot.utils.logging_utils import AverageMeter
 from lerobot.utils.utils import inside_slurm
+from torch import Tensor
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from lerobot_playbyear.compat import WandBLogger
-from lerobot_playbyear.datasets.episode_store import EpisodeStore
+from lerobot_playbyear.compat import WandBLogger, metrics_tracker
 from lerobot_playbyear.hub.push import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.figures import Figures
-from lerobot_playbyear.training.parts import TrainingParts
+from lerobot_playbyear.training.learner import Learner
+from lerobot_playbyear.training.store import EpisodeStore
+
+_MOST_WAITING = 1000  # updates
 
 
 class Counter(Protocol):
@@ -92,12 +96,12 @@ class Progress(abc.ABC):
 class Report(Progress):
     """Tells a person, a file and W&B how training goes."""
 
-    def __init__(self, cfg: PlaybyearTrainConfig, store: EpisodeStore, parts: TrainingParts) -> None:
-        super().__init__(cfg, parts, cfg.steps, parts.step, "step", "Training")
+    def __init__(self, cfg: PlaybyearTrainConfig, store: EpisodeStore, learner: Learner) -> None:
+        super().__init__(cfg, learner, cfg.steps, learner.step, "step", "Training")
         self._path = Path(str(cfg.output_dir)) / METRICS_NAME
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._began = time.perf_counter()
-        self._figures = Figures(cfg.batch_size, store, parts.step, parts.accelerator)
+        self._figures = Figures(cfg.batch_size, store, learner.step, learner.accelerator)
 
     def updated(self, figures: Mapping[str, Any]) -> None:
         """One more update is done, with these figures."""
@@ -146,3 +150,58 @@ def print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
         print(f"Policy:     {policy}")
         print(f"Evaluate:   lerobot-eval --policy.path={policy}{env}")
         print(f"Go on:      playbyear-train --resume=true --config_path={policy / 'train_config.json'} --steps=...")
+
+
+class Figures:
+    """Averages over updates. Numbers stay on the GPU until somebody reads them, so that no update waits for one.
+
+    Args:
+        batch_size: Items per update and process.
+        store: What they are drawn from.
+        step: Updates done before.
+        accelerator: Of the processes whose figures are averaged; None: of this one alone.
+    """
+
+    def __init__(
+        self, batch_size: int, store: EpisodeStore, step: int = 0, accelerator: Accelerator | None = None
+    ) -> None:
+        meters = {
+            "loss": AverageMeter("loss", ":.3f", reduction="mean"),
+            "grad_norm": AverageMeter("grdn", ":.3f"),
+            "lr": AverageMeter("lr", ":0.1e"),
+            "update_s": AverageMeter("updt_s", ":.3f", reduction="max"),
+            "dataloading_s": AverageMeter("data_s", ":.3f", reduction="max"),
+        }
+        if torch.cuda.is_available():
+            meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
+        self._accelerator = accelerator
+        self._tracker = metrics_tracker(
+            accelerator, batch_size, len(store), store.n_episodes, meters, initial_step=step
+        )
+        self._waiting: list[Mapping[str, Any]] = []
+
+    def add(self, figures: Mapping[str, Any]) -> None:
+        """Those of one more update: numbers, or tensors of one number."""
+        self._waiting.append(figures)
+        self._tracker.step()
+        if len(self._waiting) >= _MOST_WAITING:
+            self._take_in()
+
+    def read(self) -> tuple[dict[str, float], str]:
+        """The averages since the last time, by name and as a line. Every process has to call it."""
+        self._take_in()
+        if self._accelerator is not None:
+            self._tracker.reduce_across_ranks()
+        figures, line = self._tracker.to_dict(), str(self._tracker)
+        self._tracker.reset_averages()
+        return figures, line
+
+    def _take_in(self) -> None:
+        tensors = [v.detach().float() for each in self._waiting for v in each.values() if isinstance(v, Tensor)]
+        numbers = iter(torch.stack(tensors).tolist() if tensors else [])
+        for each in self._waiting:
+            values = {name: next(numbers) if isinstance(v, Tensor) else v for name, v in each.items()}
+            for name in values.keys() & self._tracker.metrics.keys():
+                self._tracker.metrics[name].update(values[name])
+            self._tracker.update_metrics({name: v for name, v in values.items() if name not in self._tracker.metrics})
+        self._waiting.clear()

@@ -7,19 +7,19 @@ own draw of the data; where they disagree nobody has shown what to do. They are 
 memory changes with the policy.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-_HIDDEN = 128
-_BATCH = 256
-FOR_GOOD = sys.maxsize
-"""`n_least` of a robot that never goes on by itself: once it asks, it asks to the attempt's end."""
+_N_HEADS = 5  # whose disagreement is novelty; ThriftyDAgger: five policies
+_DISCOUNT = 0.9999  # of a success, per step (ThriftyDAgger)
+_N_UPDATES = 400  # of each head and of each success value
+_HIDDEN, _BATCH = 128, 256
 
 
 @dataclass
@@ -53,19 +53,16 @@ class GateModel:
 
     Args:
         played: Demonstrations and attempts; at least one frame of an expert.
-        n_heads: That tell the expert's actions.
-        n_updates: Of every head, and of each of the two success values.
-        discount: Of a success, per step.
         seed: Of all that is random.
     """
 
-    def __init__(self, played: list[Played], n_heads: int, n_updates: int, discount: float, seed: int) -> None:
+    def __init__(self, played: list[Played], seed: int) -> None:
         memories = torch.cat([each.memories for each in played]).float()
         self._mean, self._std = memories.mean(0), memories.std(0).clamp(min=1e-6)
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
             torch.manual_seed(seed)
-            self._heads = self._learn_heads(played, n_heads, n_updates)
-            self._values = self._learn_values(played, n_updates, discount)
+            self._heads = self._learn_heads(played)
+            self._values = self._learn_values(played)
 
     @torch.no_grad()
     def novelty(self, memories: Tensor) -> Tensor:
@@ -94,21 +91,19 @@ class GateModel:
     def _scaled(self, memories: Tensor) -> Tensor:
         return (memories.float() - self._mean) / self._std
 
-    def _learn_heads(self, played: list[Played], n_heads: int, n_updates: int) -> list[nn.Module]:
+    def _learn_heads(self, played: list[Played]) -> list[nn.Module]:
         masks = [torch.from_numpy(each.by_expert) for each in played]
         memories = self._scaled(torch.cat([p.memories[mask] for p, mask in zip(played, masks, strict=True)]))
         actions = torch.cat([p.actions[mask] for p, mask in zip(played, masks, strict=True)]).float()
         heads = []
-        for _ in range(n_heads):
+        for _ in range(_N_HEADS):
             head = _network(memories.shape[1], actions.shape[1])
-            own = torch.randint(
-                len(memories), (len(memories),)
-            )  # a draw with replacement, as ThriftyDAgger's policies have
-            _fit(head, memories[own], actions[own], n_updates, nn.functional.mse_loss)
+            own = torch.randint(len(memories), (len(memories),))  # with replacement, as ThriftyDAgger's policies draw
+            _fit(head, memories[own], actions[own], nn.functional.mse_loss)
             heads.append(head)
         return heads
 
-    def _learn_values(self, played: list[Played], n_updates: int, discount: float) -> list[nn.Module]:
+    def _learn_values(self, played: list[Played]) -> list[nn.Module]:
         kinds = [[each.seed for each in played if each.is_visited and each.success is kind] for kind in (True, False)]
         self._half = {seed: number % 2 for seeds in kinds for number, seed in enumerate(seeds)}  # both see both kinds
         values = []
@@ -120,21 +115,11 @@ class GateModel:
                 own = slice(_last_takeover(each.by_expert), None)
                 seen.append(torch.cat([self._scaled(each.memories), each.actions.float()], dim=-1)[own])
                 ahead = torch.arange(len(each.memories) - 1, -1, -1)[own]
-                outcomes.append(each.success * discount ** ahead.float())
+                outcomes.append(each.success * _DISCOUNT ** ahead.float())
             inputs, targets = torch.cat(seen), torch.cat(outcomes).unsqueeze(-1)
             values.append(_network(inputs.shape[1], 1))
-            _fit(values[-1], inputs, targets, n_updates, nn.functional.binary_cross_entropy_with_logits)
+            _fit(values[-1], inputs, targets, nn.functional.binary_cross_entropy_with_logits)
         return values
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """Above which novelty or risk the robot asks, and below which of both it goes on by itself."""
-
-    novelty: float
-    risk: float
-    calm_novelty: float
-    calm_risk: float
 
 
 @dataclass(frozen=True)
@@ -151,65 +136,44 @@ class Trace:
     is_own: np.ndarray
 
 
-class Asking:
-    """Whether the robot asks for help, step by step.
+@dataclass(frozen=True)
+class Thresholds:
+    """The robot asks beyond either of them, and from then on to the end of the attempt."""
 
-    Args:
-        thresholds: When.
-        n_least: Steps for which it asks at least.
-    """
+    novelty: float
+    risk: float
 
-    def __init__(self, thresholds: Thresholds, n_least: int) -> None:
-        self._thresholds, self._n_least = thresholds, n_least
-        self._asked_for = 0
-
-    @property
-    def is_asking(self) -> bool:
-        """Whether it asked in the last step."""
-        return self._asked_for > 0
-
-    def asks(self, novelty: float, risk: float) -> bool:
-        """Whether it asks now."""
-        limits = self._thresholds
-        if not self._asked_for:
-            asks = novelty > limits.novelty or risk > limits.risk
-        else:
-            asks = self._asked_for < self._n_least or novelty >= limits.calm_novelty or risk >= limits.calm_risk
-        self._asked_for = self._asked_for + 1 if asks else 0
-        return asks
+    def are_exceeded(self, novelty: Any, risk: Any) -> Any:
+        """Whether the robot asks, of numbers or of arrays of them."""
+        return (novelty > self.novelty) | (risk > self.risk)
 
 
-def thresholds_for(traces: list[Trace], share: float, n_least: int, calm_share: float = 0.5) -> Thresholds:
+def thresholds_for(traces: list[Trace], share: float) -> Thresholds:
     """The thresholds with which a robot would have asked in a wanted share of the steps of which that can be told.
 
-    It asks above the same quantile of novelty and of risk, and until both are calm. Of all such quantiles, from that of the
-    calm on, that one is taken which comes nearest. Where the expert had brought the robot, nobody knows how a robot would
-    stand that had not asked before: such steps are left out, unless it would still be asking then. So each quantile has its
-    own steps, and the share is met only about.
+    It asks above the same quantile of novelty and of risk. Of all such quantiles from the median on, that one is taken which
+    comes nearest. Where the expert had brought the robot, nobody knows how a robot would stand that had not asked before: such
+    steps are left out, unless it would still be asking then. So each quantile has its own steps, and the share is met about.
 
     Args:
         traces: Of every attempt.
         share: Of the steps in which the expert shall act.
-        n_least: Steps for which it asks at least.
-        calm_share: Share of the steps whose novelty, or risk, is calm; a half is ThriftyDAgger's, of risk.
     """
     novelty = np.concatenate([each.novelty[each.is_own] for each in traces])
     risk = np.concatenate([each.risk[each.is_own] for each in traces])
-    calm = float(np.quantile(novelty, calm_share)), float(np.quantile(risk, calm_share))
-    best, nearest = Thresholds(float(novelty.max()), float(risk.max()), *calm), share
-    for quantile in 1 - (1 - calm_share) * np.linspace(1, 0, 101)[:-1] ** 2:  # finer where few steps are asked in
-        limits = Thresholds(float(np.quantile(novelty, quantile)), float(np.quantile(risk, quantile)), *calm)
-        asked = np.concatenate([_asked(each, limits, n_least) for each in traces])
+    best, nearest = Thresholds(float(novelty.max()), float(risk.max())), share
+    for quantile in 1 - 0.5 * np.linspace(1, 0, 101)[:-1] ** 2:  # finer where few steps are asked in
+        limits = Thresholds(float(np.quantile(novelty, quantile)), float(np.quantile(risk, quantile)))
+        asked = np.concatenate([_asked(each, limits) for each in traces])
         if abs(asked.mean() - share) < nearest:
             best, nearest = limits, float(abs(asked.mean() - share))
     return best
 
 
-def _asked(trace: Trace, limits: Thresholds, n_least: int) -> np.ndarray:
+def _asked(trace: Trace, limits: Thresholds) -> np.ndarray:
     """Whether a robot would have asked, in the steps of which that can be told."""
-    asking = Asking(limits, n_least)
-    steps = zip(trace.novelty, trace.risk, trace.is_own, strict=True)
-    return np.array([asking.asks(float(new), float(risky)) for new, risky, own in steps if own or asking.is_asking])
+    asks = np.logical_or.accumulate(limits.are_exceeded(trace.novelty, trace.risk) & trace.is_own)
+    return asks[trace.is_own | asks]
 
 
 def _last_takeover(by_expert: np.ndarray) -> int:
@@ -224,9 +188,9 @@ def _network(n_in: int, n_out: int) -> nn.Module:
     return nn.Sequential(*layers, nn.Linear(_HIDDEN, n_out))
 
 
-def _fit(network: nn.Module, inputs: Tensor, targets: Tensor, n_updates: int, loss_of: Callable[..., Tensor]) -> None:
+def _fit(network: nn.Module, inputs: Tensor, targets: Tensor, loss_of: Callable[..., Tensor]) -> None:
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
-    for _ in range(n_updates):
+    for _ in range(_N_UPDATES):
         batch = torch.randint(len(inputs), (_BATCH,))
         optimizer.zero_grad()
         loss_of(network(inputs[batch]), targets[batch]).backward()

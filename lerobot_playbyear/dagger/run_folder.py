@@ -5,11 +5,12 @@ it. A checkpoint is written beside its place, put on the disk and renamed before
 removed when the run goes on.
 """
 
+import contextlib
 import json
+import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,40 @@ from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
-from lerobot_playbyear.dagger.run_lock import LOCK, RunLock
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import check_can_be_made, flush, is_trial
+from lerobot_playbyear.datasets.files import (
+    PARTIAL,
+    FolderLock,
+    FolderLockedError,
+    check_can_be_made,
+    is_trial,
+    new_folder,
+    write_atomically,
+)
 from lerobot_playbyear.hub.push import METRICS_NAME, figures_in
-from lerobot_playbyear.training.checkpoints import BEST_LINK
 
 STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""
 
-_PARTIAL = ".partial"
+BEST_LINK = "best"
+"""Name of the link to the checkpoint of the best evaluation."""
+
+LOCK = ".lock"
+"""File in the output folder while a run is at work."""
+
+_SAME_RUN = (
+    "demos",
+    "interventions",
+    "env",
+    "expert",
+    "method",
+    "skip_s",
+    "new_weights",
+    "seed",
+    "episode_seed",
+    "warmup_episodes",
+    "rename_map",
+)  # options that stay as they are when a run goes on
 
 
 @dataclass
@@ -44,16 +69,17 @@ class RunState:
         kept, failed, unneeded, discarded: What became of them: solved with the expert's help; not solved; solved without
             it; ended by the expert as void.
         next_seed: Of the next attempt.
-        evaluated_round: The round after which the last evaluation took place; -1 for none.
-        evaluated_step: Updates that there had been; -1 for none, and where an older version evaluated.
+        to_show: The seed of an attempt that failed, whose scene the expert demonstrates next; None otherwise.
         fruitless: What became of the attempts since the last that was kept, but for those in which nobody could help.
-        evaluated_episodes: How many it had; None before, and where an older version evaluated.
+        evaluated_round: The round after which the last evaluation took place; -1 for none.
+        evaluated_step: Updates that there had been; -1 for none.
+        evaluated_episodes: How many it had; None before.
         success: What it gave [%].
         best: The best evaluation on the present seeds: its `success` [%], its `seeds` (first, number), and the `checkpoint`
             that it was of, None for the policy that the run began with. Empty before, and where that checkpoint was removed.
         checkpoint: Folder of the newest weights; None before the first update.
         milestones: Checkpoints that are kept for good.
-        method: What the method keeps, such as what it knew when the round began.
+        method: What the method keeps.
         wandb_run_id: To go on with the same run there.
     """
 
@@ -68,6 +94,8 @@ class RunState:
     unneeded: int = 0
     discarded: int = 0
     next_seed: int = 0
+    to_show: int | None = None
+    fruitless: list[str] = field(default_factory=list)
     evaluated_round: int = -1
     evaluated_step: int = -1
     evaluated_episodes: int | None = None
@@ -76,7 +104,6 @@ class RunState:
     checkpoint: str | None = None
     milestones: list[str] = field(default_factory=list)
     method: dict[str, Any] = field(default_factory=dict)
-    fruitless: list[str] = field(default_factory=list)
     wandb_run_id: str | None = None
 
 
@@ -91,14 +118,39 @@ class RunFolder:
         self.path = Path(path)
         self.checkpoints = self.path / CHECKPOINTS_DIR
 
-    def lock(self) -> RunLock:
-        """Makes this process the only one that works in the folder.
+    @contextlib.contextmanager
+    def locked(self) -> Iterator[None]:
+        """Makes this process the only one that works in the folder. Of a run that never began nothing remains.
 
         Raises:
             InputError: It cannot be written, or another process works in it.
         """
         check_can_be_made(self.path, f"--output_dir={self.path}")
-        return RunLock(self.path)
+        in_use = (
+            f"--output_dir={self.path}: another playbyear-dagger is at work there. Wait until it has ended, or choose another "
+            "folder."
+        )
+        is_new = not self.path.exists()
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.callback(FolderLock(self.path / LOCK, in_use).release)
+            except FolderLockedError as error:
+                raise InputError(str(error)) from error
+            except OSError as error:
+                logging.warning(f"{self.path} cannot be locked ({error}): let no other playbyear-dagger work there.")
+            stack.callback(self._leave_nothing, is_new)
+            yield
+
+    def _leave_nothing(self, is_new: bool) -> None:
+        """Removes what was made for a run that did not begin."""
+        if (self.path / CONFIG_NAME).exists():
+            return
+        with contextlib.suppress(
+            OSError
+        ):  # there was no lock, Windows removes no open file, or something else is there
+            (self.path / LOCK).unlink()
+            if is_new:
+                self.path.rmdir()
 
     def claim(self, resume: bool) -> RunState | None:
         """Find out whether there is a run to go on with.
@@ -113,7 +165,7 @@ class RunFolder:
             InputError: The folder holds a run and `resume` is off, or it holds something else.
         """
         is_run = (self.path / CONFIG_NAME).is_file()
-        begun = {LOCK, CONFIG_NAME + _PARTIAL}  # of a run that could not write even its options
+        begun = {LOCK, CONFIG_NAME + PARTIAL}  # of a run that could not write even its options
         names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
         if {name for name in names if not is_trial(name)} <= begun:
             return None
@@ -132,7 +184,7 @@ class RunFolder:
         """Make the folder of a new run; or note the options of one that goes on, and remove what was in progress."""
         with _errors_of_writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
-            _replace(self.path / CONFIG_NAME, json.dumps(cfg.options(), indent=1))
+            write_atomically(self.path / CONFIG_NAME, json.dumps(cfg.options(), indent=1))
         best = state.best.get("checkpoint")
         if best is not None and not (self.checkpoints / best).is_dir():  # somebody made room
             state.best = {}
@@ -147,7 +199,7 @@ class RunFolder:
             InputError: It cannot be written. The state before is unharmed.
         """
         with _errors_of_writing(self.path):
-            _replace(self.path / STATE_NAME, json.dumps(asdict(state), indent=1))
+            write_atomically(self.path / STATE_NAME, json.dumps(asdict(state), indent=1))
 
     def checkpoint(self, state: RunState) -> Path | None:
         """The folder of the newest weights, None before the first update.
@@ -172,16 +224,12 @@ class RunFolder:
         Raises:
             InputError: It cannot be written; those before are unharmed.
         """
-        partial, folder = self.checkpoints / (name + _PARTIAL), self.checkpoints / name
-        shutil.rmtree(partial, ignore_errors=True)
-        with _errors_of_writing(self.path, partial):
-            write(partial)
-            for path in [*partial.rglob("*"), partial]:
-                flush(path)
+        folder = self.checkpoints / name
+        with _errors_of_writing(self.path):
             if folder.exists():  # from a round that was not completed
                 shutil.rmtree(folder)
-            os.replace(partial, folder)
-            flush(self.checkpoints)
+            with new_folder(folder) as partial:
+                write(partial)
 
     def clean(self, state: RunState) -> None:
         """Remove checkpoints that are neither the newest nor the best nor milestones; `last` and `best` name those."""
@@ -193,7 +241,7 @@ class RunFolder:
                 if (self.checkpoints / name).is_symlink():
                     (self.checkpoints / name).unlink()
                 continue
-            link, place = self.checkpoints / (name + _PARTIAL), self.checkpoints / name
+            link, place = self.checkpoints / (name + PARTIAL), self.checkpoints / name
             link.unlink(missing_ok=True)
             link.symlink_to(checkpoint)
             if place.is_dir() and not place.is_symlink():  # the folder was copied, and what links named with it
@@ -203,6 +251,19 @@ class RunFolder:
         for path in self.checkpoints.iterdir():
             if path.is_dir() and not path.is_symlink() and path.name not in wanted:
                 shutil.rmtree(path, ignore_errors=True)
+
+    def differences(self, cfg: DaggerConfig) -> list[str]:
+        """What tells a run apart from the one in the folder: another task, other data, another expert or method."""
+        saved = json.loads((self.path / CONFIG_NAME).read_text())
+        options = json.loads(json.dumps(cfg.options()))
+        changed = [
+            f"--{name} was {_brief(saved.get(name))} and is {_brief(options[name])}"
+            for name in _SAME_RUN
+            if saved.get(name) != options[name]
+        ]
+        if (saved["episodes"] > 0) != cfg.is_online:  # one collects, and the other learns from what is there
+            changed.append(f"--episodes was {saved['episodes']} and is {cfg.episodes}")
+        return changed
 
     # Figures
 
@@ -229,35 +290,21 @@ class RunFolder:
             if line and line["attempt" if line["kind"] == "attempt" else "round"] <= done[line["kind"]]:
                 kept.append(text + "\n")
         with _errors_of_writing(self.path):
-            _replace(path, "".join(kept))
-
-    def note(self, name: str, text: str) -> None:
-        """Keeps a few words of a method's in a file of this name."""
-        with _errors_of_writing(self.path):
-            _replace(self.path / name, text)
-
-    def noted(self, name: str) -> str:
-        """The words of that file."""
-        return (self.path / name).read_text()
+            write_atomically(path, "".join(kept))
 
 
-def _replace(path: Path, content: str) -> None:
-    """Write a file so that at every moment the old or the new one is there."""
-    partial = path.with_name(path.name + _PARTIAL)
-    partial.write_text(content)
-    flush(partial)
-    os.replace(partial, path)
-    flush(path.parent)
-
-
-@contextmanager
-def _errors_of_writing(folder: Path, partial: Path | None = None) -> Iterator[None]:
+@contextlib.contextmanager
+def _errors_of_writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, SafetensorError) as error:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)
         raise InputError(
             f"Cannot write to {folder}: {error}. What was saved before is complete; once there is room, go on with "
             "--resume=true."
         ) from error
+
+
+def _brief(value: Any) -> str:
+    if not isinstance(value, dict):
+        return str(value)
+    return str({key: item for key, item in value.items() if key not in ("features", "features_map")})

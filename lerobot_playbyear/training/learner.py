@@ -1,20 +1,31 @@
-"""The parts of a training run, made as lerobot-train makes them."""
+"""What learns, made as lerobot-train makes it: its updates, its checkpoints, and what it cannot learn."""
 
+import logging
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
+from accelerate import Accelerator
+from accelerate.utils import DistributedDataParallelKwargs, InitProcessGroupKwargs
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
+from lerobot.optim import load_optimizer_state, load_scheduler_state
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
-from lerobot.processor import PolicyProcessorPipeline
-from lerobot.utils.constants import OBS_STR
+from lerobot.processor import PolicyProcessorPipeline, TransitionKey, create_transition
+from lerobot.utils.constants import ACTION, OBS_STR, TRAINING_STATE_DIR, TRAINING_STEP
+from lerobot.utils.io_utils import load_json
+from lerobot.utils.random_utils import load_rng_state
 from lerobot.utils.utils import has_method
+from torch import Tensor
+from torch.optim import Optimizer
 
 from lerobot_playbyear.compat import (
     eval_policy_all,
@@ -25,35 +36,43 @@ from lerobot_playbyear.compat import (
 )
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
-from lerobot_playbyear.training.checkpoints import load_training_state
+from lerobot_playbyear.training.acceleration import compile_networks, fuse, prefer_channels_last
+from lerobot_playbyear.training.batches import dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.windows import dataset_names
 
-if TYPE_CHECKING:
-    from accelerate import Accelerator
+_DTYPES = {"bfloat16": "bf16", "float16": "fp16", "float32": "no"}
+_PATIENCE = timedelta(days=7)  # others wait while one evaluates or decodes a dataset
+
+_TOLERANCE = 0.01  # of the range of actions: what is learned a hundredth too small is not worth a word
+_SLACK = 1.1  # tanh gets to its ends only slowly
+_LARGEST = 10.0  # what is normalised and would need more than this has not been demonstrated at all
 
 
 @dataclass
-class TrainingParts:
+class Learner:
     """Everything that learns, and everything between it and the data.
 
     Attributes:
-        accelerator: Device and precision.
-        policy: The policy.
+        accelerator: Device, precision and processes.
+        policy: The policy, as `accelerator` wraps it.
         optimizer: Its optimizer.
         scheduler: Of the learning rate; None means constant.
         preprocessor: From batches to what the policy takes.
         postprocessor: From what the policy returns to actions.
+        action_names: Of the action's dimensions; None: they have none.
         step: Updates done.
     """
 
-    accelerator: "Accelerator"
+    accelerator: Accelerator
     policy: PreTrainedPolicy
-    optimizer: torch.optim.Optimizer
+    optimizer: Optimizer
     scheduler: Any
     preprocessor: PolicyProcessorPipeline
     postprocessor: PolicyProcessorPipeline
+    action_names: Sequence[str] | None = None
     step: int = 0
 
     def update(self, batch: Mapping[str, Any], grad_clip_norm: float) -> dict[str, Any]:
@@ -77,9 +96,8 @@ class TrainingParts:
         self.optimizer.zero_grad()
         if self.scheduler is not None:
             self.scheduler.step()
-        unwrapped: Any = self._unwrapped()
-        if has_method(unwrapped, "update"):  # a policy with buffers of its own
-            unwrapped.update()
+        if has_method(self.unwrapped, "update"):  # a policy with buffers of its own
+            self.unwrapped.update()
         self.step += 1
         figures = {
             **(figures or {}),
@@ -94,12 +112,17 @@ class TrainingParts:
     @torch.no_grad()
     def loss(self, batch: Mapping[str, Any]) -> float:
         """The policy's loss on a batch, as it would be in a rollout: no augmentation, no dropout."""
-        policy = self._unwrapped()
+        policy = self.unwrapped
         policy.eval()
         with self.accelerator.autocast():
             loss, _ = policy.forward(self.preprocessor(dict(batch)))
         policy.train()
         return float(loss)
+
+    @property
+    def unwrapped(self) -> Any:
+        """The policy itself, of one process. The wrapped one waits for the others."""
+        return self.accelerator.unwrap_model(self.policy)
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
         """Write a checkpoint where lerobot-train would, and return its folder."""
@@ -117,7 +140,7 @@ class TrainingParts:
             cfg,
             checkpoint_dir=folder,
             step=self.step,
-            policy=self._unwrapped(),
+            policy=self.unwrapped,
             optimizer=self.optimizer,
             scheduler=self.scheduler,
             preprocessor=self.preprocessor,
@@ -130,19 +153,18 @@ class TrainingParts:
             raise ValueError("An evaluation needs an environment: give --env.type and --env.task.")
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg=cfg.env, policy_cfg=cfg.policy)
         envs = make_env(cfg.env, n_envs=cfg.eval.batch_size, use_async_envs=cfg.eval.use_async_envs)
+        videos = Path(str(cfg.output_dir)) / "eval" / f"videos_step_{get_step_identifier(self.step, cfg.steps)}"
         try:
             with torch.no_grad(), self.accelerator.autocast():
                 return eval_policy_all(
                     envs=envs,
-                    policy=self._unwrapped(),
+                    policy=self.unwrapped,
                     env_preprocessor=env_preprocessor,
                     env_postprocessor=env_postprocessor,
                     preprocessor=self.preprocessor,
                     postprocessor=self.postprocessor,
                     n_episodes=cfg.eval.n_episodes,
-                    videos_dir=Path(str(cfg.output_dir))
-                    / "eval"
-                    / f"videos_step_{get_step_identifier(self.step, cfg.steps)}",
+                    videos_dir=videos,
                     max_episodes_rendered=n_videos,
                     start_seed=cfg.seed,
                     max_parallel_tasks=cfg.env.max_parallel_tasks,
@@ -151,18 +173,60 @@ class TrainingParts:
             close_envs(envs)
             self.policy.train()
 
-    def _unwrapped(self) -> PreTrainedPolicy:
-        """The policy itself, of one process. The wrapped one waits for the others."""
-        policy: PreTrainedPolicy = self.accelerator.unwrap_model(self.policy)
-        return policy
+    def warn_of_reach(self, actions: Tensor, what: str) -> None:
+        """Logs which actions the policy cannot learn, if there are any, and what to do.
+
+        The policy `playbyear` ends at `action_range` times the normalised range of the actions that its statistics were made
+        of. Other policies are taken to have no end.
+
+        Args:
+            actions: (N, n_actions), as recorded; (N,) of a single one, as LeRobot keeps it.
+            what: What they are, for the message.
+        """
+        config = self.unwrapped.config
+        if not isinstance(config, PlaybyearConfig) or len(actions) == 0:
+            return
+        actions = actions.reshape(len(actions), -1)
+        needed = self._normalized(actions).abs().cpu()  # (N, n_actions)
+        is_out = needed > config.action_range * (1 + _TOLERANCE)
+        if not is_out.any():
+            return
+        names = self.action_names or [f"action[{i}]" for i in range(actions.shape[1])]
+        shares = {name: float(share) for name, share in zip(names, is_out.float().mean(dim=0), strict=True) if share}
+        farthest = dict(zip(names, needed.amax(dim=0).tolist(), strict=True))
+        is_normalized = config.normalization_mapping.get("ACTION") != NormalizationMode.IDENTITY
+        largest = _LARGEST if is_normalized else math.inf
+        unmoved = [f"'{name}'" for name in shares if farthest[name] > largest]
+        reachable = [farthest[name] for name in shares if farthest[name] <= largest]
+        listed = ", ".join(f"'{name}' in {100 * share:.1f} %" for name, share in shares.items())
+        text = (
+            f"Some actions of {what} are out of the policy's reach: {listed} of {len(actions)} frames lie beyond the end of "
+            f"its last layer (action_range={config.action_range:g}, normalised), and are learned as that end."
+        )
+        if reachable:
+            option = f"--policy.action_range={math.ceil(10 * _SLACK * max(reachable)) / 10:g}"
+            text += (
+                f" Train with {option}; a trained policy gets it with playbyear-train --policy.path=... {option} on its "
+                "demonstrations."
+            )
+        if unmoved:
+            text += f" {', '.join(unmoved)} hardly moves in the demonstrations: demonstrate it too."
+        logging.warning(text)
+
+    def _normalized(self, actions: Tensor) -> Tensor:
+        transition = create_transition(observation={}, action=actions.float())
+        for step in self.preprocessor.steps:  # `process_action` would stop at a step that wants an observation
+            transition = step(transition)
+        normalized: Tensor = transition[TransitionKey.ACTION]  # type: ignore[assignment]
+        return normalized
 
 
-def make_training_parts(
+def make_learner(
     cfg: PlaybyearTrainConfig,
     meta: LeRobotDatasetMetadata,
     keep_normalization: bool = False,
-    accelerator: "Accelerator | None" = None,
-) -> TrainingParts:
+    accelerator: Accelerator | None = None,
+) -> Learner:
     """Make policy, processors, optimizer and schedule for a dataset; where the run is resumed, from its checkpoint.
 
     Args:
@@ -174,24 +238,15 @@ def make_training_parts(
 
     Raises:
         ValueError: If the dataset does not suit the policy, before the policy is made.
+        InputError: If the recordings of noise that it learns with cannot be used.
     """
-    policy_cfg = cfg.policy
-    if policy_cfg is None:
+    if cfg.policy is None:
         raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
-    check_dataset_suits(policy_cfg, meta, cfg.rename_map)
-    from lerobot_playbyear.training.acceleration import compile_networks, fuse, prefer_channels_last
-
-    policy = make_policy(cfg=policy_cfg, ds_meta=meta, rename_map=cfg.rename_map)
-    from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-
+    check_dataset_suits(cfg.policy, meta, cfg.rename_map)
+    policy = make_policy(cfg=cfg.policy, ds_meta=meta, rename_map=cfg.rename_map)
     if keep_normalization and isinstance(policy, PlaybyearPolicy):
         policy.keep_normalization()
-    if accelerator is None:
-        from lerobot_playbyear.training.processes import (
-            make_accelerator,
-        )  # late: it takes a second, and the data may be wrong
-
-        accelerator = make_accelerator(policy_cfg)
+    accelerator = accelerator or make_accelerator(cfg.policy)
     stats = None if cfg.resume or keep_normalization else meta.stats
     preprocessor, postprocessor = _make_processors(cfg, policy, stats, accelerator.device)
     optimizer, scheduler = make_optimizer_and_scheduler(cfg, policy)
@@ -206,18 +261,78 @@ def make_training_parts(
         compile_networks(policy)
     policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
     policy.train()
-    return TrainingParts(accelerator, policy, optimizer, scheduler, preprocessor, postprocessor, step)
-
-
-def read_recorded_noise(policy: torch.nn.Module) -> None:
-    """Reads the folder of recorded noise that a policy learns with, if there is one, before any work is done.
-
-    Raises:
-        InputError: The folder cannot be used.
-    """
     for module in policy.modules():
         if isinstance(module, SoundAugmentation):
             module.read_recordings()
+    names = action_names(meta.features[ACTION])
+    return Learner(accelerator, policy, optimizer, scheduler, preprocessor, postprocessor, names, step)
+
+
+def make_accelerator(policy: PreTrainedConfig) -> Accelerator:
+    """The Accelerator that lerobot-train makes for a policy: its device, its precision, and the processes launched."""
+    mixed_precision = _DTYPES.get(getattr(policy, "dtype", ""))
+    if not hasattr(policy, "dtype") and policy.use_amp:
+        dtype = torch.get_autocast_dtype(torch.device(str(policy.device)).type)
+        mixed_precision = {torch.bfloat16: "bf16", torch.float16: "fp16"}[dtype]
+    handlers = [
+        # Every parameter of ours is part of every update; of other policies, who knows.
+        DistributedDataParallelKwargs(find_unused_parameters=not isinstance(policy, PlaybyearConfig)),
+        InitProcessGroupKwargs(timeout=_PATIENCE),
+    ]
+    return Accelerator(
+        step_scheduler_with_optimizer=False,
+        mixed_precision=mixed_precision,
+        cpu=policy.device == "cpu",
+        kwargs_handlers=handlers,
+    )
+
+
+def noise_seed(seed: int, process_index: int, step: int) -> int:
+    """The seed of what a process of several draws by itself, such as augmentation, from an update on.
+
+    Args:
+        seed: Of the run.
+        process_index: Of the process.
+        step: Updates done before; a run that goes on draws other noise than at its begin.
+    """
+    if step == 0:
+        return seed + process_index
+    return int(np.random.SeedSequence([seed, process_index, step]).generate_state(1)[0])
+
+
+def action_names(feature: Mapping[str, Any]) -> list[str] | None:
+    """The names of an action's dimensions, as a dataset's features hold them; None if there are none."""
+    names = feature.get("names")
+    if isinstance(names, Mapping):  # LeRobot also writes {"motors": [...]}
+        names = next(iter(names.values()), None)
+    size = math.prod(feature["shape"])
+    return [str(name) for name in names] if isinstance(names, Sequence) and len(names) == size else None
+
+
+def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: Any) -> int:
+    """Reads what LeRobot wrote beside the policy, before the optimizer is prepared: random numbers, optimizer, schedule.
+
+    LeRobot's own function for this is another one in every version; the parts that it calls stay.
+
+    Args:
+        checkpoint: `<run>/checkpoints/<step>`.
+        optimizer: Gets its state.
+        scheduler: Gets its state; None: there is none.
+
+    Returns:
+        Updates done.
+
+    Raises:
+        NotADirectoryError: The checkpoint has no training state.
+    """
+    folder = checkpoint / TRAINING_STATE_DIR
+    if not folder.is_dir():
+        raise NotADirectoryError(folder)
+    load_rng_state(folder)
+    load_optimizer_state(optimizer, folder)
+    if scheduler is not None:
+        load_scheduler_state(scheduler, folder)
+    return int(load_json(folder / TRAINING_STEP)["step"])
 
 
 def check_dataset_suits(

@@ -1,17 +1,106 @@
-"""The expert that comes with an environment, `--expert.type=scripted`; alone, or as a person with a person's imperfections."""
+"""Who corrects a policy: the protocol between HG-DAgger and an expert, and the script that comes with an environment.
 
+An expert for another environment is a subclass of `Expert` with three methods and a configuration that makes it, registered
+under a name for `--expert.type` (`examples/own_expert.py`).
+"""
+
+import abc
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
+import draccus
 import gymnasium as gym
 import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.episode import Observation
-from lerobot_playbyear.episodes.expert import Expert, ExpertConfig, ExpertError
-from lerobot_playbyear.episodes.script import Script
+from lerobot_playbyear.episodes.play import Observation, Verdict
+from lerobot_playbyear.episodes.pool import Script
 
 _SCRIPTS = ("intervention_gate", "scripted_expert")
+
+
+class ExpertError(InputError):
+    """The environment and the expert do not go together; the message says what is missing."""
+
+
+class Expert(abc.ABC):
+    """Watches a policy at work and takes over.
+
+    In each step `wants_control` is called once with what the policy would do, then `act` if it returned True, then the
+    environment steps, then `verdict`. A step may take as long as the expert likes: a person's expert keeps the pace and
+    shows a window in `wants_control`.
+
+    The methods of HG-DAgger (`--method.type`) may ask for more: `take_over` where somebody else decides who acts, `call` where
+    the robot asks for help.
+
+    Attributes:
+        decides: It takes over when it likes, also where the robot asks, as a person does: then it is only called.
+        judges: It says by itself when it takes over. Otherwise it only shows whole scenes, `--method.type=redo`.
+        clock_fps: Steps per second of the person who corrects; None where nobody's time is spent.
+    """
+
+    decides: ClassVar[bool] = False
+    judges: ClassVar[bool] = True
+    clock_fps: float | None = None
+
+    @abc.abstractmethod
+    def reset(self, env: gym.Env) -> None:
+        """A new episode has begun.
+
+        Args:
+            env: The environment, reset. It is the same object in all episodes; `env.unwrapped` is the task itself.
+        """
+
+    @abc.abstractmethod
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        """Whether the expert, and not the policy, chooses this step's action.
+
+        Args:
+            observation: The environment's, as `env.step` returned it.
+            policy_action: (action dim,) what the policy would do.
+        """
+
+    @abc.abstractmethod
+    def act(self) -> np.ndarray:
+        """The expert's action (action dim,) for this step."""
+
+    def take_over(self) -> None:  # noqa: B027 (an expert that looks at the present state needs none)
+        """Somebody else says that the expert is in control from this step on, until the attempt ends. Called after
+        `wants_control`, before `act`, or after `reset`."""
+
+    def call(self, is_called: bool) -> None:  # noqa: B027
+        """Whether the robot asks for help in this step. Called before `wants_control` of an expert that `decides`."""
+
+    def verdict(self) -> Verdict | None:
+        """Whether the attempt ends now; None goes on. Asked after every step, or more often."""
+        return None
+
+    def close(self) -> None:  # noqa: B027 (most experts have nothing to close)
+        """No episode follows."""
+
+
+@dataclass
+class ExpertConfig(draccus.ChoiceRegistry, abc.ABC):
+    """Options of an expert, `--expert.*`. Subclasses register with `@ExpertConfig.register_subclass("name")`."""
+
+    @property
+    def type(self) -> str:
+        return str(self.get_choice_name(self.__class__))
+
+    @classmethod
+    def default_choice_name(cls) -> str | None:
+        return "scripted"
+
+    @abc.abstractmethod
+    def make(self, env: gym.Env) -> Expert:
+        """Makes the expert.
+
+        Args:
+            env: The environment that all episodes happen in.
+
+        Raises:
+            ExpertError: It does not go with this environment.
+        """
 
 
 @ExpertConfig.register_subclass("scripted")
@@ -72,24 +161,18 @@ class ScriptedExpert(Expert):
     def act(self) -> np.ndarray:
         return np.asarray(self._gate.act(), np.float32)
 
-    def take_over(self, until_told: bool = True) -> None:
-        if hasattr(self._gate, "take_over"):
-            self._gate.take_over(until_told)
+    def take_over(self) -> None:
+        self._tell_gate("take_over")
 
-    def hand_back(self) -> None:
-        if hasattr(self._gate, "hand_back"):
-            self._gate.hand_back()
-
-    def label(self) -> np.ndarray:
-        ask = self._gate.label if hasattr(self._gate, "label") else self._gate.act
-        return np.asarray(ask(), np.float32)
+    def _tell_gate(self, what: str, *args: bool) -> None:
+        """Gates that look at the present state need not be told who acts, and have no such method."""
+        getattr(self._gate, what, lambda *_: None)(*args)
 
 
 class ScriptedDemonstrator(Expert):
     """Shows the scenes that it is told to, from their first step on; in the middle its script would not know what to do."""
 
     judges = False
-    can_label = False
 
     def __init__(self) -> None:
         self._script = Script()
@@ -105,11 +188,8 @@ class ScriptedDemonstrator(Expert):
     def act(self) -> np.ndarray:
         return np.asarray(self._script.act(self._observation), np.float32)
 
-    def take_over(self, until_told: bool = True) -> None:
+    def take_over(self) -> None:
         self._acts = True
-
-    def hand_back(self) -> None:
-        self._acts = False
 
 
 class ScriptedPerson(ScriptedExpert):
@@ -146,13 +226,9 @@ class ScriptedPerson(ScriptedExpert):
     def call(self, is_called: bool) -> None:
         self._called = is_called
 
-    def take_over(self, until_told: bool = True) -> None:
-        super().take_over(until_told)
-        self._acts, self._is_held = True, until_told
-
-    def hand_back(self) -> None:
-        super().hand_back()
-        self._acts = self._is_held = False
+    def take_over(self) -> None:
+        super().take_over()
+        self._acts = self._is_held = True
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
         seen = super().wants_control(observation, policy_action)
@@ -162,17 +238,14 @@ class ScriptedPerson(ScriptedExpert):
         is_wrong = self._is_wrong(wishes)
         acts = wishes or is_wrong or self._is_held
         if acts and not self._acts:
-            super().take_over(until_told=self._called is not None or not wishes)
+            self._tell_gate("take_over", self._called is not None or not wishes)
         elif self._acts and not acts:
-            super().hand_back()
+            self._tell_gate("hand_back")
         self._acts = acts
         return acts
 
     def act(self) -> np.ndarray:
         return self._by_hand(super().act())
-
-    def label(self) -> np.ndarray:
-        return self._by_hand(super().label())
 
     def _is_wrong(self, is_needed: bool) -> bool:
         """Whether it acts although nothing is wrong. A chance is drawn in every step, so that none depends on another."""

@@ -1,0 +1,257 @@
+"""The methods of interactive imitation, `--method.type`: who acts when, and what is kept and learned from.
+
+A method of your own is a subclass of `Method` with what it does otherwise than HG-DAgger, and a configuration that makes it,
+registered under a name for `--method.type`.
+"""
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import draccus
+import gymnasium as gym
+import numpy as np
+
+from lerobot_playbyear.dagger.batches import BalancedBatches, Batches, JoinedBatches
+from lerobot_playbyear.episodes.experts import Expert
+from lerobot_playbyear.episodes.play import Episode, Observation, Verdict
+from lerobot_playbyear.training.store import EpisodeStore
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.dagger.config import DaggerConfig
+    from lerobot_playbyear.dagger.loop import Loop
+    from lerobot_playbyear.training.batches import PolicyWindows
+
+
+@dataclass
+class MethodConfig(draccus.ChoiceRegistry, abc.ABC):
+    """Options of a method, `--method.*`. Subclasses register with `@MethodConfig.register_subclass("name")`.
+
+    Attributes:
+        is_watched: A person who corrects has to watch all of every attempt.
+        needs_judge: The expert has to say when it takes over.
+        skips_beginnings: Corrections have a beginning that is not learned from by default, `--skip_s`.
+    """
+
+    is_watched: ClassVar[bool] = True
+    needs_judge: ClassVar[bool] = True
+    skips_beginnings: ClassVar[bool] = True
+
+    @property
+    def type(self) -> str:
+        return str(self.get_choice_name(self.__class__))
+
+    @classmethod
+    def default_choice_name(cls) -> str | None:
+        return "hg_dagger"
+
+    def check(self) -> None:
+        """Raise an InputError if an option is out of its range."""
+
+    @abc.abstractmethod
+    def make(self) -> "Method":
+        """Makes the method."""
+
+
+class Method:
+    """HG-DAgger; others override what they do otherwise.
+
+    Attributes:
+        shows_failures: Where an attempt fails, the scene is set up again with the same seed, and the expert demonstrates the
+            task in it from the first step on.
+    """
+
+    shows_failures = False
+
+    def beside(self, expert: Expert) -> Expert:
+        """Who sits beside the policy: the expert, or somebody who speaks for it."""
+        return expert
+
+    def begin(self, loop: "Loop") -> None:
+        """The run begins, or goes on; `loop` has all of it. Not called where nobody acts."""
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether nobody helps in the next attempt, whatever happens: such a one counts for no `--max_attempts`."""
+        return False
+
+    def prepare(self, demonstrates: bool) -> None:
+        """An attempt follows. What is made here must depend on the state of the run alone, so that it resumes exactly.
+
+        Args:
+            demonstrates: Whether the expert acts in it from the first step on, because the attempt before failed.
+        """
+
+    def outcome(self, episode: Episode) -> str:
+        """What becomes of an attempt: `kept` (learned from), `unneeded`, `failed` or `discarded`."""
+        if episode.verdict is Verdict.DISCARD:
+            return "discarded"
+        if not episode.success:
+            return "failed"
+        return "kept" if episode.intervention_share > 0 else "unneeded"
+
+    def note(self, episode: Episode, outcome: str) -> None:
+        """An attempt was made, and saved if it is kept; it counts after this."""
+
+    def figures(self) -> Mapping[str, float]:
+        """Further figures of the last attempt."""
+        return {}
+
+    def recovered(self, cost: Mapping[str, Any]) -> Mapping[str, float]:
+        """The same of an attempt that was saved just before the run was killed, and counts after this.
+
+        Args:
+            cost: What `attempt_figures` says of it.
+        """
+        return {}
+
+    def close(self) -> None:
+        """No attempt follows."""
+
+    def batches(
+        self,
+        cfg: "DaggerConfig",
+        windows: "PolicyWindows",
+        demonstrations: EpisodeStore,
+        corrections: EpisodeStore | None,
+    ) -> Batches:
+        """What is learned from: half demonstrations, half of what the expert chose in corrections."""
+        n_skipped = cfg.n_skipped(demonstrations.fps)
+        return BalancedBatches(windows, demonstrations, corrections, cfg.batch_size, cfg.seed, n_skipped)
+
+
+@MethodConfig.register_subclass("hg_dagger")
+@dataclass
+class HgDaggerConfig(MethodConfig):
+    """The expert takes over and hands back as it likes (Kelly et al., 2019)."""
+
+    def make(self) -> Method:
+        return Method()
+
+
+@MethodConfig.register_subclass("no_handback")
+@dataclass
+class NoHandbackConfig(MethodConfig):
+    """The expert takes over as it likes and acts to the end: an attempt holds one correction (as in RaC, Hu et al., 2025)."""
+
+    def make(self) -> Method:
+        return NoHandback()
+
+
+class NoHandback(Method):
+    """An attempt ends with its correction."""
+
+    def beside(self, expert: Expert) -> Expert:
+        return Staying(expert)
+
+
+@MethodConfig.register_subclass("redo")
+@dataclass
+class RedoConfig(MethodConfig):
+    """Where the policy fails, the scene is set up again, and the expert demonstrates the task in it from the first step on."""
+
+    needs_judge: ClassVar[bool] = False
+    skips_beginnings: ClassVar[bool] = False
+
+    def make(self) -> Method:
+        return Redo()
+
+
+class Redo(Method):
+    """Demonstrations of the scenes that the policy fails in; they weigh as much as those that are there, frame by frame.
+
+    The policy tries first, until the expert would take over or the attempt ends.
+    """
+
+    shows_failures = True
+
+    def beside(self, expert: Expert) -> Expert:
+        self._expert = Showing(expert)
+        return self._expert
+
+    def prepare(self, demonstrates: bool) -> None:
+        self._expert.demonstrates = demonstrates
+
+    def batches(
+        self,
+        cfg: "DaggerConfig",
+        windows: "PolicyWindows",
+        demonstrations: EpisodeStore,
+        corrections: EpisodeStore | None,
+    ) -> Batches:
+        return JoinedBatches(windows, demonstrations, corrections, cfg.batch_size, cfg.seed)
+
+
+# Experts that speak for another
+
+
+class Beside(Expert):
+    """Passes everything on to an expert.
+
+    Args:
+        expert: The expert.
+    """
+
+    def __init__(self, expert: Expert) -> None:
+        self.expert = expert
+        self.clock_fps, self.decides = expert.clock_fps, expert.decides  # type: ignore[misc]
+
+    def reset(self, env: gym.Env) -> None:
+        self.expert.reset(env)
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        return self.expert.wants_control(observation, policy_action)
+
+    def act(self) -> np.ndarray:
+        return self.expert.act()
+
+    def verdict(self) -> Verdict | None:
+        return self.expert.verdict()
+
+    def close(self) -> None:
+        self.expert.close()
+
+
+class Staying(Beside):
+    """Once the expert has taken over, it acts until the attempt ends."""
+
+    def reset(self, env: gym.Env) -> None:
+        super().reset(env)
+        self._stays = False
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        wants = super().wants_control(observation, policy_action)
+        if wants and not self._stays:
+            self._stays = True
+            self.expert.take_over()
+        # A person who ended the attempt has no action for its last step.
+        has_left = self.decides and not wants and super().verdict() is not None
+        return self._stays and not has_left
+
+
+class Showing(Beside):
+    """In a try the policy acts, and the expert's wish to take over ends it; in a demonstration the expert acts all the time.
+
+    Attributes:
+        demonstrates: Set it before the attempt.
+    """
+
+    def __init__(self, expert: Expert) -> None:
+        super().__init__(expert)
+        self.demonstrates = False
+
+    def reset(self, env: gym.Env) -> None:
+        super().reset(env)
+        self._is_over = False
+        if self.demonstrates:
+            self.expert.take_over()
+
+    def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
+        wants = super().wants_control(observation, policy_action)
+        self._is_over = wants and not self.demonstrates
+        return self.demonstrates
+
+    def verdict(self) -> Verdict | None:
+        verdict = super().verdict()
+        return Verdict.FAILURE if verdict is None and self._is_over else verdict

@@ -1,0 +1,287 @@
+"""Batches: which runs of frames are drawn, what is cut out for each, and how processes share them.
+
+A training item is a run of K windows, named by its last frame: its windows end at that frame and at the K - 1 frames before.
+"""
+
+import copy
+import itertools
+import logging
+from collections import deque
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
+from lerobot.utils.constants import ACTION
+from torch import Tensor
+
+from lerobot_playbyear.datasets import audio_keys, check_audio_features
+from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.training.columns import features_at, sample_rate_in
+from lerobot_playbyear.training.store import EpisodeStore
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+_AHEAD = 2
+
+
+def make_batches(
+    accelerator: "Accelerator",
+    windows: "PolicyWindows",
+    store: EpisodeStore,
+    batch_size: int,
+    seed: int,
+    first: int = 0,
+) -> Iterator[dict[str, Any]]:
+    """This process's share of every batch, without end.
+
+    All processes draw the same runs, so that together they have those of one process.
+
+    Args:
+        accelerator: Of the processes.
+        windows: Cut the items.
+        store: The episodes.
+        batch_size: Items of a process per update.
+        seed: Of the draws.
+        first: Number of the first batch; a run that goes on continues with that of its next update.
+    """
+    sampler = RunSampler(run_weights(store, windows.n_windows, windows.n_dropped), seed)
+    n_items, share = (
+        batch_size * accelerator.num_processes,
+        slice(accelerator.process_index, None, accelerator.num_processes),
+    )
+    batches = (windows.batch(store, sampler.draw(n_items, number)[share]) for number in itertools.count(first))
+    if accelerator.device.type == "cuda" and store.device.type == "cpu":
+        return prefetched(pinned(batch) for batch in batches)
+    return batches
+
+
+class RunSampler:
+    """Draws runs in proportion to their weights, spread over the whole store.
+
+    A batch of B is drawn with one run in each B-th part of the total weight, so that it comes from as many episodes
+    as there are. Every batch has a generator of its own, seeded with the seed and its number: resuming needs that number alone.
+
+    Args:
+        weights: (N,) the weight of the run that ends at each frame; at least one above 0.
+        seed: Of the random numbers.
+
+    Raises:
+        ValueError: If a weight is negative or not finite, or all are 0.
+    """
+
+    def __init__(self, weights: Tensor, seed: int = 0) -> None:
+        weights = weights.to("cpu", torch.float64)
+        if weights.ndim != 1 or not weights.isfinite().all() or (weights < 0).any() or weights.sum() <= 0:
+            raise ValueError("Weights must be one finite number >= 0 per frame, and not all of them 0.")
+        self._seed = seed
+        self._frames = weights.nonzero().squeeze(1)
+        self._cumulative = weights[self._frames].cumsum(0)
+
+    def draw(self, n: int, number: int) -> Tensor:
+        """The last frames of the runs of a batch, (n,) int64, in random order.
+
+        Args:
+            n: Runs.
+            number: Of the batch, counted from 0.
+        """
+        seed = int(np.random.SeedSequence([self._seed, number]).generate_state(1, np.uint64)[0])
+        generator = torch.Generator().manual_seed(seed)
+        within = torch.rand(n, generator=generator, dtype=torch.float64)
+        shift = torch.rand(1, generator=generator, dtype=torch.float64)
+        places = (torch.randperm(n, generator=generator) + within) / n + shift
+        position = torch.searchsorted(self._cumulative, (places % 1.0) * self._cumulative[-1], right=True)
+        return self._frames[position.clamp_(max=len(self._frames) - 1)]
+
+
+def run_weights(store: EpisodeStore, n_windows: int = 1, n_dropped: int = 0) -> Tensor:
+    """How often to draw the run that ends at each frame, so that all frames are learned from alike.
+
+    Runs that would reach before the episode are not drawn. Only one run holds the first frame, and only one the last, whereas
+    K hold one in the middle: the first and the last run of an episode weigh (K + 1) / 2 to make up for it.
+
+    Args:
+        store: The episodes.
+        n_windows: K, the windows per run.
+        n_dropped: How many of the last frames of every episode no run reaches; an episode no longer is not drawn at all.
+
+    Returns:
+        (N,) float64, 0 for frames at which no run ends.
+    """
+    weights = torch.zeros(len(store), dtype=torch.float64)
+    for start, whole_end in zip(store.starts, store.ends, strict=True):
+        end = whole_end - n_dropped
+        if end <= start:
+            continue
+        k = min(n_windows, end - start)
+        weights[start + k - 1 : end] = 1
+        weights[start + k - 1] += (k - 1) / 2
+        weights[end - 1] += (k - 1) / 2
+    return weights
+
+
+class PolicyWindows:
+    """Cuts the batches a policy trains on out of stores.
+
+    The policy `playbyear` gets its observations only as far back as each is looked at, as bytes and 16-bit sound;
+    other policies get exactly what LeRobot's data loader would give them.
+
+    Args:
+        policy: The policy's configuration, complete with its features.
+        meta: The dataset's metadata; of sound at the rate at which it is to be cut out.
+        rename_map: The dataset's names of observations, with what the policy calls them.
+
+    Attributes:
+        image_size: Height and width at which the policy looks at pictures [pixels]; None: as they are recorded.
+        n_windows: Windows per item that lie in a run of frames, K.
+        n_dropped: How many of the last frames of every episode the policy does not learn from, its `drop_n_last_frames`.
+        action_deltas: Where the actions of an item lie, in frames from its last or, of a chunk, its first one; empty for a
+            policy that learns single actions.
+    """
+
+    def __init__(
+        self, policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
+    ) -> None:
+        self._meta = meta
+        self._as_lerobot = not isinstance(policy, PlaybyearConfig)
+        if isinstance(policy, PlaybyearConfig):
+            names = dataset_names(policy, rename_map)
+            self._deltas = {names[key]: list(range(1 - n, 1)) for key, n in _history(policy).items()}
+            self._deltas[ACTION] = list(policy.action_delta_indices)
+        else:
+            timestamps = resolve_delta_timestamps(policy, meta) or {}
+            self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
+        self.image_size = policy.image_size if isinstance(policy, PlaybyearConfig) else None
+        self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
+        self.n_dropped: int = getattr(policy, "drop_n_last_frames", None) or 0
+        self.action_deltas: list[int] = self._deltas.get(ACTION, [])
+
+    @property
+    def keys(self) -> list[str] | None:
+        """The features that a store has to hold; None means all that it can."""
+        return None if self._as_lerobot else list(self._deltas)
+
+    @property
+    def sample_rates(self) -> dict[str, int]:
+        """The rate at which each microphone is cut out [Hz]; of those alone whose feature says it."""
+        rates = {key: sample_rate_in(self._meta.features[key]) for key in audio_keys(self._meta.features)}
+        return {key: rate for key, rate in rates.items() if rate is not None}
+
+    def check_lengths(self, reader: DatasetReader) -> None:
+        """Refuse a dataset of which no frame would be drawn.
+
+        Raises:
+            ValueError: No episode is longer than what the policy drops of each.
+        """
+        longest = max(map(len, reader.episodes), default=0)
+        if longest <= self.n_dropped:
+            raise ValueError(
+                f"--policy.drop_n_last_frames={self.n_dropped} leaves no frame of '{reader.repo_id}', whose longest "
+                f"episode has {longest}; wanted fewer than that. Give less, or a dataset with longer episodes."
+            )
+
+    def batch(self, store: EpisodeStore, last_frames: Tensor) -> dict[str, Any]:
+        """The training items whose last frames are `last_frames` (B,), on the store's device."""
+        return store.windows(last_frames, self._deltas, as_lerobot=self._as_lerobot)
+
+
+def dataset_names(policy: PreTrainedConfig, rename_map: Mapping[str, str] | None = None) -> dict[str, str]:
+    """What the dataset calls each observation of the policy."""
+    original = {renamed: key for key, renamed in (rename_map or {}).items()}
+    return {key: original.get(key, key) for key in policy.input_features or {}}
+
+
+def _history(policy: PlaybyearConfig) -> dict[str, int]:
+    """How many frames of each observation a training item holds."""
+    return {
+        **dict.fromkeys(policy.camera_keys if policy.use_vision else [], policy.n_image_frames),
+        **dict.fromkeys(audio_keys(policy.input_features or {}) if policy.use_audio else [], policy.n_audio_frames),
+        **dict.fromkeys(policy.low_dimensional_keys, policy.n_run_frames),
+    }
+
+
+def learned_meta(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata) -> LeRobotDatasetMetadata:
+    """The metadata that a policy is made for: sound at the rate at which it is learned from.
+
+    Returns:
+        `meta` itself where nothing of it changes.
+
+    Raises:
+        ValueError: The frame rate does not divide the policy's sample rate.
+    """
+    if not (isinstance(policy, PlaybyearConfig) and policy.use_audio and policy.sample_rate is not None):
+        return meta
+    features = features_at(meta.features, dict.fromkeys(audio_keys(meta.features), policy.sample_rate), meta.fps)
+    changed = [key for key in features if features[key] is not meta.features[key]]
+    if not changed:
+        return meta
+    check_audio_features({key: meta.features[key] for key in changed}, meta.fps)
+    logging.info(f"'{meta.repo_id}': {', '.join(changed)} resampled to {policy.sample_rate} Hz")
+    meta = copy.copy(meta)
+    meta.info = copy.copy(meta.info)
+    meta.info.features = features
+    return meta
+
+
+def first_of_each_task(reader: DatasetReader, n_samples: int) -> Tensor | None:
+    """The frames that `--max_eval_samples` leaves of held-out episodes, as lerobot-train chooses them.
+
+    Args:
+        reader: Of the held-out episodes.
+        n_samples: How many frames, shared evenly by the tasks, at least one of each; 0: all.
+
+    Returns:
+        (N,) bool, the first ones of each task; None where all frames count.
+    """
+    if n_samples <= 0:
+        return None
+    tasks = torch.from_numpy(reader.values("task_index"))
+    kinds = tasks.unique()
+    chosen = torch.zeros(len(tasks), dtype=torch.bool)
+    for kind in kinds:
+        chosen[(tasks == kind).nonzero().squeeze(1)[: max(1, n_samples // len(kinds))]] = True
+    return chosen
+
+
+def runs_of_each_frame(store: EpisodeStore, n_windows: int, chosen: Tensor | None = None) -> Tensor:
+    """The last frames of runs in which every frame lies once; the first run of an episode may be shorter.
+
+    Args:
+        store: The episodes.
+        n_windows: Windows per run, K.
+        chosen: (N,) bool, the frames that count; None: all. A stretch of them that begins within an episode may have up to
+            K - 1 frames before it in its first run.
+    """
+    ends = []
+    for start, end in zip(store.starts, store.ends, strict=True):
+        counts = torch.ones(end - start, dtype=torch.bool) if chosen is None else chosen[start:end]
+        edges = counts.int().diff(prepend=torch.zeros(1, dtype=torch.int), append=torch.zeros(1, dtype=torch.int))
+        stretches = zip((edges > 0).nonzero().squeeze(1), (edges < 0).nonzero().squeeze(1), strict=True)
+        ends += [torch.arange(start + int(last) - 1, start + int(first) - 1, -n_windows) for first, last in stretches]
+    return torch.cat(ends)
+
+
+def prefetched(batches: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+    """The same, made in a thread, two ahead of the one that is learned from.
+
+    Raises:
+        Exception: What making a batch raises, when it is wanted.
+    """
+    pool = ThreadPoolExecutor(1, thread_name_prefix="batches")
+    try:
+        waiting = deque(pool.submit(next, batches) for _ in range(_AHEAD))
+        while True:
+            waiting.append(pool.submit(next, batches))
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def pinned(batch: Mapping[str, Any]) -> dict[str, Any]:
+    """The batch in memory that a GPU reads by itself, so that copying it holds up nothing."""
+    return {key: value.pin_memory() if isinstance(value, Tensor) else value for key, value in batch.items()}

@@ -1,0 +1,523 @@
+"""The store hands out what LeRobot's loader would, from memory as from the disk; and runs are drawn as promised."""
+
+import errno
+import itertools
+import json
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import torch
+from dataset_factory import CAMERA, MICROPHONE, TASK, audio_feature, dataset_features, make_dataset, random_frame
+from disk_forks import IMAGE_SIZE
+from lerobot.datasets import LeRobotDataset
+from torch.utils.data import default_collate
+
+from lerobot_playbyear.datasets import check_dataset_files
+from lerobot_playbyear.datasets.pictures import shrink
+from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
+from lerobot_playbyear.training import EpisodeStore, RunSampler, columns, frame_cache, run_weights
+from lerobot_playbyear.training.frame_cache import CacheError
+
+FPS = 20
+LENGTHS = (12, 17, 9)
+SIZE = 32
+DELTAS = {CAMERA: range(-4, 1), MICROPHONE: range(-20, 1), "observation.state": range(-20, 1), "action": range(-3, 3)}
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["image", "video"])
+def root(request, tmp_path_factory):
+    root = tmp_path_factory.mktemp("data") / "noise"
+    make_dataset(root, LENGTHS, image_size=SIZE, use_videos=request.param)
+    return root
+
+
+def open_stock(root, episodes=None):
+    timestamps = {key: [delta / FPS for delta in deltas] for key, deltas in DELTAS.items()}
+    return LeRobotDataset("tests/noise", root, episodes=episodes, delta_timestamps=timestamps, video_backend="pyav")
+
+
+@pytest.mark.parametrize("episodes", [pytest.param(None, marks=pytest.mark.slow), [0, 2]])
+def test_windows_equal_those_of_lerobot(root, episodes):
+    stock = open_stock(root, episodes)
+    store = EpisodeStore.from_dataset(stock, device="cpu")
+    indices = torch.randint(len(stock), (60,), generator=torch.Generator().manual_seed(0)).tolist()
+
+    expected = default_collate([stock[i] for i in indices])
+    batch = store.windows(indices, DELTAS, as_lerobot=True)
+
+    assert batch.keys() == expected.keys()
+    assert batch.pop("task") == expected.pop("task") == [TASK] * 60
+    for key, values in expected.items():
+        assert batch[key].dtype == values.dtype, key
+        assert torch.equal(batch[key], values), key
+
+
+def test_compact_windows_hold_the_same_as_integers(root):
+    stock = open_stock(root)
+    store = EpisodeStore.from_dataset(stock, device="cpu")
+
+    batch = store.windows([0, 14, 37], DELTAS)
+
+    expected = default_collate([stock[i] for i in (0, 14, 37)])
+    assert batch[CAMERA].dtype == torch.uint8
+    assert batch[MICROPHONE].dtype == torch.int16
+    assert torch.equal(batch[CAMERA].float() / 255, expected[CAMERA])
+    assert torch.equal(batch[MICROPHONE].long(), expected[MICROPHONE])
+    assert torch.equal(batch[f"{CAMERA}_is_pad"], expected[f"{CAMERA}_is_pad"])
+    assert "next.reward" not in batch
+
+
+def test_only_the_keys_asked_for_are_read_and_what_is_not_there_is_named(root):
+    dataset = open_stock(root)
+    store = EpisodeStore.from_dataset(dataset, keys=["action"], device="cpu")
+
+    assert set(store.keys) == {"action", "index", "episode_index", "frame_index", "task_index", "timestamp"}
+    with pytest.raises(ValueError, match=r"holds no 'observation.state'"):
+        store.windows([0], {"observation.state": [0]})
+    with pytest.raises(ValueError, match=r"has no 'observation.audio.table'; it has"):
+        EpisodeStore.from_dataset(dataset, keys=["observation.audio.table"])
+    with pytest.raises(IndexError, match="the store has 38"):
+        store.windows([38], {"action": [0]})
+
+
+def test_appended_episodes_are_as_good_as_read_ones(tmp_path):
+    features = dataset_features(image_size=16)
+    rng = np.random.default_rng(1)
+    episodes = [[{**random_frame(features, rng), "task": task} for _ in range(n)] for n, task in ((5, "a"), (8, "b"))]
+    writer = LeRobotDataset.create("tests/noise", FPS, features, root=tmp_path / "all", use_videos=False)
+    for frames in episodes:
+        for frame in frames:
+            writer.add_frame(dict(frame))
+        writer.save_episode()
+    writer.finalize()
+    whole = LeRobotDataset("tests/noise", tmp_path / "all")
+    expected = EpisodeStore.from_dataset(whole, device="cpu")
+    store = EpisodeStore.from_dataset(LeRobotDataset("tests/noise", tmp_path / "all", episodes=[0]), device="cpu")
+
+    store.append_episode(episodes[1])
+
+    assert (len(store), store.n_episodes, store.starts, store.ends) == (13, 2, [0, 5], [5, 13])
+    for i in range(13):
+        ours, theirs = (s.windows([i], DELTAS, as_lerobot=True) for s in (store, expected))
+        assert ours.pop("task") == theirs.pop("task")
+        assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def test_a_bad_episode_is_refused_and_leaves_the_store_as_it_was(tmp_path):
+    store = EpisodeStore.from_dataset(make_dataset(tmp_path / "noise", (4,), image_size=8), device="cpu")
+    features = dataset_features(image_size=8)
+    good = random_frame(features, np.random.default_rng(0))
+    bad_frames = {
+        "'action' is missing in frame 0": {key: value for key, value in good.items() if key != "action"},
+        "'observation.state' holds NaN": {**good, "observation.state": np.full(7, np.nan, np.float32)},
+        r"'action' has shape \(3,\)": {**good, "action": np.zeros(3, np.float32)},
+        "'observation.images.front' has dtype": {**good, CAMERA: np.zeros((8, 8, 3), np.float32)},
+    }
+
+    for message, frame in bad_frames.items():
+        with pytest.raises(ValueError, match=message):
+            store.append_episode([frame])
+    with pytest.raises(ValueError, match="without frames"):
+        store.append_episode([])
+
+    assert len(store) == 4
+    assert store.n_episodes == 1
+
+
+def test_a_dataset_without_an_episode_is_refused(tmp_path):
+    LeRobotDataset.create("tests/noise", FPS, dataset_features(image_size=8), root=tmp_path / "empty", use_videos=False)
+    with pytest.raises(ValueError, match="is empty: no episode was saved"):
+        check_dataset_files("tests/noise", tmp_path / "empty")
+
+
+# On the disk
+
+
+def load(root, cache, **options):
+    return EpisodeStore.load("tests/noise", root, device="cpu", place="disk", cache=cache, **options)
+
+
+def in_memory(root, **options):
+    return EpisodeStore.load("tests/noise", root, device="cpu", **options)
+
+
+def assert_same(store, other):
+    assert store.keys == other.keys
+    for key in store.keys:
+        assert torch.equal(store.column(key), other.column(key)), key
+
+
+def folders(cache):
+    return sorted(path for path in cache.iterdir() if path.is_dir())
+
+
+@pytest.fixture
+def decoded(monkeypatch):
+    """The columns that are decoded from now on; a test may put what happens to one under its name."""
+    pieces, seen = columns._pieces, {}
+
+    def counted(*args):
+        key = args[-1]
+        then = seen.get(key)
+        seen[key] = None
+        yield from pieces(*args)
+        if then is not None:
+            raise then
+
+    monkeypatch.setattr(columns, "_pieces", counted)
+    return seen
+
+
+@pytest.mark.parametrize("image_size", [None, 24])
+def test_the_disk_holds_what_memory_would_and_a_second_run_decodes_nothing(root, tmp_path, decoded, image_size):
+    expected = in_memory(root, image_size=image_size)
+    assert_same(load(root, tmp_path, image_size=image_size), expected)
+    decoded.clear()
+    assert_same(load(root, tmp_path, image_size=image_size), expected)
+    assert load(root, tmp_path, image_size=image_size).column(CAMERA).shape[-1] == (image_size or SIZE)
+    assert not decoded
+    assert_same(load(root, tmp_path, episodes=[0, 2]), in_memory(root, episodes=[0, 2]))
+    assert len(folders(tmp_path)) == 2
+
+
+def test_shrunk_pictures_are_those_that_the_policy_makes_and_augments(root, tmp_path):
+    recorded = in_memory(root).column(CAMERA).float() / 255
+    kept = load(root, tmp_path, image_size=24).column(CAMERA).float() / 255
+    seen = resize(recorded.unsqueeze(1), 24).squeeze(1)
+    assert (seen - kept).abs().max() <= 1.01 / 255
+    assert (seen - kept).abs().mean() <= 0.4 / 255  # rounding along rows, and along columns
+    assert (seen - kept).mean().abs() <= 0.25 / 255  # torch rounds down a little
+    large = torch.rand(2, 3, 3, 60, 80).mul(255).byte()
+    small = torch.from_numpy(np.stack([shrink(run.numpy(), 24) for run in large]))
+    augment = Augmentation(PlaybyearConfig(augmentation_brightness=0.3, augmentation_hue=0.1, augmentation_scale=0.1))
+    torch.manual_seed(0)
+    expected = augment(large.float() / 255, 24)
+    torch.manual_seed(0)
+    assert (augment(small.float() / 255, 24, (60, 80)) - expected).abs().max() < 2 / 255
+
+
+def test_a_dataset_that_changed_is_another_one_even_if_its_times_and_sizes_say_otherwise(root, tmp_path):
+    copy, cache = tmp_path / "copy", tmp_path / "cache"
+    shutil.copytree(root, copy)
+    for number, path in enumerate([*copy.glob("data/*/*.parquet"), *copy.glob("videos/*/*/*.mp4")], 1):
+        load(copy, cache)
+        assert len(folders(cache)) == number
+        details, content = path.stat(), path.read_bytes()
+        path.write_bytes(content)
+        os.utime(path, ns=(details.st_atime_ns, details.st_mtime_ns))
+        assert path.stat().st_mtime_ns == details.st_mtime_ns
+    load(copy, cache)
+    assert len(folders(cache)) == number + 1
+
+
+@pytest.mark.parametrize("n_kills", [5, pytest.param(10, marks=pytest.mark.slow)])
+def test_a_store_that_was_killed_at_random_times_is_whole(tmp_path, n_kills):
+    root = tmp_path / "noise"
+    make_dataset(root, (60, 90, 40), image_size=96, use_videos=True, sample_rate=2000)
+    command = [
+        sys.executable,
+        str(Path(__file__).with_name("disk_forks.py")),
+        str(root),
+        str(tmp_path / "cache"),
+        str(n_kills),
+        "0",
+    ]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert process.returncode == 0, process.stderr
+    answer = json.loads(process.stdout.splitlines()[-1])
+    assert answer["wrong"] == []
+    assert answer["frames"] == 190
+    assert answer["finished_early"] < n_kills, "no kill hit"
+    assert not list((tmp_path / "cache").glob("*/*.part"))
+
+
+def test_a_column_that_was_cut_off_is_decoded_again_and_the_others_stay(root, tmp_path, decoded):
+    decoded[CAMERA] = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        load(root, tmp_path)
+    decoded.clear()
+    assert_same(load(root, tmp_path), in_memory(root))
+    assert CAMERA in decoded
+
+
+@pytest.fixture
+def with_nan(tmp_path):
+    """A dataset whose sound, as floats, and state hold one NaN in the fourth row."""
+    features = dataset_features(image_size=SIZE)
+    features[MICROPHONE]["dtype"] = "float32"
+    make_dataset(tmp_path / "noise", LENGTHS, features=features)
+    (path,) = (tmp_path / "noise").glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    for key in (MICROPHONE, "observation.state"):
+        field = table.schema.field(key)
+        values = np.array(table[key].to_pylist(), np.float32)
+        values[3, 2] = np.nan
+        table = table.set_column(table.column_names.index(key), field, pa.array(values.tolist(), field.type))
+    pq.write_table(table, path)
+    return tmp_path / "noise"
+
+
+@pytest.mark.parametrize("options", [{}, {"place": "disk"}, {"place": "disk", "sample_rates": {MICROPHONE: 8000}}])
+def test_nan_is_refused_by_every_run_with_the_episode_that_holds_it(with_nan, tmp_path, options):
+    options = {**options, "cache": tmp_path / "cache"} if options else {}
+    for key in (MICROPHONE,) if "sample_rates" in options else (MICROPHONE, "observation.state"):
+        for _ in range(2):
+            with pytest.raises(ValueError, match=rf"'{key}' holds NaN .* of 3 episodes \(0\)"):
+                in_memory(with_nan, keys=[key], **options)
+
+
+@pytest.mark.parametrize("damage", ["shortened", "removed"])
+def test_a_column_that_was_damaged_since_is_made_anew(root, tmp_path, caplog, damage):
+    load(root, tmp_path)
+    victim = folders(tmp_path)[0] / "0.npy"
+    content = victim.read_bytes()[:-20]
+    victim.unlink()
+    if damage == "shortened":
+        victim.write_bytes(content)
+    with caplog.at_level(logging.WARNING):
+        assert_same(load(root, tmp_path), in_memory(root))
+    assert ("made anew" in caplog.text) is (damage == "shortened")
+
+
+def test_two_at_once_make_one_and_share_it(root, tmp_path, monkeypatch):
+    made, original = [], frame_cache._write_column
+    monkeypatch.setattr(frame_cache, "_write_column", lambda *args: (made.append(args[1]), original(*args)))
+    stores = []
+    threads = [threading.Thread(target=lambda: stores.append(load(root, tmp_path))) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == len(set(made)) > 0
+    assert_same(stores[0], stores[1])
+
+
+def test_too_little_room_is_told_before_anything_is_decoded(root, tmp_path, monkeypatch, decoded):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1000))
+    with pytest.raises(CacheError, match=r"need .* GiB on the disk of .*--store\.cache"):
+        load(root, tmp_path)
+    assert not decoded
+
+
+def test_a_disk_that_fills_up_costs_no_column_that_was_complete(root, tmp_path, monkeypatch):
+    fsync, calls = os.fsync, itertools.count()
+
+    def full(descriptor):
+        if next(calls) == 6:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(CacheError, match="became full"):
+            load(root, tmp_path)
+    assert list(folders(tmp_path)[0].glob("*.npy"))
+    assert_same(load(root, tmp_path), in_memory(root))
+
+
+def test_a_folder_that_cannot_be_written_is_named_and_a_dataset_that_cannot_be_read_is_no_fault_of_it(
+    root, tmp_path, decoded
+):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(CacheError, match=r"file.*--store\.cache"):
+        load(root, tmp_path / "file")
+    decoded[CAMERA] = OSError(errno.EIO, os.strerror(errno.EIO), str(root / "videos" / "file.mp4"))
+    with pytest.raises(OSError, match=r"Input/output error.*file\.mp4") as raised:
+        load(root, tmp_path / "cache")
+    assert not isinstance(raised.value, CacheError)
+    assert_same(load(root, tmp_path / "cache"), in_memory(root))
+
+
+def test_auto_takes_memory_while_the_frames_fit(root, monkeypatch):
+    reader = DatasetReader("tests/noise", root)
+    assert columns.choose_place("auto", reader) == "memory"
+    monkeypatch.setattr(columns, "available_memory", lambda: 100_000)
+    assert columns.choose_place("auto", reader) == "disk"
+    assert columns.choose_place("memory", reader) == "memory"
+    with pytest.raises(ValueError, match="--store=tape is not known: wanted one of memory, disk, auto"):
+        columns.choose_place("tape", reader)
+
+
+def test_appended_pictures_are_shrunk_like_those_of_the_disk(tmp_path):
+    dataset = make_dataset(tmp_path / "noise", (6,), image_size=SIZE)
+    disk = load(tmp_path / "noise", tmp_path / "cache", image_size=IMAGE_SIZE)
+    own = in_memory(tmp_path / "noise", image_size=IMAGE_SIZE)
+    features = {key: dataset.features[key] for key in dataset.features if key in own.keys and "index" not in key}
+    features.pop("timestamp")
+    frame = random_frame(features, np.random.default_rng(1))
+    own.append_episode([frame, frame])
+    assert own.column(CAMERA).shape == (8, 3, IMAGE_SIZE, IMAGE_SIZE)
+    expected = shrink(frame[CAMERA].transpose(2, 0, 1)[None], IMAGE_SIZE)
+    assert np.array_equal(own.column(CAMERA)[-1].numpy(), expected[0])
+    assert torch.equal(own.column(CAMERA)[:6], disk.column(CAMERA))
+
+
+# Sound at another rate
+
+RATE_LENGTHS = (7, 12)
+HERTZ = (440.0, 1330.0)  # an episode each, so that what leaks into its neighbour is seen
+LEVEL = 0.4
+REACH = 80  # samples at 16 kHz that the resampler's filter sees
+
+
+def tone(rate: int, episode: int, hertz=HERTZ) -> np.ndarray:
+    """(n,) in [-1, 1], cut off where it is loud."""
+    time = np.arange(RATE_LENGTHS[episode] * rate // FPS) / rate
+    return LEVEL * np.cos(2 * np.pi * hertz[episode] * time + 0.3)
+
+
+def write(root, rate: int, dtype: str = "int16", hertz=HERTZ, level: float = 1.0) -> LeRobotDataset:
+    features = {
+        MICROPHONE: {**audio_feature(rate, FPS), "dtype": dtype},
+        "observation.state": {"dtype": "float32", "shape": (2,), "names": None},
+        "action": {"dtype": "float32", "shape": (2,), "names": None},
+    }
+    dataset = LeRobotDataset.create("tests/tones", FPS, features, root=root, use_videos=False)
+    for episode, length in enumerate(RATE_LENGTHS):
+        samples = (level * tone(rate, episode, hertz)).clip(-1, 32767 / 32768).reshape(length, -1)
+        samples = np.round(samples * 32768).astype(np.int16) if dtype == "int16" else samples.astype(dtype)
+        for i, block in enumerate(samples):
+            low = np.full(2, i, np.float32)
+            dataset.add_frame({MICROPHONE: block, "observation.state": low, "action": low, "task": TASK})
+        dataset.save_episode()
+    dataset.finalize()
+    return LeRobotDataset("tests/tones", root=root)
+
+
+@pytest.fixture(scope="module")
+def tones(tmp_path_factory) -> dict[int, LeRobotDataset]:
+    folder = tmp_path_factory.mktemp("tones")
+    return {rate: write(folder / str(rate), rate) for rate in (16000, 44100, 48000)}
+
+
+def at(dataset, rate=None, **options) -> EpisodeStore:
+    rates = None if rate is None else {MICROPHONE: rate}
+    return EpisodeStore.from_dataset(dataset, device="cpu", sample_rates=rates, **options)
+
+
+@pytest.mark.parametrize(("recorded", "wanted"), [(48000, 16000), (16000, 48000), (44100, 16000)])
+def test_windows_are_those_that_the_other_rate_would_have_recorded(tones, recorded, wanted):
+    deltas = {MICROPHONE: range(-30, 1), "observation.state": [0]}
+    last = [0, 3, 6, 7, 12, 18]  # first, middle and last frame of both episodes
+    store = at(tones[recorded], wanted)
+    batch, expected = store.windows(last, deltas), at(tones[wanted]).windows(last, deltas)
+
+    assert batch[MICROPHONE].dtype == torch.int16
+    assert torch.equal(batch[f"{MICROPHONE}_is_pad"], expected[f"{MICROPHONE}_is_pad"])
+    assert torch.equal(batch["observation.state"], expected["observation.state"])
+    wrong = (batch[MICROPHONE].int() - expected[MICROPHONE].int()).abs()
+    if wanted > recorded:  # an episode's last sample stands for more than one, which nobody heard
+        wrong = wrong[..., : 1 - wanted // recorded]
+    assert wrong.max() <= 0.02 * LEVEL * 32768
+    for episode, (start, end) in enumerate(zip(store.starts, store.ends, strict=True)):
+        wrong = store.column(MICROPHONE)[start:end].reshape(-1).numpy() - tone(wanted, episode) * 32768
+        edge = REACH * wanted // 16000
+        assert np.abs(wrong[edge:-edge]).max() <= 3  # only edges differ by more than rounding
+
+
+def test_what_the_lower_rate_cannot_hold_is_gone_and_not_folded_back(tmp_path):
+    sound = at(write(tmp_path / "high", 48000, hertz=(9000.0, 12000.0)), 16000).column(MICROPHONE)[1:6].float()
+    assert sound.square().mean().sqrt() < 0.01 * LEVEL * 32768
+
+
+def test_sound_at_full_scale_is_cut_off_and_does_not_turn_over(tmp_path):
+    sound = at(write(tmp_path / "loud", 48000, hertz=(100.0, 100.0), level=50.0), 16000).column(MICROPHONE)
+    assert (sound.max(), sound.min()) == (32767, -32768)  # a band-limited square reaches further than the square
+    square = np.sign(np.concatenate([tone(16000, episode, (100.0, 100.0)) for episode in (0, 1)]))
+    assert (np.sign(sound.reshape(-1).numpy()) == square).mean() > 0.95
+
+
+def test_floats_stay_floats_and_the_disk_has_a_folder_for_each_rate(tones, tmp_path):
+    store = at(write(tmp_path / "floats", 48000, "float32"), 16000)
+    assert store.column(MICROPHONE).dtype == torch.float32
+    assert np.abs(store.column(MICROPHONE)[:7].reshape(-1).numpy() - tone(16000, 0)).max() < 0.01 * LEVEL
+    for number, rate in enumerate((48000, 16000, 8000), 1):
+        kept = at(tones[48000], rate, place="disk", cache=tmp_path / "cache")
+        assert torch.equal(kept.column(MICROPHONE), at(tones[48000], rate).column(MICROPHONE))
+        assert len(folders(tmp_path / "cache")) == number
+    with pytest.raises(ValueError, match=r"sample_rate / fps = 16001 / 20"):
+        at(tones[48000], 16001)
+
+
+# What is drawn
+
+
+def make_store(*lengths):
+    """A store of frames that are nothing but their number."""
+    ends = np.cumsum(lengths).tolist()
+    return EpisodeStore({"action": torch.arange(ends[-1]).float()[:, None]}, [0, *ends[:-1]], ends, FPS)
+
+
+def coverage(store, weights, n_windows, n_draws=200, batch_size=64):
+    """How often each frame is learned from, relative to the mean."""
+    sampler = RunSampler(weights, seed=0)
+    counts = torch.zeros(len(store))
+    for number in range(n_draws):
+        last = sampler.draw(batch_size, number)
+        for delta in range(n_windows):
+            counts.index_add_(0, last - delta, torch.ones(batch_size))
+    return counts / counts.mean()
+
+
+def test_single_windows_are_drawn_evenly():
+    store = make_store(30, 50)
+
+    assert torch.allclose(coverage(store, run_weights(store), 1), torch.ones(80), atol=0.3)
+
+
+@pytest.mark.parametrize("n_windows", [4, 8])
+def test_runs_neglect_neither_the_first_nor_the_last_frames(n_windows):
+    store = make_store(60, 40)
+
+    covered = coverage(store, run_weights(store, n_windows), n_windows)
+
+    for edge in (covered[:n_windows], covered[60 : 60 + n_windows], covered[60 - n_windows : 60], covered[-n_windows:]):
+        assert 0.8 < edge.mean() < 1.2
+        assert edge.min() > 0.4
+
+
+def test_runs_never_reach_out_of_their_episode_unless_it_is_shorter():
+    weights = run_weights(make_store(10, 3), 4)
+
+    assert weights[:3].eq(0).all()
+    assert weights[3:10].gt(0).all()
+    assert weights[10:].tolist() == [0, 0, 3]
+    assert weights.sum() == 13
+
+
+def test_the_last_frames_of_episodes_are_left_out_and_the_others_learned_from_evenly():
+    store = make_store(60, 3, 40)
+
+    weights = run_weights(store, 4, n_dropped=7)
+    covered = coverage(store, weights, 4)
+
+    assert weights[53:63].eq(0).all()
+    assert weights[96:].eq(0).all()
+    assert covered[53:63].eq(0).all()
+    assert torch.equal(weights[:53], run_weights(make_store(53), 4))
+
+
+def test_a_batch_comes_from_as_many_episodes_as_possible_and_depends_on_its_number_alone():
+    weights = run_weights(make_store(*[20] * 8))
+    first, again = RunSampler(weights, seed=3), RunSampler(weights, seed=3)
+    assert len((first.draw(16, 0) // 20).unique()) == 8
+    assert torch.equal(first.draw(8, 4), again.draw(8, 4))
+    assert not torch.equal(first.draw(8, 4), again.draw(8, 5))
+
+
+@pytest.mark.parametrize("weights", [torch.zeros(3), torch.tensor([1.0, -1.0]), torch.tensor([1.0, float("nan")])])
+def test_impossible_weights_are_refused(weights):
+    with pytest.raises(ValueError, match="not all of them 0"):
+        RunSampler(weights)
