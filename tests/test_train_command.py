@@ -23,7 +23,7 @@ from torch.utils.data import default_collate
 from lerobot_playbyear.datasets import EpisodeStore
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.scripts import train as train_script
+from lerobot_playbyear.scripts.commands import train as train_script
 from lerobot_playbyear.training import loop
 from lerobot_playbyear.training.command_line import with_long_store
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
@@ -204,7 +204,7 @@ def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(
         f"--output_dir={tmp_path / 'out'}",
     )
 
-    command(train_script.main, f"--policy.path={policy}", *data(root), *options)
+    command(train_script, f"--policy.path={policy}", *data(root), *options)
 
     tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (tuned["image_size"], tuned["vision_width"]) == (32, 8)
@@ -399,13 +399,13 @@ def test_an_output_that_cannot_be_made_is_told_before_the_dataset_is_read(name, 
     monkeypatch.setattr(loop, "read_store", lambda *_: pytest.fail("the dataset was read"))
 
     with pytest.raises(SystemExit, match=r"^error: --output_dir=.*/run cannot be written: (Perm|Not a dir).* wanted"):
-        command(train_script.main, *TINY, *data(root), f"--output_dir={tmp_path / name}")
+        command(train_script, *TINY, *data(root), f"--output_dir={tmp_path / name}")
     assert list((tmp_path / "blocked").iterdir()) == []
 
 
 def test_the_command_says_in_one_line_what_is_wrong(command):
     with pytest.raises(SystemExit, match=r"^error: --preset=tpu is not known. The presets are: cpu .*; paper "):
-        command(train_script.main, "--preset=tpu", "--dataset.repo_id=tests/noise")
+        command(train_script, "--preset=tpu", "--dataset.repo_id=tests/noise")
 
 
 def test_a_preset_gives_way_to_the_command_line():
@@ -450,7 +450,7 @@ def test_presets_are_options_that_exist(name, command, monkeypatch, root):
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
 
     with pytest.raises(ZeroDivisionError):
-        command(train_script.main, f"--preset={name}", *data(root))
+        command(train_script, f"--preset={name}", *data(root))
 
     assert seen[0].policy.type == "playbyear"
     assert seen[0].steps == int(preset_options(name)["steps"])
@@ -464,7 +464,7 @@ def test_a_preset_is_a_configuration_file_as_well(name, command, monkeypatch, ro
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
     for options in ((f"--preset={name}", "--policy.use_amp=false"), (f"--config_path={RECIPES / name}.json",)):
         with pytest.raises(ZeroDivisionError):
-            command(train_script.main, *options, *data(root))
+            command(train_script, *options, *data(root))
     by_name, by_file = seen
     assert by_name.preset == name
     by_name.preset = None
@@ -480,15 +480,15 @@ def test_where_frames_are_kept_has_a_short_name(given):
 def test_a_run_from_the_disk_resumes_from_there_and_sees_shrunk_pictures(tmp_path, command):
     make_dataset(tmp_path / "data", (12, 17), image_size=48)
     options = (*TINY, *data(tmp_path / "data"), "--store=disk", f"--store.cache={tmp_path / 'cache'}")
-    command(train_script.main, *options, "--steps=2", f"--output_dir={tmp_path / 'out'}")
+    command(train_script, *options, "--steps=2", f"--output_dir={tmp_path / 'out'}")
     (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.is_dir())
     assert np.load(folder / "0.npy", mmap_mode="r").shape == (29, 3, 32, 32)
     last = tmp_path / "out" / "checkpoints" / "last"
-    command(train_script.main, "--resume=true", f"--config_path={config_of(last)}", "--steps=3")
+    command(train_script, "--resume=true", f"--config_path={config_of(last)}", "--steps=3")
     assert step_of(last.resolve()) == 3
     assert [path for path in (tmp_path / "cache").iterdir() if path.is_dir()] == [folder]
 
 
 def test_a_place_that_does_not_exist_is_named(command, root, tmp_path):
     with pytest.raises(SystemExit, match="--store=tape is not known: wanted one of memory, disk, auto"):
-        command(train_script.main, *TINY, *data(root), "--store=tape", f"--output_dir={tmp_path / 'out'}")
+        command(train_script, *TINY, *data(root), "--store=tape", f"--output_dir={tmp_path / 'out'}")
