@@ -152,6 +152,11 @@ def hub() -> Iterator[dict[str, str]]:
         yield server.environment()
 
 
+def program(command: str) -> tuple[str, ...]:
+    """Starts a command of ours, also where it is not installed."""
+    return sys.executable, "-c", f"from lerobot_playbyear.scripts.commands import {command}; {command}()"
+
+
 def long_episode(folder: Path, minutes: int, limit: int, only: list[str]) -> list[Row]:
     """Makes the episode where it is not there, and measures the commands."""
     if not (folder / "0.wav").is_file():
@@ -159,11 +164,8 @@ def long_episode(folder: Path, minutes: int, limit: int, only: list[str]) -> lis
     with hub() as environment:
         home = {**environment, "HF_HOME": str(folder / "home")}
         commands = {name: COMMANDS[name](folder) for name in only}
-        module = (sys.executable, "-m")
         return [
-            measure(
-                f"{name}, {minutes} minutes", [*module, f"lerobot_playbyear.scripts.{command}", *options], limit, home
-            )
+            measure(f"{name}, {minutes} minutes", [*program(command), *options], limit, home)
             for name, (command, *options) in commands.items()
         ]
 
@@ -180,7 +182,7 @@ def store(folder: Path, limit: int) -> list[Row]:
     for made in ("store", "train"):
         shutil.rmtree(folder / made, ignore_errors=True)
     train = [
-        *(sys.executable, "-m", "lerobot_playbyear.scripts.train", "--policy.type=playbyear", "--policy.device=cpu"),
+        *(*program("train"), "--policy.type=playbyear", "--policy.device=cpu"),
         *(f"--policy.fps={FPS}", "--policy.image_size=224", "--policy.vision_width=16", "--policy.push_to_hub=false"),
         *(*_named("dataset", root), "--store=disk", f"--store.cache={folder / 'store'}", "--batch_size=1"),
     ]

@@ -20,7 +20,7 @@ from lerobot.envs import EnvConfig
 
 from lerobot_playbyear.dagger import Expert, ExpertConfig
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
-from lerobot_playbyear.scripts import dagger, train
+from lerobot_playbyear.scripts.commands import dagger, train
 
 
 def push(velocity: float) -> np.ndarray:
@@ -116,7 +116,7 @@ def main() -> None:
 
     new = f"--policy.type=playbyear --policy.device=cpu --policy.push_to_hub=false --output_dir={folder / 'train'}".split()
     sys.argv[1:] = [*new, *small, *demos, f"--steps={args.steps}", "--batch_size=8"]
-    train.main()
+    train()
 
     sys.argv[1:] = [
         f"--policy.path={folder / 'train/checkpoints/last/pretrained_model'}",
@@ -133,7 +133,7 @@ def main() -> None:
         "--eval.n_episodes=10",
         f"--output_dir={folder / 'dagger'}",
     ]
-    dagger.main()
+    dagger()
 
 
 if __name__ == "__main__":

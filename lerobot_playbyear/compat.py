@@ -177,8 +177,3 @@ def look_for_cards_again(sounddevice: "ModuleType") -> None:
     """Lets PortAudio see what was plugged in since its first look. It closes all streams."""
     sounddevice._terminate()
     sounddevice._initialize()
-
-
-def stream_kind(sounddevice: "ModuleType") -> type:
-    """What all streams of the package sounddevice are."""
-    return sounddevice._StreamBase

@@ -48,7 +48,7 @@ def noise(shared) -> Path:
 @pytest.fixture(scope="session")
 def recorded(shared) -> Path:
     """A dataset of two episodes of the expert in `ENV`. Copy it to change it."""
-    from lerobot_playbyear.scripts.record import main
+    from lerobot_playbyear.scripts.commands import record as main
 
     def record(root: Path) -> None:
         data = ("--dataset.repo_id=tests/demos", f"--dataset.root={root}", "--dataset.num_episodes=2")
@@ -60,7 +60,7 @@ def recorded(shared) -> Path:
 @pytest.fixture(scope="session")
 def trained(recorded, shared) -> Path:
     """A checkpoint, `pretrained_model`, of the policy `TINY` after two updates on `recorded`: it does nothing well."""
-    from lerobot_playbyear.scripts.train import main
+    from lerobot_playbyear.scripts.commands import train as main
 
     def train(folder: Path) -> None:
         data = ("--dataset.repo_id=tests/demos", f"--dataset.root={recorded}")

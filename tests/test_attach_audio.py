@@ -172,13 +172,13 @@ def test_lerobot_trains_on_it(silent, tmp_path):
     files = write_sounds(tmp_path / "sound")
     places = [f"--dataset.repo_id=test/silent --dataset.root={silent}", "--output.repo_id=test/heard"]
     attach = [
-        "lerobot_playbyear.scripts.attach_audio",
+        "from lerobot_playbyear.scripts.commands import attach_audio; attach_audio()",
         *" ".join(places).split(),
         f"--output.root={tmp_path / 'heard'}",
     ]
     run(*attach, f"--files={files}", "--microphone=gripper", f"--offset={OFFSET}")
     run(
-        "lerobot.scripts.lerobot_train",
+        "from lerobot.scripts.lerobot_train import main; main()",
         ["--policy.type=playbyear", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.image_size=32"],
         ["--policy.vision_width=4", "--dataset.repo_id=test/heard", "--batch_size=2", "--steps=2", "--num_workers=0"],
         f"--dataset.root={tmp_path / 'heard'}",
@@ -188,7 +188,7 @@ def test_lerobot_trains_on_it(silent, tmp_path):
     assert KEY in config["input_features"]
 
 
-def run(module: str, *arguments: str | list[str]) -> None:
+def run(program: str, *arguments: str | list[str]) -> None:
     flat = [part for argument in arguments for part in ([argument] if isinstance(argument, str) else argument)]
-    result = subprocess.run([sys.executable, "-m", module, *flat], capture_output=True, text=True, check=False)
+    result = subprocess.run([sys.executable, "-c", program, *flat], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr[-3000:]

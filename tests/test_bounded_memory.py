@@ -17,7 +17,7 @@ from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot.datasets.video_utils import decode_video_frames
 from PIL import Image
 
-from lerobot_playbyear.training.columns import available_memory
+from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.datasets.pictures import video_pictures
 from lerobot_playbyear.datasets.reader import DatasetReader

@@ -21,7 +21,7 @@ from lerobot_playbyear.dagger.run_folder import RunFolder
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes import frames, saving
-from lerobot_playbyear.scripts import dagger as dagger_script
+from lerobot_playbyear.scripts.commands import dagger as dagger_script
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -138,7 +138,7 @@ def test_nothing_to_do_is_said(finished, tmp_path):
 def test_the_command_says_in_one_line_what_is_wrong(finished, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(finished, *QUICK)])
     with pytest.raises(SystemExit, match=r"^error: --output_dir=.* holds a run already"):
-        dagger_script.main()
+        dagger_script()
 
 
 def test_a_fault_of_the_program_shows_where_it_happened(monkeypatch, tmp_path):
@@ -148,7 +148,7 @@ def test_a_fault_of_the_program_shows_where_it_happened(monkeypatch, tmp_path):
     monkeypatch.setattr(loop, "play", play)
     monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(tmp_path, *QUICK)])
     with pytest.raises(ValueError, match=r"^a fault$") as error:
-        dagger_script.main()
+        dagger_script()
     assert not isinstance(error.value, PlaybyearError)
 
 
@@ -161,7 +161,7 @@ def test_an_environment_that_breaks_its_word_in_the_middle_is_told_in_one_line(m
     monkeypatch.setattr(saving, "episode_frames", episode_frames)
     monkeypatch.setattr(sys, "argv", ["playbyear-dagger", *arguments(tmp_path, *QUICK)])
     with pytest.raises(SystemExit, match=r"^error: .*observation\.state"):
-        dagger_script.main()
+        dagger_script()
 
 
 # Recorded corrections

@@ -52,9 +52,9 @@ COMMANDS = """
 train | --bach_size=3 | --bach_size is no option; did you mean --batch_size?
 train | --datset.root=x | did you mean --dataset.root?
 train | --policy.image_sise=3 | did you mean --policy.image_size?
-train | --steps=many | --steps=many: wanted a whole number
-train | --dataset.eval_split=long | --dataset.eval_split=long: wanted a number
-train | --resume=perhaps | --resume=perhaps: wanted true or false
+train | --steps=many | steps | 'many' into an int
+train | --dataset.eval_split=long | eval_split | 'long' into a float
+train | --resume=perhaps | resume | 'perhaps' into a bool
 train | --steps | --steps needs a value
 train | cpu | 'cpu' is no option
 train | -dataset.repo_id | --dataset.repo_id is needed

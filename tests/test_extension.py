@@ -22,7 +22,7 @@ from lerobot_playbyear.dagger import ExpertConfig
 from lerobot_playbyear.policy.extension import register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.processor_playbyear import make_playbyear_pre_post_processors
-from lerobot_playbyear.scripts import train
+from lerobot_playbyear.scripts.commands import train
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "extension"
 THEIRS = {"audio_encoder": "spectrogram_gru", "audio_steps": ("remove_offset",)}
@@ -53,11 +53,13 @@ def dataset(tmp_path_factory) -> Path:
 def call(command, *arguments: str | Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
-        command.main()
+        command()
 
 
 @pytest.mark.parametrize(
-    "command", [train, pytest.param(lerobot_train, marks=pytest.mark.slow)], ids=["playbyear-train", "lerobot-train"]
+    "command",
+    [train, pytest.param(lerobot_train.main, marks=pytest.mark.slow)],
+    ids=["playbyear-train", "lerobot-train"],
 )
 def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, dataset, tmp_path):
     call(
@@ -86,7 +88,7 @@ def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, dat
     steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
     assert [step["registry_name"] for step in steps][-2:] == ["remove_offset", "normalizer_processor"]
     call(
-        lerobot_eval,
+        lerobot_eval.main,
         f"--policy.path={checkpoint}",
         "--env.type=playbyear",
         "--env.task=OccludedGrasp-v1",

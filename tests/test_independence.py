@@ -25,9 +25,9 @@ for package in (lerobot_playbyear, lerobot_policy_playbyear):
         print(module.name)
 """
     imported = run_without({"mujoco", "gym_playbyear", "lerobot_env_playbyear"}, code).split()
-    assert {"lerobot_playbyear.recording.record", "lerobot_playbyear.scripts.record"} <= set(imported)
+    assert {"lerobot_playbyear.recording.record", "lerobot_playbyear.scripts.commands"} <= set(imported)
 
 
 def test_what_a_rollout_worker_imports_needs_neither_lerobot_nor_torch():
     """Otherwise each worker takes half a minute to start on a slow machine."""
-    run_without({"torch", "lerobot"}, "import lerobot_playbyear.episodes.pool, lerobot_playbyear.scripts.record")
+    run_without({"torch", "lerobot"}, "import lerobot_playbyear.episodes.pool, lerobot_playbyear.scripts.commands")

@@ -21,7 +21,7 @@ from lerobot_playbyear.inspection import Finding, InspectionError
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.motion import sudden_sounds
 from lerobot_playbyear.inspection.sound import flat_tops, gaps, repeats
-from lerobot_playbyear.scripts.inspect import main
+from lerobot_playbyear.scripts.commands import inspect as main
 
 FPS, SAMPLE_RATE, SIZE = 20, 16000, 32
 BLOCK = SAMPLE_RATE // FPS

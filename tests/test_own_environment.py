@@ -11,7 +11,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts import lerobot_eval
 
 from lerobot_playbyear.policy.processor_playbyear import Pcm16ToFloatProcessorStep
-from lerobot_playbyear.scripts import record, train
+from lerobot_playbyear.scripts.commands import record, train
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 ENV = ["--env.discover_packages_path=gym_knock", "--env.type=knock"]
@@ -20,7 +20,7 @@ ENV = ["--env.discover_packages_path=gym_knock", "--env.type=knock"]
 def call(command, *arguments: str | Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
-        command.main()
+        command()
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def trained(tmp_path_factory) -> Path:
 
 def test_lerobot_eval_takes_an_environment_of_ones_own_with_int16_sound(trained):
     call(
-        lerobot_eval,
+        lerobot_eval.main,
         f"--policy.path={trained / 'train/checkpoints/last/pretrained_model'}",
         *ENV,
         "--eval.n_episodes=1",

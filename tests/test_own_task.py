@@ -21,7 +21,7 @@ from gym_playbyear.registry import PluginError, make_definition
 from gym_playbyear.sound.materials import material
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.recording.record import RecordConfig
-from lerobot_playbyear.scripts import record, train
+from lerobot_playbyear.scripts.commands import record, train
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "own_task"
 BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
@@ -71,7 +71,7 @@ def installed(tmp_path_factory):
 def call(command, *arguments: str | Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
-        command.main()
+        command()
 
 
 def test_the_example_is_short():
@@ -155,7 +155,7 @@ def test_lerobot_records_trains_and_evaluates_it_without_a_change_here(tmp_path)
         f"--output_dir={tmp_path / 't'}",
     )
     call(
-        lerobot_eval,
+        lerobot_eval.main,
         f"--policy.path={tmp_path / 't/checkpoints/last/pretrained_model'}",
         *ENV,
         "--env.episode_length=5",

@@ -235,7 +235,8 @@ def test_an_environment_that_breaks_its_word_in_the_middle_is_an_error_of_input(
 
 @pytest.mark.slow
 def test_the_command_prints_one_line_for_an_unknown_task(tmp_path):
-    command = [sys.executable, "-m", "lerobot_playbyear.scripts.record", "--env.type=playbyear", "--env.task=Nope-v0"]
+    program = "from lerobot_playbyear.scripts.commands import record; record()"
+    command = [sys.executable, "-c", program, "--env.type=playbyear", "--env.task=Nope-v0"]
     command += ["--dataset.repo_id=a/b", f"--dataset.root={tmp_path}"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode != 0

@@ -38,7 +38,7 @@ from lerobot_playbyear.datasets.journal import lock_dataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.repair import RepairReport, repair_dataset
-from lerobot_playbyear.scripts import repair as repair_command
+from lerobot_playbyear.scripts.commands import repair as repair_command
 
 N_EPISODES = 6
 EPISODES, TASKS_TABLE = "meta/episodes/chunk-000/file-000.parquet", "meta/tasks.parquet"
@@ -483,7 +483,7 @@ def command(*arguments: str) -> int | str | None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["playbyear-repair", *arguments])
         with pytest.raises(SystemExit) as end:
-            repair_command.main()
+            repair_command()
     return end.value.code
 
 

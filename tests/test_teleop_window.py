@@ -176,7 +176,8 @@ def person_corrects(screen, process, log):
 def test_playbyear_dagger_learns_from_a_person_at_lerobots_keyboard(screen, tmp_path):
     kind = "keyboard_ee" if find_spec("pynput") else "keyboard_window"
     options = ("--expert.type=teleop", f"--expert.teleop.type={kind}", "--episodes=1", "--env.episode_length=2000")
-    command = [sys.executable, "-m", "lerobot_playbyear.scripts.dagger", *arguments(tmp_path, *options)]
+    program = "from lerobot_playbyear.scripts.commands import dagger; dagger()"
+    command = [sys.executable, "-c", program, *arguments(tmp_path, *options)]
     log = tmp_path / "log.txt"
     with log.open("w") as file:
         process = subprocess.Popen(command, env=screen.environment, stdout=file, stderr=subprocess.STDOUT)

@@ -19,7 +19,7 @@ from torch.utils.data import default_collate
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.scripts import train as train_script
+from lerobot_playbyear.scripts.commands import train as train_script
 from lerobot_playbyear.training import EpisodeStore, batches
 from lerobot_playbyear.training import train as loop
 from lerobot_playbyear.training.batches import PolicyWindows, first_of_each_task, runs_of_each_frame
@@ -199,7 +199,7 @@ def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(
         f"--output_dir={tmp_path / 'out'}",
     )
 
-    command(train_script.main, f"--policy.path={policy}", *data(root), *options)
+    command(train_script, f"--policy.path={policy}", *data(root), *options)
 
     tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (tuned["image_size"], tuned["vision_width"]) == (32, 8)
@@ -374,7 +374,7 @@ def test_presets_are_options_that_exist(name, command, monkeypatch, root):
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
 
     with pytest.raises(ZeroDivisionError):
-        command(train_script.main, f"--preset={name}", *data(root))
+        command(train_script, f"--preset={name}", *data(root))
 
     assert seen[0].policy.type == "playbyear"
     assert seen[0].steps == int(preset_options(name)["steps"])
@@ -388,7 +388,7 @@ def test_a_preset_is_a_configuration_file_as_well(name, command, monkeypatch, ro
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
     for options in ((f"--preset={name}", "--policy.use_amp=false"), (f"--config_path={RECIPES / name}.json",)):
         with pytest.raises(ZeroDivisionError):
-            command(train_script.main, *options, *data(root))
+            command(train_script, *options, *data(root))
     by_name, by_file = seen
     assert by_name.preset == name
     by_name.preset = None
@@ -404,10 +404,10 @@ def test_where_frames_are_kept_has_a_short_name(given):
 def test_a_run_from_the_disk_resumes_from_there_and_sees_shrunk_pictures(tmp_path, command):
     make_dataset(tmp_path / "data", (12, 17), image_size=48)
     options = (*TINY, *data(tmp_path / "data"), "--store=disk", f"--store.cache={tmp_path / 'cache'}")
-    command(train_script.main, *options, "--steps=2", f"--output_dir={tmp_path / 'out'}")
+    command(train_script, *options, "--steps=2", f"--output_dir={tmp_path / 'out'}")
     (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.is_dir())
     assert np.load(folder / "0.npy", mmap_mode="r").shape == (29, 3, 32, 32)
     last = tmp_path / "out" / "checkpoints" / "last"
-    command(train_script.main, "--resume=true", f"--config_path={config_of(last)}", "--steps=3")
+    command(train_script, "--resume=true", f"--config_path={config_of(last)}", "--steps=3")
     assert step_of(last.resolve()) == 3
     assert [path for path in (tmp_path / "cache").iterdir() if path.is_dir()] == [folder]

@@ -57,12 +57,12 @@ def _options_of(config: type) -> dict[str, Any]:
     opened = {name for name in names if any(map(_is_choice, (hints[name], *typing.get_args(hints[name]))))}
     groups = {"config_path", *names} - opened  # what the latter hold depends on a type
     options = {
-        option.removeprefix("--"): _kind(action.type)
+        option.removeprefix("--")
         for action in ArgumentParser(config).parser._actions
         for option in action.option_strings
         if option.removeprefix("--").partition(".")[0] in groups
     }
-    return {"options": dict(sorted(options.items())), "open": sorted(opened), "required": _required(config)}
+    return {"options": sorted(options), "open": sorted(opened), "required": _required(config)}
 
 
 def _required(config: type, prefix: str = "") -> list[str]:
@@ -78,11 +78,6 @@ def _required(config: type, prefix: str = "") -> list[str]:
 
 def _is_choice(kind: Any) -> bool:
     return isinstance(kind, type) and is_choice_type(kind)
-
-
-def _kind(of: Any) -> str:
-    kinds = [part for part in typing.get_args(of) or (of,) if part is not type(None)]
-    return kinds[0].__name__ if len(kinds) == 1 and kinds[0] in (bool, int, float) else ""
 
 
 def as_text(listed: dict[str, Any]) -> str:

@@ -33,7 +33,7 @@ from lerobot_playbyear.datasets.episode_files import stage_episode
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
 from lerobot_playbyear.datasets.features import check_features, check_frame, differences, is_depth
 from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
-from lerobot_playbyear.training.columns import available_memory
+from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
 from lerobot_playbyear.datasets.pictures import encode_picture
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey

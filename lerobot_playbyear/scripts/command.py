@@ -1,9 +1,9 @@
 """What every command does around its work: answer at once what needs no imports, read its options, say what went wrong."""
 
 import difflib
+import functools
 import inspect
 import json
-import re
 import sys
 from collections.abc import Callable, Mapping
 from importlib import metadata
@@ -12,31 +12,58 @@ from typing import Any
 
 from lerobot_playbyear.training.command_line import given_options
 
+HELP = Path(__file__).with_name("help")
+"""The folder of what `--help` prints, a file for each command."""
+
 OPTIONS_FILE = Path(__file__).with_name("options.json")
 """The names of all options of each command; `python tools/list_options.py` writes it."""
 
-_NOTHING = ("", "~", "null", "none")
-_TRUTHS = ("true", "false", "yes", "no", "on", "off")  # YAML's, which also are 1 and 0
-_INFINITIES = ("inf", ".inf", "nan", ".nan", "infinity")
-_WORDS_OF_KIND = {"bool": _TRUTHS, "int": _TRUTHS, "float": (*_TRUTHS, *_INFINITIES)}
-_WANTED = {"bool": "true or false", "int": "a whole number", "float": "a number"}
 
+def command(interrupted: int | str = 130, flag: str = "") -> Callable[[Callable[[], object]], Callable[[], None]]:
+    """Decorates a function that imports what it needs and does a command's work, and has the command's name.
 
-def answer_at_once(command: str, short_help: str | None) -> None:
-    """Prints the help, or what is certainly wrong with the command line, and ends the process; otherwise does nothing.
-
-    `--help=all` becomes `--help`, which the full parser answers.
+    What needs no imports is answered at once, and what cannot be done is said in one line.
 
     Args:
-        command: Its name.
-        short_help: What `--help` prints.
+        interrupted: What Ctrl-C ends it with: an exit status, or what is to be said.
+        flag: An option that needs no value.
+    """
+
+    def decorate(work: Callable[[], object]) -> Callable[[], None]:
+        @functools.wraps(work)
+        def run() -> None:
+            sys.argv[1:] = [f"{option}=true" if option == flag else option for option in sys.argv[1:]]
+            answer_at_once(f"playbyear-{work.__name__.replace('_', '-')}")
+            from lerobot_playbyear.datasets.errors import PlaybyearError
+
+            try:
+                work()
+            except (PlaybyearError, MemoryError) as error:
+                sys.exit(f"error: {str(error) or 'there is not enough memory'}")
+            except KeyboardInterrupt:
+                sys.exit(interrupted)
+
+        return run
+
+    return decorate
+
+
+def short_help(command: str) -> str:
+    """What `playbyear-... --help` prints."""
+    return (HELP / f"{command}.txt").read_text()
+
+
+def answer_at_once(command: str) -> None:
+    """Prints the help, or which option there is not, and ends the process; otherwise does nothing.
+
+    `--help=all` becomes `--help`, which the full parser answers.
     """
     args = sys.argv[1:]
     if "--help=all" in args:
         sys.argv[1:] = [*(argument for argument in args if argument != "--help=all"), "--help"]
         return
     if "--help" in args or "-h" in args:
-        print((short_help or "").strip())
+        print(short_help(command).strip())
         sys.exit(0)
     listed = json.loads(OPTIONS_FILE.read_text())
     if metadata.version("lerobot") != listed["lerobot"]:
@@ -48,64 +75,33 @@ def answer_at_once(command: str, short_help: str | None) -> None:
 
 
 def find_mistake(args: list[str], listed: Mapping[str, Any], policies: Mapping[str, Any]) -> str | None:
-    """What the full parser would certainly refuse; None where nothing is certain.
+    """What the full parser would certainly refuse of the names of options; None where nothing is certain.
 
     Args:
         args: The command line.
-        listed: The command's `options` with their kinds, its `required` ones, and the groups that are `open`: what they hold
-            depends on a type, which plugins may add.
+        listed: The command's `options`, its `required` ones, and the groups that are `open`: what they hold depends on a
+            type, which plugins may add.
         policies: The options of the policies that are known here, by their type.
     """
     given, strays = given_options(args)
     if strays:
         return f"'{strays[0]}' is no option: options begin with --."
-    known: dict[str, str] = dict(listed["options"])
-    opened = list(listed["open"])
+    known, opened = set(listed["options"]), set(listed["open"])
     policy_type = given.get("policy.type") or ("playbyear" if given.get("preset") else "")
     if "policy" in opened and policy_type in policies and not given.keys() & {"policy.path", "config_path"}:
         opened.remove("policy")
-        known.update({f"policy.{name}": kind for name, kind in policies[policy_type].items()})
-        known.update({f"policy.{name}": "" for name in ("type", "path")})
+        known.update(f"policy.{name}" for name in ("type", "path", *policies[policy_type]))
     for name, value in given.items():
         is_open = name.partition(".")[0] in opened or name.endswith("discover_packages_path")
         if name not in known and not is_open:
-            near = difflib.get_close_matches(name, known, 1)
+            near = difflib.get_close_matches(name, sorted(known), 1)
             return f"--{name} is no option{f'; did you mean --{near[0]}?' if near else '.'}"
         if name in known and value is None:
             return f"--{name} needs a value, --{name}=..."
-        if name in known and not _may_be(known[name], value or ""):
-            return f"--{name}={value}: wanted {_WANTED[known[name]]}."
     if given.keys() & {"config_path", "resume"}:
         return None
     missing = [name for name in listed["required"] if name not in given and name.partition(".")[0] not in given]
     return f"--{missing[0]} is needed." if missing else None
-
-
-def _may_be(kind: str, value: str) -> bool:
-    word = value.strip().strip("'\"").lower()
-    if kind not in _WANTED or word in _NOTHING or word.startswith("include"):
-        return True
-    return word.lstrip("+-") in _WORDS_OF_KIND[kind] or (kind != "bool" and re.search(r"\d", word) is not None)
-
-
-def run_command(name: str, short_help: str | None, work: Callable[[], object], interrupted: int | str = 130) -> None:
-    """A command: what needs no imports is answered at once, and what cannot be done is said in one line.
-
-    Args:
-        name: Its name.
-        short_help: What `--help` prints.
-        work: Imports what it needs, and does the rest.
-        interrupted: What Ctrl-C ends it with: an exit status, or what is to be said.
-    """
-    answer_at_once(name, short_help)
-    from lerobot_playbyear.datasets.errors import PlaybyearError
-
-    try:
-        work()
-    except (PlaybyearError, MemoryError) as error:
-        sys.exit(f"error: {str(error) or 'there is not enough memory'}")
-    except KeyboardInterrupt:
-        sys.exit(interrupted)
 
 
 def run_alone[Result](work: Callable[[Any], Result], parse: Callable[[type], Any] | None = None) -> Result:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.datasets.audio_files import resample
 from lerobot_playbyear.datasets.features import IS_FIRST, check_audio_features, samples_per_frame, to_pcm_s16
-from lerobot_playbyear.training.columns import available_memory
+from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.parquet import episode_bounds
 from lerobot_playbyear.datasets.pictures import kept_shape, shrink
 from lerobot_playbyear.datasets.reader import DatasetReader, check_finite

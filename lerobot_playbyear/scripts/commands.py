@@ -1,0 +1,131 @@
+"""The commands: what each imports when it is called, and what it does. Their help is in `help/`."""
+
+import logging
+import sys
+
+from lerobot_playbyear.scripts.command import check_local_dataset, command, run_alone, run_with_lerobot
+
+
+@command("Interrupted. The saved episodes are safe; go on with the same command and --resume=true.")
+def record() -> None:
+    # Here, because the processes that roll out import this module, and start in 2 seconds without LeRobot.
+    from lerobot_playbyear.recording.record import record
+
+    run_with_lerobot(record)
+
+
+@command("Interrupted. Go on from the last checkpoint with --resume=true --config_path=<its train_config.json>.")
+def train() -> None:
+    from lerobot_playbyear.training.command_line import apply_preset, with_long_store
+
+    sys.argv[1:] = apply_preset(with_long_store(sys.argv[1:]))
+    from lerobot_playbyear.training.acceleration import keep_freed_memory
+    from lerobot_playbyear.training.config import PlaybyearTrainConfig
+
+    keep_freed_memory()
+
+    def train(cfg: PlaybyearTrainConfig) -> None:
+        check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
+        from lerobot_playbyear.training.train import train as learn
+
+        learn(cfg)
+
+    run_with_lerobot(train)
+
+
+@command("Interrupted. Go on with --resume=true and the same --output_dir.")
+def dagger() -> None:
+    from lerobot_playbyear.dagger.config import DaggerConfig, with_saved_options
+    from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
+    from lerobot_playbyear.training.acceleration import keep_freed_memory
+    from lerobot_playbyear.training.command_line import with_long_store
+
+    keep_freed_memory()
+    sys.argv[1:] = with_saved_options(with_long_store(sys.argv[1:]))
+
+    def correct(cfg: DaggerConfig) -> None:
+        cfg.check()
+        check_local_dataset(cfg.demos.repo_id, cfg.demos.root)
+        from lerobot_playbyear.dagger.run import run_dagger
+
+        run_dagger(cfg)
+
+    run_with_lerobot(correct)
+
+
+@command()
+def video() -> None:
+    logging.basicConfig(level=logging.WARNING)
+    from lerobot_playbyear.datasets.errors import errors_of_input
+    from lerobot_playbyear.film.rollout_film import film
+
+    with errors_of_input(OSError):
+        run_with_lerobot(film)
+
+
+@command(flag="--json")
+def inspect() -> None:
+    logging.basicConfig(level=logging.WARNING)
+    from lerobot_playbyear.datasets.findings import worst
+    from lerobot_playbyear.inspection.inspect import inspect
+    from lerobot_playbyear.inspection.source import InspectionError
+
+    try:
+        findings = run_alone(inspect)
+    except InspectionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(worst(findings) == "error")
+
+
+@command()
+def repair() -> None:
+    from lerobot_playbyear.datasets.errors import errors_of_input
+    from lerobot_playbyear.repair.repair import repair
+
+    with errors_of_input():
+        try:
+            report = run_alone(repair)
+        except (OSError, MemoryError) as error:
+            sys.exit(
+                f"error: {str(error) or 'there is not enough memory'}\n"
+                "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
+            )
+    sys.exit(0 if report.is_done else 1)
+
+
+@command()
+def attach_audio() -> None:
+    from lerobot_playbyear.audio.attach import AttachError, attach_audio
+
+    try:
+        run_alone(attach_audio)
+    except OSError as error:
+        raise AttachError(f"The copy cannot be written: {error}") from error
+
+
+@command()
+def attach_spectrogram() -> None:
+    from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramError, attach_spectrogram
+
+    try:
+        run_alone(attach_spectrogram)
+    except OSError as error:
+        raise AttachSpectrogramError(f"The copy cannot be written: {error}") from error
+
+
+@command()
+def find_microphones() -> None:
+    from lerobot_playbyear.datasets.errors import errors_of_input
+    from lerobot_playbyear.microphones.finding import find_microphones
+
+    with errors_of_input(OSError):
+        run_alone(find_microphones)
+
+
+@command("Interrupted. The same command goes on; what has arrived is not sent again.")
+def push() -> None:
+    logging.basicConfig(level=logging.WARNING)
+    from lerobot_playbyear.hub.push import push
+
+    run_alone(push)
