@@ -57,10 +57,10 @@ def inspect(root: str) -> dict[str, Any]:
 
     from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig
     from lerobot_playbyear.inspection.inspect import inspect as inspect_dataset
-    from lerobot_playbyear.inspection.source import DatasetSource
+    from lerobot_playbyear.datasets.reader import SurveyedDataset
 
     inspect_dataset(InspectConfig(dataset=InspectDatasetConfig(repo_id=REPO_ID, root=root)))
-    return {"episodes": len(DatasetSource.open(REPO_ID, root).episodes)}
+    return {"episodes": len(SurveyedDataset.open(REPO_ID, root).episodes)}
 
 
 def record(root: str) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from lerobot_playbyear.film.video import at_a_rate_of_aac
 from lerobot_playbyear.hub.dataset_card import describe_dataset
 from lerobot_playbyear.hub.push import HubError, _files, push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
-from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
+from lerobot_playbyear.inspection.source import SurveyedDataset, InspectionError
 from lerobot_playbyear.training import EpisodeStore
 
 SECRET = (250, 5, 120)  # a colour that no other picture has
@@ -144,7 +144,7 @@ def test_a_picture_outside_the_folder_is_shown_nowhere(root, secret, hub, tmp_pa
     (root / "images" / "link.png").symlink_to(secret)
     point_to(root, [str(secret), "../secret.png", "images/link.png"][which])
     monkeypatch.chdir(root / "meta")  # from where "../secret.png" is nothing: names are the dataset's
-    source = DatasetSource.open("a/b", root)
+    source = SurveyedDataset.open("a/b", root)
     with pytest.raises(ValueError, match="outside its folder"):
         list(source.pictures(source.episodes[0], CAMERA))
     with pytest.raises(ValueError, match="outside its folder"):
@@ -169,7 +169,7 @@ def test_a_picture_in_a_file_of_the_dataset_is_read(root, tmp_path, monkeypatch)
     point_to(root, "pictures/one.png")
     monkeypatch.chdir(tmp_path)
     assert (EpisodeStore.load("a/b", str(root), device="cpu").column(CAMERA)[0, :, 0, 0].numpy() == SECRET).all()
-    source = DatasetSource.open("a/b", root)
+    source = SurveyedDataset.open("a/b", root)
     assert (next(source.pictures(source.episodes[0], CAMERA))[0, 0] == SECRET).all()
 
 
@@ -223,7 +223,7 @@ def test_a_template_that_leads_elsewhere_is_refused(videos, tmp_path, template):
         edit_info(videos, lambda info, name=name: info.update({name: template}))
         said = f"info.json: {name}|not in its folder"
         with pytest.raises(InspectionError, match=said):
-            DatasetSource.open("a/b", videos)
+            SurveyedDataset.open("a/b", videos)
         with pytest.raises(ValueError, match=said):
             EpisodeStore.load("a/b", str(videos), device="cpu")
         (videos / "meta" / "info.json").write_text(before)
@@ -232,7 +232,7 @@ def test_a_template_that_leads_elsewhere_is_refused(videos, tmp_path, template):
 def test_a_camera_whose_name_leads_elsewhere_is_refused(videos):
     rename_feature(videos, CAMERA, "../../secret")
     with pytest.raises(InspectionError, match="not in its folder"):
-        DatasetSource.open("a/b", videos)
+        SurveyedDataset.open("a/b", videos)
 
 
 def test_an_episode_whose_file_number_is_a_path_is_refused(videos, tmp_path):
@@ -415,7 +415,7 @@ def test_the_card_of_a_dataset_shows_names_as_they_are(root):
     rename_task(root, EVIL)
     rename_feature(root, MICROPHONE, 'observation.audio.a`<img src=x>|"\n```\n# Head')
     edit_info(root, lambda info: info.update(robot_type=EVIL))
-    card = describe_dataset(DatasetSource.open("a/b", root), "me/hostile", None, None)
+    card = describe_dataset(SurveyedDataset.open("a/b", root), "me/hostile", None, None)
     assert_harmless(card, head=0)
     rows = [line for line in card.splitlines() if line.startswith("| ")]
     assert all(len(re.findall(r"(?<!\\)\|", row)) == 3 for row in rows), rows
@@ -426,7 +426,7 @@ def test_the_card_of_a_dataset_shows_names_as_they_are(root):
 
 def test_a_card_shows_a_sample_rate_that_is_none(root):
     edit_info(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate="<b>abc"))
-    source = DatasetSource.open("a/b", root)
+    source = SurveyedDataset.open("a/b", root)
     card = describe_dataset(source, "a/b", None, None)
     assert "abc" in card
     assert "<b>" not in card
@@ -592,4 +592,4 @@ def test_features_of_an_honest_dataset_are_believed(tmp_path):
         3,
         4,
     )
-    assert len(DatasetSource.open("a/b", tmp_path / "set").episodes) == 2
+    assert len(SurveyedDataset.open("a/b", tmp_path / "set").episodes) == 2

@@ -17,7 +17,8 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_playbyear.datasets.features import audio_feature
 from lerobot_playbyear.datasets.parquet import with_values
-from lerobot_playbyear.inspection import Finding, InspectionError
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.inspection import Finding
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.motion import sudden_sounds
 from lerobot_playbyear.inspection.sound import flat_tops, gaps, repeats
@@ -342,7 +343,7 @@ def test_actions_are_held_to_the_range_given(clean):
     verdict = found(look(clean, action_range=[-0.5, 1.0]))["action range"]
     assert verdict.level == "error"
     assert verdict.figures["frames_outside"] > 10
-    with pytest.raises(InspectionError, match=r"action_range=\[1, -1\]"):
+    with pytest.raises(InputError, match=r"action_range=\[1, -1\]"):
         look(clean, action_range=[1, -1])
 
 

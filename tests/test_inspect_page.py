@@ -15,7 +15,7 @@ from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets.features import audio_feature
-from lerobot_playbyear.inspection import DatasetSource, check_numbers
+from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.page import PageWriter
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
@@ -322,11 +322,11 @@ def recorded(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_a_page_of_fifty_episodes_opens_in_two_seconds_and_is_small(browser, recorded, tmp_path):
-    source = DatasetSource.open("tests/recorded", recorded)
+    source = SurveyedDataset.open("tests/recorded", recorded)
     with PageWriter(tmp_path / "page.html", source) as writer:
         for i in range(50):
             episode = source.episodes[i % 2]
-            writer.add(episode, {camera: source.pictures(episode, camera) for camera in source.cameras})
+            writer.add(episode, {camera: source.pictures(camera, episode) for camera in source.cameras})
         path = writer.finish(check_numbers(source))
     assert path.stat().st_size < 30e6
     browser.open("about:blank")
@@ -337,7 +337,7 @@ def test_a_page_of_fifty_episodes_opens_in_two_seconds_and_is_small(browser, rec
 
 
 def test_an_interrupted_page_leaves_no_file(written, tmp_path):
-    source = DatasetSource.open("tests/page", written.parent / "dataset")
+    source = SurveyedDataset.open("tests/page", written.parent / "dataset")
 
     def pictures() -> Iterator[np.ndarray]:
         yield np.zeros((SIZE, SIZE, 3), np.uint8)

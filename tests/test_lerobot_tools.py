@@ -24,7 +24,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets import audio_feature, audio_keys, episode_waveform
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.inspection import DatasetSource, check_numbers
+from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.training import EpisodeStore
@@ -68,7 +68,7 @@ def assert_episodes(edited: LeRobotDataset, original: LeRobotDataset, episodes: 
     assert EpisodeStore.from_dataset(edited).column(MICROPHONE).shape == (sum(LENGTHS[e] for e in episodes), 800)
     wrong = [
         verdict
-        for verdict in check_numbers(DatasetSource.open("tests/edited", edited.root))
+        for verdict in check_numbers(SurveyedDataset.open("tests/edited", edited.root))
         if verdict.level == "error"
     ]
     assert wrong == []
@@ -177,7 +177,7 @@ def write(root: Path, seed: int = 0, resume: bool = False) -> Path:
 
 
 def statistics_verdict(root: Path) -> str:
-    (verdict,) = [each for each in check_numbers(DatasetSource.open("tests/heard", root)) if each.check == "statistics"]
+    (verdict,) = [each for each in check_numbers(SurveyedDataset.open("tests/heard", root)) if each.check == "statistics"]
     return f"{verdict.level}: {verdict.message}"
 
 

@@ -3,33 +3,43 @@
 LeRobot reads row by row, every value as a Python object, and copies all files into its cache first. Here a column becomes
 numpy arrays through Arrow. An episode is the unit of memory for sound and numbers; pictures come one by one.
 
-What is read is not judged: NaN is data, for `playbyear-inspect` reports it and training refuses it.
+`DatasetReader` reads what LeRobot's metadata say, for training and copies; `SurveyedDataset` what a survey calls whole, for
+inspection and uploads. What is read is not judged: NaN is data, for `playbyear-inspect` reports it and training refuses it.
 """
 
 import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, list_files
-from lerobot_playbyear.datasets.info import check_dataset_files, file_inside
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features, is_depth
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
+from lerobot_playbyear.datasets.info import (
+    INDEX_COLUMNS,
+    InfoError,
+    OutsideError,
+    check_claims,
+    check_dataset_files,
+    file_inside,
+)
 from lerobot_playbyear.datasets.parquet import DataFile, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
+from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
+from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-TOLERANCE_S = 1e-4
-"""How far a video's picture may be from its frame's time, as in LeRobot [s]."""
-
 _PICTURES_AT_ONCE = 64  # that are decoded ahead
+_LISTED = 3  # findings
 
 
 @dataclass
@@ -72,62 +82,36 @@ class EpisodeRows:
         return slice(self.start, self.stop)
 
 
-class DatasetReader:
-    """Reads a dataset, local or from the Hub. Rows are numbered as `LeRobotDataset[i]` numbers them.
+class EpisodeReader:
+    """Reads episodes whose frames lie in some data files. Rows are numbered through the episodes, in the files' order.
 
     Args:
-        repo_id: Its name.
-        root: Its folder; None: LeRobot's own place for `repo_id`, or else the Hub.
-        episodes: Only these; None: all.
-        meta: What LeRobot has read of it already.
+        repo_id: The dataset's name.
+        root: Its folder.
+        fps: Frames per second [Hz].
+        features: Every feature.
+        files: Its data files.
+        tasks: The text of each task.
 
     Attributes:
-        repo_id: Its name.
-        root: Its folder.
-        meta: What LeRobot knows of it.
-        fps: Frames per second [Hz].
-        features: Every feature, as `meta.features`.
+        repo_id, root, fps, features, tasks: As above.
         episodes: The episodes, in the order of their rows.
-
-    Raises:
-        ValueError: A file of the dataset is truncated, or it is empty, or it says what no one should trust, or its sound
-            lies in files beside the frames.
-        Exception: Whatever LeRobot raises where there is none, or it cannot be read.
     """
 
     def __init__(
         self,
         repo_id: str,
-        root: str | Path | None = None,
-        episodes: Sequence[int] | None = None,
-        *,
-        meta: "LeRobotDatasetMetadata | None" = None,
+        root: Path,
+        fps: int,
+        features: dict[str, dict[str, Any]],
+        files: Iterable[DataFile],
+        tasks: Mapping[int, str],
     ) -> None:
-        if meta is None:
-            is_local = bool(check_dataset_files(repo_id, root))
-            from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
-
-            if is_local:
-                meta = LeRobotDatasetMetadata(repo_id, root)
-            else:  # it fetches what is missing
-                meta = LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).meta
-        self.meta, self.repo_id, self.root = meta, meta.repo_id, Path(meta.root)
-        self.fps, self.features = int(meta.fps), meta.features
-        check_audio_features({key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps)
-        self._files = [DataFile(path) for path in list_files(self.root, "data/*/*.parquet")]
+        self.repo_id, self.root, self.fps, self.features, self.tasks = repo_id, root, fps, features, tasks
+        self.episodes: list[EpisodeRows] = []
+        self._files = list(files)
         self._firsts = [0, *itertools.accumulate(file.n_rows for file in self._files)]
         self._rows: np.ndarray = np.arange(self._firsts[-1])  # where each row here is in the files, in order
-        numbers = self.values("episode_index")
-        if episodes is not None:
-            self._rows = np.flatnonzero(np.isin(numbers, list(episodes)))
-            numbers = numbers[self._rows]
-        bounds = zip(*episode_bounds(numbers), strict=True) if len(numbers) else ()
-        self.episodes = [EpisodeRows(int(numbers[start]), start, stop) for start, stop in bounds]
-
-    @classmethod
-    def of(cls, dataset: "LeRobotDataset") -> "DatasetReader":
-        """Reads what LeRobot has opened: the same episodes of the same files."""
-        return cls(dataset.repo_id, dataset.root, dataset.episodes, meta=dataset.meta)
 
     def __len__(self) -> int:
         """The number of frames, N."""
@@ -136,7 +120,8 @@ class DatasetReader:
     @property
     def cameras(self) -> list[str]:
         """The keys of all colour cameras."""
-        return [key for key in self.meta.camera_keys if key not in self.meta.depth_keys]
+        pictures = [key for key, feature in self.features.items() if feature["dtype"] in ("image", "video")]
+        return [key for key in pictures if not is_depth(self.features[key])]
 
     @property
     def microphones(self) -> list[str]:
@@ -155,8 +140,8 @@ class DatasetReader:
         """
         start, stop = (0, len(self)) if episode is None else (episode.start, episode.stop)
         shape = tuple(self.features[key]["shape"])
-        parts = [column_to_numpy(column) for column in self._columns(key, start, stop)]
         try:
+            parts = [column_to_numpy(column) for column in self._columns(key, start, stop)]
             return np.concatenate(parts).reshape(stop - start, *(() if shape == (1,) else shape))
         except ValueError as error:
             raise ValueError(
@@ -182,8 +167,7 @@ class DatasetReader:
         """
         feature = self.features[key]
         if feature["dtype"] == "video":
-            path = file_inside(self.root, self.meta.get_video_file_path(episode.index, key))
-            begin = self.meta.episodes[episode.index][f"videos/{key}/from_timestamp"]
+            path, begin = self._film(key, episode)
             times = [begin + float(time) for time in self.values("timestamp", episode)[first:]]
             yield from video_pictures(path, times, TOLERANCE_S, key, feature["shape"])
             return
@@ -200,9 +184,21 @@ class DatasetReader:
 
     def task(self, episode: EpisodeRows) -> str:
         """The episode's task in words; empty if it has none."""
-        number = int(self.values("task_index", EpisodeRows(episode.index, episode.start, episode.start + 1))[0])
-        tasks = self.meta.tasks
-        return str(tasks.index[number]) if tasks is not None and 0 <= number < len(tasks) else ""
+        number = self.values("task_index", EpisodeRows(episode.index, episode.start, episode.start + 1))[0]
+        return self.tasks.get(int(number), "")
+
+    def _choose(self, found: Iterable[tuple[int, int, int]]) -> None:
+        """Reads only these episodes: of each its number, its first row in all files, and the one after its last."""
+        rows = [np.empty(0, int)]
+        for number, first, end in sorted(found, key=lambda episode: episode[1]):
+            start = self.episodes[-1].stop if self.episodes else 0
+            self.episodes.append(EpisodeRows(number, start, start + end - first))
+            rows.append(np.arange(first, end))
+        self._rows = np.concatenate(rows)
+
+    def _film(self, key: str, episode: EpisodeRows) -> tuple[Path, float]:
+        """The film with an episode's pictures, and when they begin in it [s]."""
+        raise NotImplementedError
 
     def _columns(self, key: str, start: int, stop: int) -> Iterator[pa.ChunkedArray]:
         """The rows from `start` to before `stop` of a column, file by file."""
@@ -212,6 +208,191 @@ class DatasetReader:
             if len(own):
                 column = file.read(int(own[0]), int(own[-1]) + 1, [key]).column(key)
                 yield column if len(column) == len(own) else column.take(own - own[0])
+
+
+class DatasetReader(EpisodeReader):
+    """Reads a dataset, local or from the Hub. Rows are numbered as `LeRobotDataset[i]` numbers them.
+
+    Args:
+        repo_id: Its name.
+        root: Its folder; None: LeRobot's own place for `repo_id`, or else the Hub.
+        episodes: Only these; None: all.
+        meta: What LeRobot has read of it already.
+
+    Attributes:
+        meta: What LeRobot knows of it.
+
+    Raises:
+        ValueError: A file of the dataset is truncated, or it is empty, or it says what no one should trust, or its sound
+            lies in files beside the frames.
+        Exception: Whatever LeRobot raises where there is none, or it cannot be read.
+    """
+
+    def __init__(
+        self,
+        repo_id: str,
+        root: str | Path | None = None,
+        episodes: Sequence[int] | None = None,
+        *,
+        meta: "LeRobotDatasetMetadata | None" = None,
+    ) -> None:
+        if meta is None:
+            is_local = bool(check_dataset_files(repo_id, root))
+            from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+
+            if is_local:
+                meta = LeRobotDatasetMetadata(repo_id, root)
+            else:  # it fetches what is missing
+                meta = LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).meta
+        self.meta = meta
+        folder = Path(meta.root)
+        files = [DataFile(path) for path in list_files(folder, "data/*/*.parquet")]
+        tasks = {} if meta.tasks is None else dict(enumerate(meta.tasks.index.astype(str)))
+        super().__init__(meta.repo_id, folder, int(meta.fps), meta.features, files, tasks)
+        check_audio_features({key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps)
+        numbers = self.values("episode_index")
+        bounds = zip(*episode_bounds(numbers), strict=True) if len(numbers) else ()
+        found = [(int(numbers[start]), start, stop) for start, stop in bounds]
+        self._choose(each for each in found if episodes is None or each[0] in episodes)
+
+    @classmethod
+    def of(cls, dataset: "LeRobotDataset") -> "DatasetReader":
+        """Reads what LeRobot has opened: the same episodes of the same files."""
+        return cls(dataset.repo_id, dataset.root, dataset.episodes, meta=dataset.meta)
+
+    def _film(self, key: str, episode: EpisodeRows) -> tuple[Path, float]:
+        path = file_inside(self.root, self.meta.get_video_file_path(episode.index, key))
+        return path, self.meta.episodes[episode.index][f"videos/{key}/from_timestamp"]
+
+
+class SurveyedDataset(EpisodeReader):
+    """Reads the episodes of a dataset that are whole, with or without sound, ours or another tool's.
+
+    Args:
+        repo_id: Its name.
+        found: The survey of its folder.
+        episodes: Only these; None: all. Of those that are not whole the survey's findings tell.
+
+    Attributes:
+        survey: The survey.
+        info: What its `meta/info.json` says.
+        chosen: The numbers of the episodes that are asked for; None: all.
+    """
+
+    def __init__(self, repo_id: str, found: Survey, episodes: Sequence[int] | None = None) -> None:
+        files = {each.frames.file.path: each.frames.file for each in found.whole if each.frames}
+        super().__init__(
+            repo_id, found.root, int(found.info["fps"]), found.info["features"], files.values(), found.tasks
+        )
+        self.survey, self.info = found, found.info
+        self.chosen = None if episodes is None else set(episodes)
+        self._places = {each.number: each.places for each in found.whole}
+        first_of = dict(zip(files, self._firsts, strict=False))
+        frames = [each.frames for each in found.whole if each.frames and (episodes is None or each.number in episodes)]
+        starts = [first_of[each.file.path] + each.start for each in frames]
+        self._choose((each.episode, start, start + each.length) for each, start in zip(frames, starts, strict=True))
+
+    @classmethod
+    def open(
+        cls,
+        repo_id: str,
+        root: str | Path | None = None,
+        episodes: list[int] | None = None,
+        damaged: bool = False,
+    ) -> "SurveyedDataset":
+        """Opens a dataset from its folder, or by its name from LeRobot's cache or the Hub.
+
+        Args:
+            repo_id, root, episodes: As above; without a root, where LeRobot has it, or fetches it to.
+            damaged: Whether one that is damaged is read as far as it is whole.
+
+        Raises:
+            InputError: There is none, or it claims what is not there, or it is damaged.
+        """
+        folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+        if root is not None and not (folder / INFO_PATH).is_file():
+            problem = "it does not exist" if not folder.exists() else f"it has no {INFO_PATH}"
+            raise InputError(f"There is no LeRobotDataset in '{folder}': {problem}. Check --dataset.root.")
+        if not (folder / INFO_PATH).is_file():
+            folder = _fetch(repo_id, folder, episodes)
+        try:
+            found = survey(folder, thorough=False)
+            dataset = cls(repo_id, found, episodes)
+            check_claims(folder, [file.footer for file in dataset._files], len(found.episodes))
+        except (OutsideError, InfoError, DatasetDamagedError) as error:
+            raise InputError(str(error)) from error
+        except (OSError, MemoryError) as error:
+            said = f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
+            raise InputError(f"The dataset in '{folder}' cannot be opened: {said}.") from error
+        if found.damage and not (damaged and dataset.episodes):
+            said, more = "; ".join(map(str, found.damage[:_LISTED])), len(found.damage) - _LISTED
+            raise InputError(
+                f"The dataset in '{folder}' cannot be opened: {said}{f'; and {more} more' if more > 0 else ''}. "
+                f"Repair it: playbyear-repair --root={folder}"
+            )
+        if not dataset.episodes:
+            raise InputError(f"The dataset in '{folder}' is empty: no episode was saved. Record at least one.")
+        return dataset
+
+    @cached_property
+    def numbers(self) -> list[str]:
+        """The keys of all other numeric features of one dimension that can be read, without LeRobot's index columns."""
+        return [key for key in self._columns_of_numbers() if key not in {*self.microphones, *self.unreadable}]
+
+    @cached_property
+    def timed_microphones(self) -> list[str]:
+        """The microphones whose rows are what their sample rate says; of the others no moment in time is known."""
+        fitting = []
+        for key in self.microphones:
+            try:
+                check_audio_features({key: self.features[key]}, self.fps)
+            except ValueError:
+                continue
+            if key not in self.unreadable:
+                fitting.append(key)
+        return fitting
+
+    @cached_property
+    def unreadable(self) -> dict[str, str]:
+        """The columns of numbers and of sound that lack values, or whose rows differ in length, and why."""
+        reasons = {}
+        for key in self._columns_of_numbers():
+            try:
+                for episode in self.episodes:
+                    self.values(key, episode)
+            except ValueError as error:
+                reasons[key] = " ".join(str(error).split())
+        return reasons
+
+    def pictures(self, key: str, episode: EpisodeRows, first: int = 0) -> Iterator[np.ndarray]:
+        """As above, but each (H, W, 3) uint8, whatever the channels of the feature."""
+        for picture in super().pictures(key, episode, first):
+            yield np.broadcast_to(picture, (*picture.shape[:2], 3))
+
+    def _columns_of_numbers(self) -> list[str]:
+        others = ("image", "video", "string", "language")
+        return [
+            key
+            for key, feature in self.features.items()
+            if key not in INDEX_COLUMNS and feature["dtype"] not in others and len(feature["shape"]) <= 1
+        ]
+
+    def _film(self, key: str, episode: EpisodeRows) -> tuple[Path, float]:
+        place = self._places[episode.index][key]
+        return film_path(self.root, self.info, key, place), place.start
+
+
+def _fetch(repo_id: str, folder: Path, episodes: list[int] | None) -> Path:
+    """Lets LeRobot fetch a dataset from the Hub, or find it in its cache. Returns its folder."""
+    from lerobot.datasets import LeRobotDataset
+
+    try:
+        check_dataset_files(repo_id)  # before its data come
+        return Path(LeRobotDataset(repo_id, episodes=episodes).root)
+    except Exception as error:  # whatever LeRobot or the network may raise
+        reason = " ".join(str(error.__cause__ or error).split()) or type(error).__name__
+        where = f"'{repo_id}' (neither in '{folder}' nor from the Hub)"
+        raise InputError(f"The dataset {where} cannot be opened: {reason}") from error
 
 
 def check_finite(reader: DatasetReader, key: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lerobot_playbyear.film.video import at_a_rate_of_aac, write_film
+from lerobot_playbyear.film.video import film_sound, write_film
 
 _SOUND_BIT_RATE = 200_000  # bits per second, of two channels
 _LOWEST_BIT_RATE = 60_000  # of the pictures
@@ -63,26 +63,36 @@ def encode(
         pictures: n pictures (H, W, 3) uint8, H and W even.
         n_pictures: n.
         fps: Frames per second [Hz].
-        sound: For each microphone what it heard, (n * S,) in steps of 16-bit PCM; the block of frame t was heard before its
-            picture was taken. The first two are heard, or only the first if their rates differ.
+        sound: As for `blocks_of`.
         gain: By how much to amplify.
         most_bytes: About how large it may become: the film of an episode of hours is coarser, so that a browser can
             hold it.
     """
-    heard = [own for own in sound[:2] if len(own) == len(sound[0])]
-    size = len(heard[0]) // n_pictures if heard else 0
-    film = np.zeros((n_pictures * size, len(heard)), np.int16)
-    for channel, own in enumerate(
-        heard
-    ):  # a picture is shown from when it was taken: the block after it is heard with it
-        film[: len(own) - size, channel] = np.clip(own[size:] * np.float32(gain), -32768, 32767)
-    samples, sample_rate = at_a_rate_of_aac(film, size * fps)
+    samples, sample_rate = film_sound(blocks_of(sound, n_pictures), fps, gain)
     # Key frames every second, so that stepping backwards is quick.
     options = {"crf": "23", "g": str(fps)}
     bit_rate = max(round(8 * most_bytes * fps / n_pictures) - _SOUND_BIT_RATE, _LOWEST_BIT_RATE)
     if bit_rate < _LIMITED_BIT_RATE:
         options |= {"maxrate": str(bit_rate), "bufsize": str(2 * bit_rate)}
     return write_film(path, pictures, fps, samples, sample_rate, options)
+
+
+def blocks_of(sound: Sequence[np.ndarray], n_pictures: int) -> np.ndarray:
+    """The sound of a film: of the first two microphones, or only of the first if their rates differ.
+
+    Args:
+        sound: For each microphone what it heard, (n * S,) in steps of 16-bit PCM; the block of frame t was heard before its
+            picture was taken.
+        n_pictures: n.
+
+    Returns:
+        (n, S, n_microphones) int16; (n, 0, 0) without a microphone.
+    """
+    heard = [own for own in sound[:2] if len(own) == len(sound[0])]
+    if not heard:
+        return np.zeros((n_pictures, 0, 0), np.int16)
+    pcm = np.clip(np.stack(heard, axis=-1), -32768, 32767).astype(np.int16)
+    return pcm.reshape(n_pictures, -1, len(heard))
 
 
 def _fitted(size: int, limit: int) -> int:

@@ -15,7 +15,7 @@ from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Actor, Episode, Observation, play
 from lerobot_playbyear.episodes.pool import Script
-from lerobot_playbyear.film.video import amplify, at_a_rate_of_aac, compose, episode_sound, inset, write_film
+from lerobot_playbyear.film.video import compose, film_sound, inset, write_film
 
 _AUDIO = "audio."  # how raw observations name microphones
 
@@ -117,8 +117,7 @@ def write_episode_film(episode: Episode, path: Path, fps: int) -> None:
         fps: Steps per second.
     """
     blocks = np.stack([_sound(observation) for observation in episode.observations])  # (T + 1, S, n_microphones)
-    heard, sample_rate = at_a_rate_of_aac(amplify(episode_sound(blocks)), blocks.shape[1] * fps)
-    sound = heard[:]
+    sound, sample_rate = film_sound(blocks, fps)
     views = [_first_camera(observation) for observation in episode.observations]
     pictures = (p if v is None else inset(p, v) for p, v in zip(episode.watched, views, strict=True))
     write_film(path, compose(pictures, len(views), sound, sample_rate), fps, sound, sample_rate)

@@ -9,7 +9,7 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lerobot_playbyear.datasets.audio_files import Channels, Resampled
+from lerobot_playbyear.datasets.audio_files import resample
 
 _VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of FFmpeg has
 _AUDIO_CODECS = ("aac", "libmp3lame")
@@ -46,22 +46,32 @@ def episode_sound(blocks: np.ndarray) -> np.ndarray:
     return shifted.reshape(blocks.shape[0] * blocks.shape[1], blocks.shape[2])
 
 
-def amplify(samples: np.ndarray) -> np.ndarray:
-    """Makes the loudest sample 70 % of full scale, with a gain of at most 40 dB; int16 in, int16 out."""
-    return (samples * gain_of(np.abs(samples.astype(np.int32)).max(initial=0) / 32768)).astype(np.int16)
+def film_sound(blocks: np.ndarray, fps: int, gain: float | None = None) -> tuple[np.ndarray, int]:
+    """The sound of an episode, in time with its pictures, amplified, and at a sample rate that AAC has.
+
+    Args:
+        blocks: As for `episode_sound`; S is 0 without a microphone.
+        fps: Frames per second.
+        gain: By how much it is amplified; None: see `amplify`.
+
+    Returns:
+        (n, n_microphones) int16, and the sample rate [Hz].
+    """
+    samples, sample_rate = amplify(episode_sound(blocks), gain), blocks.shape[1] * fps
+    rate = next((rate for rate in _AAC_RATES if rate >= sample_rate), _AAC_RATES[-1])
+    return (resample(samples, sample_rate, rate) if samples.size else samples), rate
+
+
+def amplify(samples: np.ndarray, gain: float | None = None) -> np.ndarray:
+    """Makes the loudest sample 70 % of full scale, unless a gain is given; int16 in, int16 out."""
+    if gain is None:
+        gain = gain_of(np.abs(samples.astype(np.int32)).max(initial=0) / 32768)
+    return np.clip(samples * np.float32(gain), -32768, 32767).astype(np.int16)
 
 
 def gain_of(peak: float) -> float:
     """What makes `peak`, as a share of full scale, 70 % of it; at most 40 dB."""
     return min(_LOUDEST / max(peak, 1e-6), _MAX_GAIN)
-
-
-def at_a_rate_of_aac(samples: Channels, sample_rate: int) -> tuple[Channels, int]:
-    """Resamples (n, channels) to the next higher rate that AAC has, where that is necessary."""
-    if samples.shape[1] == 0 or sample_rate in _AAC_RATES:
-        return samples, sample_rate or _AAC_RATES[-1]
-    rate = next((rate for rate in _AAC_RATES if rate > sample_rate), _AAC_RATES[-1])
-    return Resampled(samples, sample_rate, rate), rate
 
 
 def spectra(columns: np.ndarray, sample_rate: int) -> np.ndarray:
@@ -152,7 +162,7 @@ def write_film(
     path: str | Path,
     frames: Iterable[np.ndarray],
     fps: int,
-    sound: Channels,
+    sound: np.ndarray,
     sample_rate: int,
     x264_options: Mapping[str, str] | None = None,
 ) -> Path:
@@ -162,7 +172,7 @@ def write_film(
         path: Of the file; its folder is made.
         frames: (H, W, 3) uint8; of an odd side the last row or column is left out, as H.264 wants it.
         fps: Frames per second.
-        sound: (n, n_microphones) int16; it is read frame by frame. One microphone is mono, two are left and right, of
+        sound: (n, n_microphones) int16. One microphone is mono, two are left and right, of
             more only the first two are heard; none makes a silent film.
         sample_rate: [Hz].
         x264_options: Of the H.264 encoder, besides its preset; by default constant quality 20.

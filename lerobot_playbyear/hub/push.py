@@ -22,13 +22,13 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineMod
 from huggingface_hub.utils import validate_repo_id
 
 from lerobot_playbyear.compat import card_writer
-from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, FolderLockedError, entries_below
 from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out
 from lerobot_playbyear.datasets.journal import JournalError, lock_dataset
 from lerobot_playbyear.datasets.markdown import word
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.hub.dataset_card import CARD, FILM, write_dataset_card
-from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
 METRICS_NAME = "metrics.jsonl"
 """File in the output folder of a training with one JSON object per line."""
@@ -171,14 +171,14 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
     options.check()
     with _locked(folder), TemporaryDirectory() as scratch:
         try:
-            source = DatasetSource.open(repo_id, folder)
+            dataset = SurveyedDataset.open(repo_id, folder)
             check_links(folder)
             files = _files(folder)
             before = _stamps(files)
             card = write_dataset_card(
-                source, repo_id, Path(scratch), options.tags, options.license or "apache-2.0", options.preview
+                dataset, repo_id, Path(scratch), options.tags, options.license or "apache-2.0", options.preview
             )
-        except (InspectionError, OutsideError, OSError) as error:
+        except (InputError, OutsideError, OSError) as error:
             raise HubError(f"Not pushed. {error}") from error
 
         def upload() -> str:

@@ -6,13 +6,9 @@ from lerobot_playbyear import lazy_names
 
 if TYPE_CHECKING:
     from lerobot_playbyear.datasets.findings import Finding, worst
+    from lerobot_playbyear.datasets.reader import SurveyedDataset
     from lerobot_playbyear.inspection.inspect import check_numbers
-    from lerobot_playbyear.inspection.source import DatasetSource, InspectionError
 
-__all__ = ["DatasetSource", "Finding", "InspectionError", "check_numbers", "worst"]
+__all__ = ["Finding", "SurveyedDataset", "check_numbers", "worst"]
 
-_HOMES = {
-    "inspect": ("check_numbers", "Finding", "worst"),
-    "source": ("DatasetSource", "InspectionError"),
-}
-__getattr__ = lazy_names(__name__, _HOMES)
+__getattr__ = lazy_names(__name__, {"inspect": __all__})

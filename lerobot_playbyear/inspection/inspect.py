@@ -11,12 +11,13 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.info import OutsideError, check_links_out
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.inspection.motion import check_actions, check_alignment, check_interventions, check_success
 from lerobot_playbyear.inspection.pictures import PictureChecks
 from lerobot_playbyear.inspection.sound import check_sound
-from lerobot_playbyear.inspection.source import DatasetSource, InspectionError, finite
 from lerobot_playbyear.inspection.structure import (
     check_columns,
     check_finite_numbers,
@@ -24,7 +25,8 @@ from lerobot_playbyear.inspection.structure import (
     check_sample_rates,
     check_statistics,
     check_survey,
-    fit_microphones,
+    facts,
+    finite,
 )
 
 _COLOURS = {"ok": "32", "info": "36", "warning": "33", "error": "31;1"}
@@ -38,13 +40,11 @@ class InspectDatasetConfig:
         repo_id: Its name, `user/name`.
         root: Its folder. None: LeRobot's cache, or else the Hub.
         episodes: Only these. None: all.
-        video_backend: LeRobot's video decoder, "pyav" or "torchcodec".
     """
 
     repo_id: str
     root: str | None = None
     episodes: list[int] | None = None
-    video_backend: str = "pyav"
 
 
 @dataclass
@@ -77,60 +77,58 @@ def inspect(cfg: InspectConfig) -> list[Finding]:
         All findings.
 
     Raises:
-        InspectionError: There is no dataset, or an option is out of range, or the page cannot be written, or would hold
+        InputError: There is no dataset, or an option is out of range, or the page cannot be written, or would hold
             what is not in the dataset's folder.
     """
     _check_options(cfg)
-    options = cfg.dataset
-    source = DatasetSource.open(options.repo_id, options.root, options.episodes, options.video_backend, damaged=True)
+    dataset = SurveyedDataset.open(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.episodes, damaged=True)
     if cfg.html is not None:
-        _check_links(Path(source.root))
-    findings = check_numbers(source, cfg.action_range)
+        _check_links(dataset.root)
+    findings = check_numbers(dataset, cfg.action_range)
     try:
-        findings = _watch_pictures(cfg, source, findings)
+        findings = _watch_pictures(cfg, dataset, findings)
     except OSError as error:
-        raise InspectionError(f"The page cannot be written to '{cfg.html}': {error}") from error
+        raise InputError(f"The page cannot be written to '{cfg.html}': {error}") from error
     if cfg.json:
-        print(as_json(source, findings))
+        print(as_json(dataset, findings))
         return findings
-    print(as_text(source, findings, colour=sys.stdout.isatty()))
+    print(as_text(dataset, findings, colour=sys.stdout.isatty()))
     if cfg.html is not None:
         print(f"Page: {cfg.html} ({cfg.html.stat().st_size / 1e6:.1f} MB). Open it in a browser.")
     return findings
 
 
-def check_numbers(source: DatasetSource, action_range: Sequence[float] | None = None) -> list[Finding]:
+def check_numbers(dataset: SurveyedDataset, action_range: Sequence[float] | None = None) -> list[Finding]:
     """All checks that need no picture, in the order in which a person reads them.
 
     Args:
-        source: The dataset.
+        dataset: The dataset.
         action_range: Lowest and highest action allowed; None: see `check_actions`.
     """
-    microphones = fit_microphones(source)
     return [
-        *check_survey(source),
-        *check_columns(source),
-        *check_lengths(source),
-        *check_finite_numbers(source),
-        *check_statistics(source),
-        *check_actions(source, action_range),
-        *check_interventions(source),
-        *check_success(source),
-        *check_sample_rates(source),
-        *check_sound(source, microphones),
-        *check_alignment(source, microphones),
+        *check_survey(dataset),
+        *check_columns(dataset),
+        *check_lengths(dataset),
+        *check_finite_numbers(dataset),
+        *check_statistics(dataset),
+        *check_actions(dataset, action_range),
+        *check_interventions(dataset),
+        *check_success(dataset),
+        *check_sample_rates(dataset),
+        *check_sound(dataset),
+        *check_alignment(dataset),
     ]
 
 
-def _watch_pictures(cfg: InspectConfig, source: DatasetSource, findings: list[Finding]) -> list[Finding]:
+def _watch_pictures(cfg: InspectConfig, dataset: SurveyedDataset, findings: list[Finding]) -> list[Finding]:
     """Reads every picture once, for the checks and for the page."""
     from lerobot_playbyear.inspection.page import PageWriter
 
-    checks = PictureChecks(source)
-    with PageWriter(cfg.html, source, cfg.picture_height) if cfg.html is not None else nullcontext() as page:
-        for episode in tqdm(source.episodes, desc="Looking", unit="episode", disable=None):
+    checks = PictureChecks(dataset)
+    with PageWriter(cfg.html, dataset, cfg.picture_height) if cfg.html is not None else nullcontext() as page:
+        for episode in tqdm(dataset.episodes, desc="Looking", unit="episode", disable=None):
             pictures: dict[str, Iterator[np.ndarray]] = {
-                camera: checks.watch(episode, camera, source.pictures(episode, camera)) for camera in source.cameras
+                camera: checks.watch(episode, camera, dataset.pictures(camera, episode)) for camera in dataset.cameras
             }
             if page is not None:
                 page.add(episode, pictures)
@@ -147,33 +145,33 @@ def _check_links(root: Path) -> None:
     try:
         check_links_out(root)
     except OutsideError as error:
-        raise InspectionError(
+        raise InputError(
             f"No page is written, since it would hold what a link leads to: {error} Of a dataset that lies on another disk, "
             "let the whole folder lie there, and name it with --dataset.root. Without --html it is checked as it is."
         ) from error
     except OSError as error:
-        raise InspectionError(f"The dataset in '{root}' cannot be read: {error}") from error
+        raise InputError(f"The dataset in '{root}' cannot be read: {error}") from error
 
 
 def _check_options(cfg: InspectConfig) -> None:
     bounds = cfg.action_range
     if bounds is not None and not (len(bounds) == 2 and bounds[0] < bounds[1]):
-        raise InspectionError(f"action_range={bounds}: give the lowest and the highest action, like [-1, 1].")
+        raise InputError(f"action_range={bounds}: give the lowest and the highest action, like [-1, 1].")
     if cfg.picture_height < 16:
-        raise InspectionError(f"picture_height={cfg.picture_height}: give at least 16 pixels.")
+        raise InputError(f"picture_height={cfg.picture_height}: give at least 16 pixels.")
 
 
 # What is told of it
 
 
-def as_text(source: DatasetSource, findings: Sequence[Finding], colour: bool = False) -> str:
+def as_text(dataset: SurveyedDataset, findings: Sequence[Finding], colour: bool = False) -> str:
     """One line per finding, between a head and a summary."""
-    facts = source.facts()
+    known = facts(dataset)
     name_width = max(len(finding.check) for finding in findings)
     lines = [
-        _printable(f"{facts['repo_id']} in {facts['root']}"),
-        f"{facts['episodes']} episodes, {facts['frames']:,} frames, {facts['seconds']:,.1f} s at {facts['fps']} Hz; "
-        f"cameras: {_printable(_names(source.cameras))}; microphones: {_printable(_names(source.microphones))}",
+        _printable(f"{known['repo_id']} in {known['root']}"),
+        f"{known['episodes']} episodes, {known['frames']:,} frames, {known['seconds']:,.1f} s at {known['fps']} Hz; "
+        f"cameras: {_printable(_names(dataset.cameras))}; microphones: {_printable(_names(dataset.microphones))}",
         "",
     ]
     for finding in findings:
@@ -181,15 +179,15 @@ def as_text(source: DatasetSource, findings: Sequence[Finding], colour: bool = F
         feature = f"{finding.feature}: " if finding.feature else ""
         lines.append(f"{level}  {finding.check:<{name_width}}  {_printable(feature + str(finding))}")
     lines += ["", summary(findings)]
-    if source.survey.damage:
-        lines.append(f"A repaired copy: playbyear-repair --root={facts['root']}")
+    if dataset.survey.damage:
+        lines.append(f"A repaired copy: playbyear-repair --root={known['root']}")
     return "\n".join(lines)
 
 
-def as_json(source: DatasetSource, findings: Sequence[Finding]) -> str:
+def as_json(dataset: SurveyedDataset, findings: Sequence[Finding]) -> str:
     """The same for a program."""
     report = {
-        "dataset": source.facts(),
+        "dataset": facts(dataset),
         "worst": worst(findings),
         "verdicts": [finding.to_dict() for finding in findings],
     }

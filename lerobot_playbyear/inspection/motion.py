@@ -22,8 +22,11 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
-from lerobot_playbyear.inspection.sound import runs
-from lerobot_playbyear.inspection.source import FULL_SCALE, INTERVENTION, SUCCESS, DatasetSource, Episode
+from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
+from lerobot_playbyear.inspection.sound import FULL_SCALE, heard, runs
+
+SUCCESS = "next.success"
+INTERVENTION = "intervention"
 
 _ACTION = "action"
 _NORMALISED_SHARE = 0.9  # of all values in [-1, 1]: then the actions are taken to be normalised
@@ -48,20 +51,20 @@ _JITTER_S = STEP_S / 2 + 0.001  # by which single sounds are off
 _WIDEST = 160  # pixels that are looked at; a hand is larger
 
 
-def check_actions(source: DatasetSource, bounds: Sequence[float] | None = None) -> Iterator[Finding]:
+def check_actions(dataset: SurveyedDataset, bounds: Sequence[float] | None = None) -> Iterator[Finding]:
     """Actions stay in their range, and each of their dimensions is used.
 
     Args:
-        source: The dataset.
+        dataset: The dataset.
         bounds: Lowest and highest value allowed; beyond them is an error. None: where nine values in ten lie in
             [-1, 1] that range is taken to be meant, and beyond it is a warning.
     """
-    if _ACTION in source.unreadable:
+    if _ACTION in dataset.unreadable:
         return
-    if _ACTION not in source.numbers:
+    if _ACTION not in dataset.numbers:
         yield Finding("actions", "warning", f"no '{_ACTION}' column: nothing can be learned from this dataset")
         return
-    actions = source.values(_ACTION).reshape(len(source), -1)
+    actions = dataset.values(_ACTION).reshape(len(dataset), -1)
     finite: np.ndarray = np.where(np.isfinite(actions), actions, 0)  # (N, D)
     low, high = bounds if bounds is not None else (-1.0, 1.0)
     outside = np.abs(finite - np.clip(finite, low, high)).max(axis=1) > 0  # (N,)
@@ -72,31 +75,31 @@ def check_actions(source: DatasetSource, bounds: Sequence[float] | None = None) 
         message = f"{actions.shape[1]} dimensions, {seen}; say the range allowed to have it checked (--action_range)"
         yield Finding("action range", "info", message, _ACTION, figures={**figures, "frames_outside": None})
     elif outside.any():
-        episodes = [e.index for e in source.episodes if outside[e.rows].any()]
+        episodes = [e.index for e in dataset.episodes if outside[e.rows].any()]
         level: Level = "error" if bounds is not None else "warning"
         message = f"{int(outside.sum())} frames outside [{low:g}, {high:g}] ({name_episodes(episodes)}): {seen}"
         yield Finding("action range", level, message, _ACTION, episodes, figures)
     else:
         yield Finding("action range", "ok", f"{seen}, inside [{low:g}, {high:g}]", _ACTION, figures=figures)
     constant = np.flatnonzero(np.ptp(finite, axis=0) == 0)
-    if len(constant) and len(source) > 1:
+    if len(constant) and len(dataset) > 1:
         message = f"dimension{'s' if len(constant) > 1 else ''} {', '.join(map(str, constant))} never changes"
         yield Finding("actions used", "warning", message, _ACTION, figures={"constant": constant.tolist()})
     else:
         yield Finding("actions used", "ok", f"all {actions.shape[1]} dimensions change", _ACTION)
 
 
-def check_interventions(source: DatasetSource) -> Iterator[Finding]:
+def check_interventions(dataset: SurveyedDataset) -> Iterator[Finding]:
     """How much of the dataset the expert acted in."""
-    if INTERVENTION in source.unreadable:
+    if INTERVENTION in dataset.unreadable:
         return
-    if INTERVENTION not in source.numbers:
+    if INTERVENTION not in dataset.numbers:
         yield Finding("interventions", "info", f"no '{INTERVENTION}' column")
         return
-    tagged = source.values(INTERVENTION).astype(bool)
-    spans = sum(len(runs(tagged[episode.rows])) for episode in source.episodes)
+    tagged = dataset.values(INTERVENTION).astype(bool)
+    spans = sum(len(runs(tagged[episode.rows])) for episode in dataset.episodes)
     share = float(tagged.mean())
-    without = [episode.index for episode in source.episodes if not tagged[episode.rows].any()]
+    without = [episode.index for episode in dataset.episodes if not tagged[episode.rows].any()]
     figures = {"share": share, "spans": spans, "episodes_without": len(without)}
     if share == 1:
         message = "the expert was in control throughout: demonstrations"
@@ -108,19 +111,35 @@ def check_interventions(source: DatasetSource) -> Iterator[Finding]:
     yield Finding("interventions", "ok", message, INTERVENTION, without if 0 < share < 1 else (), figures)
 
 
-def check_success(source: DatasetSource) -> Iterator[Finding]:
+def check_success(dataset: SurveyedDataset) -> Iterator[Finding]:
     """How many episodes reached the task's goal."""
-    if SUCCESS in source.unreadable:
+    if SUCCESS in dataset.unreadable:
         return
-    if SUCCESS not in source.numbers:
+    if SUCCESS not in dataset.numbers:
         yield Finding("success", "info", f"no '{SUCCESS}' column")
         return
-    failed = [episode.index for episode in source.episodes if source.succeeded(episode) == -1]
-    n_episodes = len(source.episodes)
+    failed = [episode.index for episode in dataset.episodes if first_success(dataset, episode) == -1]
+    n_episodes = len(dataset.episodes)
     n_succeeded = n_episodes - len(failed)
     message = f"{n_succeeded} of {n_episodes} episodes succeeded"
     figures = {"succeeded": n_succeeded, "episodes": n_episodes}
     yield Finding("success", "ok" if n_succeeded else "warning", message, SUCCESS, failed, figures)
+
+
+def first_success(dataset: SurveyedDataset, episode: EpisodeRows) -> int | None:
+    """The first frame, counted from the episode's start, with success; -1 without success, None if not known."""
+    if SUCCESS not in dataset.numbers:
+        return None
+    frames = np.flatnonzero(dataset.values(SUCCESS, episode))
+    return int(frames[0]) if len(frames) else -1
+
+
+def motion_of_arm(dataset: SurveyedDataset) -> tuple[str | None, np.ndarray]:
+    """What says how the arm moved, the state or else the action, and its values (N, D); None where there is neither."""
+    key = next((key for key in ("observation.state", _ACTION) if key in dataset.numbers), None)
+    if key is None:
+        return None, np.zeros((len(dataset), 0))
+    return key, np.nan_to_num(dataset.values(key).reshape(len(dataset), -1).astype(np.float64))
 
 
 def block_levels(samples: np.ndarray, size: int) -> np.ndarray:
@@ -147,20 +166,20 @@ def sudden_sounds(samples: np.ndarray, sample_rate: float) -> np.ndarray:
     return np.flatnonzero(loud & (recent == 0)) * step / sample_rate
 
 
-def check_alignment(source: DatasetSource, microphones: Sequence[str]) -> Iterator[Finding]:
-    """How often sudden sounds and changes of motion coincide, for each of these microphones."""
-    motion_key = source.motion_key
+def check_alignment(dataset: SurveyedDataset) -> Iterator[Finding]:
+    """How often sudden sounds and changes of motion coincide, for each microphone."""
+    motion_key, values = motion_of_arm(dataset)
     if motion_key is None:
         return
-    motion = _motion_changes(source, motion_key)
-    for key in microphones:
-        onsets = [_onset_frames(source, key, episode) for episode in source.episodes]
+    motion = _motion_changes(dataset, values, order=1 if motion_key == _ACTION else 2)
+    for key in dataset.timed_microphones:
+        onsets = [_onset_frames(dataset, key, episode) for episode in dataset.episodes]
         n_onsets = sum(len(frames) for frames in onsets)
         if n_onsets < _MIN_ONSETS:
             message = f"{n_onsets} sudden sounds: too few to compare them with the arm's motion"
             yield Finding("sound and motion", "info", message, key, figures={"sudden_sounds": n_onsets})
             continue
-        search = round(_SEARCH_S * source.fps)
+        search = round(_SEARCH_S * dataset.fps)
         shares = {shift: _coincidence(onsets, motion, shift) for shift in range(-search, search + 1)}
         chance = float(np.mean([_near(changes).mean() for changes in motion]))
         best = max(shares, key=lambda shift: (shares[shift], -abs(shift)))
@@ -170,29 +189,27 @@ def check_alignment(source: DatasetSource, microphones: Sequence[str]) -> Iterat
         )
         if best != 0 and shares[best] > shares[0]:
             moment = "after" if best > 0 else "before"
-            message += f"; {shares[best]:.0%} come {abs(best) / source.fps:.3g} s {moment} one"
+            message += f"; {shares[best]:.0%} come {abs(best) / dataset.fps:.3g} s {moment} one"
         figures = {
             "sudden_sounds": n_onsets,
             "coincide": shares[0],
             "by_chance": chance,
-            "best_lag_s": best / source.fps,
+            "best_lag_s": best / dataset.fps,
         }
         yield Finding("sound and motion", "info", message, key, figures=figures)
 
 
-def _onset_frames(source: DatasetSource, key: str, episode: Episode) -> np.ndarray:
+def _onset_frames(dataset: SurveyedDataset, key: str, episode: EpisodeRows) -> np.ndarray:
     """The frames, from the episode's start, at which a sudden sound had been heard."""
-    times = sudden_sounds(source.sound(key, episode), source.features[key]["shape"][0] * source.fps)
+    times = sudden_sounds(heard(dataset, key, episode), dataset.features[key]["shape"][0] * dataset.fps)
     # Row i ends with picture i, so a sound inside row i is seen, at the earliest, in picture i.
-    return np.minimum((times * source.fps).astype(int), len(episode) - 1)
+    return np.minimum((times * dataset.fps).astype(int), len(episode) - 1)
 
 
-def _motion_changes(source: DatasetSource, key: str) -> list[np.ndarray]:
+def _motion_changes(dataset: SurveyedDataset, values: np.ndarray, order: int) -> list[np.ndarray]:
     """For every episode the frames of large changes, (n,) bool."""
-    order = 2 if key == "observation.state" else 1
-    values = np.nan_to_num(source.rows(key))
     changes = []
-    for episode in source.episodes:
+    for episode in dataset.episodes:
         change = np.zeros((len(episode), values.shape[1]))
         if len(episode) > 2:
             change[1 : len(episode) - order + 1] = np.abs(np.diff(values[episode.rows], n=order, axis=0))
@@ -229,24 +246,21 @@ def difference(picture: np.ndarray, before: np.ndarray) -> float:
     return float(np.abs(small[0] - small[1]).mean())
 
 
-def check_delay(
-    source: DatasetSource, microphones: Sequence[str], motion: Mapping[str, Sequence[Sequence[float]]]
-) -> Iterator[Finding]:
+def check_delay(dataset: SurveyedDataset, motion: Mapping[str, Sequence[Sequence[float]]]) -> Iterator[Finding]:
     """How much later the sound of each microphone comes than each camera's pictures, where contacts tell it.
 
     Args:
-        source: The dataset.
-        microphones: Whose rows are what their sample rate says.
+        dataset: The dataset.
         motion: Of each camera and episode how much every picture differs from the one before (`difference`).
     """
-    for key in microphones:
-        rate = source.features[key]["shape"][0] * source.fps
+    for key in dataset.timed_microphones:
+        rate = dataset.features[key]["shape"][0] * dataset.fps
         # Row i ends with picture i: the first row was heard before the first picture.
-        onsets = (sudden_sounds(source.sound(key, episode), rate) for episode in source.episodes)
-        heard = [_apart(times) + STEP_S / 2 - 1 / source.fps for times in onsets]
+        onsets = (sudden_sounds(heard(dataset, key, episode), rate) for episode in dataset.episodes)
+        sounds = [_apart(times) + STEP_S / 2 - 1 / dataset.fps for times in onsets]
         for camera, episodes in motion.items():
-            seen = [_motion_ends(np.asarray(each), source.fps) for each in episodes]
-            contacts = np.concatenate([np.zeros((0, 2)), *map(_delays, heard, seen)])  # (k, 2) [s]
+            seen = [_motion_ends(np.asarray(each), dataset.fps) for each in episodes]
+            contacts = np.concatenate([np.zeros((0, 2)), *map(_delays, sounds, seen)])  # (k, 2) [s]
             if len(contacts) >= _FEWEST:
                 yield from _told(contacts, key, camera)
 

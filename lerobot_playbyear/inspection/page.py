@@ -22,12 +22,12 @@ import numpy as np
 from PIL import Image
 
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
+from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 from lerobot_playbyear.film.dataset_film import encode, tile
 from lerobot_playbyear.film.video import TOP_FREQUENCY, WINDOW_S, gain_of, spectra
-from lerobot_playbyear.inspection.motion import block_levels, sudden_sounds
-from lerobot_playbyear.inspection.sound import runs
-from lerobot_playbyear.inspection.source import FULL_SCALE, INTERVENTION, DatasetSource, Episode, finite
-from lerobot_playbyear.inspection.structure import fit_microphones
+from lerobot_playbyear.inspection.motion import INTERVENTION, block_levels, first_success, sudden_sounds
+from lerobot_playbyear.inspection.sound import FULL_SCALE, heard, runs
+from lerobot_playbyear.inspection.structure import facts, finite
 
 _SCRIPTS = ("data.js", "timeline.js", "panels.js", "player.js", "app.js")
 _EPISODES_HERE = "<!-- episodes -->"
@@ -49,22 +49,22 @@ class PageWriter:
 
     Args:
         path: The file to write; its folder is made.
-        source: The dataset.
+        dataset: The dataset.
         picture_height: Of the film [pixels], at most.
 
     Raises:
         OSError: If the file cannot be written.
     """
 
-    def __init__(self, path: Path, source: DatasetSource, picture_height: int = 240) -> None:
+    def __init__(self, path: Path, dataset: SurveyedDataset, picture_height: int = 240) -> None:
         self.path = path
-        self._source = source
-        self._data = EpisodeData(source, fit_microphones(source))
+        self._dataset = dataset
+        self._data = EpisodeData(dataset)
         self._picture_height = picture_height
         self._index: list[dict[str, Any]] = []
         self._partial = path.with_name(f".{path.name}.partial")
         path.parent.mkdir(parents=True, exist_ok=True)
-        before, self._after = _skeleton(source.repo_id).split(_EPISODES_HERE)
+        before, self._after = _skeleton(dataset.repo_id).split(_EPISODES_HERE)
         self._file = self._partial.open("w", encoding="utf-8")
         self._file.write(before)
 
@@ -75,7 +75,7 @@ class PageWriter:
         self._file.close()
         self._partial.unlink(missing_ok=True)
 
-    def add(self, episode: Episode, pictures: Mapping[str, Iterator[np.ndarray]]) -> None:
+    def add(self, episode: EpisodeRows, pictures: Mapping[str, Iterator[np.ndarray]]) -> None:
         """Writes an episode.
 
         Args:
@@ -87,14 +87,14 @@ class PageWriter:
         self._write("application/json", f"episode-{position}", [_json(self._data.draw(episode))])
         with tempfile.TemporaryDirectory() as folder:
             sound, gain = self._data.sound(episode), self._data.gain
-            film = encode(Path(folder) / "film.mp4", frames, len(episode), self._source.fps, sound, gain)
+            film = encode(Path(folder) / "film.mp4", frames, len(episode), self._dataset.fps, sound, gain)
             self._write("text/plain", f"film-{position}", _base64_parts(film))
         self._index.append(
             {
                 "index": episode.index,
                 "frames": len(episode),
-                "task": self._source.task(episode),
-                "success": self._source.succeeded(episode),
+                "task": self._dataset.task(episode),
+                "success": first_success(self._dataset, episode),
                 "widths": widths,
                 "preview": self._data.preview(episode),
             }
@@ -102,10 +102,10 @@ class PageWriter:
 
     def finish(self, findings: Sequence[Finding]) -> Path:
         """Writes what concerns the whole dataset, and puts the file into its place."""
-        dataset = {
-            "facts": self._source.facts(),
+        whole = {
+            "facts": facts(self._dataset),
             "episodes": self._index,
-            "cameras": self._source.cameras,
+            "cameras": self._dataset.cameras,
             "microphones": [asdict(microphone) for microphone in self._data.microphones],
             "gain": self._data.gain,
             "curves": self._data.curves,
@@ -113,7 +113,7 @@ class PageWriter:
             "worst": worst(findings),
             "verdicts": [{**finding.to_dict(), "figures": None} for finding in findings],
         }
-        self._write("application/json", "dataset", [_json(dataset)])
+        self._write("application/json", "dataset", [_json(whole)])
         self._file.write(self._after)
         self._file.close()
         os.replace(self._partial, self.path)
@@ -184,13 +184,12 @@ class EpisodeData:
     """Prepares the drawings of one episode after another.
 
     Args:
-        source: The dataset; its microphones must be in the format's shape.
-        microphones: The keys to draw.
+        dataset: The dataset; drawn are the microphones whose rows are what their sample rate says.
     """
 
-    def __init__(self, source: DatasetSource, microphones: Sequence[str]) -> None:
-        self._source = source
-        self.microphones = [self._measure(key) for key in microphones]
+    def __init__(self, dataset: SurveyedDataset) -> None:
+        self._dataset = dataset
+        self.microphones = [self._measure(key) for key in dataset.timed_microphones]
 
     @cached_property
     def gain(self) -> float:
@@ -202,20 +201,20 @@ class EpisodeData:
         """The features that are drawn as curves, with the range of each dimension in the dataset."""
         wanted = [
             "observation.state",
-            *(key for key in self._source.numbers if key.startswith("observation")),
+            *(key for key in self._dataset.numbers if key.startswith("observation")),
             "action",
         ]
-        if "next.reward" in self._source.numbers and len(np.unique(self._source.values("next.reward"))) > 2:
+        if "next.reward" in self._dataset.numbers and len(np.unique(self._dataset.values("next.reward"))) > 2:
             wanted.append("next.reward")  # one of 0 and 1 says no more than the mark of success
         curves = []
-        for key in dict.fromkeys(key for key in wanted if key in self._source.numbers):
-            values = self._source.values(key).reshape(len(self._source), -1)[:, :_MAX_CURVES].astype(np.float64)
+        for key in dict.fromkeys(key for key in wanted if key in self._dataset.numbers):
+            values = self._dataset.values(key).reshape(len(self._dataset), -1)[:, :_MAX_CURVES].astype(np.float64)
             finite = np.where(np.isfinite(values), values, 0)
             curves.append(
                 {
                     "key": key,
-                    "names": _dimension_names(self._source.features[key], values.shape[1]),
-                    "unit": str((self._source.features[key].get("info") or {}).get("unit", "")),
+                    "names": _dimension_names(self._dataset.features[key], values.shape[1]),
+                    "unit": str((self._dataset.features[key].get("info") or {}).get("unit", "")),
                     "low": finite.min(axis=0).tolist(),
                     "high": finite.max(axis=0).tolist(),
                     "held": key == "action",  # until the next frame, so drawn as steps
@@ -223,16 +222,16 @@ class EpisodeData:
             )
         return curves
 
-    def sound(self, episode: Episode) -> list[np.ndarray]:
+    def sound(self, episode: EpisodeRows) -> list[np.ndarray]:
         """What each microphone heard, in steps of 16-bit PCM."""
-        return [self._source.sound(microphone.key, episode) for microphone in self.microphones]
+        return [heard(self._dataset, microphone.key, episode) for microphone in self.microphones]
 
-    def draw(self, episode: Episode) -> dict[str, Any]:
+    def draw(self, episode: EpisodeRows) -> dict[str, Any]:
         """Everything but the film, for JSON."""
-        source = self._source
+        dataset = self._dataset
         interventions = None  # or the first and the last frame of each
-        if INTERVENTION in source.numbers:
-            tagged = source.values(INTERVENTION)[episode.rows].astype(bool)
+        if INTERVENTION in dataset.numbers:
+            tagged = dataset.values(INTERVENTION, episode).astype(bool)
             interventions = [(start, stop - 1) for start, stop in runs(tagged)]
         return {
             "microphones": [
@@ -242,11 +241,11 @@ class EpisodeData:
             "interventions": interventions,
         }
 
-    def preview(self, episode: Episode) -> list[int]:
+    def preview(self, episode: EpisodeRows) -> list[int]:
         """The level of the first microphone over the episode, 0 to 99 of its loudest, for the list of episodes."""
         if not self.microphones:
             return []
-        sound = self._source.sound(self.microphones[0].key, episode)
+        sound = heard(self._dataset, self.microphones[0].key, episode)
         level = block_levels(sound, len(sound) // len(episode))
         edges = np.linspace(0, len(level), min(_PREVIEW_COLUMNS, len(level)) + 1).astype(int)
         level = np.maximum.reduceat(level, edges[:-1])
@@ -254,11 +253,11 @@ class EpisodeData:
         return np.clip(99 * share, 0, 99).astype(int).tolist()
 
     def _measure(self, key: str) -> Microphone:
-        source = self._source
-        rate = source.features[key]["shape"][0] * source.fps
-        episodes = source.episodes[:: max(len(source.episodes) // _SAMPLED_EPISODES, 1)]
-        levels = np.concatenate([_levels(source.sound(key, episode), rate)[0] for episode in episodes])
-        peak = max(float(np.abs(source.sound(key, each)).max()) for each in source.episodes) / FULL_SCALE
+        dataset = self._dataset
+        rate = dataset.features[key]["shape"][0] * dataset.fps
+        episodes = dataset.episodes[:: max(len(dataset.episodes) // _SAMPLED_EPISODES, 1)]
+        levels = np.concatenate([_levels(heard(dataset, key, episode), rate)[0] for episode in episodes])
+        peak = max(float(np.abs(heard(dataset, key, each)).max()) for each in dataset.episodes) / FULL_SCALE
         top = float(np.ceil(levels.max() / 5) * 5)
         bottom = float(np.floor(np.quantile(levels, _DARKEST_SHARE) / 5) * 5)
         return Microphone(
@@ -275,7 +274,7 @@ class EpisodeData:
         share = (levels - microphone.bottom_db) / (microphone.top_db - microphone.bottom_db)
         grey = np.clip(np.round(share * (_GREY_LEVELS - 1)), 0, _GREY_LEVELS - 1) * (255 // (_GREY_LEVELS - 1))
         onsets = sudden_sounds(samples, microphone.sample_rate)
-        frame_s = 1 / self._source.fps  # the first block was heard before the first picture
+        frame_s = 1 / self._dataset.fps  # the first block was heard before the first picture
         return {
             "spectrogram": _png(grey.astype(np.uint8).T[::-1]),
             "hop": hop_s,
@@ -283,9 +282,9 @@ class EpisodeData:
             "onsets": [round(float(time) - frame_s, 4) for time in onsets],
         }
 
-    def _curve(self, key: str, episode: Episode) -> np.ndarray:
+    def _curve(self, key: str, episode: EpisodeRows) -> np.ndarray:
         """(n * D,) float32."""
-        values = self._source.values(key)[episode.rows].reshape(len(episode), -1)[:, :_MAX_CURVES]
+        values = self._dataset.values(key, episode).reshape(len(episode), -1)[:, :_MAX_CURVES]
         return values.astype("<f4").reshape(-1)
 
 

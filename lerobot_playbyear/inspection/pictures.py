@@ -7,9 +7,8 @@ import numpy as np
 from PIL import Image
 
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
-from lerobot_playbyear.inspection.motion import check_delay, difference
-from lerobot_playbyear.inspection.source import DatasetSource, Episode
-from lerobot_playbyear.inspection.structure import fit_microphones
+from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
+from lerobot_playbyear.inspection.motion import check_delay, difference, motion_of_arm
 
 _BLANK_SPREAD = 2.0  # grey levels, standard deviation within a picture
 _LEVELS = np.arange(256.0)
@@ -38,15 +37,15 @@ class PictureChecks:
     """Looks at every picture as it passes by, and judges when all have passed.
 
     Args:
-        source: The dataset.
+        dataset: The dataset.
     """
 
-    def __init__(self, source: DatasetSource) -> None:
-        self._source = source
-        self._watched: dict[str, list[_Watched]] = {key: [] for key in source.cameras}
-        self._moves = _moving_frames(source)
+    def __init__(self, dataset: SurveyedDataset) -> None:
+        self._dataset = dataset
+        self._watched: dict[str, list[_Watched]] = {key: [] for key in dataset.cameras}
+        self._moves = _moving_frames(dataset)
 
-    def watch(self, episode: Episode, camera: str, pictures: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    def watch(self, episode: EpisodeRows, camera: str, pictures: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         """Passes an episode's pictures (H, W, 3) on; one that cannot be read ends them, and is noted."""
         found, moves = _Watched(episode.index), self._moves[episode.rows]
         self._watched[camera].append(found)
@@ -86,16 +85,16 @@ class PictureChecks:
                 yield self._judge_repeats(key, watched)
                 yield _judge_blank(key, watched)
         motion = {key: [each.motion for each in watched] for key, watched in self._watched.items()}
-        yield from check_delay(self._source, fit_microphones(self._source), motion)
+        yield from check_delay(self._dataset, motion)
 
     def _judge_repeats(self, key: str, watched: list[_Watched]) -> Finding:
         n_repeated = sum(each.n_repeated for each in watched)
         share = n_repeated / max(sum(each.n_moving for each in watched), 1)
-        freeze_s = max(each.longest_freeze for each in watched) / self._source.fps
+        freeze_s = max(each.longest_freeze for each in watched) / self._dataset.fps
         figures = {"repeated_while_moving": n_repeated, "share": share, "longest_freeze_s": freeze_s}
         if not n_repeated:
             return Finding("frames that repeat", "ok", "none while the arm moves", key, figures=figures)
-        tolerated = _TOLERATED_SHARE[self._source.features[key]["dtype"]]
+        tolerated = _TOLERATED_SHARE[self._dataset.features[key]["dtype"]]
         level: Level = "error" if freeze_s >= _FREEZE_S else "warning" if share > tolerated else "ok"
         repeating = [each.episode for each in watched if each.n_repeated]
         message = (
@@ -119,17 +118,17 @@ def _spread(picture: np.ndarray) -> float:
     return float(np.sqrt(counts @ np.square(_LEVELS - mean) / picture.size))
 
 
-def _moving_frames(source: DatasetSource) -> np.ndarray:
+def _moving_frames(dataset: SurveyedDataset) -> np.ndarray:
     """Frames before which the arm moved more than it does before half of all frames, (N,) bool.
 
     Without a state the action tells; without either, all frames.
     """
-    if source.motion_key is None:
-        return np.ones(len(source), bool)
-    values = np.nan_to_num(source.rows(source.motion_key))
+    key, values = motion_of_arm(dataset)
+    if key is None:
+        return np.ones(len(dataset), bool)
     change = np.abs(np.diff(values, axis=0, prepend=values[:1])) / (values.std(axis=0) + 1e-12)
     size = change.max(axis=1)  # (N,)
     moving = size > np.median(size)
-    for episode in source.episodes:
+    for episode in dataset.episodes:
         moving[episode.start] = False
     return moving

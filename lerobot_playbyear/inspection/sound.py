@@ -4,13 +4,16 @@ Levels are in dB of full scale (dBFS), samples in steps of 16-bit PCM whatever t
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
-from lerobot_playbyear.inspection.source import FULL_SCALE, DatasetSource, Episode
+from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
+
+FULL_SCALE = 32768.0
+"""Of 16-bit PCM, in its steps."""
 
 _QUIET_DBFS = -80.0  # 16-bit PCM has 3 steps of RMS there: hardly anything was heard
 _CLIPPED = 32766.0  # steps; at or beyond it a sample may have been cut
@@ -36,7 +39,7 @@ class _Spans:
     n_bad: int = 0
     first: str = ""
 
-    def add(self, episode: Episode, spans: list[tuple[int, int]]) -> None:
+    def add(self, episode: EpisodeRows, spans: list[tuple[int, int]]) -> None:
         if spans:
             self.first = self.first or f"episode {episode.index} at {spans[0][0] / self.sample_rate:.3f} s"
             self.episodes.append(episode.index)
@@ -56,10 +59,21 @@ class _Spans:
         return Finding(check, level, message, self.key, self.episodes, figures)
 
 
-def check_sound(source: DatasetSource, microphones: Sequence[str]) -> Iterator[Finding]:
-    """All checks of these microphones, whose rows must be what their sample rate says."""
-    for key in microphones:
-        yield from _check_microphone(source, key)
+def check_sound(dataset: SurveyedDataset) -> Iterator[Finding]:
+    """All checks of the microphones whose rows are what their sample rate says."""
+    for key in dataset.timed_microphones:
+        yield from _check_microphone(dataset, key)
+
+
+def heard(dataset: SurveyedDataset, key: str, episode: EpisodeRows) -> np.ndarray:
+    """What a microphone heard in an episode, (n * S,) float32 in steps of 16-bit PCM.
+
+    NaN and infinite samples, a finding of their own, are 0.
+    """
+    sound = dataset.sound(key, episode)
+    if sound.dtype.kind == "f":
+        sound = np.nan_to_num(sound * FULL_SCALE, nan=0.0, posinf=0.0, neginf=0.0)
+    return sound.astype(np.float32)
 
 
 def dbfs(rms_steps: float) -> float:
@@ -121,14 +135,14 @@ def repeats(samples: np.ndarray, samples_per_frame: int) -> list[tuple[int, int]
     return merged
 
 
-def _check_microphone(source: DatasetSource, key: str) -> Iterator[Finding]:
-    samples_per_frame = source.features[key]["shape"][0]
-    sample_rate = float(samples_per_frame * source.fps)
+def _check_microphone(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
+    samples_per_frame = dataset.features[key]["shape"][0]
+    sample_rate = float(samples_per_frame * dataset.fps)
     dead, quiet, offset = [], [], []
-    cut, lost, repeated = (_Spans(key, sample_rate, len(source) * samples_per_frame) for _ in range(3))
+    cut, lost, repeated = (_Spans(key, sample_rate, len(dataset) * samples_per_frame) for _ in range(3))
     levels, peak, worst_offset = [], 0.0, 0.0
-    for episode in source.episodes:
-        samples = source.sound(key, episode)
+    for episode in dataset.episodes:
+        samples = heard(dataset, key, episode)
         mean = float(samples.mean(dtype=np.float64))
         levels.append(dbfs(float(samples.std(dtype=np.float64))))
         peak = max(peak, float(np.abs(samples).max()))

@@ -1,54 +1,56 @@
 """Checks of a dataset's shape: what the survey found, lengths, sample rates, numbers and their statistics."""
 
-from collections.abc import Iterator
+import json
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
-from lerobot_playbyear.datasets.features import check_audio_features
 from lerobot_playbyear.datasets.findings import Finding, name_episodes
-from lerobot_playbyear.inspection.source import DatasetSource
+from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
+from lerobot_playbyear.datasets.survey import STATS_PATH
 
 _LENGTH_FACTOR = 4.0  # an episode this much longer or shorter than the median is named
 _STATS_TOLERANCE = 0.02  # of a value's range; LeRobot sums statistics in float32, episode by episode
 
 
-def check_survey(source: DatasetSource) -> Iterator[Finding]:
+def check_survey(dataset: SurveyedDataset) -> Iterator[Finding]:
     """Files, rows, times and tasks: what is wrong with the episodes that are looked at."""
-    asked = source.chosen
+    asked = dataset.chosen
     found = [
-        each for each in source.survey.findings if not each.episodes or asked is None or asked & set(each.episodes)
+        each for each in dataset.survey.findings if not each.episodes or asked is None or asked & set(each.episodes)
     ]
     yield from found
     if not any(finding.check in ("files", "rows", "info") for finding in found):
-        message = f"{len(source.episodes)} episodes, {len(source):,} frames, none missing"
-        yield Finding("rows", "ok", message, figures={"episodes": len(source.episodes), "frames": len(source)})
+        message = f"{len(dataset.episodes)} episodes, {len(dataset):,} frames, none missing"
+        yield Finding("rows", "ok", message, figures={"episodes": len(dataset.episodes), "frames": len(dataset)})
     if not any(finding.check == "times" for finding in found):
-        yield Finding("times", "ok", f"frames are 1/{source.fps} s apart in every episode")
+        yield Finding("times", "ok", f"frames are 1/{dataset.fps} s apart in every episode")
 
 
-def check_columns(source: DatasetSource) -> Iterator[Finding]:
+def check_columns(dataset: SurveyedDataset) -> Iterator[Finding]:
     """Every column of numbers or sound can be read; the other checks leave those out that cannot."""
-    for key, reason in source.unreadable.items():
-        message = f"cannot be read: {reason}. Record these episodes again, or leave them out with --dataset.episodes"
-        yield Finding("columns", "error", message, key)
-    if not source.unreadable:
+    for key, reason in dataset.unreadable.items():
+        yield Finding("columns", "error", reason, key)
+    if not dataset.unreadable:
         yield Finding("columns", "ok", "all can be read")
 
 
-def check_lengths(source: DatasetSource) -> Iterator[Finding]:
+def check_lengths(dataset: SurveyedDataset) -> Iterator[Finding]:
     """Episodes are of a usable and comparable length."""
-    lengths = np.array([len(episode) for episode in source.episodes])
-    seconds = lengths / source.fps
+    lengths = np.array([len(episode) for episode in dataset.episodes])
+    seconds = lengths / dataset.fps
     median = float(np.median(lengths))
     figures = {
         "shortest_s": float(seconds.min()),
-        "median_s": median / source.fps,
+        "median_s": median / dataset.fps,
         "longest_s": float(seconds.max()),
         "total_s": float(seconds.sum()),
     }
-    text = f"{seconds.min():.4g} to {seconds.max():.4g} s, median {median / source.fps:.4g} s"
-    single = [e.index for e in source.episodes if len(e) < 2]
-    odd = [e.index for e in source.episodes if not median / _LENGTH_FACTOR <= len(e) <= median * _LENGTH_FACTOR]
+    text = f"{seconds.min():.4g} to {seconds.max():.4g} s, median {median / dataset.fps:.4g} s"
+    single = [e.index for e in dataset.episodes if len(e) < 2]
+    odd = [e.index for e in dataset.episodes if not median / _LENGTH_FACTOR <= len(e) <= median * _LENGTH_FACTOR]
     if single:
         message = f"{name_episodes(single)}: a single frame; {text}"
         yield Finding("episode lengths", "warning", message, episodes=single, figures=figures)
@@ -59,38 +61,27 @@ def check_lengths(source: DatasetSource) -> Iterator[Finding]:
         yield Finding("episode lengths", "ok", text, figures=figures)
 
 
-def check_sample_rates(source: DatasetSource) -> Iterator[Finding]:
+def check_sample_rates(dataset: SurveyedDataset) -> Iterator[Finding]:
     """Each microphone's rows hold sample_rate / fps samples; where they cannot, the survey says so."""
-    if not source.microphones:
+    if not dataset.microphones:
         yield Finding("sound", "info", "no sound: no key starts with observation.audio.")
-    for key in fit_microphones(source):
-        block = source.features[key]["shape"][0]
-        rate = block * source.fps
-        message = f"{rate:,} Hz / {source.fps} Hz = {block} samples per frame"
+    for key in dataset.timed_microphones:
+        block = dataset.features[key]["shape"][0]
+        rate = block * dataset.fps
+        message = f"{rate:,} Hz / {dataset.fps} Hz = {block} samples per frame"
         yield Finding("sample rate", "ok", message, key, figures={"sample_rate": rate, "samples_per_frame": block})
 
 
-def fit_microphones(source: DatasetSource) -> list[str]:
-    """The microphones whose rows are what their sample rate says; of the others no moment in time is known."""
-    fitting = []
-    for key in source.microphones:
-        try:
-            check_audio_features({key: source.features[key]}, source.fps)
-        except ValueError:
-            continue
-        if key not in source.unreadable:
-            fitting.append(key)
-    return fitting
-
-
-def check_finite_numbers(source: DatasetSource) -> Iterator[Finding]:
+def check_finite_numbers(dataset: SurveyedDataset) -> Iterator[Finding]:
     """No NaN and no infinite value in any column of floats."""
     n_columns, is_finite = 0, True
-    for key in _readable(source):
-        if source.block(key, source.episodes[0]).dtype.kind != "f":
+    for key in _readable(dataset):
+        if _rows(dataset, key, dataset.episodes[0]).dtype.kind != "f":
             continue
         n_columns += 1
-        bad = {each.index: int((~np.isfinite(source.block(key, each)).all(axis=1)).sum()) for each in source.episodes}
+        bad = {
+            each.index: int((~np.isfinite(_rows(dataset, key, each)).all(axis=1)).sum()) for each in dataset.episodes
+        }
         if n_bad := sum(bad.values()):
             is_finite = False
             episodes = [episode for episode, own in bad.items() if own]
@@ -100,17 +91,17 @@ def check_finite_numbers(source: DatasetSource) -> Iterator[Finding]:
         yield Finding("finite numbers", "ok", f"no NaN and no infinite value in {n_columns} columns of floats")
 
 
-def check_statistics(source: DatasetSource) -> Iterator[Finding]:
+def check_statistics(dataset: SurveyedDataset) -> Iterator[Finding]:
     """meta/stats.json, with which training normalises, describes the data that is there."""
-    if len(source.episodes) != len(source.survey.episodes):
+    if len(dataset.episodes) != len(dataset.survey.episodes):
         yield Finding("statistics", "info", "not compared: only some of the episodes were opened")
         return
-    wrong, missing, n_compared = [], [], 0
-    for key in _readable(source):
-        if key not in source.stats:
+    stats, wrong, missing, n_compared = _stored_stats(dataset), [], [], 0
+    for key in _readable(dataset):
+        if key not in stats:
             missing.append(key)
             continue
-        difference = _stats_difference(source, key)
+        difference = _stats_difference(dataset, key, stats[key])
         n_compared += 1
         if difference:
             wrong.append(f"{key} ({difference})")
@@ -123,29 +114,42 @@ def check_statistics(source: DatasetSource) -> Iterator[Finding]:
         yield Finding("statistics", "ok", f"meta/stats.json fits the data of {n_compared} columns")
 
 
-def _readable(source: DatasetSource) -> list[str]:
-    return [*source.numbers, *(key for key in source.microphones if key not in source.unreadable)]
+def _readable(dataset: SurveyedDataset) -> list[str]:
+    return [*dataset.numbers, *(key for key in dataset.microphones if key not in dataset.unreadable)]
 
 
-def _stats_difference(source: DatasetSource, key: str) -> str | None:
+def _rows(dataset: SurveyedDataset, key: str, episode: EpisodeRows) -> np.ndarray:
+    """(n, D)"""
+    return dataset.values(key, episode).reshape(len(episode), -1)
+
+
+def _stored_stats(dataset: SurveyedDataset) -> dict[str, dict[str, Any]]:
+    """Empty where they cannot be read, which the survey says."""
+    try:
+        return json.loads((dataset.root / STATS_PATH).read_bytes())
+    except (OSError, ValueError):
+        return {}
+
+
+def _stats_difference(dataset: SurveyedDataset, key: str, own: Mapping[str, Any]) -> str | None:
     """What differs, in words.
 
     Statistics are per element, or one number for all elements of a row, given once or repeated for each. Those of sound
     are compared as statistics of all samples: where a sample stands in its row means nothing, and merging datasets
     averages both kinds.
     """
-    found = _summarise(source, key)
+    found = _summarise(dataset, key)
     if found is None:
         return None  # a finding of its own
     size = found["min"].size
     stored: dict[str, np.ndarray] = {}
     for name in ("min", "max", "mean", "std"):
-        if name not in source.stats[key]:
+        if name not in own:
             return f"no {name}"
-        stored[name] = np.asarray(source.stats[key][name], np.float64).reshape(-1)
+        stored[name] = np.asarray(own[name], np.float64).reshape(-1)
         if stored[name].size not in (1, size):
             return f"{name} has {stored[name].size} values for {size} elements"
-    stored = _of_all_elements(stored) if key in source.microphones else stored
+    stored = _of_all_elements(stored) if key in dataset.microphones else stored
     for name, value in stored.items():
         value = value[:1] if (value == value[0]).all() else value
         compared = found if value.size == size else _of_all_elements(found)
@@ -157,11 +161,11 @@ def _stats_difference(source: DatasetSource, key: str) -> str | None:
     return None
 
 
-def _summarise(source: DatasetSource, key: str) -> dict[str, np.ndarray] | None:
+def _summarise(dataset: SurveyedDataset, key: str) -> dict[str, np.ndarray] | None:
     """Least, largest, mean and standard deviation of each element of a column, (D,); None if a value is not finite."""
     n, low, high, mean, squares = 0, np.array(np.inf), np.array(-np.inf), np.array(0.0), np.array(0.0)
-    for episode in source.episodes:
-        values = source.block(key, episode).astype(np.float64)  # (k, D)
+    for episode in dataset.episodes:
+        values = _rows(dataset, key, episode).astype(np.float64)  # (k, D)
         if not np.isfinite(values).all():
             return None
         own, share = values.mean(axis=0), len(values) / (n + len(values))
@@ -177,3 +181,34 @@ def _of_all_elements(each: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     variance = (np.square(each["std"]) + np.square(each["mean"] - mean)).mean()
     together = {"min": each["min"].min(), "max": each["max"].max(), "mean": mean, "std": np.sqrt(variance)}
     return {name: np.atleast_1d(value) for name, value in together.items()}
+
+
+# What a report says of the dataset itself
+
+
+def facts(dataset: SurveyedDataset) -> dict[str, Any]:
+    """What the dataset is, for the head of a report; in JSON's numbers."""
+    rates = {key: (dataset.features[key].get("info") or {}).get("sample_rate") for key in dataset.microphones}
+    return finite(
+        {
+            "repo_id": dataset.repo_id,
+            "root": str(dataset.root),
+            "robot_type": dataset.info.get("robot_type"),
+            "fps": dataset.fps,
+            "episodes": len(dataset.episodes),
+            "frames": len(dataset),
+            "seconds": len(dataset) / dataset.fps,
+            "cameras": {key: list(dataset.features[key]["shape"]) for key in dataset.cameras},
+            "microphones": rates,
+            "tasks": sorted({dataset.task(episode) for episode in dataset.episodes}),
+        }
+    )
+
+
+def finite(value: Any) -> Any:
+    """The same for JSON, which has no NaN and no infinite numbers, though Python reads them in one: null for each."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: finite(each) for key, each in value.items()}
+    return [finite(each) for each in value] if isinstance(value, list | tuple) else value

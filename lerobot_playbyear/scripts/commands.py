@@ -66,13 +66,13 @@ def video() -> None:
 @command(flag="--json")
 def inspect() -> None:
     logging.basicConfig(level=logging.WARNING)
+    from lerobot_playbyear.datasets.errors import InputError
     from lerobot_playbyear.datasets.findings import worst
     from lerobot_playbyear.inspection.inspect import inspect
-    from lerobot_playbyear.inspection.source import InspectionError
 
     try:
         findings = run_alone(inspect)
-    except InspectionError as error:
+    except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     sys.exit(worst(findings) == "error")
