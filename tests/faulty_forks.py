@@ -55,9 +55,9 @@ def _told(report: Any) -> dict[str, Any]:
 def inspect(root: str) -> dict[str, Any]:
     from recording_factory import REPO_ID
 
+    from lerobot_playbyear.datasets.reader import SurveyedDataset
     from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig
     from lerobot_playbyear.inspection.inspect import inspect as inspect_dataset
-    from lerobot_playbyear.datasets.reader import SurveyedDataset
 
     inspect_dataset(InspectConfig(dataset=InspectDatasetConfig(repo_id=REPO_ID, root=root)))
     return {"episodes": len(SurveyedDataset.open(REPO_ID, root).episodes)}

@@ -1,12 +1,13 @@
 """What `DurableWriter` leaves on the disk, whatever happens to it."""
 
-import contextlib
 import json
+import multiprocessing
 import os
-import resource
+import random
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
@@ -16,12 +17,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.dataset_tools import delete_episodes
 from lerobot.datasets.io_utils import load_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from recording_factory import (
+    CAMERA,
     FEATURES,
     FPS,
     MICROPHONE,
@@ -32,72 +33,46 @@ from recording_factory import (
     episode_frames,
     load,
 )
+from support.recording import ENCODER, assert_recorded, everything, write, write_episode, writer
 
 from lerobot_playbyear.datasets import audio_feature, episode_files, journal
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
-from lerobot_playbyear.datasets.survey import survey
-
-ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
-
-
-def writer(root: Path, features: dict[str, Any] = FEATURES, **options) -> DurableWriter:
-    return DurableWriter(REPO_ID, root, FPS, features, **{"rgb_encoder": ENCODER, "resume": True, **options})
-
-
-def write_episode(target: DurableWriter, number: int) -> int:
-    for frame in episode_frames(number, target.features):
-        target.add_frame(frame)
-    return target.save_episode()
-
-
-def write(root: Path, numbers: range | list[int], features: dict[str, Any] = FEATURES, **options) -> None:
-    with writer(root, features, **options) as target:
-        for number in numbers:
-            write_episode(target, number)
-
-
-def is_as_recorded(root: Path, numbers: range | list[int], features: dict[str, Any] = FEATURES) -> bool:
-    dataset = load(root)
-    assert dataset.num_episodes == len(numbers)
-    assert not differences(dataset, dict(enumerate(numbers)), features)
-    return True
-
+from lerobot_playbyear.datasets.files import FolderLockedError
+from lerobot_playbyear.datasets.journal import (
+    JOURNAL,
+    LOCK,
+    STAGING,
+    JournalError,
+    finish_journal,
+    lock_dataset,
+    publish,
+)
 
 # What is on the disk
 
 
-def test_every_value_comes_back(tmp_path):
-    write(tmp_path / "dataset", range(4), RICH_FEATURES)
-    assert is_as_recorded(tmp_path / "dataset", range(4), RICH_FEATURES)
-    assert survey(tmp_path / "dataset").is_sound
-
-
-def test_nothing_but_the_dataset_stays_on_disk(tmp_path):
+def test_every_value_comes_back_and_nothing_else_stays(tmp_path):
     root = tmp_path / "dataset"
-    with writer(root) as target:
-        write_episode(target, 0)
-        target.add_frame(episode_frames(1, FEATURES)[0])
-    assert {path.name for path in root.iterdir()} == {"data", "meta", "images"}
+    with writer(root, RICH_FEATURES) as target:
+        for number in range(4):
+            write_episode(target, number)
+        target.add_frame(episode_frames(4, RICH_FEATURES)[0])
+    assert_recorded(root, range(4), RICH_FEATURES)
+    assert {path.name for path in root.iterdir()} == {"data", "meta", "images", "videos"}
     assert [path.name for path in (root / "images").iterdir()] == [".lock"]
-    assert is_as_recorded(root, [0])
 
 
-def test_short_episodes_share_files(tmp_path):
+def test_short_episodes_share_files_and_large_files_are_not_written_again(tmp_path, monkeypatch):
     root = tmp_path / "dataset"
-    write(root, range(3))
-    write(root, range(3, 6))
+    write(root, range(2))
+    write(root, range(2, 4))
     assert len(list(root.glob("data/*/*"))) == len(list(root.glob("meta/episodes/*/*"))) == 1
-    assert pq.ParquetFile(next(root.glob("data/*/*"))).num_row_groups == 6  # LeRobot's: one per episode
-    assert is_as_recorded(root, range(6))
-
-
-def test_large_files_are_not_written_again(tmp_path, monkeypatch):
+    assert pq.ParquetFile(next(root.glob("data/*/*"))).num_row_groups == 4  # LeRobot's: one per episode
     monkeypatch.setattr(episode_files, "SMALL_DATA_BYTES", 5000)
     monkeypatch.setattr(episode_files, "SMALL_TABLE_BYTES", 5000)
-    root = tmp_path / "dataset"
-    write(root, range(4))
-    assert [path.name for path in sorted(root.glob("data/*/*"))] == [f"file-00{i}.parquet" for i in range(4)]
-    assert is_as_recorded(root, range(4))
+    write(root, range(4, 6))
+    assert [path.name for path in sorted(root.glob("data/*/*"))] == [f"file-00{i}.parquet" for i in range(3)]
+    assert_recorded(root, range(6))
 
 
 def test_a_damaged_file_is_not_continued(tmp_path, caplog):
@@ -114,52 +89,20 @@ def test_a_damaged_file_is_not_continued(tmp_path, caplog):
     assert "is not continued" in caplog.text
 
 
-SECONDS, RATE = 5, 48000
-
-
-@pytest.fixture(scope="module")
-def sizes(tmp_path_factory) -> dict[str, tuple[Path, int]]:
-    """Two episodes with one microphone at 48 kHz, of noise at full scale and of silence."""
-    folder = tmp_path_factory.mktemp("sizes")
-    features = {MICROPHONE: audio_feature(RATE, FPS), "action": FEATURES["action"]}
-    rng = np.random.default_rng(0)
-    found = {}
-    for name in ("noise", "silence"):
-        with DurableWriter(REPO_ID, folder / name, FPS, features) as target:
-            for _ in range(2):
-                for _ in range(SECONDS * FPS):
-                    sound = rng.integers(-32768, 32768, RATE // FPS) if name == "noise" else np.zeros(RATE // FPS)
-                    frame = {MICROPHONE: sound.astype(np.int16), "action": np.zeros(4, np.float32), "task": "listen"}
-                    target.add_frame(frame)
-                target.save_episode()
-        found[name] = (folder / name, 2 * SECONDS * RATE)
-    return found
-
-
 @pytest.mark.parametrize(("name", "limit"), [("noise", 2.2), ("silence", 0.2)])
-def test_sound_takes_little_room(sizes, name, limit):
-    root, n_samples = sizes[name]
-    assert sum(path.stat().st_size for path in root.glob("data/*/*")) / n_samples < limit
-
-
-def test_an_episode_adds_little_to_the_metadata(sizes):
-    root, _ = sizes["noise"]
-    grown = sum(path.stat().st_size for path in root.glob("meta/episodes/*/*"))
-    assert grown < 2 * 20_000
-    assert (root / "meta/stats.json").stat().st_size < 250_000  # once per dataset: LeRobot wants it per sample index
-
-
-def test_a_microphones_statistics_are_those_of_all_its_samples(tmp_path):
-    root = tmp_path / "dataset"
-    write(root, range(3))
-    stats = load(root).meta.stats[MICROPHONE]
-    samples = np.concatenate([frame[MICROPHONE] for number in range(3) for frame in episode_frames(number, FEATURES)])
-    n_frames = len(samples) // 80
-    expected = {"min": samples.min(), "max": samples.max(), "mean": samples.mean(), "std": samples.std()}
-    assert int(stats["count"][0]) == n_frames
-    for name, value in expected.items():
-        assert stats[name].shape == (80,)
-        np.testing.assert_allclose(stats[name], value, rtol=1e-3)
+def test_sound_takes_little_room(tmp_path, name, limit):
+    """Bytes a sample at 48 kHz, of noise at full scale and of silence."""
+    rate, n_frames = 48000, 100
+    features = {MICROPHONE: audio_feature(rate, FPS), "action": FEATURES["action"]}
+    rng = np.random.default_rng(0)
+    with DurableWriter(REPO_ID, tmp_path, FPS, features, resume=True) as target:
+        for _ in range(n_frames):
+            sound = rng.integers(-32768, 32768, rate // FPS) if name == "noise" else np.zeros(rate // FPS)
+            target.add_frame({MICROPHONE: sound.astype(np.int16), "action": np.zeros(4, np.float32), "task": "listen"})
+        target.save_episode()
+    assert sum(path.stat().st_size for path in tmp_path.glob("data/*/*")) / (n_frames * rate / FPS) < limit
+    assert sum(path.stat().st_size for path in tmp_path.glob("meta/episodes/*/*")) < 20_000
+    assert (tmp_path / "meta/stats.json").stat().st_size < 250_000  # once: LeRobot wants it per sample index
 
 
 # Other tools
@@ -211,32 +154,22 @@ def test_rows_and_statistics_are_those_that_lerobot_writes(tmp_path):
 
 
 def test_lerobot_goes_on_with_our_dataset_and_we_with_lerobots(tmp_path):
+    """It appends, merges and deletes."""
     root = tmp_path / "dataset"
-    write(root, range(2))
-    dataset = LeRobotDataset.resume(REPO_ID, root=root, video_backend="pyav")
-    for number in (2, 3):
-        for frame in episode_frames(number, FEATURES):
-            dataset.add_frame(frame)
-        dataset.save_episode()
+    write(root, range(2), RICH_FEATURES)
+    dataset = LeRobotDataset.resume(REPO_ID, root=root, video_backend="pyav", rgb_encoder=ENCODER)
+    for frame in episode_frames(2, RICH_FEATURES):
+        dataset.add_frame(frame)
+    dataset.save_episode()
     dataset.finalize()
-    write(root, range(4, 6))
-    assert is_as_recorded(root, range(6))
-    assert survey(root).is_sound
-    assert int(load(root).meta.stats[MICROPHONE]["count"][0]) == load(root).num_frames
-
-
-def test_lerobot_merges_and_deletes(tmp_path):
-    write(tmp_path / "one", range(3), RICH_FEATURES)
-    write(tmp_path / "two", range(3, 5), RICH_FEATURES)
-    aggregate_datasets(
-        ["a/one", "a/two"], REPO_ID, roots=[tmp_path / "one", tmp_path / "two"], aggr_root=tmp_path / "merged"
-    )
-    assert is_as_recorded(tmp_path / "merged", range(5), RICH_FEATURES)
-    assert survey(tmp_path / "merged").is_sound
+    write(root, [3], RICH_FEATURES)
+    assert_recorded(root, range(4), RICH_FEATURES)
+    write(tmp_path / "two", [4], RICH_FEATURES)
+    aggregate_datasets(["a/one", "a/two"], REPO_ID, roots=[root, tmp_path / "two"], aggr_root=tmp_path / "merged")
+    assert_recorded(tmp_path / "merged", range(5), RICH_FEATURES)
     delete_episodes(load(tmp_path / "merged"), [1, 3], output_dir=tmp_path / "left", repo_id=REPO_ID)
-    assert survey(tmp_path / "left").is_sound
     write(tmp_path / "left", [7], RICH_FEATURES)
-    assert is_as_recorded(tmp_path / "left", [0, 2, 4, 7], RICH_FEATURES)
+    assert_recorded(tmp_path / "left", [0, 2, 4, 7], RICH_FEATURES)
 
 
 # Crashes
@@ -272,9 +205,7 @@ def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, mo
         survived = target.num_episodes
         assert survived == (1 if moves_before == 0 else 2)  # the journal is the first move, and the point of no return
         write_episode(target, 2)
-    assert is_as_recorded(root, [0, 1, 2] if survived == 2 else [0, 2])
-    stats = load(root).meta.stats["action"]
-    assert int(stats["count"][0]) == load(root).num_frames
+    assert_recorded(root, [0, 1, 2] if survived == 2 else [0, 2])
 
 
 def test_files_are_on_the_disk_before_anything_refers_to_them(tmp_path, monkeypatch):
@@ -295,8 +226,7 @@ def test_files_are_on_the_disk_before_anything_refers_to_them(tmp_path, monkeypa
 
     monkeypatch.setattr(journal.os, "fsync", fsync)
     monkeypatch.setattr(journal.os, "replace", replace)
-    with writer(root, RICH_FEATURES) as target:
-        write_episode(target, 1)
+    write(root, [1], RICH_FEATURES)
     monkeypatch.undo()
 
     moves = [path for what, path in events if what == "move"]
@@ -313,16 +243,13 @@ def test_files_are_on_the_disk_before_anything_refers_to_them(tmp_path, monkeypa
             assert ("sync", path.parent) in events[at:]
 
 
-KILLER = Path(__file__).parent / "recording_forks.py"
-
-
 class Forks:
     """A process that has imported what it needs, and forks a child for each order: a fresh process without the wait."""
 
     def __init__(self, role: str, cache: Path) -> None:
         environment = {**os.environ, "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
-            [sys.executable, str(KILLER), role],
+            [sys.executable, str(Path(__file__).parent / "recording_forks.py"), role],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -350,8 +277,10 @@ def forks(tmp_path_factory) -> Iterator[tuple[Forks, Forks]]:
         one.close()
 
 
-def kill_at_random(forks: tuple[Forks, Forks], root: Path, n_kills: int) -> None:
-    recorder, reader = forks
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("n_kills", [3, pytest.param(100, marks=pytest.mark.slow)])
+def test_every_reported_episode_survives_sigkill(forks, tmp_path, n_kills):
+    root, (recorder, reader) = tmp_path / "dataset", forks
     rng = np.random.default_rng(0)
     saved = 0
     for kill in range(n_kills):
@@ -366,105 +295,151 @@ def kill_at_random(forks: tuple[Forks, Forks], root: Path, n_kills: int) -> None
         assert found["rows"] >= found["frames"]  # those of an episode that was not yet reported may be there
         assert found["episodes"] in (saved, saved + 1)  # one may have been complete, and not yet reported
         saved = found["episodes"]
-    with writer(root, RICH_FEATURES):
-        pass
-    assert survey(root).is_sound
-    assert is_as_recorded(root, range(load(root).num_episodes), RICH_FEATURES)
+    writer(root, RICH_FEATURES).close()
+    assert_recorded(root, range(load(root).num_episodes), RICH_FEATURES)
 
 
-def test_every_reported_episode_survives_sigkill(forks, tmp_path):
-    kill_at_random(forks, tmp_path / "dataset", 3)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(1800)
-def test_every_reported_episode_survives_a_hundred_sigkills(forks, tmp_path):
-    kill_at_random(forks, tmp_path / "dataset", 100)
-
-
-# Disks
-
-
-@pytest.mark.parametrize("limit", [1000, 5000, 30_000])
-def test_a_full_disk_leaves_the_dataset_as_it_was(tmp_path, limit):
-    root = tmp_path / "dataset"
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with writer(root) as target:
-        write_episode(target, 0)
-        for number in range(1, 12):
-            for frame in episode_frames(number, FEATURES):
-                target.add_frame(frame)
-        try:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
-            with pytest.raises(DatasetWriteError, match=r"Episode 1 could not be written.*1 episodes before it"):
-                target.save_episode()
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        assert is_as_recorded(root, [0])
-        assert target.save_episode() == 1  # there is room again
-    dataset = load(root)
-    assert dataset.num_episodes == 2
-    assert dataset.num_frames == sum(len(episode_frames(number, FEATURES)) for number in range(12))
+# A journal is taken for a stranger's: what is moved stays inside the dataset, or nothing is moved at all
 
 
 @pytest.fixture
-def small_disk(tmp_path) -> Iterator[Path]:
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mount = shutil.which("mount")
-    if os.geteuid() != 0 or mount is None:
-        pytest.skip("mounting a small disk takes root")
-    if subprocess.run([mount, "-t", "tmpfs", "-o", "size=600k", "tmpfs", folder], check=False).returncode:
-        pytest.skip("a small disk cannot be mounted here")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
-def test_a_disk_that_fills_up(small_disk):
-    """Until it is full every episode is safe; then there is one error, and after it the dataset is whole."""
-    root = small_disk / "dataset"
-    with pytest.raises(DatasetWriteError, match="the disk is full"):
-        write(root, range(100))
-    saved = load(root).num_episodes
-    assert saved >= 2
-    assert is_as_recorded(root, range(saved))
-    with contextlib.suppress(DatasetWriteError):  # closing freed what the episode that failed had taken
-        write(root, [saved])
-    assert is_as_recorded(root, range(load(root).num_episodes))
-
-
-@contextlib.contextmanager
-def read_only(folder: Path) -> Iterator[None]:
-    """A folder that this process can read and not write to, even as root."""
-    for path in [*folder.rglob("*"), *list(folder.parents)[:3]]:  # pytest's own are closed to others
-        path.chmod(path.stat().st_mode | 0o555)
-    folder.chmod(0o555)
-    user = os.geteuid()
-    if user == 0:
-        os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(user)
-        folder.chmod(0o755)
-
-
-def test_a_read_only_folder_gives_one_clear_error(tmp_path):
-    root = tmp_path / "dataset"
+def root(tmp_path) -> Path:
+    """A dataset of one episode, two folders below one that nothing may reach."""
+    root = tmp_path / "outside/datasets/dataset"
     write(root, [0])
-    with read_only(root), pytest.raises(DatasetWriteError, match=f"Cannot write to {root}: Permission denied"):
-        writer(root)
-    assert is_as_recorded(root, [0])
+    return root
 
 
-# Who may write
+def plant(root: Path, names: str = "", victim: str = "data/new.parquet") -> None:
+    """A journal as a stranger may write one, with a file that it could move."""
+    (root / STAGING / victim).parent.mkdir(parents=True, exist_ok=True)
+    (root / STAGING / victim).write_bytes(b"a stranger's")
+    (root / JOURNAL).write_text(names)
 
 
-def test_a_dataset_of_another_kind_is_refused(tmp_path):
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "demo.hdf5").write_bytes(b"\x89HDF")
-    with pytest.raises(FileExistsError, match="is not empty and holds no dataset"):
+@pytest.mark.parametrize("names", ["", '["../x", "a/../../../../x"]', "[" * 100_000])
+def test_nothing_is_moved_out_of_the_dataset_whatever_a_journal_says(root, tmp_path, names):
+    plant(root, names)
+    (root / STAGING / "../../x").write_bytes(b"not staged")
+    (root / STAGING / "x").write_bytes(b"no file of a dataset")
+    before = everything(tmp_path)
+    finish_journal(root)
+    after = everything(tmp_path)
+    where = root.relative_to(tmp_path)
+    assert after.pop(str(where / "data/new.parquet"))[0] == b"a stranger's"
+    assert before.keys() - after.keys() == {
+        str(where / name) for name in (STAGING / "data/new.parquet", STAGING / "x", JOURNAL)
+    }
+    assert all(before[name] == content for name, content in after.items())
+
+
+def test_no_link_is_followed(root, tmp_path):
+    """A link in place of the journal, the lock, the scratch folder, or a folder of the dataset or of the staging."""
+    elsewhere = tmp_path / "elsewhere"
+    (elsewhere / ".staging").mkdir(parents=True)
+    for name in ("file-000.mp4", JOURNAL.name, ".staging/thesis.tex"):
+        (elsewhere / name).write_bytes(b"the user's own")
+    places = {
+        root / JOURNAL: root / "meta/info.json",
+        root / "videos": elsewhere,
+        root / STAGING / "videos": elsewhere,
+        root / STAGING / "videos/file-000.mp4": elsewhere / "file-000.mp4",
+        root / STAGING: elsewhere,
+        root / "images": elsewhere,
+    }
+    for place, target in places.items():
+        shutil.rmtree(root / "images")
+        plant(root, victim="videos/file-000.mp4" if place == root / "videos" else "data/new.parquet")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if place.is_dir():
+            shutil.rmtree(place)
+        place.unlink(missing_ok=True)
+        place.symlink_to(target)
+        before = everything(tmp_path)
+        for refused in (finish_journal, publish, writer):
+            if place == root / JOURNAL and refused is publish:
+                continue  # it writes its own in its place
+            with pytest.raises(JournalError, match=r"is a link|no ordinary file"):
+                refused(root)
+            assert everything(tmp_path) == before, place
+        assert not (elsewhere / ".lock").exists()
+        place.unlink()
+        (root / "images").mkdir(exist_ok=True)
+    (root / LOCK).unlink(missing_ok=True)
+    (root / LOCK).symlink_to(tmp_path / "new")
+    with pytest.raises(OSError, match="symbolic link"):
+        lock_dataset(root)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_dataset_that_is_reached_by_a_link_is_written(root, tmp_path):
+    (tmp_path / "link").symlink_to(root)
+    write(tmp_path / "link", [1])
+    assert (tmp_path / "link").is_symlink()
+    assert load(root).num_episodes == 2
+
+
+# Who may write, and what
+
+
+def hold(root: Path, n_times: int, answers) -> None:
+    """Takes the lock so many times, and notes when another one has it as well."""
+    end = time.monotonic() + 60.0
+    taken = doubled = 0
+    marker = root / "held"
+    while taken < n_times and time.monotonic() < end:
+        try:
+            lock = lock_dataset(root)
+        except FolderLockedError:
+            time.sleep(random.uniform(0.0, 0.003))  # or all of them only ever stand in each other's way
+            continue
+        except BaseException as error:
+            answers.put(error)
+            raise
+        try:
+            os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+        except FileExistsError:
+            doubled += 1
+        else:
+            taken += 1
+            time.sleep(0.0005)
+            marker.unlink()
+        lock.release()
+        time.sleep(0.001)  # let another one have it
+    answers.put((taken, doubled))
+
+
+def test_two_processes_never_hold_the_lock_at_once(tmp_path):
+    processes = multiprocessing.get_context("fork")
+    answers = processes.Queue()
+    workers = [processes.Process(target=hold, args=(tmp_path, 10, answers)) for _ in range(4)]
+    for worker in workers:
+        worker.start()
+    found = [answers.get(timeout=90) for _ in workers]
+    for worker in workers:
+        worker.join()
+    assert not [answer for answer in found if isinstance(answer, BaseException)]
+    assert sum(taken for taken, _ in found) >= 10  # all 40, unless the machine has much else to do
+    assert sum(doubled for _, doubled in found) == 0
+
+
+@pytest.mark.filterwarnings("ignore:flock not supported")
+@pytest.mark.parametrize("has_locks", [True, False])
+def test_a_second_writer_waits_until_the_first_has_closed(tmp_path, monkeypatch, has_locks):
+    """Also on a disk without locks of the system, where the lock's file alone tells."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def fail(*_):
+        raise OSError(38, "Function not implemented")
+
+    if not has_locks:
+        monkeypatch.setattr(fcntl, "flock", fail)
+    first = writer(tmp_path)
+    with pytest.raises(FolderLockedError, match="Another process is writing"):
         writer(tmp_path)
+    first.close()
+    first.close()
+    writer(tmp_path).close()
 
 
 def arm(*joints: str) -> dict[str, Any]:
@@ -481,4 +456,58 @@ def test_another_robot_or_other_joints_are_not_appended(tmp_path):
         writer(tmp_path / "data", arm(*joints), robot_type="koch_follower")
     write(tmp_path / "data", [1], arm(*joints), robot_type="so101_follower")
     write(tmp_path / "data", [2])  # says neither
-    assert is_as_recorded(tmp_path / "data", range(3))
+    assert_recorded(tmp_path / "data", range(3))
+
+
+@pytest.mark.parametrize("fps", [0, 29.97, True, "20"])
+def test_a_frame_rate_that_is_none_is_refused(tmp_path, fps):
+    with pytest.raises(ValueError, match=rf"fps={fps!r}"):
+        DurableWriter(REPO_ID, tmp_path / "dataset", fps, FEATURES)
+    assert not (tmp_path / "dataset").exists()
+
+
+def floats(value: float) -> np.ndarray:
+    sound = np.zeros(80, np.float32)
+    sound[17] = value
+    return sound
+
+
+REFUSED = [
+    (MICROPHONE, floats(np.nan), f"'{MICROPHONE}': sample 17 is nan"),
+    (MICROPHONE, floats(1.25), r"sample 17 is 1\.25; .*\[-1, 1\]"),
+    (MICROPHONE, floats(0).astype(np.float64), "float64"),
+    (MICROPHONE, np.zeros(79, np.float32), r"\(79,\)"),
+    (MICROPHONE, [0.0] * 80, "list"),
+    (CAMERA, np.full((16, 16, 3), 2.0, np.float32), rf"'{CAMERA}'.*\[0\.0, 1\.0\]"),
+    (CAMERA, np.zeros((16, 8, 3), np.uint8), r"\(16, 8, 3\)"),
+    ("task", None, "'task'"),
+    ("task", b"Knock.", "'task'"),
+]
+
+
+def test_a_bad_frame_is_refused_and_the_episode_goes_on(tmp_path):
+    features = {**FEATURES, MICROPHONE: {**FEATURES[MICROPHONE], "dtype": "float32"}}
+    good = [
+        {**frame, MICROPHONE: (frame[MICROPHONE] / 32768).astype(np.float32)} for frame in episode_frames(0, FEATURES)
+    ]
+    good += [{**good[0], MICROPHONE: floats(value)} for value in (1.0, -1.0)]  # full scale is not too loud
+    with writer(tmp_path, features) as target:
+        with pytest.raises(DatasetWriteError, match="Episode 0 has no frames"):
+            target.save_episode()
+        for frame in good:
+            for key, value, message in REFUSED:
+                with pytest.raises(ValueError, match=message):
+                    target.add_frame({**frame, key: value})
+            again = {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in frame.items()}
+            target.add_frame(again)
+            for value in again.values():  # a camera, or a sound card, may use its memory again
+                if isinstance(value, np.ndarray):
+                    value.fill(0)
+        target.save_episode()
+    dataset = load(tmp_path)
+    assert dataset.num_frames == len(good)
+    for index, frame in enumerate(good):
+        for key in (MICROPHONE, "action"):
+            np.testing.assert_array_equal(dataset[index][key].numpy(), frame[key])
+        pixels = (dataset[index][CAMERA].numpy().transpose(1, 2, 0) * 255).round().astype(np.uint8)
+        np.testing.assert_array_equal(pixels, frame[CAMERA])

@@ -64,6 +64,7 @@ repair | --dry-run=true | did you mean --dry_run?
 record | --dataset.root={noise} | {noise} already holds a dataset | resume=true
 record | --dataset.root={full} --resume=true | {full} is not empty and holds no dataset
 record | --dataset.root={file}/new | Cannot write | {file}
+record | --dataset.root={truncated} --resume=true | {truncated} | damaged | playbyear-repair --root={truncated}
 record | --dataset.root={noise} --resume=true | {noise} does not fit | seed is absent there | choose another root
 train | --output_dir={full} | {full} already exists | resume
 train | --output_dir={file}/run | --output_dir={file}/run cannot be written: Not a directory | wanted

@@ -1,7 +1,9 @@
-"""A save that failed can be repeated: nothing of the episode is lost, nothing is counted that is not on the disk."""
+"""A save that failed can be repeated, and resuming finishes what a writer of ours had begun: nothing of an episode is lost,
+nothing is counted that is not on the disk. All else that is wrong is said, with what to do, and left alone."""
 
 import contextlib
 import errno
+import json
 import os
 import shutil
 import subprocess
@@ -10,40 +12,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
 import pytest
-from lerobot.configs.video import RGBEncoderConfig
-from recording_factory import FEATURES, FILM, FPS, REPO_ID, RICH_FEATURES, differences, episode_frames, load
+from recording_factory import FEATURES, FILM, RICH_FEATURES, differences, episode_frames, load
+from support.recording import add_episode, assert_recorded, everything, write, write_episode, writer
 
 from lerobot_playbyear.datasets import durable, episode_files, files
-from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
-from lerobot_playbyear.datasets.survey import survey
+from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, has_dataset
+from lerobot_playbyear.datasets.survey import DatasetDamagedError
 from lerobot_playbyear.episodes.saving import save_or_ask
+from lerobot_playbyear.repair import repair_dataset
 
-ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
 TWO_FILMS = {**RICH_FEATURES, FILM + "2": RICH_FEATURES[FILM]}
-
-
-def writer(root: Path, features: dict[str, Any] = FEATURES, **options) -> DurableWriter:
-    return DurableWriter(REPO_ID, root, FPS, features, **{"rgb_encoder": ENCODER, "resume": True, **options})
-
-
-def add_episode(target: DurableWriter, number: int) -> None:
-    for frame in episode_frames(number, target.features):
-        target.add_frame(frame)
-
-
-def write_episode(target: DurableWriter, number: int) -> int:
-    add_episode(target, number)
-    return target.save_episode()
-
-
-def assert_recorded(root: Path, n_episodes: int, features: dict[str, Any] = FEATURES) -> None:
-    dataset = load(root)
-    assert dataset.num_episodes == n_episodes
-    films = {key: feature for key, feature in features.items() if key != FILM + "2"}
-    assert not differences(dataset, {n: n for n in range(n_episodes)}, films)
-    assert int(dataset.meta.stats["action"]["count"][0]) == dataset.num_frames
-    assert survey(root).is_sound
 
 
 def no_room(*_: Any, **__: Any) -> None:
@@ -51,17 +31,31 @@ def no_room(*_: Any, **__: Any) -> None:
 
 
 @pytest.fixture
-def disk(tmp_path) -> Iterator[Path]:
-    """A file system of 4 MB."""
-    folder = tmp_path / "disk"
+def disk(tmp_path, request) -> Iterator[Path]:
+    """A file system of its own, of 4 MB or as large as is asked for."""
+    folder, size = tmp_path / "disk", getattr(request, "param", "4m")
     folder.mkdir()
     mount = shutil.which("mount")
     if os.geteuid() != 0 or mount is None:
         pytest.skip("mounting a small disk takes root")
-    if subprocess.run([mount, "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], check=False).returncode:
+    if subprocess.run([mount, "-t", "tmpfs", "-o", f"size={size}", "tmpfs", folder], check=False).returncode:
         pytest.skip("a small disk cannot be mounted here")
     yield folder
     subprocess.run(["umount", "-l", folder], check=True)
+
+
+@pytest.mark.parametrize("disk", ["600k"], indirect=True)
+def test_a_disk_that_fills_up(disk):
+    """Until it is full every episode is safe; then there is one error, and after it the dataset is whole."""
+    root = disk / "dataset"
+    with pytest.raises(DatasetWriteError, match="the disk is full"):
+        write(root, range(100))
+    saved = load(root).num_episodes
+    assert saved >= 2
+    assert_recorded(root, range(saved))
+    with contextlib.suppress(DatasetWriteError):  # closing freed what the episode that failed had taken
+        write(root, [saved])
+    assert_recorded(root, range(load(root).num_episodes))
 
 
 def leave_free(disk: Path, n_bytes: int) -> None:
@@ -93,7 +87,7 @@ def test_a_save_on_a_full_disk_is_repeated_when_there_is_room(disk):
         assert (index, target.num_episodes, target.num_frames) == (1, 2, load(root).num_frames)
         (disk / "ballast").unlink()
         assert write_episode(target, 2) == 2
-    assert_recorded(root, 3, RICH_FEATURES)
+    assert_recorded(root, range(3), RICH_FEATURES)
 
 
 FAULTS = {
@@ -106,10 +100,9 @@ FAULTS = {
 @pytest.mark.parametrize(
     ("module", "call", "step", "fault"),
     [
-        (os, "replace", 1, "full disk"),
         (os, "replace", 1, "interrupt"),
         (os, "fsync", 4, "broken disk"),
-        (episode_files, "encode_video_frames", 1, "broken disk"),
+        (episode_files, "encode_video_frames", 1, "full disk"),
         (episode_files, "encode_video_frames", 1, "interrupt"),
     ],
 )
@@ -140,7 +133,7 @@ def test_a_save_is_repeated_wherever_it_failed(tmp_path, monkeypatch, module, ca
             assert failures < 100
         assert failures >= 2 * step
         assert (index, target.num_episodes) == (1, 2)
-    assert_recorded(root, 2, TWO_FILMS)
+    assert_recorded(root, range(2), TWO_FILMS)
 
 
 def fail_to_save(target: DurableWriter) -> None:
@@ -172,7 +165,7 @@ def test_an_episode_that_failed(tmp_path, caplog, what):
         assert "an episode that had not been saved was removed" in caplog.text
         assert write_episode(target, 1) == 1
     target.close()
-    assert_recorded(root, 2)
+    assert_recorded(root, range(2))
     assert [path.name for path in (root / "images").iterdir()] == [".lock"]
 
 
@@ -190,7 +183,7 @@ def test_an_episode_that_was_published_in_vain_is_there_after_closing(tmp_path, 
             with pytest.raises(DatasetWriteError, match="is complete on disk already"):
                 target.discard_episode()
         assert target.num_episodes == load(root).num_episodes == 1
-    assert_recorded(root, 2)
+    assert_recorded(root, range(2))
 
 
 def test_a_drive_that_is_gone_is_not_begun_anew(tmp_path):
@@ -207,20 +200,20 @@ def test_a_drive_that_is_gone_is_not_begun_anew(tmp_path):
         shutil.rmtree(root)
         (tmp_path / "unplugged").rename(root)
         assert target.save_episode() == 1
-    assert_recorded(root, 2)
+    assert_recorded(root, range(2))
 
 
 def test_a_frame_that_could_not_be_added_is_not_half_there(tmp_path, monkeypatch):
     root = tmp_path / "dataset"
     with writer(root) as target:
         for frame in episode_frames(0, FEATURES):
-            with monkeypatch.context() as patch, contextlib.suppress(OSError):
+            with monkeypatch.context() as patch:
                 patch.setattr(durable, "image_array_to_pil_image", no_room)
-                target.add_frame(frame)
-                pytest.fail("it was added")
+                with pytest.raises(OSError, match="No space"):
+                    target.add_frame(frame)
             target.add_frame(frame)
         target.save_episode()
-    assert_recorded(root, 1)
+    assert_recorded(root, [0])
 
 
 @pytest.mark.parametrize(("typed", "is_saved"), [("\n\n", True), ("\nq\n", False), ("", False), (None, False)])
@@ -237,15 +230,7 @@ def test_a_person_at_the_terminal_is_asked_before_an_episode_is_given_up(tmp_pat
         with contextlib.nullcontext() if is_saved else pytest.raises(DatasetWriteError, match="Episode 1"):
             save_or_ask(target, episode_frames(1, FEATURES))
     os.close(ours)
-    assert_recorded(root, 2 if is_saved else 1)
-
-
-def test_an_episode_without_frames_is_no_episode(tmp_path):
-    with writer(tmp_path / "dataset") as target:
-        with pytest.raises(DatasetWriteError, match="Episode 0 has no frames"):
-            target.save_episode()
-        assert write_episode(target, 0) == 0
-    assert_recorded(tmp_path / "dataset", 1)
+    assert_recorded(root, range(2 if is_saved else 1))
 
 
 def test_an_episode_that_the_memory_cannot_hold_is_refused_before_the_process_is_killed(tmp_path, monkeypatch):
@@ -266,3 +251,135 @@ def test_an_episode_that_the_memory_cannot_hold_is_refused_before_the_process_is
         target.add_frame(frame)
         target.save_episode()
     assert [int(length) for length in load(root).meta.episodes["length"]] == [n_frames, 1]
+
+
+# Resuming what is damaged
+
+N_EPISODES = 4
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    """Each episode in a file of its own."""
+    root = tmp_path_factory.mktemp("original") / "dataset"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(episode_files, "SMALL_DATA_BYTES", 0)
+        write(root, range(N_EPISODES))
+    return root
+
+
+@pytest.fixture
+def root(original, tmp_path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "parent/dataset"))
+
+
+def data_file(root: Path, number: int) -> Path:
+    return root / f"data/chunk-000/file-{number:03d}.parquet"
+
+
+def not_synchronised(path: Path) -> None:
+    """As a power cut leaves what was written and not synchronised: the size is there, and no content."""
+    path.write_bytes(bytes(path.stat().st_size))
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def lead_away(name: str) -> Any:
+    """A path that leads out of the dataset and back in again: it can be read, and would be written to elsewhere."""
+
+    def change(path: Path) -> None:
+        template = "../dataset/data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+        path.write_text(json.dumps({**json.loads(path.read_text()), name: template}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("damage", "victims"),
+    [
+        (not_synchronised, [data_file(Path(), 1)]),
+        (cut, [data_file(Path(), 2), data_file(Path(), 3)]),
+        (Path.unlink, [data_file(Path(), 1), data_file(Path(), 2)]),
+        *((Path.unlink, [Path("meta", name)]) for name in ("stats.json", "tasks.parquet", "info.json")),
+        *((lead_away(name), [Path("meta/info.json")]) for name in ("data_path", "video_path")),
+    ],
+)
+def test_what_is_damaged_is_neither_dropped_nor_made_anew_in_passing(root, damage, victims):
+    for name in victims:
+        damage(root / name)
+    before = everything(root.parent)
+    with pytest.raises(DatasetDamagedError) as error:
+        writer(root)
+    if "lead_away" not in damage.__qualname__:
+        assert f"playbyear-repair --root={root}" in str(error.value)
+    assert everything(root.parent) == before
+    assert {path.name for path in root.parent.iterdir()} == {"dataset"}
+    assert [path.name for path in (root / "images").iterdir()] == [".lock"]
+
+
+def test_the_command_that_is_named_makes_it_good(root):
+    cut(data_file(root, 1))
+    with pytest.raises(DatasetDamagedError, match=rf"(?s)othing was changed.*playbyear-repair --root={root}"):
+        writer(root)
+    repaired = repair_dataset(root).target
+    assert writer(repaired).num_episodes == N_EPISODES - 1
+    assert not differences(load(repaired), {0: 0, 1: 2, 2: 3}, FEATURES)
+
+
+@pytest.mark.parametrize(("code", "after"), [(errno.ESTALE, 0), (errno.EIO, 2), (errno.ENOMEM, 3)])
+def test_a_read_that_failed_once_costs_no_episode(root, monkeypatch, code, after):
+    """An error of the network or the disk while a data file is read; then it can be read again."""
+    real, calls = pq.ParquetFile.read_row_group, iter(range(1000))
+
+    def read_row_group(*args, **kwargs):
+        if next(calls) == after:
+            raise OSError(code, os.strerror(code))
+        return real(*args, **kwargs)
+
+    before = everything(root.parent)
+    with monkeypatch.context() as patch:
+        patch.setattr(pq.ParquetFile, "read_row_group", read_row_group)
+        with contextlib.suppress(DatasetWriteError, DatasetDamagedError):  # or it reads once more, and finds all well
+            writer(root).close()
+    assert everything(root.parent) == before
+    assert writer(root).num_episodes == N_EPISODES
+
+
+@contextlib.contextmanager
+def as_nobody(folder: Path, mode: int) -> Iterator[None]:
+    """As somebody who may do this with a folder, and read everything around it; takes root."""
+    if os.geteuid() != 0:
+        pytest.skip("takes root, which becomes somebody else")
+    for path in [*folder.rglob("*"), folder, *list(folder.parents)[:4]]:  # pytest's own are closed to others
+        path.chmod(path.stat().st_mode | 0o555)
+    folder.chmod(mode)
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+        folder.chmod(0o755)
+
+
+@pytest.mark.parametrize("what", ["parent", "data"])
+def test_a_folder_that_cannot_be_listed_is_not_empty(tmp_path, what):
+    """Only the names in it tell that it holds a dataset: its metadata are lost."""
+    root = tmp_path / "parent/dataset"
+    (root / "data/chunk-000").mkdir(parents=True)
+    (root / "data/chunk-000/file-000.parquet").touch()
+    assert has_dataset(root)
+    root.chmod(0o777)
+    with as_nobody(root.parent if what == "parent" else root / "data", 0):
+        with pytest.raises(PermissionError):
+            has_dataset(root)
+        with pytest.raises(DatasetWriteError, match="Permission denied"):
+            writer(root)
+    assert [path.name for path in root.iterdir()] == ["data"]
+
+
+def test_a_read_only_folder_gives_one_clear_error(root):
+    with as_nobody(root, 0o555), pytest.raises(DatasetWriteError, match=f"Cannot write to {root}: Permission denied"):
+        writer(root)
+    assert_recorded(root, range(N_EPISODES))

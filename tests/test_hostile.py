@@ -1,19 +1,19 @@
 """Datasets that a stranger made: they show no file of this machine, run nothing, and take no memory that they do not fill."""
 
 import ast
+import contextlib
 import errno
 import html.parser
 import io
 import json
 import os
 import re
-import resource
 import shlex
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -22,21 +22,25 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from dataset_factory import CAMERA, MICROPHONE, TASK, dataset_features, make_dataset
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDatasetMetadata
 from PIL import Image
-from support.hub import HubServer
+from support.hub import HubServer, come_here
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import write_audio
-from lerobot_playbyear.datasets.info import check_links
+from lerobot_playbyear.datasets.findings import worst
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.survey import survey
-from lerobot_playbyear.film.video import at_a_rate_of_aac
+from lerobot_playbyear.film.video import film_sound
 from lerobot_playbyear.hub.dataset_card import describe_dataset
-from lerobot_playbyear.hub.push import HubError, _files, push_dataset
+from lerobot_playbyear.hub.push import push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
-from lerobot_playbyear.inspection.source import SurveyedDataset, InspectionError
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training import EpisodeStore
 
+FILM = "observation.images.film"
 SECRET = (250, 5, 120)  # a colour that no other picture has
 EVIL = (
     "Lift <img src=x onerror=alert(1)> ![p](http://evil/p.png) | [l](http://evil)\n---\n# Head\n```\n"
@@ -46,55 +50,39 @@ EVIL = (
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
+    """Pictures in a column and in a film, sound, and numbers of more than one dimension, all of them believed."""
     root = tmp_path_factory.mktemp("made") / "set"
-    make_dataset(root, (6, 5), image_size=16)
-    return root
-
-
-@pytest.fixture(scope="module")
-def filmed(tmp_path_factory):
-    root = tmp_path_factory.mktemp("filmed") / "set"
-    make_dataset(root, (6, 5), image_size=16, use_videos=True)
+    features = dataset_features(image_size=16)
+    features[FILM] = {**features[CAMERA], "dtype": "video"}
+    features["observation.grid"] = {"dtype": "float32", "shape": (4, 5), "names": None}
+    make_dataset(root, (6, 5), features=features)
+    assert READERS["train"](root).column("observation.grid").shape == (11, 4, 5)
     return root
 
 
 @pytest.fixture
 def root(made, tmp_path):
-    shutil.copytree(made, tmp_path / "set")
-    return tmp_path / "set"
-
-
-@pytest.fixture
-def videos(filmed, tmp_path):
-    shutil.copytree(filmed, tmp_path / "set")
-    return tmp_path / "set"
+    """A copy, beside a picture of this machine."""
+    Image.new("RGB", (16, 16), SECRET).save(tmp_path / "secret.png")
+    return Path(shutil.copytree(made, tmp_path / "set"))
 
 
 @pytest.fixture
 def hub(monkeypatch):
     """A Hub on loopback."""
     with HubServer() as hub:
-        monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.url)
+        come_here(monkeypatch, hub)
         monkeypatch.setattr("huggingface_hub.RepoCard.validate", lambda card: None)  # it asks huggingface.co
         yield hub
 
 
-@pytest.fixture
-def secret(tmp_path):
-    """A picture of this machine, beside the dataset."""
-    path = tmp_path / "secret.png"
-    Image.new("RGB", (16, 16), SECRET).save(path)
-    return path
-
-
-def edit_info(root: Path, change) -> None:
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text())
+def edit_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    info = json.loads((root / "meta/info.json").read_text())
     change(info)
-    path.write_text(json.dumps(info))
+    (root / "meta/info.json").write_text(json.dumps(info))
 
 
-def edit_column(root: Path, key: str, change) -> None:
+def edit_column(root: Path, key: str, change: Callable[[Any], Any]) -> None:
     """`change` gets the column's values, row by row."""
     (path,) = root.glob("data/*/*.parquet")
     table = pq.read_table(path)
@@ -103,13 +91,19 @@ def edit_column(root: Path, key: str, change) -> None:
     pq.write_table(table.set_column(table.column_names.index(key), field, values), path)
 
 
-def point_to(root: Path, name: str) -> None:
-    edit_column(root, CAMERA, lambda picture: {"bytes": None, "path": name})
+def picture(path: str | None = None, data: bytes | None = None) -> Callable[[Path], None]:
+    return lambda root: edit_column(root, CAMERA, lambda _: {"bytes": data, "path": path})
+
+
+def encoded(image: Image.Image, kind: str) -> bytes:
+    file = io.BytesIO()
+    image.save(file, kind)
+    return file.getvalue()
 
 
 def rename_task(root: Path, text: str) -> None:
-    tasks = pd.read_parquet(root / "meta" / "tasks.parquet").rename(index={TASK: text})
-    tasks.to_parquet(root / "meta" / "tasks.parquet")
+    tasks = pd.read_parquet(root / "meta/tasks.parquet").rename(index={TASK: text})
+    tasks.to_parquet(root / "meta/tasks.parquet")
 
 
 def rename_feature(root: Path, old: str, new: str) -> None:
@@ -123,192 +117,214 @@ def rename_feature(root: Path, old: str, new: str) -> None:
             re.sub(rf"^(stats/|)({re.escape(old)})(?=/|$)", lambda m: m[1] + new, name) for name in table.column_names
         ]
         pq.write_table(table.rename_columns(names).replace_schema_metadata({}), path)
-    stats = json.loads((root / "meta" / "stats.json").read_text())
-    (root / "meta" / "stats.json").write_text(json.dumps({new if key == old else key: v for key, v in stats.items()}))
+    stats = json.loads((root / "meta/stats.json").read_text())
+    (root / "meta/stats.json").write_text(json.dumps({new if key == old else key: v for key, v in stats.items()}))
 
 
-def attach(root: Path, tmp_path: Path, files: str = "{episode}.wav") -> Path:
-    places = DatasetPlace("a/b", str(root)), DatasetPlace("a/c", str(tmp_path / "copy"))
-    return attach_audio(AttachAudioConfig(*places, files=files, microphone="new"))
+# What reads a dataset. Each raises what it refuses, or names as an error
 
 
-def looked(root: Path, tmp_path: Path) -> tuple[list, str]:
-    page = tmp_path / "page.html"
-    return inspect(InspectConfig(InspectDatasetConfig("a/b", str(root)), html=page)), page.read_text()
+def looked(root: Path, **options: Any) -> None:
+    findings = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root)), **options))
+    if worst(findings) == "error":
+        raise ValueError("; ".join(map(str, findings)))
 
 
-@pytest.mark.parametrize("which", range(3), ids=["absolute", "parent", "link"])
-def test_a_picture_outside_the_folder_is_shown_nowhere(root, secret, hub, tmp_path, monkeypatch, which):
-    """Not by a reader, not by training, not on a page, and in no film that is pushed."""
-    (root / "images").mkdir(exist_ok=True)
-    (root / "images" / "link.png").symlink_to(secret)
-    point_to(root, [str(secret), "../secret.png", "images/link.png"][which])
-    monkeypatch.chdir(root / "meta")  # from where "../secret.png" is nothing: names are the dataset's
-    source = SurveyedDataset.open("a/b", root)
-    with pytest.raises(ValueError, match="outside its folder"):
-        list(source.pictures(source.episodes[0], CAMERA))
-    with pytest.raises(ValueError, match="outside its folder"):
-        EpisodeStore.load("a/b", str(root), device="cpu")
-    if which == 2:
-        with pytest.raises(InspectionError, match="No page is written"):
-            looked(root, tmp_path)
-    else:
-        (root / "images" / "link.png").unlink()
-        looked(root, tmp_path)
-    findings = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
-    (finding,) = [each for each in findings if each.check == "pictures"]
-    assert (finding.level, "outside its folder" in finding.message) == ("error", True)
-    with pytest.raises(HubError, match=r"Not pushed.*outside"):
-        push_dataset("me/hostile", root)
-    assert not hub.requests
+def checked(root: Path) -> None:
+    found = survey(root)
+    if not found.is_sound:
+        raise ValueError(str(found))
 
 
-def test_a_picture_in_a_file_of_the_dataset_is_read(root, tmp_path, monkeypatch):
-    (root / "pictures").mkdir()
-    Image.new("RGB", (16, 16), SECRET).save(root / "pictures" / "one.png")
-    point_to(root, "pictures/one.png")
-    monkeypatch.chdir(tmp_path)
-    assert (EpisodeStore.load("a/b", str(root), device="cpu").column(CAMERA)[0, :, 0, 0].numpy() == SECRET).all()
-    source = SurveyedDataset.open("a/b", root)
-    assert (next(source.pictures(source.episodes[0], CAMERA))[0, 0] == SECRET).all()
+def attached(root: Path) -> None:
+    for episode in range(2):
+        write_audio(root.parent / f"{episode}.wav", np.zeros(16000, np.int16), 16000)
+    places = DatasetPlace("a/b", str(root)), DatasetPlace("a/c", str(root.parent / "copy"))
+    attach_audio(AttachAudioConfig(*places, files=str(root.parent / "{episode}.wav"), microphone="new"))
 
 
-def test_only_pictures_are_read_as_pictures(root):
-    postscript = io.BytesIO()
-    Image.new("RGB", (16, 16), SECRET).save(postscript, "EPS")
-    edit_column(root, CAMERA, lambda picture: {"bytes": postscript.getvalue(), "path": None})
-    with pytest.raises(OSError, match="cannot identify"):
-        EpisodeStore.load("a/b", str(root), device="cpu")
-    assert f"episodes 0, 1: a picture of '{CAMERA}' is damaged (it is none)" in str(survey(root))
+READERS: dict[str, Callable[[Path], Any]] = {
+    "train": lambda root: EpisodeStore.load("a/b", str(root), device="cpu"),
+    "inspect": looked,
+    "page": lambda root: looked(root, html=root.parent / "page.html"),
+    "check": checked,
+    "attach": attached,
+    "push": lambda root: push_dataset("me/hostile", root),
+}
+FILES_MADE = {"page": "page.html", "attach": "copy"}
 
 
-def test_a_picture_of_another_size_is_refused_before_it_is_decoded(root):
-    bomb = io.BytesIO()
-    Image.new("L", (12_000, 7_000)).save(bomb, "PNG")  # 100 kB, 250 MB when decoded as RGB
-    edit_column(root, CAMERA, lambda picture: {"bytes": bomb.getvalue(), "path": None})
-    with pytest.raises(ValueError, match="12000 x 7000 pixels"):
-        EpisodeStore.load("a/b", str(root), device="cpu")
+# What is hostile
 
 
-def test_a_film_of_another_size_is_refused_before_it_is_decoded(videos):
-    (path,) = videos.rglob("*.mp4")
-    with av.open(str(path), "w") as film:
+def link(name: str, target: str) -> Callable[[Path], None]:
+    def make(root: Path) -> None:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).symlink_to(root / target)
+
+    return make
+
+
+def linked_picture(root: Path) -> None:
+    link("images/link.png", "../secret.png")(root)
+    picture("images/link.png")(root)
+
+
+def elsewhere(name: str, place: str) -> Callable[[Path], None]:
+    """A file or folder of the dataset lies at another place, and a link in its own."""
+
+    def move(root: Path) -> None:
+        (path,) = root.glob(name)
+        path.rename(root / place)
+        path.symlink_to(root / place)
+
+    return move
+
+
+def template(name: str, value: str) -> Callable[[Path], None]:
+    return lambda root: edit_info(root, lambda info: info.update({name: value.replace("{root}", str(root.parent))}))
+
+
+def path_as_file_number(root: Path) -> None:
+    edit_info(root, lambda info: info.update(video_path="videos/{video_key}/{chunk_index}/{file_index}.mp4"))
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    table, name = pq.read_table(path).replace_schema_metadata({}), f"videos/{FILM}/file_index"
+    outside = pa.array(["../../../../secret"] * len(table))
+    pq.write_table(table.set_column(table.column_names.index(name), name, outside), path)
+    (root / "videos" / FILM / "0").mkdir()
+    next(root.rglob("*.mp4")).rename(root.parent / "secret.mp4")
+
+
+def larger_film(root: Path) -> None:
+    with av.open(str(next(root.rglob("*.mp4"))), "w") as film:
         stream = film.add_stream("libx264", rate=20)
         stream.width, stream.height = 1920, 1080
         for _ in range(11):
             film.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((1080, 1920, 3), np.uint8), "rgb24")))
         film.mux(stream.encode(None))
-    said = rf"'{CAMERA}': .*file-000.mp4' have 1920 x 1080 pixels; .*\(16, 16, 3\)"
-    with pytest.raises(ValueError, match=said):
-        EpisodeStore.load("a/b", str(videos), device="cpu")
-    verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))
-    (verdict,) = [v for v in verdicts if v.check == "pictures"]
-    assert verdict.level == "error"
-    assert "1920 x 1080" in verdict.message
 
 
-@pytest.mark.parametrize(
-    "template",
-    [
-        "../other/{video_key}-{chunk_index}-{file_index}.mp4",
-        "{root}/{video_key}.mp4",
-        "videos/{video_key.__class__}/{file_index}.mp4",
-        "videos/{video_key}/{chunk_index:999999999d}.mp4",
-    ],
-)
-def test_a_template_that_leads_elsewhere_is_refused(videos, tmp_path, template):
-    template = template.replace("{root}", str(tmp_path))
-    for name in ("video_path", "data_path"):
-        before = (videos / "meta" / "info.json").read_text()
-        edit_info(videos, lambda info, name=name: info.update({name: template}))
-        said = f"info.json: {name}|not in its folder"
-        with pytest.raises(InspectionError, match=said):
-            SurveyedDataset.open("a/b", videos)
-        with pytest.raises(ValueError, match=said):
-            EpisodeStore.load("a/b", str(videos), device="cpu")
-        (videos / "meta" / "info.json").write_text(before)
+def missing_picture(root: Path) -> None:
+    numbers = iter(range(11))
+    edit_column(root, CAMERA, lambda value: None if next(numbers) == 3 else value)
 
 
-def test_a_camera_whose_name_leads_elsewhere_is_refused(videos):
-    rename_feature(videos, CAMERA, "../../secret")
-    with pytest.raises(InspectionError, match="not in its folder"):
-        SurveyedDataset.open("a/b", videos)
+def flipped_bit(column: str) -> Callable[[Path], None]:
+    """In the last byte of a column's page, which has a checksum, of the table of episodes."""
 
-
-def test_an_episode_whose_file_number_is_a_path_is_refused(videos, tmp_path):
-    edit_info(videos, lambda info: info.update(video_path="videos/{video_key}/{chunk_index}/{file_index}.mp4"))
-    (path,) = videos.glob("meta/episodes/*/*.parquet")
-    table = pq.read_table(path).replace_schema_metadata({})
-    name = f"videos/{CAMERA}/file_index"
-    table = table.set_column(table.column_names.index(name), name, pa.array(["../../../../secret"] * len(table)))
-    pq.write_table(table, path)
-    (videos / "videos" / CAMERA / "0").mkdir()
-    (video,) = videos.rglob("*.mp4")
-    video.rename(tmp_path / "secret.mp4")
-    with pytest.raises(InspectionError, match=f"its pictures of '{CAMERA}' are lost"):
-        looked(videos, tmp_path)
-
-
-@pytest.mark.parametrize("what", ["statistics", "length", "more frames", "no number"])
-def test_sound_is_attached_to_no_damaged_table(root, tmp_path, what):
-    for episode in range(2):
-        write_audio(tmp_path / f"{episode}.wav", np.zeros(16000, np.int16), 16000)
-    if what == "more frames":
-        edit_column(root, "episode_index", lambda _: 1)
-    elif what == "no number":
-        edit_column(root, "frame_index", lambda number: number or None)
-    else:  # the last byte of a column's page, which has a checksum
+    def flip(root: Path) -> None:
         (path,) = root.glob("meta/episodes/*/*.parquet")
         pq.write_table(pq.read_table(path), path, write_page_checksum=True, use_dictionary=False)
         group = pq.read_metadata(path).row_group(0)
-        chunks = {group.column(i).path_in_schema: group.column(i) for i in range(group.num_columns)}
-        chunk = chunks["length" if what == "length" else "stats/action/mean.list.element"]
+        chunk = next(c for c in map(group.column, range(group.num_columns)) if c.path_in_schema == column)
         data = bytearray(path.read_bytes())
         data[chunk.data_page_offset + chunk.total_compressed_size - 1] ^= 0xFF
         path.write_bytes(data)
-    with pytest.raises(AttachError, match=r"file-000\.parquet.*playbyear-repair --root="):
-        attach(root, tmp_path, str(tmp_path / "{episode}.wav"))
-    assert not (tmp_path / "copy").exists()
+
+    return flip
 
 
-def test_a_picture_that_is_missing_is_named(root):
-    numbers = iter(range(11))
-    edit_column(root, CAMERA, lambda picture: None if next(numbers) == 3 else picture)
-    with pytest.raises(ValueError, match=f"'{CAMERA}': a picture is missing"):
-        EpisodeStore.load("a/b", str(root))
+OUTSIDE, NO_PAGE = "outside its folder", r"No page is written.* is a link to .*--dataset\.root"
+DAMAGED = r"file-000\.parquet.*playbyear-repair --root="
+ELSEWHERE = "info.json: {}|not in its folder"
+TEMPLATES = (
+    "../other/{video_key}-{chunk_index}-{file_index}.mp4",
+    "{root}/{video_key}.mp4",
+    "videos/{video_key.__class__}/{file_index}.mp4",
+    "videos/{video_key}/{chunk_index:999999999d}.mp4",
+)
+BOMB = encoded(Image.new("L", (12_000, 7_000)), "PNG")  # 100 kB, 250 MB when decoded as RGB
+POSTSCRIPT = encoded(Image.new("RGB", (16, 16)), "EPS")
+OTHER_SIZE = rf"'{FILM}': .*file-000.mp4' have 1920 x 1080 pixels; .*\(16, 16, 3\)"
+
+# What is done to the dataset, and what each reader says of it; None: it reads on
+HOSTILE: dict[str, tuple[Callable[[Path], object], dict[str, str | None]]] = {
+    "picture: parent": (
+        picture("../secret.png"),
+        {"train": OUTSIDE, "inspect": OUTSIDE, "page": OUTSIDE, "push": r"Not pushed.*outside"},
+    ),
+    "picture: absolute": (
+        lambda root: picture(str(root.parent / "secret.png"))(root),
+        {"train": OUTSIDE, "inspect": OUTSIDE, "page": OUTSIDE, "push": r"Not pushed.*outside"},
+    ),
+    "picture: link": (
+        linked_picture,
+        {"train": OUTSIDE, "inspect": OUTSIDE, "page": NO_PAGE, "push": r"Not pushed.*outside"},
+    ),
+    "picture: PostScript": (
+        picture(data=POSTSCRIPT),
+        {"train": "cannot identify", "check": r"is damaged \(it is none\)"},
+    ),
+    "picture: bomb": (picture(data=BOMB), {"train": "12000 x 7000 pixels", "inspect": "12000 x 7000 pixels"}),
+    "picture: missing": (missing_picture, {"train": f"'{CAMERA}': a picture is missing"}),
+    "film: size": (larger_film, {"train": OTHER_SIZE, "inspect": "1920 x 1080"}),
+    "film: number": (path_as_file_number, {"page": f"its pictures of '{FILM}' are lost"}),
+    **{
+        f"{name}: {number}": (template(name, value), dict.fromkeys(("train", "inspect"), ELSEWHERE.format(name)))
+        for name in ("video_path", "data_path")
+        for number, value in enumerate(TEMPLATES)
+    },
+    "camera's name": (lambda root: rename_feature(root, FILM, "../../secret"), {"inspect": "not in its folder"}),
+    "table: statistics": (flipped_bit("stats/action/mean.list.element"), {"attach": DAMAGED}),
+    "table: length": (flipped_bit("length"), {"attach": DAMAGED}),
+    "table: more frames": (lambda root: edit_column(root, "episode_index", lambda _: 1), {"attach": DAMAGED}),
+    "table: no number": (lambda root: edit_column(root, "frame_index", lambda n: n or None), {"attach": DAMAGED}),
+    "link: file": (
+        link("videos/more/x.mp4", "../secret.png"),
+        {"push": "Not pushed.*x.mp4' is a link to", "attach": "is a link to"},
+    ),
+    "link: folder": (link("meta/extra", ".."), {"push": "Not pushed.*extra' is a link to", "attach": "is a link to"}),
+    **{
+        f"link within: {part}": (
+            elsewhere(part, "kept"),
+            {"push": f"Not pushed.*{part}' is a link to a folder", "attach": "is a link to a folder"},
+        )
+        for part in ("data", "meta/episodes")
+    },
+    **{  # read as one's own, on another disk
+        f"link away: {part}": (elsewhere(part, "../elsewhere"), {"page": NO_PAGE, "inspect": None, "train": None})
+        for part in ("videos", "videos/*/*/*.mp4", "data")
+    },
+}
 
 
-@pytest.mark.parametrize("name", ["videos/more/x.mp4", "notes.txt", "meta/extra"])
-def test_a_link_out_of_the_folder_is_never_uploaded_or_copied(root, secret, hub, tmp_path, name):
-    link = root / name
-    link.parent.mkdir(parents=True, exist_ok=True)
-    link.symlink_to(secret if name != "meta/extra" else tmp_path)
-    with pytest.raises(HubError, match=f"Not pushed.*{link}' is a link to"):
-        push_dataset("me/hostile", root)
+@pytest.mark.parametrize("what", HOSTILE)
+def test_a_hostile_dataset_is_refused_by_whoever_reads_it(root, hub, monkeypatch, what):
+    """And nothing is uploaded, copied or written."""
+    spoil, says = HOSTILE[what]
+    spoil(root)
+    monkeypatch.chdir(root / "meta")  # from where "../secret.png" is nothing: names are the dataset's
+    for reader, said in says.items():
+        if said is None:
+            READERS[reader](root)
+            continue
+        with pytest.raises(Exception, match=f"(?s){said}"):
+            READERS[reader](root)
+        assert said == OUTSIDE or not (root.parent / FILES_MADE.get(reader, "nothing")).exists()
     assert not hub.requests
-    with pytest.raises(AttachError, match="is a link to"):
-        attach(root, tmp_path)
 
 
-def test_links_in_a_circle_and_pipes_hold_no_upload_up(root):
-    (root / "meta" / "loop").symlink_to("..")
-    (root / "meta" / "self").symlink_to("self")
-    os.mkfifo(root / "meta" / "pipe")
-    check_links(root)
-    names = _files(root)
+def test_a_picture_in_a_file_of_the_dataset_is_read(root, tmp_path, monkeypatch):
+    (root / "pictures").mkdir()
+    shutil.copy(tmp_path / "secret.png", root / "pictures/one.png")
+    picture("pictures/one.png")(root)
+    monkeypatch.chdir(tmp_path)
+    assert (READERS["train"](root).column(CAMERA)[0, :, 0, 0].numpy() == SECRET).all()
+    dataset = SurveyedDataset.open("a/b", root)
+    assert (next(dataset.pictures(CAMERA, dataset.episodes[0]))[0, 0] == SECRET).all()
+
+
+def test_links_in_a_circle_and_pipes_hold_nobody_up(root, hub, tmp_path):
+    (root / "meta/loop").symlink_to("..")
+    (root / "meta/self").symlink_to("self")
+    os.mkfifo(root / "meta/pipe")
+    push_dataset("me/hostile", root)
+    names = hub.dataset("me/hostile").files()
     assert "meta/info.json" in names
     assert not [name for name in names if "loop" in name or "self" in name or "pipe" in name]
-
-
-@pytest.mark.parametrize("part", ["data", "meta/episodes"])
-def test_no_upload_and_no_copy_lacks_the_files_behind_a_link(root, hub, tmp_path, part):
-    shutil.move(root / part, root / "kept")
-    (root / part).symlink_to(root / "kept")
-    with pytest.raises(HubError, match=f"Not pushed.*{part}' is a link to a folder"):
-        push_dataset("me/linked", root)
-    assert not hub.requests
-    with pytest.raises(AttachError, match="is a link to a folder"):
-        attach(root, tmp_path)
+    os.mkfifo(tmp_path / "endless.png")  # who reads it waits for ever
+    picture(str(tmp_path / "endless.png"))(root)
+    survey(root)
 
 
 def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, monkeypatch):
@@ -321,45 +337,31 @@ def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, mon
 
     (root / "notes").mkdir()
     monkeypatch.setattr(Path, "iterdir", fail)
-    with pytest.raises(HubError, match=r"Not pushed.*Permission denied"):
+    with pytest.raises(Exception, match=r"Not pushed.*Permission denied"):
         push_dataset("me/noise", root)
     assert not hub.requests
 
 
-@pytest.mark.parametrize("part", ["videos", "film", "data"])
-def test_no_page_holds_what_a_link_leads_to(videos, tmp_path, part):
-    place = next(videos.rglob("*.mp4")) if part == "film" else videos / part
-    place.rename(tmp_path / "elsewhere")
-    place.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(InspectionError, match=r"No page is written.* is a link to .*elsewhere.*--dataset\.root"):
-        looked(videos, tmp_path)
-    assert not (tmp_path / "page.html").exists()
-    verdicts = inspect(InspectConfig(InspectDatasetConfig("a/b", str(videos))))  # as one's own, on another disk
-    assert {verdict.level for verdict in verdicts if verdict.check == "pictures"} == {"ok"}
-    assert len(EpisodeStore.load("a/b", str(videos), device="cpu")) == 11
-
-
-def test_links_that_stay_at_home_are_read_through(videos, tmp_path):
+def test_links_that_stay_at_home_are_read_through(root, tmp_path):
     """Those within the dataset, and those of the Hub's cache, whose files are links to its blobs."""
-    (tmp_path / "link").symlink_to(videos)
-    (videos / "videos").rename(videos / "kept")
-    (videos / "videos").symlink_to("kept")
-    findings, _ = looked(tmp_path / "link", tmp_path)
-    assert {finding.level for finding in findings if finding.check == "pictures"} == {"ok"}
-    (videos / "videos").unlink()
-    (videos / "kept").rename(videos / "videos")
-    cache = tmp_path / "hub" / "datasets--a--b"
-    snapshot = cache / "snapshots" / "abc"
+    (tmp_path / "link").symlink_to(root)
+    elsewhere("videos", "kept")(root)
+    READERS["page"](tmp_path / "link")
+    (root / "videos").unlink()
+    (root / "kept").rename(root / "videos")
+    cache = tmp_path / "hub/datasets--a--b"
+    snapshot = cache / "snapshots/abc"
     (cache / "blobs").mkdir(parents=True)
-    for number, path in enumerate([path for path in videos.rglob("*") if path.is_file()]):
-        place = snapshot / path.relative_to(videos)
+    for number, path in enumerate([path for path in root.rglob("*") if path.is_file()]):
+        place = snapshot / path.relative_to(root)
         place.parent.mkdir(parents=True, exist_ok=True)
         path.rename(cache / "blobs" / str(number))
         place.symlink_to(os.path.relpath(cache / "blobs" / str(number), place.parent))
-    findings, _ = looked(snapshot, tmp_path)
-    assert {finding.level for finding in findings if finding.check == "pictures"} == {"ok"}
-    with pytest.raises(AttachError, match="Nothing was written"):  # only the sound is missing
-        attach(snapshot, tmp_path)
+    READERS["page"](snapshot)
+    READERS["attach"](snapshot)
+
+
+# Names and texts
 
 
 class _Markup(html.parser.HTMLParser):
@@ -374,222 +376,138 @@ class _Markup(html.parser.HTMLParser):
         self.tags.append(tag)
 
 
-def test_the_page_shows_names_as_they_are(root, tmp_path):
+def test_the_page_shows_names_as_they_are_and_a_report_commands_no_terminal(root, tmp_path, capsys):
     rename_task(root, EVIL + "</script><script>alert(1)</script><!-- episodes -->")
-    page = tmp_path / "page.html"
+    rename_feature(root, MICROPHONE, "observation.audio.\x1b]0;owned\x07\x1b[2J")
     name = "a/{{script}}{{style}}{{policy}}<b>"
-    inspect(InspectConfig(InspectDatasetConfig(name, str(root)), html=page))
-    text = page.read_text()
+    inspect(InspectConfig(InspectDatasetConfig(name, str(root)), html=tmp_path / "page.html"))
+    text = (tmp_path / "page.html").read_text()
     assert "<title>a/{{script}}{{style}}{{policy}}&lt;b&gt;</title>" in text
     assert text.count('"use strict"') == 1
-    assert _Markup(text).tags.count("b") == 0
-    assert (
-        len([tag for tag in _Markup(text).tags if tag == "script"]) == 2 * 2 + 2
-    )  # of each episode; of all, the page's
+    tags = _Markup(text).tags
+    assert (tags.count("b"), tags.count("script")) == (0, 2 * 2 + 2)  # of each episode; of all, the page's
     data = json.loads(re.search(r'id="dataset">(.*?)</script>', text)[1])
     assert data["episodes"][0]["task"].startswith(EVIL)
-
-
-def test_a_report_sends_no_commands_to_the_terminal(root, tmp_path, capsys):
-    rename_feature(root, MICROPHONE, "observation.audio.\x1b]0;owned\x07\x1b[2J")
-    inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
     out = capsys.readouterr().out
-    assert "\x1b" not in out
-    assert "\x07" not in out
     assert "owned" in out
+    assert not {"\x1b", "\x07"} & set(out)
 
 
-def assert_harmless(card: str, head: int = 1) -> None:
+def assert_harmless(card: str, head: int = 0) -> None:
     """What Markdown's rules make of a card: no HTML, no link, no picture, no heading or block that a stranger made."""
     assert card.count("\n---\n") == head
     assert "# Head" not in [line.strip() for line in card.splitlines()]
     rest = re.sub(r"^```.*?^```$", "", card, flags=re.DOTALL | re.MULTILINE)  # blocks of code
     rest = re.sub(r"(`+)(?!`).*?(?<!`)\1(?!`)", "", rest)  # and code in a line
-    assert not re.search(r"(?<!\\)<img src=x", rest)
-    assert not re.search(r"(?<!\\)\]\(http://evil", rest)
-    assert not re.search(r"(?<!\\)://evil", rest)
-    assert not re.search(r"(?<!\\)!\[p", rest)
+    assert not re.search(r"(?<!\\)(<img src=x|<b>|\]\(http://evil|://evil|!\[p)", rest)
 
 
 def test_the_card_of_a_dataset_shows_names_as_they_are(root):
     rename_task(root, EVIL)
-    rename_feature(root, MICROPHONE, 'observation.audio.a`<img src=x>|"\n```\n# Head')
+    microphone = 'observation.audio.a`<img src=x>|"\n```\n# Head'
+    rename_feature(root, MICROPHONE, microphone)
     edit_info(root, lambda info: info.update(robot_type=EVIL))
-    card = describe_dataset(SurveyedDataset.open("a/b", root), "me/hostile", None, None)
-    assert_harmless(card, head=0)
+    card = describe_dataset(SurveyedDataset.open("a/b", root), "me/hostile")
+    assert_harmless(card)
     rows = [line for line in card.splitlines() if line.startswith("| ")]
     assert all(len(re.findall(r"(?<!\\)\|", row)) == 3 for row in rows), rows
     code = re.search(r"^```python\n(.*?)^```$", card, re.DOTALL | re.MULTILINE)[1]
-    names = [node.value for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Constant)]
-    assert 'observation.audio.a`<img src=x>|"\n```\n# Head' in names
-
-
-def test_a_card_shows_a_sample_rate_that_is_none(root):
-    edit_info(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate="<b>abc"))
-    source = SurveyedDataset.open("a/b", root)
-    card = describe_dataset(source, "a/b", None, None)
+    assert microphone in [node.value for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Constant)]
+    edit_info(root, lambda info: info["features"][microphone]["info"].update(sample_rate="<b>abc"))
+    card = describe_dataset(SurveyedDataset.open("a/b", root), "a/b")
     assert "abc" in card
-    assert "<b>" not in card
+    assert_harmless(card)
 
 
 def test_the_card_of_a_policy_shows_names_as_they_are(root, hub):
     rename_task(root, EVIL)
     edit_info(root, lambda info: info.update(robot_type=EVIL))
-    odd = "observation.images.a`|<img src=x>"
-    policy = _policy(odd)
+    features = {
+        "observation.images.a`|<img src=x>": PolicyFeature(FeatureType.VISUAL, (3, 16, 16)),
+        MICROPHONE: PolicyFeature(FeatureType.STATE, (800,)),
+    }
+    action = {"action": PolicyFeature(FeatureType.ACTION, (4,))}
+    small = {"image_size": 16, "vision_width": 4, "hidden_size": 32, "device": "cpu", "sample_rate": 16000}
+    policy = PlaybyearPolicy(PlaybyearConfig(input_features=features, output_features=action, **small))
+    clean = SimpleNamespace(
+        repo_id="a/b", total_episodes=1, total_frames=1, fps=20, robot_type="x", camera_keys=[],
+        tasks=pd.DataFrame(index=["Lift"]),
+    )  # fmt: skip
+    usual = policy.generate_model_card("me/x", "playbyear", "mit", [], cfg=None, dataset_meta=clean)
     meta = LeRobotDatasetMetadata("a/b", root=root)
     card = policy.generate_model_card("me/x\n---\n# Head", "playbyear", "mit", [], cfg=None, dataset_meta=meta)
-    assert_harmless(str(card).split("---\n", 2)[2], head=str(_clean_card(policy)).count("\n---\n") - 1)
+    assert_harmless(str(card).split("---\n", 2)[2], head=str(usual).count("\n---\n") - 1)
     assert "Lift" in card.text
     command = re.search(r"lerobot-rollout(.*?)```", card.text, re.DOTALL)[1]
     arguments = shlex.split(command.replace("\\\n", " "), comments=False)
     task = next(argument for argument in arguments if argument.startswith("--task="))
     assert "rm -rf" in task  # as a word of the task, and no command
-    assert not {"$", "`", ";"} & set(task) - {";"}
+    assert not {"$", "`"} & set(task)
     assert re.fullmatch(r"--robot\.type=[\w.-]+", next(a for a in arguments if a.startswith("--robot.type")))
 
 
-def _policy(camera: str):
-    from lerobot.configs import FeatureType, PolicyFeature
-
-    from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-    from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-
-    config = PlaybyearConfig(
-        input_features={
-            camera: PolicyFeature(FeatureType.VISUAL, (3, 16, 16)),
-            MICROPHONE: PolicyFeature(FeatureType.STATE, (800,)),
-        },
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (4,))},
-        sample_rate=16000,
-        image_size=16,
-        vision_width=4,
-        hidden_size=32,
-        device="cpu",
-        push_to_hub=False,
-    )
-    return PlaybyearPolicy(config)
+# Memory
 
 
-def _clean_card(policy):
-    meta = SimpleNamespace(
-        repo_id="a/b",
-        total_episodes=1,
-        total_frames=1,
-        fps=20,
-        robot_type="x",
-        camera_keys=[],
-        tasks=pd.DataFrame(index=["Lift"]),
-    )
-    return policy.generate_model_card("me/x", "playbyear", "mit", [], cfg=None, dataset_meta=meta)
+def cut_off(root: Path) -> None:
+    """A data file without its end, as a killed recording leaves it."""
+    (path,) = root.glob("data/*/*.parquet")
+    path.write_bytes(path.read_bytes()[:-300])
 
 
-def _claims(kind: str, root: Path) -> None:
-    """What the dataset in `root` claims; `cut` is a data file without its end, as a killed recording leaves it."""
+def claim(info: dict[str, Any], kind: str) -> None:
+    sound = info["features"][MICROPHONE]
+    if kind in ("sound", "cut"):
+        sound["shape"], sound["info"]["sample_rate"] = [400_000_000], 400_000_000 * info["fps"]
+    elif kind == "state":
+        info["features"]["observation.state"]["shape"] = [400_000_000]
+    elif kind == "picture":
+        info["features"][CAMERA]["shape"] = [100_000, 100_000, 3]
+    elif kind == "fps":
+        info["fps"], sound["info"]["sample_rate"] = 20_000_000, 800 * 20_000_000
+    else:
+        info["total_episodes"] = 50_000_000
+
+
+def grown_by(work: Callable[[], object]) -> float:
+    """How much more memory this process took meanwhile than before [MB]."""
+
+    def kilobytes(name: str) -> int:
+        return int(re.search(rf"{name}:\s*(\d+) kB", Path("/proc/self/status").read_text())[1])
+
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    before = kilobytes("VmRSS")
+    work()
+    return (kilobytes("VmHWM") - before) / 1024
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells a peak anew")
+@pytest.mark.parametrize("kind", ["sound", "cut", "state", "picture", "fps", "episodes"])
+def test_claims_that_ask_for_gigabytes_get_none(root, kind):
     if kind == "cut":
-        (path,) = root.glob("data/*/*.parquet")
-        path.write_bytes(path.read_bytes()[:-300])
+        cut_off(root)
+    edit_info(root, lambda info: claim(info, kind))
 
-    def claim(info):
-        if kind in ("sound", "cut"):
-            feature = info["features"][MICROPHONE]
-            feature["shape"] = [400_000_000]
-            feature["info"]["sample_rate"] = 400_000_000 * info["fps"]
-        elif kind == "state":
-            info["features"]["observation.state"]["shape"] = [400_000_000]
-        elif kind == "picture":
-            info["features"][CAMERA]["shape"] = [100_000, 100_000, 3]
-        elif kind == "fps":
-            info["fps"] = 20_000_000
-            info["features"][MICROPHONE]["info"]["sample_rate"] = 800 * 20_000_000
-        elif kind == "episodes":
-            info["total_episodes"] = 50_000_000
+    def read(reader: str) -> None:
+        may_be_read = reader == "check" or kind == "picture"
+        said = pytest.raises(ValueError, match=r"info\.json|playbyear-repair")
+        with contextlib.suppress(MemoryError, ValueError) if may_be_read else said:
+            READERS[reader](root)
 
-    edit_info(root, claim)
-
-
-_OPEN = """
-import resource, sys
-from lerobot_playbyear.datasets import write_audio
-from lerobot_playbyear.training import EpisodeStore
-from lerobot_playbyear.datasets.info import check_links
-from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
-from lerobot_playbyear.inspection.source import InspectionError
-from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
-
-def attempt(name, work):
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    try:
-        work()
-        said = "nothing"
-    except (ValueError, MemoryError, InspectionError, DatasetDamagedError) as error:
-        said = " ".join(str(error).split())
-    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    print(f"{grown:.0f} MB|{name}|{said}", flush=True)
-
-attempt("warm", lambda: EpisodeStore.load("a/b", sys.argv[1], device="cpu"))
-attempt("warm", lambda: inspect(InspectConfig(InspectDatasetConfig("a/b", sys.argv[1]))))
-for root in sys.argv[2:]:
-    attempt(f"store {root}", lambda: EpisodeStore.load("a/b", root, device="cpu"))
-    attempt(f"inspect {root}", lambda: inspect(InspectConfig(InspectDatasetConfig("a/b", root))))
-    attempt(f"check {root}", lambda: survey(root))
-"""
-
-
-def test_claims_that_ask_for_gigabytes_get_none(made, tmp_path):
-    kinds = ("sound", "cut", "state", "picture", "fps", "episodes")
-    for kind in kinds:
-        shutil.copytree(made, tmp_path / kind)
-        _claims(kind, tmp_path / kind)
-    result = subprocess.run(
-        [sys.executable, "-c", _OPEN, str(made), *(str(tmp_path / kind) for kind in kinds)],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "HF_HUB_OFFLINE": "1"},
-        check=False,
-    )
-    lines = [line for line in result.stdout.splitlines() if " MB|" in line]
-    assert len(lines) == 2 + 3 * len(kinds), result.stdout[-3000:] + result.stderr[-3000:]
-    for line in lines[2:]:
-        grown, name, said = line.split("|", 2)
-        assert float(grown.removesuffix(" MB")) < 150, line
-        if name.startswith(("store", "inspect")) and "/picture" not in name:
-            assert "info.json" in said or "playbyear-repair" in said, line
+    for reader in ("train", "inspect", "check"):
+        assert grown_by(lambda reader=reader: read(reader)) < 150
 
 
 def test_a_rate_without_a_common_divisor_takes_no_gigabytes():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     rate = 44_101
     tone = (8000 * np.sin(2 * np.pi * 440 * np.arange(rate) / rate)).astype(np.int16)
-    resampled, higher = at_a_rate_of_aac(np.stack([tone, -tone], axis=1), rate)
-    samples = resampled[:]
-    assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024 < 300
-    assert higher == 48_000
-    assert samples.shape == (pytest.approx(48_000, abs=50), 2)
-    spectrum = np.abs(np.fft.rfft(samples[:, 0] * np.hanning(len(samples))))
-    assert np.argmax(spectrum) * higher / len(samples) == pytest.approx(440, abs=2)
-    assert np.abs(samples[1000:-1000, 0].astype(int) + samples[1000:-1000, 1]).max() <= 2
-    assert np.abs(samples[1000:-1000]).max() == pytest.approx(8000, rel=0.02)
-    pieces = np.concatenate([resampled[first : first + 7000] for first in range(0, 48_000, 7000)])
-    assert np.abs(pieces[1000:-1000].astype(int) - samples[1000:-1000]).max() <= 2
-
-
-def test_a_check_never_reads_what_a_picture_points_to(root, secret):
-    point_to(root, str(secret))
-    secret.unlink()
-    os.mkfifo(secret)  # who reads it waits for ever
-    survey(root)
-
-
-def test_features_of_an_honest_dataset_are_believed(tmp_path):
-    features = dataset_features(image_size=16)
-    features["observation.grid"] = {"dtype": "float32", "shape": (4, 5), "names": None}
-    features["observation.cube"] = {"dtype": "float32", "shape": (2, 3, 4), "names": None}
-    make_dataset(tmp_path / "set", (3, 4), features=features)
-    assert EpisodeStore.load("a/b", str(tmp_path / "set"), device="cpu").column("observation.cube").shape == (
-        7,
-        2,
-        3,
-        4,
-    )
-    assert len(SurveyedDataset.open("a/b", tmp_path / "set").episodes) == 2
+    blocks = np.stack([np.stack([tone, -tone], axis=1)] * 2)  # (2, S, 2)
+    heard = []
+    assert grown_by(lambda: heard.append(film_sound(blocks, 1, gain=1.0))) < 300
+    samples, higher = heard[0]
+    assert (higher, len(samples)) == (48_000, pytest.approx(96_000, abs=100))
+    spectrum = np.abs(np.fft.rfft(samples[:48_000, 0] * np.hanning(48_000)))
+    assert np.argmax(spectrum) == pytest.approx(440, abs=2)
+    inner = samples[1000:47_000].astype(int)
+    assert np.abs(inner.sum(axis=1)).max() <= 2
+    assert np.abs(inner).max() == pytest.approx(8000, rel=0.02)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from browser import Browser, find_chromium
 from dataset_factory import make_dataset
-from lerobot.datasets import LeRobotDataset
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.features import audio_feature
 from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
@@ -67,23 +67,22 @@ def write_marked_dataset(root: Path) -> Path:
         "intervention": {"dtype": "bool", "shape": (1,), "names": None},
         "next.success": {"dtype": "bool", "shape": (1,), "names": None},
     }
-    dataset = LeRobotDataset.create("tests/page", FPS, features, root=root, use_videos=False, video_backend="pyav")
     rng = np.random.default_rng(0)
-    for episode, length in enumerate(LENGTHS):
-        for t in range(length):
-            sound = rng.normal(0, 10, BLOCK)
-            sound[-10:] += 20000 * (t == CLICK)
-            frame = {
-                "observation.images.front": np.full((SIZE, SIZE, 3), brightness(t), np.uint8),
-                "observation.audio.gripper": sound.astype(np.int16),
-                "observation.state": np.array([0.01 * t, 5.0], np.float32),
-                "action": np.sin(np.arange(9) + t / 5).astype(np.float32),
-                "intervention": np.array([10 <= t < 20]),
-                "next.success": np.array([t == length - 1 and episode != 1]),
-            }
-            dataset.add_frame({**frame, "task": TASK})
-        dataset.save_episode()
-    dataset.finalize()
+    with DurableWriter("tests/page", root, FPS, features) as writer:
+        for episode, length in enumerate(LENGTHS):
+            for t in range(length):
+                sound = rng.normal(0, 10, BLOCK)
+                sound[-10:] += 20000 * (t == CLICK)
+                frame = {
+                    "observation.images.front": np.full((SIZE, SIZE, 3), brightness(t), np.uint8),
+                    "observation.audio.gripper": sound.astype(np.int16),
+                    "observation.state": np.array([0.01 * t, 5.0], np.float32),
+                    "action": np.sin(np.arange(9) + t / 5).astype(np.float32),
+                    "intervention": np.array([10 <= t < 20]),
+                    "next.success": np.array([t == length - 1 and episode != 1]),
+                }
+                writer.add_frame({**frame, "task": TASK})
+            writer.save_episode()
     return root
 
 
@@ -189,22 +188,22 @@ def test_o_goes_to_the_sudden_sound_that_was_recorded(page):
     assert frame(page) == CLICK - 1  # it is heard between this picture and the next
 
 
-def test_a_click_in_the_timeline_seeks(page):
+def click_in_timeline(page: Browser, panel: int) -> None:
+    """In its middle."""
     left, top, width = page.evaluate(
-        "(({left, top, width}) => [left, top, width])(document.querySelectorAll('.panel > canvas')[3].getBoundingClientRect())"
+        "(({left, top, width}) => [left, top, width])"
+        f"(document.querySelectorAll('.panel > canvas')[{panel}].getBoundingClientRect())"
     )
     page.click(left + width / 2, top + 20)
+
+
+def test_a_click_in_the_timeline_seeks_and_goes_on_playing_what_was_started_anew(page):
+    click_in_timeline(page, 3)
     assert frame(page) == pytest.approx(LENGTHS[0] / 2, abs=3)
-
-
-def test_a_click_in_the_timeline_goes_on_playing_what_was_started_anew(page):
     page.press("End")
     page.press(" ")
     page.wait("!document.getElementById('video').paused && document.getElementById('video').currentTime < 1")
-    left, top, width = page.evaluate(
-        "(({left, top, width}) => [left, top, width])(document.querySelector('.panel canvas').getBoundingClientRect())"
-    )
-    page.click(left + width / 2, top + 20)
+    click_in_timeline(page, 0)
     page.wait("!document.getElementById('video').paused && document.getElementById('video').currentTime > 1")
 
 
@@ -322,12 +321,12 @@ def recorded(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_a_page_of_fifty_episodes_opens_in_two_seconds_and_is_small(browser, recorded, tmp_path):
-    source = SurveyedDataset.open("tests/recorded", recorded)
-    with PageWriter(tmp_path / "page.html", source) as writer:
+    dataset = SurveyedDataset.open("tests/recorded", recorded)
+    with PageWriter(tmp_path / "page.html", dataset) as writer:
         for i in range(50):
-            episode = source.episodes[i % 2]
-            writer.add(episode, {camera: source.pictures(camera, episode) for camera in source.cameras})
-        path = writer.finish(check_numbers(source))
+            episode = dataset.episodes[i % 2]
+            writer.add(episode, {camera: dataset.pictures(camera, episode) for camera in dataset.cameras})
+        path = writer.finish(check_numbers(dataset))
     assert path.stat().st_size < 30e6
     browser.open("about:blank")
     start = time.monotonic()
@@ -337,12 +336,12 @@ def test_a_page_of_fifty_episodes_opens_in_two_seconds_and_is_small(browser, rec
 
 
 def test_an_interrupted_page_leaves_no_file(written, tmp_path):
-    source = SurveyedDataset.open("tests/page", written.parent / "dataset")
+    dataset = SurveyedDataset.open("tests/page", written.parent / "dataset")
 
     def pictures() -> Iterator[np.ndarray]:
         yield np.zeros((SIZE, SIZE, 3), np.uint8)
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), PageWriter(tmp_path / "page.html", source) as writer:
-        writer.add(source.episodes[0], {"observation.images.front": pictures()})
+    with pytest.raises(KeyboardInterrupt), PageWriter(tmp_path / "page.html", dataset) as writer:
+        writer.add(dataset.episodes[0], {"observation.images.front": pictures()})
     assert list(tmp_path.iterdir()) == []

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,24 +14,22 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 import torchvision
-from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset, random_frame
-from lerobot.datasets import LeRobotDataset, StreamingLeRobotDataset, merge_datasets, recompute_stats
+from dataset_factory import MICROPHONE, dataset_features, make_dataset, random_frame
+from lerobot.datasets import LeRobotDataset, merge_datasets, recompute_stats
 from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
 from lerobot.scripts import lerobot_edit_dataset, lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
+from support.shared import TINY, run_in_process
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.datasets import audio_feature, audio_keys, episode_waveform
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
-from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.training import EpisodeStore
 
 FPS = 20
 LENGTHS = (12, 17, 9, 14)
-
-Edit = Callable[..., None]
 
 
 @pytest.fixture(scope="module")
@@ -40,15 +37,10 @@ def original(tmp_path_factory) -> LeRobotDataset:
     return make_dataset(tmp_path_factory.mktemp("peers") / "original", LENGTHS, image_size=16)
 
 
-@pytest.fixture
-def edit(monkeypatch) -> Edit:
-    """`lerobot-edit-dataset` with these options."""
-
-    def run(*options: str) -> None:
-        monkeypatch.setattr(sys, "argv", ["lerobot-edit-dataset", *options])
-        lerobot_edit_dataset.main()
-
-    return run
+def edit(old: Path | str, new: Path | str, operation: str, *options: str) -> None:
+    """`lerobot-edit-dataset`."""
+    names = ("--repo_id=tests/noise", f"--root={old}", "--new_repo_id=tests/edited", f"--new_root={new}")
+    run_in_process(lerobot_edit_dataset.main, *names, f"--operation.type={operation}", *options)
 
 
 def load(root: Path) -> LeRobotDataset:
@@ -86,20 +78,12 @@ def bytes_per_sample(root: Path) -> float:
     return sum(column.total_compressed_size for column in sound) / sum(column.num_values for column in sound)
 
 
-def test_deleted_episodes_take_their_sound_with_them(edit, original, tmp_path):
-    target = f"--new_root={tmp_path / 'new'}"
-    edit(
-        "--repo_id=tests/noise",
-        f"--root={original.root}",
-        "--new_repo_id=tests/edited",
-        target,
-        "--operation.type=delete_episodes",
-        "--operation.episode_indices=[0, 2]",
-    )
+def test_deleted_episodes_take_their_sound_with_them(original, tmp_path):
+    edit(original.root, tmp_path / "new", "delete_episodes", "--operation.episode_indices=[0, 2]")
     assert_episodes(load(tmp_path / "new"), original, [1, 3])
 
 
-def test_deleting_episodes_costs_a_few_bytes(edit, tmp_path):
+def test_deleting_episodes_costs_a_few_bytes(tmp_path):
     """Our sound, of a quiet room, is stored as differences; LeRobot's copy of it is not, and takes little more room."""
     features, rng = {MICROPHONE: audio_feature(16000, FPS)}, np.random.default_rng(0)
     with DurableWriter("tests/quiet", tmp_path / "ours", FPS, features) as writer:
@@ -107,48 +91,27 @@ def test_deleting_episodes_costs_a_few_bytes(edit, tmp_path):
             for _ in range(30):
                 writer.add_frame({MICROPHONE: rng.normal(0, 20, 800).astype(np.int16), "task": "Listen."})
             writer.save_episode()
-    edit(
-        "--repo_id=tests/quiet",
-        f"--root={tmp_path / 'ours'}",
-        "--new_repo_id=tests/left",
-        f"--new_root={tmp_path / 'left'}",
-        "--operation.type=delete_episodes",
-        "--operation.episode_indices=[0]",
-    )
+    edit(tmp_path / "ours", tmp_path / "left", "delete_episodes", "--operation.episode_indices=[0]")
     before, after = bytes_per_sample(tmp_path / "ours"), bytes_per_sample(tmp_path / "left")
     assert before < 1.1
     assert after < 1.2 * before, "more than docs/dataset.md says"
 
 
-def test_a_dataset_is_split_and_merged_again(edit, original, tmp_path):
-    edit(
-        "--repo_id=tests/noise",
-        f"--root={original.root}",
-        f"--new_root={tmp_path}",
-        "--operation.type=split",
-        '--operation.splits={"first": [0, 2], "second": [1, 3]}',
-    )
+def test_a_dataset_is_split_and_merged_again(original, tmp_path):
+    edit(original.root, tmp_path, "split", '--operation.splits={"first": [0, 2], "second": [1, 3]}')
     assert_episodes(load(tmp_path / "first"), original, [0, 2])
     assert_episodes(load(tmp_path / "second"), original, [1, 3])
-    edit(
-        "--new_repo_id=tests/edited",
-        f"--new_root={tmp_path / 'merged'}",
-        "--operation.type=merge",
+    run_in_process(
+        lerobot_edit_dataset.main,
+        *("--new_repo_id=tests/edited", f"--new_root={tmp_path / 'merged'}", "--operation.type=merge"),
         "--operation.repo_ids=['tests/second', 'tests/first']",
         f"--operation.roots=['{tmp_path / 'second'}', '{tmp_path / 'first'}']",
     )
     assert_episodes(load(tmp_path / "merged"), original, [1, 3, 0, 2])
 
 
-def test_a_microphone_can_be_removed(edit, original, tmp_path):
-    edit(
-        "--repo_id=tests/noise",
-        f"--root={original.root}",
-        "--new_repo_id=tests/edited",
-        f"--new_root={tmp_path / 'new'}",
-        "--operation.type=remove_feature",
-        f"--operation.feature_names=['{MICROPHONE}']",
-    )
+def test_a_microphone_can_be_removed(original, tmp_path):
+    edit(original.root, tmp_path / "new", "remove_feature", f"--operation.feature_names=['{MICROPHONE}']")
     deaf = load(tmp_path / "new")
     assert audio_keys(deaf.features) == []
     assert len(deaf) == sum(LENGTHS)
@@ -177,7 +140,9 @@ def write(root: Path, seed: int = 0, resume: bool = False) -> Path:
 
 
 def statistics_verdict(root: Path) -> str:
-    (verdict,) = [each for each in check_numbers(SurveyedDataset.open("tests/heard", root)) if each.check == "statistics"]
+    (verdict,) = [
+        each for each in check_numbers(SurveyedDataset.open("tests/heard", root)) if each.check == "statistics"
+    ]
     return f"{verdict.level}: {verdict.message}"
 
 
@@ -229,53 +194,13 @@ def test_both_kinds_of_statistics_merge_and_go_on(ours, recomputed, tmp_path):
 
 # Streaming
 
-DATA = {"repo_id": "tests/noise", "return_uint8": True}
 
-
-def timestamps(n_frames, *keys):
-    return {key: [i / FPS for i in range(1 - n_frames, 1)] for key in keys}
-
-
-def test_the_stream_holds_the_windows_of_the_dataset(original):
-    config = PlaybyearConfig(device="cpu")
-    observed = timestamps(len(config.observation_delta_indices), CAMERA, MICROPHONE, "observation.state")
-    windows = observed | {"action": [i / FPS for i in config.action_delta_indices]}
-    expected = LeRobotDataset(root=original.root, delta_timestamps=windows, **DATA)
-    seen = []
-    for item in StreamingLeRobotDataset(root=original.root, delta_timestamps=windows, **DATA):
-        seen.append(int(item["index"]))
-        same = expected[seen[-1]]
-        assert item.keys() == same.keys()
-        assert item[MICROPHONE].dtype == torch.int64  # as it was recorded, not yet in [-1, 1]
-        for key, value in same.items():
-            assert (
-                torch.equal(torch.as_tensor(item[key], dtype=value.dtype), value)
-                if key != "task"
-                else item[key] == value
-            )
-    assert sorted(seen) == list(range(sum(LENGTHS)))
-
-
-def test_lerobot_train_learns_from_the_stream(original, tmp_path, monkeypatch):
+def test_lerobot_train_learns_from_the_stream(original, tmp_path):
     register_third_party_plugins()
-    options = [
-        *("--policy.type=playbyear", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.image_size=16"),
-        *("--policy.vision_width=8", "--policy.hidden_size=32", "--policy.audio_window_s=0.9"),
-        *(
-            "--dataset.repo_id=tests/noise",
-            f"--dataset.root={original.root}",
-            "--dataset.streaming=true",
-            "--num_workers=1",
-        ),
-        *(
-            "--dataloader_multiprocessing_context=fork",
-            "--batch_size=4",
-            "--steps=12",
-            f"--output_dir={tmp_path / 'out'}",
-        ),
-    ]
-    monkeypatch.setattr(sys, "argv", ["lerobot-train", *options])
-    lerobot_train.main()  # 12 batches of 4: the second time through the data, too
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={original.root}", "--dataset.streaming=true")
+    workers = ("--num_workers=1", "--dataloader_multiprocessing_context=fork", "--batch_size=4")
+    options = (*TINY, *data, *workers, "--steps=12", f"--output_dir={tmp_path / 'out'}")
+    run_in_process(lerobot_train.main, *options)  # 12 batches of 4: the second time through the data, too
     config = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (config["sample_rate"], config["type"]) == (16000, "playbyear")
 

@@ -180,7 +180,9 @@ def test_every_frame_shows_the_last_seconds_and_all_else_stays(original, seen, t
     pixels = np.stack([picture(new, row) for row in range(len(new))]) / 255
     np.testing.assert_allclose(new.meta.stats[PICTURE]["mean"].ravel(), pixels.mean((0, 1, 2)), atol=1e-6)
     assert survey(seen).is_sound
-    assert [verdict for verdict in check_numbers(SurveyedDataset.open("t/seen", seen)) if verdict.level == "error"] == []
+    assert [
+        verdict for verdict in check_numbers(SurveyedDataset.open("t/seen", seen)) if verdict.level == "error"
+    ] == []
 
 
 def test_a_video_shows_nearly_the_same(original, seen, tmp_path):

@@ -14,8 +14,7 @@ from lerobot.policies import ACTConfig, make_policy, make_policy_config, make_pr
 from lerobot.scripts.lerobot_eval import rollout
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.episodes.environment import RolloutError, env_spec
+from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.film.rollout_film import VideoConfig, film, write_episode_film
@@ -35,7 +34,7 @@ def decode(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_env(**options) -> PlaybyearEnvConfig:
-    return PlaybyearEnvConfig(visualization_width=128, visualization_height=128, **options)
+    return PlaybyearEnvConfig(image_size=16, visualization_width=128, visualization_height=128, **options)
 
 
 def test_an_experts_film_has_every_step_and_its_sound(tmp_path, capsys):
@@ -98,11 +97,9 @@ def test_a_film_without_microphones_is_silent(tmp_path):
         assert container.streams.video[0].frames == 6
 
 
-def test_a_blind_baseline_can_be_filmed_and_an_unknown_one_is_named(tmp_path):
+def test_a_blind_baseline_can_be_filmed(tmp_path):
     env = small_env(episode_length=5)
     assert film(VideoConfig(env, output=tmp_path / "blind.mp4", baseline="search")).exists()
-    with pytest.raises(RolloutError, match=r"no blind baseline 'deaf'; there are: .*search"):
-        film(VideoConfig(env, output=tmp_path / "film.mp4", baseline="deaf"))
 
 
 def save_act(env: PlaybyearEnvConfig, folder: Path, **options) -> ACTConfig:
@@ -156,25 +153,6 @@ def test_a_loaded_policy_acts_bit_for_bit_as_in_lerobot_eval(tmp_path, use_amp):
     vec.close()
     np.testing.assert_array_equal(episode.actions, result["action"][0].clamp(-1, 1))
     assert episode.actions.any()
-
-
-@pytest.mark.parametrize(
-    ("output", "options", "wanted"),
-    [
-        ("film.mp4", {"seed": -1}, "seed=-1: give 0 or more"),
-        ("film.gif", {}, r"--output=.*film.gif: films are mp4"),
-        ("file/film.mp4", {}, r"--output=.*film.mp4 cannot be written: Not a directory"),
-        (
-            "film.mp4",
-            {"policy": ACTConfig(device="cpu"), "baseline": "search"},
-            "--baseline=search: it acts without a policy",
-        ),
-    ],
-)
-def test_what_cannot_be_filmed_is_told_before_anything_is_played(tmp_path, output, options, wanted):
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match=wanted):
-        film(VideoConfig(**{"env": SimpleNamespace(), "output": tmp_path / output, **options}))
 
 
 def test_an_interrupted_film_leaves_no_file(tmp_path):

@@ -52,24 +52,17 @@ def one_in(n: int, seed: int) -> Fault:
     return lambda method, path: rng.choice(["unavailable", "cut", "lost", "slow"]) if rng.random() < 1 / n else None
 
 
-def down_after(n: int) -> Fault:
-    """After n large files have come up there is no Hub any more."""
-    count = itertools.count()
-    is_down = False
-
-    def fault(method: str, path: str) -> str | None:
-        nonlocal is_down
-        if method == "PUT" and not is_down:
-            is_down = next(count) >= n
-        return "cut" if is_down else None
-
-    return fault
-
-
 def every_second(kind: str, method: str, pattern: str) -> Fault:
     """What goes wrong with the first, the third, ... request to the paths that match."""
     count = itertools.count()
     return lambda asked, path: kind if asked == method and re.search(pattern, path) and next(count) % 2 == 0 else None
+
+
+def come_here(monkeypatch: Any, hub: "HubServer") -> None:
+    """Lets this process, and not only commands that are started with `HubServer.environment`, talk to a server."""
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.url)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_DISABLE_XET", True)
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
 
 
 # What a Hub keeps
