@@ -1,6 +1,5 @@
 """A headless Chromium, driven over its DevTools protocol."""
 
-import base64
 import itertools
 import json
 import os
@@ -119,10 +118,6 @@ class Browser:
         """Presses and releases the left button."""
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-    def screenshot(self, path: Path) -> None:
-        """Writes what is seen as a PNG."""
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
 
     def _attach(self, profile: Path) -> ClientConnection:
         deadline = time.monotonic() + 60

@@ -154,7 +154,6 @@ def test_rows_and_statistics_are_those_that_lerobot_writes(tmp_path):
 
 
 def test_lerobot_goes_on_with_our_dataset_and_we_with_lerobots(tmp_path):
-    """It appends, merges and deletes."""
     root = tmp_path / "dataset"
     write(root, range(2), RICH_FEATURES)
     dataset = LeRobotDataset.resume(REPO_ID, root=root, video_backend="pyav", rgb_encoder=ENCODER)
@@ -164,8 +163,13 @@ def test_lerobot_goes_on_with_our_dataset_and_we_with_lerobots(tmp_path):
     dataset.finalize()
     write(root, [3], RICH_FEATURES)
     assert_recorded(root, range(4), RICH_FEATURES)
-    write(tmp_path / "two", [4], RICH_FEATURES)
-    aggregate_datasets(["a/one", "a/two"], REPO_ID, roots=[root, tmp_path / "two"], aggr_root=tmp_path / "merged")
+
+
+def test_lerobot_merges_and_deletes(tmp_path):
+    write(tmp_path / "one", range(3), RICH_FEATURES)
+    write(tmp_path / "two", range(3, 5), RICH_FEATURES)
+    roots = [tmp_path / "one", tmp_path / "two"]
+    aggregate_datasets(["a/one", "a/two"], REPO_ID, roots=roots, aggr_root=tmp_path / "merged")
     assert_recorded(tmp_path / "merged", range(5), RICH_FEATURES)
     delete_episodes(load(tmp_path / "merged"), [1, 3], output_dir=tmp_path / "left", repo_id=REPO_ID)
     write(tmp_path / "left", [7], RICH_FEATURES)

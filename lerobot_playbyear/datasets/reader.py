@@ -7,7 +7,6 @@ numpy arrays through Arrow. An episode is the unit of memory for sound and numbe
 inspection and uploads. What is read is not judged: NaN is data, for `playbyear-inspect` reports it and training refuses it.
 """
 
-import itertools
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -110,7 +109,7 @@ class EpisodeReader:
         self.repo_id, self.root, self.fps, self.features, self.tasks = repo_id, root, fps, features, tasks
         self.episodes: list[EpisodeRows] = []
         self._files = list(files)
-        self._firsts = [0, *itertools.accumulate(file.n_rows for file in self._files)]
+        self._firsts: np.ndarray = np.cumsum([0, *(file.n_rows for file in self._files)])
         self._rows: np.ndarray = np.arange(self._firsts[-1])  # where each row here is in the files, in order
 
     def __len__(self) -> int:
@@ -192,7 +191,7 @@ class EpisodeReader:
         rows = [np.empty(0, int)]
         for number, first, end in sorted(found, key=lambda episode: episode[1]):
             start = self.episodes[-1].stop if self.episodes else 0
-            self.episodes.append(EpisodeRows(number, start, start + end - first))
+            self.episodes.append(EpisodeRows(number, start, start + int(end - first)))
             rows.append(np.arange(first, end))
         self._rows = np.concatenate(rows)
 
@@ -203,7 +202,8 @@ class EpisodeReader:
     def _columns(self, key: str, start: int, stop: int) -> Iterator[pa.ChunkedArray]:
         """The rows from `start` to before `stop` of a column, file by file."""
         rows = self._rows[start:stop]
-        for file, first in zip(self._files, self._firsts, strict=False):
+        begin, end = np.searchsorted(self._firsts, rows[[0, -1]], side="right") if len(rows) else (1, 0)
+        for file, first in zip(self._files[begin - 1 : end], self._firsts[begin - 1 :], strict=False):
             own = rows[slice(*np.searchsorted(rows, [first, first + file.n_rows]))] - first
             if len(own):
                 column = file.read(int(own[0]), int(own[-1]) + 1, [key]).column(key)
