@@ -5,10 +5,8 @@ import multiprocessing
 import os
 import random
 import shutil
-import subprocess
-import sys
+import signal
 import time
-from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -33,6 +31,7 @@ from recording_factory import (
     episode_frames,
     load,
 )
+from support.commands import run_without
 from support.recording import ENCODER, assert_recorded, everything, write, write_episode, writer
 
 from lerobot_playbyear.datasets import audio_feature, episode_files, journal
@@ -247,58 +246,75 @@ def test_files_are_on_the_disk_before_anything_refers_to_them(tmp_path, monkeypa
             assert ("sync", path.parent) in events[at:]
 
 
-class Forks:
-    """A process that has imported what it needs, and forks a child for each order: a fresh process without the wait."""
+def record_and_kill(root: Path, episodes: int, share: float) -> int:
+    """Has a child record, and kills it.
 
-    def __init__(self, role: str, cache: Path) -> None:
-        environment = {**os.environ, "HF_DATASETS_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
-        self._process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).parent / "recording_forks.py"), role],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            env=environment,
-        )
+    Args:
+        root: The dataset's folder.
+        episodes: How many it may save first; -1: it is killed while it opens the dataset.
+        share: When it is killed, as a share of the time that the last episode, or the opening, took.
 
-    def order(self, **what: Any) -> dict[str, Any]:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        print(json.dumps(what), file=self._process.stdin, flush=True)
-        return json.loads(self._process.stdout.readline())
+    Returns:
+        How many episodes it reported to be saved.
+    """
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            target = writer(root, RICH_FEATURES)
+            while True:
+                os.write(writing, b"%d\n" % target.num_episodes)
+                write_episode(target, target.num_episodes)
+        except BaseException as error:
+            os.write(writing, f"{error!r}\n".encode())
+        os._exit(1)
+    os.close(writing)
+    with os.fdopen(reading) as pipe:
+        lines: list[str] = []
+        last, took = time.monotonic(), 0.5
+        while len(lines) < episodes + 1:
+            lines.append(pipe.readline())
+            assert lines[-1], "the child ended"
+            took, last = time.monotonic() - last, time.monotonic()
+        time.sleep(share * took)
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        counts = [int(line) for line in [*lines, *pipe.read().split("\n")[:-1]]]  # an error is no number
+    return counts[-1] if counts else 0
 
-    def close(self) -> None:
-        self._process.kill()
-        self._process.wait()
 
-
-@pytest.fixture(scope="module")
-def forks(tmp_path_factory) -> Iterator[tuple[Forks, Forks]]:
-    """One that records and is killed, and one that knows only LeRobot and reads."""
-    both = tuple(Forks(role, tmp_path_factory.mktemp("cache")) for role in ("record", "read"))
-    yield both
-    for one in both:
-        one.close()
+READ_BY_LEROBOT = """
+import random, sys
+sys.path.insert(0, {tests!r})
+from recording_factory import RICH_FEATURES, differences, load
+for root, n_before, n_episodes in {copies!r}:
+    dataset = load(root)
+    some = random.Random(n_before).sample(range(n_before), min(n_before, 5))
+    wrong = differences(dataset, {{n: n for n in [*some, *range(n_before, n_episodes)]}}, RICH_FEATURES)
+    # the rows of an episode that was not yet reported may be there
+    print(root, dataset.num_episodes - n_episodes, min(len(dataset.hf_dataset) - dataset.num_frames, 0), wrong[:5])
+"""
 
 
 @pytest.mark.timeout(1800)
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork")
 @pytest.mark.parametrize("n_kills", [3, pytest.param(100, marks=pytest.mark.slow)])
-def test_every_reported_episode_survives_sigkill(forks, tmp_path, n_kills):
-    root, (recorder, reader) = tmp_path / "dataset", forks
-    rng = np.random.default_rng(0)
-    saved = 0
+def test_every_reported_episode_survives_sigkill(tmp_path, monkeypatch, n_kills):
+    """What each kill leaves is read by a process that has LeRobot alone."""
+    root, rng = tmp_path / "dataset", np.random.default_rng(0)
+    saved, copies = 0, []
     for kill in range(n_kills):
         episodes = 1 if kill == 0 else int(rng.integers(-1, 3))
-        after = recorder.order(root=str(root), episodes=episodes, share=float(rng.random()))
-        assert after["error"] is None
-        assert after["saved"] >= saved + episodes if episodes >= 0 else after["saved"] in (0, saved, saved + 1)
-        saved, saved_before = max(saved, after["saved"]), saved
-        found = reader.order(root=str(root), begin=saved_before)
-        assert found["error"] is None
-        assert not found["wrong"]
-        assert found["rows"] >= found["frames"]  # those of an episode that was not yet reported may be there
-        assert found["episodes"] in (saved, saved + 1)  # one may have been complete, and not yet reported
-        saved = found["episodes"]
+        reported = record_and_kill(root, episodes, share=float(rng.random()))
+        assert reported >= saved + episodes if episodes >= 0 else reported in (0, saved, saved + 1)
+        before, reported = saved, max(saved, reported)
+        saved = json.loads((root / "meta/info.json").read_text())["total_episodes"]
+        assert saved in (reported, reported + 1)  # one may have been complete, and not yet reported
+        copies.append((shutil.copytree(root, tmp_path / f"{kill}"), before, saved))
+    monkeypatch.setenv("HF_DATASETS_CACHE", str(tmp_path / "cache"))
+    read = READ_BY_LEROBOT.format(tests=str(Path(__file__).parent), copies=[(str(copy), *n) for copy, *n in copies])
+    answers = run_without({"lerobot_playbyear", "lerobot_policy_playbyear", "gym_playbyear"}, read)
+    assert answers.split("\n") == [*(f"{copy} 0 0 []" for copy, *_ in copies), ""]
     writer(root, RICH_FEATURES).close()
     assert_recorded(root, range(load(root).num_episodes), RICH_FEATURES)
 

@@ -187,12 +187,12 @@ class EpisodeReader:
         return self.tasks.get(int(number), "")
 
     def _choose(self, found: Iterable[tuple[int, int, int]]) -> None:
-        """Reads only these episodes: of each its number, its first row in all files, and the one after its last."""
+        """Reads only these episodes: of each its number, its first row in all files, and how many."""
         rows = [np.empty(0, int)]
-        for number, first, end in sorted(found, key=lambda episode: episode[1]):
+        for number, first, length in sorted(found, key=lambda episode: episode[1]):
             start = self.episodes[-1].stop if self.episodes else 0
-            self.episodes.append(EpisodeRows(number, start, start + int(end - first)))
-            rows.append(np.arange(first, end))
+            self.episodes.append(EpisodeRows(number, start, start + length))
+            rows.append(np.arange(first, first + length))
         self._rows = np.concatenate(rows)
 
     def _film(self, key: str, episode: EpisodeRows) -> tuple[Path, float]:
@@ -252,8 +252,9 @@ class DatasetReader(EpisodeReader):
         check_audio_features({key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps)
         numbers = self.values("episode_index")
         bounds = zip(*episode_bounds(numbers), strict=True) if len(numbers) else ()
-        found = [(int(numbers[start]), start, stop) for start, stop in bounds]
-        self._choose(each for each in found if episodes is None or each[0] in episodes)
+        found = [(int(numbers[start]), start, stop - start) for start, stop in bounds]
+        wanted = None if episodes is None else set(episodes)
+        self._choose(each for each in found if wanted is None or each[0] in wanted)
 
     @classmethod
     def of(cls, dataset: "LeRobotDataset") -> "DatasetReader":
@@ -288,9 +289,9 @@ class SurveyedDataset(EpisodeReader):
         self.chosen = None if episodes is None else set(episodes)
         self._places = {each.number: each.places for each in found.whole}
         first_of = dict(zip(files, self._firsts, strict=False))
-        frames = [each.frames for each in found.whole if each.frames and (episodes is None or each.number in episodes)]
-        starts = [first_of[each.file.path] + each.start for each in frames]
-        self._choose((each.episode, start, start + each.length) for each, start in zip(frames, starts, strict=True))
+        frames = [each.frames for each in found.whole if each.frames]
+        places = [(each.episode, first_of[each.file.path] + each.start, each.length) for each in frames]
+        self._choose(place for place in places if self.chosen is None or place[0] in self.chosen)
 
     @classmethod
     def open(
