@@ -27,14 +27,14 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from PIL import Image
 from support.hub import HubServer, come_here
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import write_audio
 from lerobot_playbyear.datasets.findings import worst
 from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.film.video import film_sound
 from lerobot_playbyear.hub.dataset_card import describe_dataset
-from lerobot_playbyear.hub.push import push_dataset
+from lerobot_playbyear.hub.push import HubError, push_dataset
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -151,6 +151,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "attach": attached,
     "push": lambda root: push_dataset("me/hostile", root),
 }
+ERRORS = {"train": (ValueError, OSError), "attach": AttachError, "push": HubError}  # of the others ValueError
 FILES_MADE = {"page": "page.html", "attach": "copy"}
 
 
@@ -298,7 +299,7 @@ def test_a_hostile_dataset_is_refused_by_whoever_reads_it(root, hub, monkeypatch
         if said is None:
             READERS[reader](root)
             continue
-        with pytest.raises(Exception, match=f"(?s){said}"):
+        with pytest.raises(ERRORS.get(reader, ValueError), match=f"(?s){said}"):
             READERS[reader](root)
         assert said == OUTSIDE or not (root.parent / FILES_MADE.get(reader, "nothing")).exists()
     assert not hub.requests
@@ -337,7 +338,7 @@ def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, mon
 
     (root / "notes").mkdir()
     monkeypatch.setattr(Path, "iterdir", fail)
-    with pytest.raises(Exception, match=r"Not pushed.*Permission denied"):
+    with pytest.raises(HubError, match=r"Not pushed.*Permission denied"):
         push_dataset("me/noise", root)
     assert not hub.requests
 
