@@ -196,6 +196,12 @@ class FolderLock:
         """Lets another process in. Safe to call twice."""
         self._lock.release()
 
+    def __enter__(self) -> "FolderLock":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
 
 def scratch_folder() -> tempfile.TemporaryDirectory[str]:
     """A folder for files of gigabytes, beside LeRobot's cache: what `tempfile` chooses by itself may be memory."""

@@ -169,7 +169,7 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
     folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
     check_name("dataset.repo_id", repo_id, needs_user=True)
     options.check()
-    with _locked(folder), TemporaryDirectory() as scratch:
+    with _lock(folder), TemporaryDirectory() as scratch:
         try:
             dataset = SurveyedDataset.open(repo_id, folder)
             check_links(folder)
@@ -196,22 +196,16 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         return _upload(upload, f"The dataset is complete in {folder}", later, options)
 
 
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _lock(folder: Path) -> contextlib.AbstractContextManager[object]:
     """Keeps recordings away from a dataset; where no lock can be made, only `_check_unchanged` notices them."""
     try:
-        lock = lock_dataset(folder) if folder.is_dir() else None
+        return lock_dataset(folder) if folder.is_dir() else contextlib.nullcontext()
     except FolderLockedError as error:
         raise HubError(
             f"Not pushed. {folder} is being recorded to, repaired or uploaded by another process: push when it has ended."
         ) from error
     except (OSError, JournalError):
-        lock = None
-    try:
-        yield
-    finally:
-        if lock is not None:
-            lock.release()
+        return contextlib.nullcontext()
 
 
 def _files(folder: Path) -> dict[str, Path]:
@@ -466,14 +460,10 @@ def _commit(repository: RepoUrl, files: Mapping[str, Path], message: str, stale:
     def commit() -> str:
         head = api.repo_info(name, repo_type=kind, revision="main").sha
         there = api.list_repo_files(name, repo_type=kind, revision=head) if stale else []
-        operations: list[CommitOperationAdd | CommitOperationDelete] = [
-            *(CommitOperationAdd(path_in_repo, path) for path_in_repo, path in files.items()),
-            *(
-                CommitOperationDelete(old, is_folder=False)
-                for old in there
-                if old.startswith(stale) and old not in files
-            ),
-        ]
+        gone = [old for old in there if old.startswith(stale) and old not in files]
+        operations: list[CommitOperationAdd | CommitOperationDelete] = []
+        operations += [CommitOperationAdd(path_in_repo, path) for path_in_repo, path in files.items()]
+        operations += [CommitOperationDelete(old, is_folder=False) for old in gone]
         with _card_is_refused():
             made = api.create_commit(name, operations, repo_type=kind, commit_message=message, parent_commit=head)
         return str(made.oid)
