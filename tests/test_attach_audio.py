@@ -10,8 +10,9 @@ import pytest
 from dataset_factory import CAMERA, dataset_features, make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets import episode_waveform, write_audio
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey
 

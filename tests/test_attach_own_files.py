@@ -12,7 +12,7 @@ from audio_layout_factory import EARS, PRE_ROLL_S, TABLE, add_files_of_sound
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_attach_audio import FPS, LENGTHS, RATE, SIZE, silent_dataset
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import AUDIO_PREFIX, episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey

@@ -9,20 +9,11 @@ import numpy as np
 import pytest
 from dataset_factory import CAMERA, MICROPHONE, make_dataset
 
+from lerobot_playbyear.audio import cut_into_frames, read_audio, resample, write_audio
+from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces
 from lerobot_playbyear.audio.audio_import import _spool
-from lerobot_playbyear.audio.audio_layout import AudioTrack
-from lerobot_playbyear.datasets import (
-    audio_feature,
-    audio_keys,
-    check_audio_features,
-    cut_into_frames,
-    episode_waveform,
-    read_audio,
-    resample,
-    write_audio,
-    write_wav,
-)
-from lerobot_playbyear.datasets.audio_files import AudioFileError, audio_pieces
+from lerobot_playbyear.audio.lerobot_audio import AudioTrack
+from lerobot_playbyear.datasets import audio_feature, audio_keys, check_audio_features, episode_waveform
 
 RATE, FPS = 16000, 20
 SIZE = RATE // FPS
@@ -274,7 +265,7 @@ def test_an_episode_is_heard_as_it_was_recorded(tmp_path):
     dataset = make_dataset(tmp_path / "noise", episode_lengths=(4, 6), image_size=8)
 
     waveform, sample_rate = episode_waveform(dataset, 1, MICROPHONE)
-    path = write_wav(tmp_path / "episode.wav", waveform, sample_rate)
+    path = write_audio(tmp_path / "episode.wav", waveform, sample_rate)
 
     with wave.open(str(path)) as file:
         assert (file.getframerate(), file.getnchannels(), file.getnframes()) == (16000, 1, 6 * 800)
@@ -285,10 +276,10 @@ def test_an_episode_is_heard_as_it_was_recorded(tmp_path):
 
 
 def test_float_sound_is_written_at_full_scale(tmp_path):
-    path = write_wav(tmp_path / "float.wav", np.array([-1.5, -1.0, 0.0, 0.5, 1.0], dtype=np.float32), 8000)
+    path = write_audio(tmp_path / "float.wav", np.array([-1.5, -1.0, 0.0, 0.5, 1.0], dtype=np.float32), 8000)
 
     with wave.open(str(path)) as file:
         samples = np.frombuffer(file.readframes(5), dtype="<i2")
     assert samples.tolist() == [-32768, -32768, 0, 16384, 32767]
     with pytest.raises(ValueError, match="NaN"):
-        write_wav(tmp_path / "nan.wav", np.array([np.nan]), 8000)
+        write_audio(tmp_path / "nan.wav", np.array([np.nan]), 8000)

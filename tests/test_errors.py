@@ -18,7 +18,7 @@ from lerobot.datasets import LeRobotDataset
 from support.shared import ENV, TINY
 
 from gym_playbyear.environment import TaskEnv
-from lerobot_playbyear.datasets import write_audio
+from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig

@@ -26,8 +26,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from PIL import Image
 from support.hub import HubServer
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets import write_audio
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.film.video import at_a_rate_of_aac
@@ -510,7 +510,7 @@ def _claims(kind: str, root: Path) -> None:
 
 _OPEN = """
 import resource, sys
-from lerobot_playbyear.datasets import write_audio
+from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.training import EpisodeStore
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey

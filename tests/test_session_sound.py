@@ -12,10 +12,11 @@ from dataset_factory import dataset_features, make_dataset, random_frame
 from lerobot.datasets import LeRobotDataset
 from test_attach_audio import KEY, RATE, load
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.audio import cut_into_frames, note_episode_start, write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
 from lerobot_playbyear.audio.clock_drift import ClockLine, MarksError, Steady, read_marks
-from lerobot_playbyear.datasets import cut_into_frames, episode_waveform, note_episode_start, write_audio
-from lerobot_playbyear.datasets.episode_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts
+from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts
+from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.repair import repair_dataset
@@ -179,7 +180,7 @@ def test_an_episodes_start_is_noted_and_survives_being_killed(tmp_path):
     """The process is killed again and again while it notes: the file is whole at every moment, and loses nothing."""
     note_episode_start(tmp_path, 0, 1754400000.123456)
     program = (
-        "import itertools, sys\nfrom lerobot_playbyear.datasets.episode_clock import note_episode_start\n"
+        "import itertools, sys\nfrom lerobot_playbyear.audio.recorder_clock import note_episode_start\n"
         "print(flush=True)\nfor i in itertools.count(1):\n    note_episode_start(sys.argv[1], i % 50 + 1, i)\n"
     )
     for _ in range(3):

@@ -26,7 +26,7 @@ from torchvision.ops import FrozenBatchNorm2d
 from experiments import act_start
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.audio import picture_storage
-from lerobot_playbyear.audio.attach import AttachError, DatasetPlace
+from lerobot_playbyear.audio.attach_audio import AttachError, DatasetPlace
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
 from lerobot_playbyear.audio.sound_picture import SoundPicture, pictures_of, read_pictures
 from lerobot_playbyear.datasets.durable import DurableWriter

@@ -9,7 +9,7 @@ same samples give the same picture, whichever process makes it. Environments nee
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +35,7 @@ _FULL_SCALE = 32768.0  # int16 PCM
 _SHORTEST_SEGMENT_S = 0.04  # as in "Play it by Ear", appendix: 1,920 samples at 48 kHz
 _LONGEST_FFT = 2**18
 _LARGEST = 4096  # pixels along a side
+_ROLLING_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -219,6 +220,50 @@ class SoundPicture:
 
     def _error(self, name: str, wanted: str) -> InputError:
         return InputError(f"The picture of '{self.microphone}': {name}={getattr(self, name)!r}; wanted {wanted}.")
+
+
+class RollingSpectrogram:
+    """The last two seconds of a microphone, drawn a few columns at a time: what is drawn once moves to the left.
+
+    Args:
+        sample_rate: [Hz].
+        height, width: Of the picture [pixels].
+        low_db, high_db: Levels that are black and white [dB].
+
+    Raises:
+        InputError: The picture is too large, or the levels are in another order.
+    """
+
+    def __init__(self, sample_rate: int, height: int, width: int, low_db: float, high_db: float) -> None:
+        wanted = width / _ROLLING_S
+        per_second = min((n for n in range(1, 4 * width) if sample_rate % n == 0), key=lambda n: abs(n - wanted))
+        self._hop = sample_rate // per_second
+        names = (AUDIO_PREFIX + "microphone", PICTURE_PREFIX + "microphone")
+        self._look = SoundPicture(
+            *names, sample_rate, per_second, height, width, 1, low_db, high_db, before_episode=(0,) * height
+        )
+        self._grey = np.zeros((height, width), np.uint8)
+        self._n_drawn = 0
+
+    def draw(self, counter: int, samples: Callable[[int, int], np.ndarray]) -> np.ndarray:
+        """The picture when `counter` samples had come.
+
+        Args:
+            samples: Gives those from one number to before another, (n,) int16.
+
+        Returns:
+            (height, width) uint8, low frequencies at the bottom, the newest sound at the right; it is drawn on later.
+        """
+        n, (_, width) = counter // self._hop, self._grey.shape
+        n_new = min(n - self._n_drawn, width)
+        if n_new > 0:
+            segment = self._look.segment
+            sound = samples((n - n_new + 1) * self._hop - segment, n * self._hop)
+            segments = np.lib.stride_tricks.sliding_window_view(sound, segment)[:: self._hop]  # (n_new, segment)
+            self._grey[:, : width - n_new] = self._grey[:, n_new:]
+            self._grey[:, width - n_new :] = self._look.pixels_of(self._look.levels_of(segments)).T[::-1]
+            self._n_drawn = n
+        return self._grey
 
 
 def mel_bank(n_bands: int, fft_size: int, sample_rate: int) -> list[tuple[int, np.ndarray]]:

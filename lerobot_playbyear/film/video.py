@@ -9,7 +9,7 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lerobot_playbyear.datasets.audio_files import Channels, Resampled
+from lerobot_playbyear.audio.audio_files import resample
 
 _VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of FFmpeg has
 _AUDIO_CODECS = ("aac", "libmp3lame")
@@ -56,12 +56,12 @@ def gain_of(peak: float) -> float:
     return min(_LOUDEST / max(peak, 1e-6), _MAX_GAIN)
 
 
-def at_a_rate_of_aac(samples: Channels, sample_rate: int) -> tuple[Channels, int]:
+def at_a_rate_of_aac(samples: np.ndarray, sample_rate: int) -> tuple[np.ndarray, int]:
     """Resamples (n, channels) to the next higher rate that AAC has, where that is necessary."""
     if samples.shape[1] == 0 or sample_rate in _AAC_RATES:
         return samples, sample_rate or _AAC_RATES[-1]
     rate = next((rate for rate in _AAC_RATES if rate > sample_rate), _AAC_RATES[-1])
-    return Resampled(samples, sample_rate, rate), rate
+    return resample(samples, sample_rate, rate), rate
 
 
 def spectra(columns: np.ndarray, sample_rate: int) -> np.ndarray:
@@ -152,7 +152,7 @@ def write_film(
     path: str | Path,
     frames: Iterable[np.ndarray],
     fps: int,
-    sound: Channels,
+    sound: np.ndarray,
     sample_rate: int,
     x264_options: Mapping[str, str] | None = None,
 ) -> Path:
