@@ -146,11 +146,12 @@ class PutAside:
         """All that was added, as columns of a copy."""
         from lerobot_playbyear.audio.dataset_copy import AddedColumn
 
-        feature = audio_feature(sample_rate, fps)
-        return {
-            key: AddedColumn(feature, self._stats[key], lambda episode, key=key: np.load(self._file(key, episode)))
-            for key in self._keys
-        }
+        def column(key: str) -> AddedColumn:
+            return AddedColumn(
+                audio_feature(sample_rate, fps), self._stats[key], lambda episode: np.load(self._file(key, episode))
+            )
+
+        return {key: column(key) for key in self._keys}
 
     def _file(self, key: str, episode: int) -> Path:
         return self._folder / f"{key}-{episode}.npy"
