@@ -405,6 +405,7 @@ def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path,
     assert not torch.equal(*actions), "what is heard has no part in what is done"
 
 
+@pytest.mark.slow
 def test_act_without_pretrained_weights_begins_with_norms_that_tell_pictures_apart(recorded, tmp_path):
     options = ["pretrained_backbone_weights=null", *SMALL["act"].split()]
     command = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)

@@ -136,9 +136,9 @@ class SoundPicture:
     def levels_of(self, segments: np.ndarray) -> np.ndarray:
         """The levels of columns, (n, height) [dB], from the samples behind each, (n, segment)."""
         wave = segments / _FULL_SCALE if segments.dtype.kind == "i" else segments.astype(np.float64)
-        spectrum = np.fft.rfft(wave * self._window, self._fft_size)
+        size, bins, weights, firsts = self._bank
+        spectrum = np.fft.rfft(wave * self._window, size)
         power = spectrum.real**2 + spectrum.imag**2  # (n, bins)
-        bins, weights, firsts = self._flat_bank
         bands = np.add.reduceat(power[:, bins] * weights, firsts, axis=1)
         return 10 * np.log10(bands + 10 ** (FLOOR_DB / 10))
 
@@ -194,29 +194,20 @@ class SoundPicture:
         window = np.sin(np.pi * np.arange(self.segment) / self.segment) ** 2  # Hann's, periodic
         return 2 * window / window.sum()
 
-    @property
-    def _fft_size(self) -> int:
-        return 2 * (self._bank_and_bins[1] - 1)
-
     @cached_property
-    def _flat_bank(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The bins of all bands one after the other, their weights, and where each band begins among them."""
-        bank = self._bank_and_bins[0]
-        bins = np.concatenate([first + np.arange(len(weights)) for first, weights in bank])
-        lengths = [len(weights) for _, weights in bank]
-        return bins, np.concatenate([weights for _, weights in bank]), np.cumsum([0, *lengths[:-1]])
-
-    @cached_property
-    def _bank_and_bins(self) -> tuple[list[tuple[int, np.ndarray]], int]:
-        """Each band's first bin and the weights of its bins, and how many bins there are: so many that no band is without."""
+    def _bank(self) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        """The size of the transform, so large that no band is without a bin; the bins of all bands one after the other, their
+        weights, and where each band begins among them."""
         size = 1 << (self.segment - 1).bit_length()
-        while True:
-            bank = mel_bank(self.height, size, self.sample_rate)
-            if all(len(weights) for _, weights in bank):
-                return bank, size // 2 + 1
+        bank = mel_bank(self.height, size, self.sample_rate)
+        while not all(len(weights) for _, weights in bank):
             size *= 2
             if size > _LONGEST_FFT:
                 raise self._error("height", "fewer bands")
+            bank = mel_bank(self.height, size, self.sample_rate)
+        bins = np.concatenate([first + np.arange(len(weights)) for first, weights in bank])
+        lengths = [len(weights) for _, weights in bank]
+        return size, bins, np.concatenate([weights for _, weights in bank]), np.cumsum([0, *lengths[:-1]])
 
     def _error(self, name: str, wanted: str) -> InputError:
         return InputError(f"The picture of '{self.microphone}': {name}={getattr(self, name)!r}; wanted {wanted}.")
