@@ -8,6 +8,7 @@ No two clocks run alike. A recorder that is 100 parts in a million fast is 0.36 
 Two moments that are known on both clocks, such as a clap at the start and one at the end, say how fast it runs.
 """
 
+import contextlib
 import csv
 import json
 import math
@@ -53,28 +54,23 @@ def note_episode_start(root: str | Path, episode_index: int, unix_time_s: float)
     _write(Path(root) / CLOCK_PATH, starts)
 
 
-def renumber_episode_starts(root: str | Path, numbers: Mapping[int, int]) -> str | None:
+def renumber_episode_starts(root: str | Path, numbers: Mapping[int, int]) -> None:
     """Moves the times of episodes that got other numbers, and drops those of episodes that are gone.
+
+    Times that cannot be read stay as they are.
 
     Args:
         root: The folder of the dataset with the new numbers, which still has the times of the old ones.
         numbers: The new number of every episode that is still there.
 
-    Returns:
-        What is said of it; None: nothing was to be changed.
-
     Raises:
         OSError: The file cannot be read or written.
     """
-    try:
-        starts = read_episode_starts(root)
-        moved = {numbers[episode]: time_s for episode, time_s in (starts or {}).items() if episode in numbers}
-        if starts is None or moved == starts:
-            return None
-        _write(Path(root) / CLOCK_PATH, moved)
-        return f"{CLOCK_PATH} has the times of {len(moved)} episodes, by their new numbers; it had {len(starts)}"
-    except ClockError as error:
-        return f"{CLOCK_PATH} stays as it is, by the old numbers: {error}"
+    with contextlib.suppress(ClockError):
+        starts = read_episode_starts(root) or {}
+        moved = {numbers[episode]: time_s for episode, time_s in starts.items() if episode in numbers}
+        if moved != starts:
+            _write(Path(root) / CLOCK_PATH, moved)
 
 
 def _write(path: Path, starts: Mapping[int, float]) -> None:

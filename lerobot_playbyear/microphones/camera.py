@@ -1,7 +1,7 @@
 """A microphone as a LeRobot camera: `--robot.cameras='{mic: {type: microphone, device: "USB Audio"}}'`.
 
 Its picture shows the spectrogram of the last two seconds, and carries the exact samples and their number (see
-`audio.sample_strip`).
+`audio.microphone_pictures`).
 """
 
 import logging
