@@ -25,8 +25,15 @@ from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets import LeRobotDataset
 from PIL import Image
 
-from lerobot_playbyear.audio.rolling_spectrogram import RollingSpectrogram
-from lerobot_playbyear.audio.sample_strip import Strip, n_kept, n_rows, read_timecode, write_strip, write_timecode
+from lerobot_playbyear.audio.microphone_pictures import (
+    Strip,
+    n_kept,
+    n_rows,
+    read_timecode,
+    write_strip,
+    write_timecode,
+)
+from lerobot_playbyear.audio.sound_picture import RollingSpectrogram
 from lerobot_playbyear.datasets.durable import DurableWriter
 
 FPS, N_FRAMES = 20, 200

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_playbyear.datasets import audio_keys, episode_waveform, write_wav
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.datasets import audio_keys, episode_waveform
 
 
 def main() -> None:
@@ -24,7 +25,7 @@ def main() -> None:
     for key in audio_keys(dataset.meta.features):
         waveform, sample_rate = episode_waveform(dataset, args.episode, key)
         path = args.output_dir / f"episode_{args.episode}_{key.rsplit('.', 1)[-1]}.wav"
-        write_wav(path, waveform, sample_rate)
+        write_audio(path, waveform, sample_rate)
         print(f"{path}: {len(waveform) / sample_rate:.2f} s at {sample_rate} Hz")
 
 

@@ -14,7 +14,8 @@ import av
 import numpy as np
 from PIL import Image
 
-from lerobot_playbyear.datasets import audio_feature, cut_into_frames, read_audio, resample
+from lerobot_playbyear.audio import cut_into_frames, read_audio, resample
+from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 
 ENDINGS = (".mp4", ".mov", ".mkv", ".webm", ".avi")

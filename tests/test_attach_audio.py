@@ -1,32 +1,36 @@
-"""Sound attached to datasets that were recorded without it."""
+"""Sound attached to datasets that were recorded without it: from a file for each episode, and from a session's recording."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from dataset_factory import CAMERA, dataset_features, make_dataset
+from dataset_factory import CAMERA, dataset_features, make_dataset, random_frame
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets import episode_waveform, write_audio
+from lerobot_playbyear.audio import cut_into_frames, note_episode_start, write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.recorder_clock import (
+    CLOCK_PATH,
+    ClockError,
+    ClockLine,
+    read_clock,
+    read_episode_starts,
+    read_marks,
+)
+from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey
+from lerobot_playbyear.repair import repair_dataset
 
 FPS, RATE = 20, 16000
 SIZE = RATE // FPS
 LENGTHS = (12, 17, 9)
 KEY = "observation.audio.gripper"
 OFFSET = 0.25
-
-
-def silent_dataset(root: Path, **options) -> LeRobotDataset:
-    features = {
-        k: f for k, f in dataset_features(image_size=16, **options).items() if not k.startswith("observation.audio")
-    }
-    return make_dataset(root, LENGTHS, features=features, repo_id="test/silent")
 
 
 def noise(episode: int, n_samples: int, n_channels: int = 1) -> np.ndarray:
@@ -43,22 +47,33 @@ def write_sounds(folder: Path, rate: int = RATE, ending: str = "wav", n_channels
 @pytest.fixture(scope="module")
 def silent(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("silent") / "dataset"
-    silent_dataset(root)
+    make_dataset(root, LENGTHS, repo_id="test/silent", image_size=16, microphones=())
     return root
 
 
-def config(dataset: Path, output: Path, files: str, **options) -> AttachAudioConfig:
-    places = DatasetPlace("test/silent", str(dataset)), DatasetPlace("test/heard", str(output))
-    return AttachAudioConfig(*places, files, **{"microphone": "gripper", "offset": OFFSET, **options})
+def attach(root: Path, target: Path, **options) -> Path:
+    places = DatasetPlace("test/silent", str(root)), DatasetPlace("test/heard", str(target))
+    return attach_audio(AttachAudioConfig(*places, **options))
+
+
+def attach_files(root: Path, target: Path, files: str, **options) -> Path:
+    return attach(root, target, files=files, **{"microphone": "gripper", "offset": OFFSET, **options})
 
 
 def load(root: Path) -> LeRobotDataset:
     return LeRobotDataset("test/heard", root=root, video_backend="pyav")
 
 
+def contents(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+# From a file for each episode
+
+
 @pytest.mark.parametrize("ending", ["wav", "flac"])
 def test_every_frame_gets_what_was_heard_before_it(silent, tmp_path, ending):
-    root = attach_audio(config(silent, tmp_path / "heard", write_sounds(tmp_path / "sound", ending=ending)))
+    root = attach_files(silent, tmp_path / "heard", write_sounds(tmp_path / "sound", ending=ending))
 
     dataset = load(root)
     first = round(OFFSET * RATE) - SIZE
@@ -75,7 +90,7 @@ def test_every_frame_gets_what_was_heard_before_it(silent, tmp_path, ending):
 
 def test_all_else_stays_as_it_was(silent, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in silent.rglob("*")}
-    root = attach_audio(config(silent, tmp_path / "heard", write_sounds(tmp_path / "sound")))
+    root = attach_files(silent, tmp_path / "heard", write_sounds(tmp_path / "sound"))
     old, new = LeRobotDataset("test/silent", root=silent, video_backend="pyav"), load(root)
     assert set(new.meta.features) - set(old.meta.features) == {KEY}
     for i in (0, 13, 37):
@@ -89,9 +104,10 @@ def test_all_else_stays_as_it_was(silent, tmp_path):
 
 
 def test_video_is_copied_and_two_channels_become_two_microphones(tmp_path):
-    silent_dataset(tmp_path / "film", use_videos=True)
+    features = dataset_features(image_size=16, use_videos=True, microphones=())
+    make_dataset(tmp_path / "film", LENGTHS, features=features, repo_id="test/silent")
     files = write_sounds(tmp_path / "sound", n_channels=2)
-    root = attach_audio(config(tmp_path / "film", tmp_path / "heard", files, microphone="left, right"))
+    root = attach_files(tmp_path / "film", tmp_path / "heard", files, microphone="left, right")
     dataset = load(root)
     assert dataset[20][CAMERA].shape == (3, 16, 16)
     expected = noise(1, round((OFFSET + LENGTHS[1] / FPS) * RATE), 2)
@@ -103,9 +119,7 @@ def test_video_is_copied_and_two_channels_become_two_microphones(tmp_path):
 
 def test_sound_of_another_rate_is_resampled(silent, tmp_path):
     files = write_sounds(tmp_path / "sound", rate=11025)
-    with pytest.raises(AttachError, match=r"11025 samples per second.*no multiple of 20.*--sample_rate=11020"):
-        attach_audio(config(silent, tmp_path / "heard", files))
-    root = attach_audio(config(silent, tmp_path / "heard", files, sample_rate=48000))
+    root = attach_files(silent, tmp_path / "heard", files, sample_rate=48000)
     assert load(root).features[KEY]["info"]["sample_rate"] == 48000
     assert load(root)[3][KEY].shape == (2400,)
 
@@ -113,82 +127,209 @@ def test_sound_of_another_rate_is_resampled(silent, tmp_path):
 def test_each_episode_may_have_its_own_offset(silent, tmp_path):
     files = write_sounds(tmp_path / "sound")
     (tmp_path / "offsets.json").write_text("[0, 0.05, -0.1]")
-    cfg = config(silent, tmp_path / "heard", files, offset=0.1, offsets=tmp_path / "offsets.json", pad=True)
-    dataset = load(attach_audio(cfg))
+    options = {"offset": 0.1, "offsets": tmp_path / "offsets.json", "pad": True}
+    dataset = load(attach_files(silent, tmp_path / "heard", files, **options))
     for episode, offset in enumerate((0.1, 0.15, 0.0)):
         waveform, _ = episode_waveform(dataset, episode, KEY)
         sound = noise(episode, round((OFFSET + LENGTHS[episode] / FPS) * RATE))[:, 0]
         np.testing.assert_array_equal(waveform[2 * SIZE : 3 * SIZE], sound[round(offset * RATE) + SIZE :][:SIZE])
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"files": "nowhere/{episode}.wav"}, r"episode 0, nowhere/0\.wav: There is no sound file(.|\n)*episode 2,"),
-        ({"files": "sound.wav"}, r"say with \{episode\}"),
-        ({"files": "{episode}/{camera}.wav"}, "Only {episode} may stand in it"),
-        ({"offset": 3.0}, r"episode 0, .*000\.wav: it lasts 0\.850 s; 12 frames.*more\. Correct the offset"),
-        ({"microphone": "left,right"}, "1 channels, and --microphone names 2"),
-        ({"microphone": ""}, "a name of its own"),
-        ({"channel": 4}, "there is no --channel=4"),
-        ({"offsets": Path("missing.json")}, "is no list of numbers"),
-        ({"dataset": DatasetPlace("test/nothing", "/nonexistent/dataset")}, "There is no dataset in /nonexistent"),
-    ],
-)
-def test_what_does_not_fit_is_one_clear_error(silent, tmp_path, options, message):
+def test_a_second_microphone_can_follow(silent, tmp_path):
     files = write_sounds(tmp_path / "sound")
-    cfg = config(silent, tmp_path / "heard", files)
-    for key, value in options.items():
-        setattr(cfg, key, value)
-    with pytest.raises(AttachError, match=message):
-        attach_audio(cfg)
-    assert [path.name for path in tmp_path.iterdir()] == ["sound"]
-
-
-def test_a_copy_that_cannot_be_made_is_told_before_any_sound_is_read(silent, tmp_path):
-    (tmp_path / "file").touch()
-    nothing_there = config(silent, tmp_path / "file/heard", str(tmp_path / "{episode}.wav"))
-    with pytest.raises(
-        InputError, match=r"--output.root=.*/heard cannot be written: Not a directory in .*/file; wanted"
-    ):
-        attach_audio(nothing_there)
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_second_microphone_and_never_the_same_twice(silent, tmp_path):
-    files = write_sounds(tmp_path / "sound")
-    one = attach_audio(config(silent, tmp_path / "one", files))
-    with pytest.raises(AttachError, match="is there already"):
-        attach_audio(config(silent, one, files))
-    with pytest.raises(AttachError, match=f"'{KEY}' is in the dataset already"):
-        attach_audio(config(one, tmp_path / "two", files))
-    two = attach_audio(config(one, tmp_path / "two", files, microphone="table"))
+    one = attach_files(silent, tmp_path / "one", files)
+    two = attach_files(one, tmp_path / "two", files, microphone="table")
     assert {KEY, "observation.audio.table"} <= set(load(two).features)
 
 
-@pytest.mark.slow
-def test_lerobot_trains_on_it(silent, tmp_path):
-    """The command as it is typed, and then LeRobot's own training."""
-    files = write_sounds(tmp_path / "sound")
-    places = [f"--dataset.repo_id=test/silent --dataset.root={silent}", "--output.repo_id=test/heard"]
-    attach = [
-        "from lerobot_playbyear.scripts.commands import attach_audio; attach_audio()",
-        *" ".join(places).split(),
-        f"--output.root={tmp_path / 'heard'}",
+# From one recording of the session
+
+
+SESSION_LENGTHS = (100, 40, 200)
+CLOCK_BEGINS = 1_754_400_000.0  # when the recorder was started
+STARTS = (CLOCK_BEGINS + 3.017, CLOCK_BEGINS + 241.5, CLOCK_BEGINS + 270.25)
+CLAPS = (CLOCK_BEGINS + 1.0, CLOCK_BEGINS + 285.0)
+FAST = 1.001  # the recorder's clock, against the robot's
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory) -> Path:
+    root = tmp_path_factory.mktemp("long") / "dataset"
+    features = {key: one for key, one in dataset_features().items() if key in ("action", "observation.state")}
+    make_dataset(root, SESSION_LENGTHS, features=features, repo_id="test/silent")
+    return root
+
+
+def taps() -> list[tuple[int, int, float]]:
+    """A tap in every third frame: episode, frame, and when, anywhere in the middle nine tenths of the frame's block."""
+    rng = np.random.default_rng(0)
+    return [
+        (episode, frame, STARTS[episode] + (frame - rng.uniform(0.05, 0.95)) / FPS)
+        for episode, length in enumerate(SESSION_LENGTHS)
+        for frame in range(1, length, 3)
     ]
-    run(*attach, f"--files={files}", "--microphone=gripper", f"--offset={OFFSET}")
-    run(
-        "from lerobot.scripts.lerobot_train import main; main()",
-        ["--policy.type=playbyear", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.image_size=32"],
-        ["--policy.vision_width=4", "--dataset.repo_id=test/heard", "--batch_size=2", "--steps=2", "--num_workers=0"],
-        f"--dataset.root={tmp_path / 'heard'}",
-        f"--output_dir={tmp_path / 'train'}",
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Path:
+    """Five minutes, recorded by a clock that is 0.1 % fast, of taps 2 ms long."""
+    samples = np.random.default_rng(1).normal(0, 20, round(290 * RATE * FAST))
+    tap = 12_000 * np.sin(2 * np.pi * 1500 * np.arange(32) / RATE) * np.hanning(32)
+    for _, _, clock_s in taps():
+        place = round((clock_s - CLOCK_BEGINS) * FAST * RATE)
+        samples[place - 16 : place + 16] += tap
+    return write_audio(tmp_path_factory.mktemp("session") / "day.flac", samples.astype(np.int16), RATE)
+
+
+def marks(*clock_s: float) -> str:
+    return ", ".join(f"{(moment - CLOCK_BEGINS) * FAST:.6f}={moment:.6f}" for moment in clock_s)
+
+
+def share_in_their_blocks(root: Path) -> float:
+    """How many of the taps are loudest in the block of their frame, of all frames within two."""
+    dataset = load(root)
+    found = 0
+    for episode, length in enumerate(SESSION_LENGTHS):
+        energy = np.abs(episode_waveform(dataset, episode, KEY)[0].reshape(length, SIZE)).max(axis=1).astype(float)
+        for _, frame, _ in (tap for tap in taps() if tap[0] == episode):
+            nearby = range(max(frame - 1, 0), min(frame + 2, length))
+            found += max(nearby, key=lambda i: energy[i]) == frame and energy[frame] > 3000
+    return found / len(taps())
+
+
+def test_taps_land_in_the_blocks_of_their_frames_though_the_recorder_is_fast(long, recording, tmp_path, capsys):
+    clock = tmp_path / "starts.csv"
+    clock.write_text("episode,seconds\n" + "".join(f"{i},{start!r}\n" for i, start in enumerate(STARTS)))
+    root = attach(long, tmp_path / "heard", session=recording, microphone="gripper", clock=clock, marks=marks(*CLAPS))
+    assert len(taps()) > 100
+    assert share_in_their_blocks(root) >= 0.99
+    assert survey(root).is_sound
+    assert "+1000 parts in a million" in capsys.readouterr().out
+
+    without = attach(
+        long, tmp_path / "drifting", session=recording, microphone="gripper", clock=clock, marks=marks(CLAPS[0])
     )
-    config = json.loads((tmp_path / "train/checkpoints/last/pretrained_model/config.json").read_text())
-    assert KEY in config["input_features"]
+    assert share_in_their_blocks(without) < 0.7, "the test would notice nothing without the drift"
 
 
-def run(program: str, *arguments: str | list[str]) -> None:
-    flat = [part for argument in arguments for part in ([argument] if isinstance(argument, str) else argument)]
-    result = subprocess.run([sys.executable, "-c", program, *flat], capture_output=True, text=True, check=False)
-    assert result.returncode == 0, result.stderr[-3000:]
+def test_times_in_the_dataset_itself_are_taken(long, recording, tmp_path):
+    """Noted while it was recorded; a clap a little off, as a person reads it, costs no tap; an offset is added."""
+    shutil.copytree(long, tmp_path / "noted")
+    for episode, start in enumerate(STARTS):
+        note_episode_start(tmp_path / "noted", episode, start)
+    two = f"{1.0 * FAST + 0.5:.3f}={CLAPS[0]:.3f},{285.0 * FAST + 0.5:.3f}={CLAPS[1]:.3f}"
+    options = {"session": recording, "microphone": "gripper", "marks": two, "offset": -0.5}
+    assert share_in_their_blocks(attach(tmp_path / "noted", tmp_path / "heard", **options)) >= 0.99
+    assert read_episode_starts(tmp_path / "heard") == dict(enumerate(STARTS))
+
+
+def test_without_marks_the_seconds_are_those_of_the_file(long, tmp_path):
+    """And not a sample is changed."""
+    sound = np.random.default_rng(2).integers(-3000, 3000, 40 * RATE).astype(np.int16)
+    session = write_audio(tmp_path / "day.wav", sound, RATE)
+    (tmp_path / "starts.json").write_text("[1.5, 10, 12.25]")
+    dataset = load(
+        attach(long, tmp_path / "heard", session=session, microphone="gripper", clock=tmp_path / "starts.json")
+    )
+    for episode, (start, length) in enumerate(zip((1.5, 10, 12.25), SESSION_LENGTHS, strict=True)):
+        wanted = cut_into_frames(sound, RATE, FPS, length, offset=start)
+        np.testing.assert_array_equal(episode_waveform(dataset, episode, KEY)[0], wanted.reshape(-1))
+
+
+def test_a_recording_without_its_drift_is_the_same_sound_at_the_right_times():
+    """A tone of a recorder that is 300 parts in a million slow, below half the sample rate, to 60 dB."""
+    for frequency in (440.0, 5000.0):
+        drifting = 10_000 * np.sin(2 * np.pi * frequency * np.arange(100_000) / RATE / 0.9997)
+        recording = np.round(drifting).astype(np.int16)[:, None]
+        steady = cut_into_frames(recording, RATE, FPS, 120, offset=0.1, speed=0.9997).reshape(-1)
+        wanted = 10_000 * np.sin(2 * np.pi * frequency * (0.05 + np.arange(len(steady)) / RATE))
+        assert np.abs(steady - wanted).max() < 10
+
+
+def test_marks_are_a_line():
+    assert read_marks(None) == ClockLine()
+    assert read_marks("2.5=100").sound_time(110) == 12.5
+    line = read_marks(" 1=101 , 1.5=101.4998, 1001 = 1101 ")
+    assert line.speed == pytest.approx(1, abs=1e-6)
+    assert 0 < line.error_s < 1e-3
+    assert read_marks("1.5=1754400000.5, 3605.1=1754403600.5").speed == pytest.approx(3603.6 / 3600)
+
+
+def test_an_episodes_start_is_noted_and_survives_being_killed(tmp_path):
+    """The process is killed again and again while it notes: the file is whole at every moment, and loses nothing."""
+    note_episode_start(tmp_path, 0, 1754400000.123456)
+    program = (
+        "import itertools, sys\nfrom lerobot_playbyear.audio.recorder_clock import note_episode_start\n"
+        "print(flush=True)\nfor i in itertools.count(1):\n    note_episode_start(sys.argv[1], i % 50 + 1, i)\n"
+    )
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"\n"
+        for _ in range(20):
+            starts = read_episode_starts(tmp_path)
+            assert starts is not None
+            assert starts[0] == 1754400000.123456
+        process.kill()
+        process.wait()
+        assert (read_episode_starts(tmp_path) or {})[0] == 1754400000.123456
+    assert json.loads((tmp_path / CLOCK_PATH).read_text())["episodes"]["0"] == 1754400000.123456
+    assert read_clock(tmp_path / CLOCK_PATH) == read_episode_starts(tmp_path)
+
+
+def test_after_a_repair_the_times_are_those_of_the_same_episodes(tmp_path):
+    """A killed recording: its second data file is lost, and the episode after it moves up."""
+    features = {key: one for key, one in dataset_features().items() if key in ("action", "observation.state")}
+    dataset = LeRobotDataset.create("test/lost", FPS, features, root=tmp_path / "lost", use_videos=False)
+    dataset.meta.update_chunk_settings(data_files_size_in_mb=1e-6)  # each episode in a file of its own
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        for _ in range(5):
+            dataset.add_frame({**random_frame(features, rng), "task": "Knock."})
+        dataset.save_episode()
+    dataset.finalize()
+    for episode, start in enumerate(STARTS):
+        note_episode_start(tmp_path / "lost", episode, start)
+    files = sorted((tmp_path / "lost").glob("data/*/*.parquet"))
+    assert len(files) == 3
+    files[1].unlink()
+    target = repair_dataset(tmp_path / "lost").target
+    assert read_episode_starts(target) == {0: STARTS[0], 1: STARTS[2]}
+
+
+def test_a_table_of_times_may_come_from_a_spreadsheet(tmp_path):
+    for text in ("0,1.5\n1,20\n", "Episode;Start\n0;1.5\n\n1;20\n", "episode\tstart\tremark\n0\t1.5\t\n1\t20\tgood\n"):
+        (tmp_path / "times.csv").write_text(text)
+        assert read_clock(tmp_path / "times.csv") == {0: 1.5, 1: 20.0}
+
+
+def test_no_start_is_noted_through_a_link_or_without_a_meaning(tmp_path):
+    outside = tmp_path / "precious.json"
+    outside.write_text('{"episodes": {}}')
+    (tmp_path / "dataset/meta").mkdir(parents=True)
+    (tmp_path / "dataset/meta/playbyear_clock.json").symlink_to(outside)
+    with pytest.raises(ClockError, match="is a link"):
+        note_episode_start(tmp_path / "dataset", 0, 1.0)
+    assert outside.read_text() == '{"episodes": {}}'
+    for index, seconds in ((-1, 1.0), (True, 1.0), (0, float("nan")), (0, "soon")):
+        with pytest.raises(ClockError, match="wanted"):
+            note_episode_start(tmp_path, index, seconds)  # type: ignore[arg-type]
+    assert read_episode_starts(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0,a\n", "the time of episode 0 is 'a'; wanted seconds"),
+        ("0,1\n0,2\n", "names episode 0 twice"),
+        ("0 1\n", "a line is '0 1'; wanted episode and seconds, such as 0,12.5"),
+        ("1,2\n", "has no time for episode 0, 2; the dataset has 3 episodes"),
+        ("0,1\n1,2\n2,500\n", r"episode 2, which began at 500.000 s of the clock: .*at its end more"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_one_clear_error(silent, tmp_path, text, message):
+    (tmp_path / "starts.csv").write_text(text)
+    session = write_audio(tmp_path / "day.wav", np.zeros(30 * RATE, np.int16), RATE)
+    with pytest.raises(InputError, match=message):
+        attach(silent, tmp_path / "heard", session=session, clock=tmp_path / "starts.csv")
+    assert not (tmp_path / "heard").exists()

@@ -1,21 +1,78 @@
 """Sound in files beside the frames (LeRobot's pull request 2824) becomes columns with the same samples."""
 
+import itertools
 import json
 import shutil
 from pathlib import Path
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from audio_layout_factory import EARS, PRE_ROLL_S, TABLE, add_files_of_sound
+from dataset_factory import make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from test_attach_audio import FPS, LENGTHS, RATE, SIZE, silent_dataset
+from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, contents, load
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import AUDIO_PREFIX, episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey
+
+PRE_ROLL_S = 1.0
+EARS = "observation.audio.ears"
+TABLE = "observation.audio.table"
+
+
+def encode(path: Path, samples: np.ndarray, rate: int, codec: str) -> None:
+    """Samples (n, channels) int16 as an M4A file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    layout = "mono" if samples.shape[1] == 1 else "stereo"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=rate, layout=layout)
+        for start in range(0, len(samples), 1024):
+            piece = np.ascontiguousarray(samples[start : start + 1024]).reshape(1, -1)
+            frame = av.AudioFrame.from_ndarray(piece, format="s16", layout=layout)
+            frame.sample_rate, frame.pts = rate, start
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+
+
+def add_files_of_sound(
+    root: Path, key: str, sounds: list[np.ndarray], rate: int, codec: str = "alac", per_file: int = 2, ends: bool = True
+) -> None:
+    """Adds a microphone to a dataset.
+
+    Args:
+        root: Its folder.
+        key: The feature.
+        sounds: For each episode (n, channels) int16, from `PRE_ROLL_S` before its first frame on.
+        rate: [Hz].
+        codec: Of the files.
+        per_file: Episodes in one file.
+        ends: Whether `to_timestamp` is there.
+    """
+    columns: dict[str, list] = {"chunk_index": [], "file_index": [], "from_timestamp": [], "to_timestamp": []}
+    for first in range(0, len(sounds), per_file):
+        part = sounds[first : first + per_file]
+        number = first // per_file
+        encode(root / f"audio/{key}/chunk-000/file-{number:03d}.m4a", np.concatenate(part), rate, codec)
+        edges = np.cumsum([0, *map(len, part)]) / rate
+        for start, end in itertools.pairwise(edges):
+            for name, value in zip(columns, (0, number, float(start), float(end)), strict=True):
+                columns[name].append(value)
+    (table,) = root.glob("meta/episodes/*/*.parquet")
+    rows = pq.read_table(table)
+    for name, values in columns.items():
+        if ends or name != "to_timestamp":
+            rows = rows.append_column(f"audio/{key}/{name}", pa.array(values))
+    pq.write_table(rows, table)
+    path = root / "meta/info.json"
+    info = json.loads(path.read_text())
+    n_channels = sounds[0].shape[1]
+    notes = {"sample_rate": rate, "audio.codec": codec, "audio.channels": n_channels, "start_time_s": PRE_ROLL_S}
+    info["features"][key] = {"dtype": "audio", "shape": [n_channels], "names": ["channels"], "info": notes}
+    info["audio_path"] = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
+    path.write_text(json.dumps(info))
 
 
 def heard(episode: int, n_channels: int, rate: int = RATE) -> np.ndarray:
@@ -36,7 +93,7 @@ def blocks_of(sound: np.ndarray, length: int) -> np.ndarray:
 @pytest.fixture(scope="module")
 def silent(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("silent") / "dataset"
-    silent_dataset(root)
+    make_dataset(root, LENGTHS, repo_id="test/silent", image_size=16, microphones=())
     return root
 
 
@@ -48,19 +105,6 @@ def with_files(silent, tmp_path_factory) -> Path:
     add_files_of_sound(root, TABLE, [heard(i, 1) for i in range(3)], RATE, ends=False)
     add_files_of_sound(root, EARS, [heard(i, 2) for i in range(3)], RATE)
     return root
-
-
-def attach(root: Path, target: Path, **options) -> Path:
-    places = DatasetPlace("test/here", str(root)), DatasetPlace("test/there", str(target))
-    return attach_audio(AttachAudioConfig(*places, **options))
-
-
-def load(root: Path) -> LeRobotDataset:
-    return LeRobotDataset("test/there", root=root, video_backend="pyav")
-
-
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
 def episodes_of(root: Path) -> list[dict]:
@@ -90,14 +134,12 @@ def test_files_become_columns_with_the_same_samples(with_files, silent, tmp_path
     assert {path.name for path in tmp_path.iterdir()} == {"columns"}
 
 
-@pytest.mark.parametrize("n_channels", [1, 2])
-def test_lossy_files_come_in_within_the_codecs_error(silent, tmp_path, n_channels):
+def test_lossy_files_come_in_within_the_codecs_error(silent, tmp_path):
     shutil.copytree(silent, tmp_path / "aac")
-    sounds = [heard(i, n_channels) for i in range(3)]
+    sounds = [heard(i, 2) for i in range(3)]
     add_files_of_sound(tmp_path / "aac", EARS, sounds, RATE, codec="aac", per_file=3)
     dataset = load(attach(tmp_path / "aac", tmp_path / "columns"))
-    for channel in range(n_channels):
-        key = EARS if n_channels == 1 else f"{EARS}_{channel}"
+    for channel, key in enumerate((f"{EARS}_0", f"{EARS}_1")):
         for episode, length in enumerate(LENGTHS):
             wanted = blocks_of(sounds[episode], length)[:, channel].astype(float)
             error = episode_waveform(dataset, episode, key)[0] - wanted
@@ -164,7 +206,6 @@ def change_column(root: Path, name: str, values: list) -> None:
         (lambda info: info["features"][TABLE]["info"].update(start_time_s=-1.0), "start_time_s is -1.0; wanted"),
         (lambda info: info["features"].update({f"{AUDIO_PREFIX}a/../b": info["features"].pop(TABLE)}), "without '/'"),
         (lambda info: info["features"].update({f"{EARS}_1": info["features"]["action"]}), "which is there already"),
-        (lambda info: info.update(fps=0), "fps is 0; wanted"),
     ],
 )
 def test_what_a_stranger_says_is_checked_first(with_files, tmp_path, change, message):
@@ -194,16 +235,12 @@ def test_a_place_that_cannot_be_is_one_clear_error(with_files, tmp_path, column,
     assert [path.name for path in tmp_path.iterdir()] == ["files"]
 
 
-def test_a_file_that_names_others_is_not_followed(with_files, tmp_path):
-    shutil.copytree(with_files, tmp_path / "files")
-    (tmp_path / f"files/audio/{TABLE}/chunk-000/file-000.m4a").write_text("ffconcat version 1.0\nfile file-001.m4a\n")
-    with pytest.raises(InputError, match=rf"'{TABLE}', episode 0, .*cannot be decoded"):
-        attach(tmp_path / "files", tmp_path / "columns")
-
-
-def test_a_link_out_of_the_dataset_is_not_followed(with_files, tmp_path):
+def test_a_file_that_names_others_or_is_a_link_is_not_followed(with_files, tmp_path):
     shutil.copytree(with_files, tmp_path / "files")
     file = tmp_path / f"files/audio/{TABLE}/chunk-000/file-000.m4a"
+    file.write_text("ffconcat version 1.0\nfile file-001.m4a\n")
+    with pytest.raises(InputError, match=rf"'{TABLE}', episode 0, .*cannot be decoded"):
+        attach(tmp_path / "files", tmp_path / "columns")
     file.unlink()
     file.symlink_to(with_files / f"audio/{TABLE}/chunk-000/file-000.m4a")
     with pytest.raises(InputError, match=r"is a link to .*outside its folder"):
@@ -219,7 +256,7 @@ def test_a_link_out_of_the_dataset_is_not_followed(with_files, tmp_path):
     ],
 )
 def test_options_that_do_not_fit_are_told(with_files, tmp_path, options, message):
-    with pytest.raises(AttachError, match=message):
+    with pytest.raises(InputError, match=message):
         attach(with_files, tmp_path / "x", **options)
 
 

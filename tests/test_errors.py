@@ -18,7 +18,7 @@ from lerobot.datasets import LeRobotDataset
 from support.shared import ENV, TINY
 
 from gym_playbyear.environment import TaskEnv
-from lerobot_playbyear.datasets import write_audio
+from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
@@ -84,7 +84,7 @@ inspect | --dataset.root={full} | it has no meta/info.json
 inspect | --dataset.root={truncated} | {truncated} | file-000.parquet | playbyear-repair --root={truncated}
 inspect | --html={file}/page.html | The page cannot be written | {file}
 repair | --root={out}/no | {out}/no holds no LeRobotDataset
-repair | --like={full} | {full}/meta/info.json
+repair | --like={full} | --like={full} holds no LeRobotDataset | the same settings
 push | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no'
 push policy | --policy.path={noise} | there is no checkpoint with config.json | {noise}
 video | --output={out}/film | --output={out}/film: films are mp4 | ends with .mp4
@@ -197,15 +197,14 @@ session | --marks=1.0 | '1.0' is no mark; wanted seconds in the sound file = sec
 session | --marks=1=5,2=5 | the same time on the clock
 session | --marks=10=1,20=5 | 2.5000 seconds of sound in a second of the clock
 session | --microphone=left,right | 1 channels, and --microphone names 2
-attach-spectrogram | --microphones=[nose] | --microphones names 'nose'; the dataset has gripper
+attach-spectrogram | --microphones=[nose] | --microphones names 'nose'; the dataset in {noise} has gripper
 attach-spectrogram | --microphones=[] | --microphones names none
-attach-spectrogram | --name=front | 'observation.images.front' is in the dataset already
+attach-spectrogram | --name=front | 'observation.images.front' is in the dataset in {noise} already
 attach-spectrogram | --seconds=3 | 60 frames do not fit into 16 columns | at most 0.80
 attach-spectrogram | --seconds=0 | --seconds=0 | above 0
 attach-spectrogram | --height=3 | --height=3 | 8 to 4096 pixels
 attach-spectrogram | --low_db=10 --high_db=-10 | --low_db=10 | the second above the first
-attach-spectrogram | --crf=10 | --crf | for --video=true
-attach-spectrogram | --dataset.root={deaf} | 't/noise' has no sound in columns | playbyear-attach-audio
+attach-spectrogram | --dataset.root={deaf} | {deaf} has no sound in columns | playbyear-attach-audio
 # Films, inspection, microphones
 video | --seed=-1 | seed=-1: give 0 or more
 video | --attempts=0 | attempts=0: give at least 1

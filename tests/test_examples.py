@@ -15,7 +15,8 @@ import pytest
 from dataset_factory import make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_playbyear.datasets import episode_waveform, read_audio
+from lerobot_playbyear.audio import read_audio
+from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.survey import survey
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -9,7 +9,7 @@ import torch
 from support.policy import batch_of, make_config, make_episode, make_policy, step_through
 from torchaudio.functional import resample
 
-from lerobot_playbyear.datasets.audio_files import write_audio
+from lerobot_playbyear.audio.audio_files import write_audio
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy import sound_augmentation
 from lerobot_playbyear.policy.configuration_playbyear import segment_and_hop

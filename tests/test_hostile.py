@@ -27,8 +27,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from PIL import Image
 from support.hub import HubServer, come_here
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets import write_audio
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.findings import worst
 from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.survey import survey

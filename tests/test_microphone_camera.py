@@ -14,19 +14,19 @@ from lerobot.policies import make_policy
 from lerobot.utils.feature_utils import hw_to_dataset_features
 
 from lerobot_playbyear.audio import camera_sound
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.audio_files import write_audio
 from lerobot_playbyear.audio.control_steps import HALF, ControlStepSound
-from lerobot_playbyear.audio.sample_strip import (
+from lerobot_playbyear.audio.microphone_pictures import (
     Strip,
     n_kept,
     n_rows,
     read_strip,
     read_timecode,
+    session_path,
     write_strip,
     write_timecode,
 )
-from lerobot_playbyear.audio.session_files import session_path
-from lerobot_playbyear.datasets.audio_files import write_wav
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
@@ -57,7 +57,7 @@ class Session:
 
     def __init__(self, folder: Path, samples: np.ndarray, session: int = 0xABCDEF01, rate: int = RATE) -> None:
         self.samples, self.session, self.rate = samples, session, rate
-        write_wav(session_path(folder, session, "2026-01-01_00-00-00"), samples, rate)
+        write_audio(session_path(folder, session, "2026-01-01_00-00-00"), samples, rate)
         self._noise = np.random.default_rng(1)
 
     def strip(self, counter: int) -> Strip:
@@ -296,7 +296,7 @@ def test_what_is_missing_is_named_and_nothing_is_written(tmp_path):
     root = recorded(tmp_path / "heard", session, [counters_of(10)], video=True)
     with pytest.raises(AttachError, match=r"session's file \*_abcdef01.wav is not in .*--session=FOLDER"):
         attached(root)
-    write_wav(session_path(tmp_path / "short", session.session, "x"), sound(0.1), RATE)
+    write_audio(session_path(tmp_path / "short", session.session, "x"), sound(0.1), RATE)
     with pytest.raises(AttachError, match="has 1600 samples, and a frame needs 8000"):
         attached(root, tmp_path / "short")
     with pytest.raises(AttachError, match=r"fps=20, and the control steps are 33\.3 ms apart"):

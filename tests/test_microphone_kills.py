@@ -10,10 +10,10 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.feature_utils import hw_to_dataset_features
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.audio_files import write_audio
 from lerobot_playbyear.audio.control_steps import ControlStepSound
-from lerobot_playbyear.audio.sample_strip import Strip, read_timecode
-from lerobot_playbyear.datasets.audio_files import write_wav
+from lerobot_playbyear.audio.microphone_pictures import Strip, read_timecode
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.repair.repair import RepairConfig, repair
 
@@ -40,7 +40,7 @@ def record(root: Path, sessions: Path, noise: Path, video: bool) -> None:
 def test_killed_at_ten_moments_every_episode_that_repair_keeps_gets_its_sound(video, tmp_path):
     rng = np.random.default_rng(int(video))
     samples = rng.normal(0, 3000, 60 * RATE).astype(np.int16)
-    noise = write_wav(tmp_path / "noise.wav", samples, RATE)
+    noise = write_audio(tmp_path / "noise.wav", samples, RATE)
     n_kept = 0
     for number in range(10):
         root, sessions = tmp_path / f"run{number}", tmp_path / f"sessions{number}"

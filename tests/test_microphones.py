@@ -15,10 +15,9 @@ from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.utils.errors import DeviceNotConnectedError
 from sound_server import RATE, Player, started, why_not
 
+from lerobot_playbyear.audio.audio_files import read_audio, write_audio
 from lerobot_playbyear.audio.control_steps import HALF
-from lerobot_playbyear.audio.sample_strip import Strip, read_strip
-from lerobot_playbyear.audio.session_files import SessionSound, find_session
-from lerobot_playbyear.datasets.audio_files import read_audio, write_wav
+from lerobot_playbyear.audio.microphone_pictures import SessionSound, Strip, find_session, read_strip
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig, MicrophoneOptionError
 from lerobot_playbyear.microphones.card import CardRecording
 from lerobot_playbyear.microphones.file import PlayedMicrophone
@@ -209,7 +208,7 @@ def test_a_pictures_sound_is_of_its_moment_to_5_ms():
 
 
 def test_microphones_of_one_card_have_one_sample_rate(tmp_path):
-    path = str(write_wav(tmp_path / "sound.wav", np.ones((RATE, 2), np.int16), RATE))
+    path = str(write_audio(tmp_path / "sound.wav", np.ones((RATE, 2), np.int16), RATE))
     with (
         pytest.raises(MicrophoneError, match=r"have sample_rate 48000 and 16000: give them the same"),
         listening(left=options(file=path), right=options(file=path, channel=1, sample_rate=16000)),
@@ -398,7 +397,7 @@ def test_an_option_without_meaning_is_named(changes, said):
 
 
 def test_a_file_that_does_not_fit_is_refused(tmp_path):
-    path = str(write_wav(tmp_path / "sound.wav", np.ones((RATE, 2), np.int16), RATE))
+    path = str(write_audio(tmp_path / "sound.wav", np.ones((RATE, 2), np.int16), RATE))
     with pytest.raises(MicrophoneError, match="channel 2 is asked for"), listening(mic=options(file=path, channel=2)):
         pass
 
@@ -408,7 +407,9 @@ def test_a_file_that_does_not_fit_is_refused(tmp_path):
 
 def test_the_pictures_samples_are_those_of_the_sessions_file_bit_for_bit_with_gain(tmp_path, caplog):
     caplog.set_level(logging.INFO)
-    path = write_wav(tmp_path / "noise.wav", np.random.default_rng(0).normal(0, 3000, (RATE, 2)).astype(np.int16), RATE)
+    path = write_audio(
+        tmp_path / "noise.wav", np.random.default_rng(0).normal(0, 3000, (RATE, 2)).astype(np.int16), RATE
+    )
     changes = {"file": str(path), "save_to": str(tmp_path / "sessions")}
     with listening(left=options(**changes), right=options(**changes, channel=1, gain_db=12)) as cameras:
         strips = []

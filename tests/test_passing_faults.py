@@ -161,10 +161,5 @@ def meet_random_faults(disk: FaultyDisk, originals: dict[str, Path], folder: Pat
 
 
 @pytest.mark.slow
-def test_whole_episodes_stay_where_a_disk_fails_for_a_moment(disk, originals, tmp_path):
-    meet_random_faults(disk, originals, tmp_path, range(10))
-
-
-@pytest.mark.slow
 def test_whole_episodes_stay_wherever_a_disk_fails_for_a_moment(disk, originals, tmp_path):
     meet_random_faults(disk, originals, tmp_path, range(1000, 1100))

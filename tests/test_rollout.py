@@ -12,8 +12,9 @@ from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_rollout
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, DatasetPlace, attach_audio
-from lerobot_playbyear.datasets import audio_feature, write_wav
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -104,7 +105,7 @@ def test_a_policy_that_hears_says_that_there_is_no_sound_and_moves_nothing(polic
 def microphone(folder: Path) -> str:
     """A card that plays noise, no place of it like another."""
     noise = np.random.default_rng(3).normal(0, 3000, 30 * 16000).astype(np.int16)
-    path = write_wav(folder / "noise.wav", noise, 16000)
+    path = write_audio(folder / "noise.wav", noise, 16000)
     return f"--robot.cameras={{gripper: {{type: microphone, file: {path}, save_to: none}}}}"
 
 

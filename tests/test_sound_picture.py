@@ -25,12 +25,13 @@ from torchvision.ops import FrozenBatchNorm2d
 
 from experiments import act_start
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.audio import picture_storage
-from lerobot_playbyear.audio.attach import AttachError, DatasetPlace
+from lerobot_playbyear.audio import attach_spectrogram as attaching
+from lerobot_playbyear.audio.attach_audio import AttachError
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
 from lerobot_playbyear.audio.sound_picture import SoundPicture, pictures_of, read_pictures
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.episodes import frames
 from lerobot_playbyear.episodes.environment import RolloutError, env_facts, env_spec
@@ -185,53 +186,16 @@ def test_every_frame_shows_the_last_seconds_and_all_else_stays(original, seen, t
     ] == []
 
 
-def test_a_video_shows_nearly_the_same(original, seen, tmp_path):
-    options = {"video": True, "vcodec": "h264", "crf": 18, "microphones": ["gripper"]}
-    film = load(attach_spectrogram(config(original, tmp_path / "film", **options)))
-    stored = load(seen)
-    assert film.features[PICTURE]["dtype"] == "video"
-    assert pictures_of(film.features) == pictures_of(stored.features)[:1]
-    wrong = [np.abs(picture(film, row).astype(int) - picture(stored, row)).mean() for row in (0, 11, 12, 30, 40, 45)]
-    assert max(wrong) < 8
-    assert survey(film.root).is_sound
-
-
 def test_a_copy_that_fails_is_not_there_and_one_that_is_there_is_not_touched(original, seen, tmp_path, monkeypatch):
     with pytest.raises(AttachError, match="is there already"):
         attach_spectrogram(config(original, seen))
-    monkeypatch.setattr(picture_storage, "_png", lambda picture: (_ for _ in ()).throw(OSError("the disk is full")))
+    monkeypatch.setattr(attaching, "_png", lambda picture: (_ for _ in ()).throw(OSError("the disk is full")))
     with pytest.raises(OSError, match="disk is full"):
         attach_spectrogram(config(original, tmp_path / "new"))
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"microphones": ["nose"]}, "--microphones names 'nose'; the dataset has gripper, table"),
-        ({"microphones": []}, "names none"),
-        ({"name": "front"}, "'observation.images.front' is in the dataset already"),
-        ({"name": "heard"}, "is in the dataset already"),  # for the second microphone
-        ({"seconds": 3.0}, "60 frames do not fit into 16 columns.*at most 0.80"),
-        ({"seconds": 0.0}, "above 0"),
-        ({"height": 3}, "8 to 4096 pixels"),
-        ({"low_db": 10.0, "high_db": -10.0}, "the second above the first"),
-        ({"crf": 10}, "for --video=true"),
-        ({"video": True, "vcodec": "mjpeg"}, "mjpeg"),
-        ({"dataset": DatasetPlace("t/nothing", "/nonexistent/dataset")}, "There is no dataset"),
-    ],
-)
-def test_what_does_not_fit_is_one_clear_error(original, tmp_path, options, message):
-    with pytest.raises(InputError, match=message):
-        attach_spectrogram(replace(config(original, tmp_path / "seen"), **options))
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_dataset_without_sound_or_with_nothing_but_silence(tmp_path):
-    features = {key: f for key, f in dataset_features(image_size=16).items() if key != MICROPHONE}
-    make_dataset(tmp_path / "deaf", (5,), features=features)
-    with pytest.raises(InputError, match="has no sound in columns"):
-        attach_spectrogram(config(tmp_path / "deaf", tmp_path / "seen"))
+def test_a_dataset_with_nothing_but_silence_is_refused(tmp_path):
     dataset = LeRobotDataset.create(
         "t/silent", 20, dataset_features(image_size=16), root=tmp_path / "silent", use_videos=False
     )
@@ -322,19 +286,6 @@ def test_a_rollout_shows_what_the_dataset_holds_bit_for_bit(recorded):
                 assert torch.equal(batch[key], torch.stack([item[key].float() for item in items])), (key, frame)
             observation, *_ = vec.step(np.stack([item["action"].numpy() for item in items]))
     vec.close()
-
-
-@pytest.mark.slow
-def test_environments_in_processes_of_their_own_show_the_same(recorded):
-    seen = []
-    for use_async_envs in (False, True):
-        vec = make_env(env_config(recorded), n_envs=2, use_async_envs=use_async_envs)["playbyear"][0]
-        vec.reset(seed=[3, 4])
-        for _ in range(3):
-            observation, *_ = vec.step(np.zeros((2, 4), np.float32))
-        seen.append(observation["pixels"]["gripper"])
-        vec.close()
-    np.testing.assert_array_equal(*seen)
 
 
 @pytest.mark.parametrize(
@@ -456,6 +407,7 @@ def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path,
     assert not torch.equal(*actions), "what is heard has no part in what is done"
 
 
+@pytest.mark.slow
 def test_act_without_pretrained_weights_begins_with_norms_that_tell_pictures_apart(recorded, tmp_path):
     options = ["pretrained_backbone_weights=null", *SMALL["act"].split()]
     command = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)

@@ -14,7 +14,7 @@ from typing import Any
 from draccus.argparsing import ArgumentParser
 from draccus.utils import is_choice_type
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.film.rollout_film import VideoConfig

@@ -1,1 +1,19 @@
-"""Sound beside pictures: samples and their number as pixels, and the sound of each control step."""
+"""Sound into datasets: from files, and from the pictures of microphones that were recorded as cameras; and as pictures."""
+
+from typing import TYPE_CHECKING
+
+from lerobot_playbyear import lazy_names
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.audio.audio_files import cut_into_frames, read_audio, resample, write_audio
+    from lerobot_playbyear.audio.recorder_clock import note_episode_start
+
+__all__ = ["cut_into_frames", "note_episode_start", "read_audio", "resample", "write_audio"]
+
+__getattr__ = lazy_names(
+    __name__,
+    {
+        "audio_files": ("cut_into_frames", "read_audio", "resample", "write_audio"),
+        "recorder_clock": ("note_episode_start",),
+    },
+)

@@ -3,20 +3,32 @@
 LeRobot is imported when the dataset's files have been looked at.
 """
 
-from dataclasses import dataclass
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_playbyear.audio.attach import DatasetPlace, open_for_copy, output_folder, write_new_dataset
-from lerobot_playbyear.audio.sound_picture import picture_feature
+import numpy as np
+from PIL import Image
+from tqdm import tqdm
+
+from lerobot_playbyear.audio.attach_audio import open_for_copy, output_folder, write_new_dataset
+from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture, picture_feature
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
+from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader, EpisodeRows
 
 if TYPE_CHECKING:
-    from lerobot_playbyear.datasets.reader import DatasetReader
+    from lerobot_playbyear.audio.dataset_copy import AddedColumn
 
 _PICTURES = ("image", "video")
 _USUAL_SIZE = (84, 84)
+_COMPRESS_LEVEL = 3  # of 9: for noise both smaller and faster than the usual 6
+_STEP_DB = 0.1  # of the histogram of levels
+_LOUDEST_DB = 20.0  # a square wave at full scale has 2
+_QUIET_SHARE = 0.01
+_LEAST_RANGE_DB = 20.0  # so that the noise of a dataset in which nothing happens stays grey
 
 
 class AttachSpectrogramError(InputError):
@@ -36,8 +48,6 @@ class AttachSpectrogramConfig:
         height, width: Of a picture [pixels]. None: as the first camera's; 84 without one.
         low_db, high_db: Levels that are black and white [dB of full scale]. None: as loud as the dataset's quietest hundredth,
             and as its loudest sound.
-        video: Whether the pictures become video, which is lossy; otherwise each is stored without loss.
-        vcodec, crf: Of video: the codec, and its quality (0 is best). None: LeRobot's own.
     """
 
     dataset: DatasetPlace
@@ -49,28 +59,6 @@ class AttachSpectrogramConfig:
     width: int | None = None
     low_db: float | None = None
     high_db: float | None = None
-    video: bool = False
-    vcodec: str | None = None
-    crf: int | None = None
-
-
-@dataclass(frozen=True)
-class PicturePlan:
-    """What is to be made of one microphone, before its levels are known.
-
-    Args:
-        microphone, feature: The keys of its sound and of its pictures.
-        sample_rate: [Hz].
-        height, width: Of a picture [pixels].
-        columns_per_frame: By how many columns a frame moves it.
-    """
-
-    microphone: str
-    feature: str
-    sample_rate: int
-    height: int
-    width: int
-    columns_per_frame: int
 
 
 def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
@@ -87,29 +75,17 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
         OSError: The copy cannot be written.
     """
     target = output_folder(cfg.output)
-    if not cfg.video:
-        for name in ("vcodec", "crf"):
-            if getattr(cfg, name) is not None:
-                raise AttachSpectrogramError(f"--{name}={getattr(cfg, name)} is for --video=true. Leave it out.")
     dataset = open_for_copy(cfg.dataset)
     plans = _plan(cfg, dataset)
-    from lerobot_playbyear.audio.attached_copy import write_changed
-    from lerobot_playbyear.audio.attached_pictures import EpisodePictures, fit_levels
-    from lerobot_playbyear.audio.picture_storage import images_change, make_encoder, video_change
-    from lerobot_playbyear.datasets.files import scratch_folder
-
-    with scratch_folder() as scratch, errors_of_input():
-        encoder = make_encoder(cfg.vcodec, cfg.crf) if cfg.video else None
-        given = (cfg.low_db, cfg.high_db)
-        pictures = [EpisodePictures(dataset, fit_levels(dataset, plan, given), Path(scratch)) for plan in plans]
-
-        def write(root: Path, folder: Path) -> None:
-            change = images_change(pictures) if encoder is None else video_change(pictures, root, folder, encoder)
-            write_changed(root, folder, change)
-
-        write_new_dataset(Path(dataset.root), target, write)
-    for own in pictures:
-        how = own.how
+    if [episode.index for episode in dataset.episodes] != list(range(dataset.meta.total_episodes)):
+        raise AttachSpectrogramError(
+            f"The data files do not hold episodes 0 to {dataset.meta.total_episodes - 1} in this order. Repair the dataset "
+            f"first: playbyear-repair --root={dataset.root}"
+        )
+    with errors_of_input():
+        fitted = [_with_levels(dataset, plan, cfg) for plan in plans]
+        write_new_dataset(dataset.root, target, {how.feature: _column(dataset, how) for how in fitted})
+    for how in fitted:
         print(
             f"{how.feature}: the last {how.seconds:.2f} s of '{how.microphone}', {how.width} x {how.height}, "
             f"{how.low_db:g} to {how.high_db:g} dB"
@@ -120,7 +96,8 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
     return target
 
 
-def _plan(cfg: AttachSpectrogramConfig, dataset: "DatasetReader") -> list[PicturePlan]:
+def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPicture]:
+    """How each microphone's pictures are made, but for their levels."""
     features, fps = dataset.meta.features, dataset.fps
     try:
         rates = check_audio_features(features, fps)
@@ -128,33 +105,36 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: "DatasetReader") -> list[Pictur
         raise AttachSpectrogramError(str(error)) from error
     if not rates:
         raise AttachSpectrogramError(
-            f"The dataset '{cfg.dataset.repo_id}' has no sound in columns '{AUDIO_PREFIX}<microphone>'. Choose another, or add "
+            f"The dataset in {dataset.root} has no sound in columns '{AUDIO_PREFIX}<microphone>'. Choose another, or add "
             "sound first: playbyear-attach-audio."
         )
     names = [key.removeprefix(AUDIO_PREFIX) for key in rates]
     for name in cfg.microphones or []:
         if name not in names:
-            raise AttachSpectrogramError(f"--microphones names '{name}'; the dataset has {', '.join(names)}.")
+            raise AttachSpectrogramError(
+                f"--microphones names '{name}'; the dataset in {dataset.root} has {', '.join(names)}."
+            )
     wanted = names if cfg.microphones is None else list(dict.fromkeys(cfg.microphones))
     if not wanted:
         raise AttachSpectrogramError("--microphones names none. Name at least one, or leave it out for all.")
     height, width = _size(cfg, features)
     columns = _columns_per_frame(cfg, width, fps)
-    plans: list[PicturePlan] = []
+    plans: list[SoundPicture] = []
     for name in wanted:
         key = AUDIO_PREFIX + name
         feature = picture_feature(key, cfg.name)
         if feature in features or feature in [plan.feature for plan in plans] or "/" in feature:
             raise AttachSpectrogramError(
-                f"--name={cfg.name}: '{feature}' is in the dataset already, or is no name. Give another, such as "
-                "--name='heard_{microphone}'."
+                f"--name={cfg.name}: '{feature}' is in the dataset in {dataset.root} already, or is no name. Give "
+                "another, such as --name='heard_{microphone}'."
             )
         if columns > rates[key] // fps:
             raise AttachSpectrogramError(
                 f"--seconds={cfg.seconds:g}: a frame of '{key}' has {rates[key] // fps} samples and would have {columns} "
                 "columns. Give more seconds, or a smaller --width."
             )
-        plans.append(PicturePlan(key, feature, rates[key], height, width, columns))
+        levels = (FLOOR_DB, _LOUDEST_DB, (0,) * height)  # until they are known
+        plans.append(SoundPicture(key, feature, rates[key], fps, height, width, columns, *levels))
     return plans
 
 
@@ -180,3 +160,78 @@ def _columns_per_frame(cfg: AttachSpectrogramConfig, width: int, fps: int) -> in
             f"at most {width / fps:.2f}, or a larger --width."
         )
     return columns
+
+
+def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrogramConfig) -> SoundPicture:
+    """How one microphone's pictures are made, once all of its sound has been heard.
+
+    Raises:
+        AttachSpectrogramError: There is nothing but silence, or the levels do not go together.
+    """
+    edges = np.arange(FLOOR_DB, _LOUDEST_DB + _STEP_DB / 2, _STEP_DB)
+    counts = np.zeros((plan.height, len(edges) - 1), np.int64)
+    bands = np.arange(plan.height)
+    heard = (frame for episode in dataset.episodes for frame in _contexts(dataset, plan, episode))
+    for sound, n_heard in tqdm(heard, "Hearing", len(dataset), unit="frame", delay=1):
+        levels = plan.levels(sound)[plan.begun(n_heard)]
+        bins = np.clip(((levels - FLOOR_DB) / _STEP_DB).astype(int), 0, counts.shape[1] - 1)
+        for column in bins:
+            counts[bands, column] += 1
+    counts[:, 0] = 0  # digital silence, which no microphone has: something is missing there
+    total = counts.sum(axis=0)
+    low, high = cfg.low_db, cfg.high_db
+    if not total.any() and (low is None or high is None):
+        raise AttachSpectrogramError(
+            f"'{plan.microphone}' holds nothing but silence. Choose others with --microphones, or give --low_db and --high_db."
+        )
+    if low is None:
+        low = float(edges[np.searchsorted(np.cumsum(total), _QUIET_SHARE * total.sum())])
+    if high is None:
+        high = max(float(edges[np.flatnonzero(total)[-1] + 1]), low + _LEAST_RANGE_DB)
+    low, high = round(low, 1), round(high, 1)
+    if not FLOOR_DB <= low < high:
+        raise AttachSpectrogramError(
+            f"--low_db={low:g} and --high_db={high:g}: wanted {FLOOR_DB:g} or more, and the second above the first."
+        )
+    halves = counts.sum(axis=1, keepdims=True) / 2
+    median = edges[(np.cumsum(counts, axis=1) < halves).sum(axis=1)]  # (height,)
+    usual = np.rint(255 * np.clip((median - low) / (high - low), 0, 1)).astype(int)
+    return replace(plan, low_db=low, high_db=high, before_episode=tuple(usual.tolist()))
+
+
+def _column(dataset: DatasetReader, how: SoundPicture) -> "AddedColumn":
+    """One microphone's pictures, without loss. They are cheap, and so drawn twice: for statistics, and when written."""
+    from lerobot_playbyear.audio.dataset_copy import AddedColumn
+    from lerobot_playbyear.datasets.statistics import picture_stats
+
+    shape, names = (how.height, how.width, 3), ["height", "width", "channels"]
+    feature = {"dtype": "image", "shape": shape, "names": names, "info": how.as_info()}
+    episodes = tqdm(dataset.episodes, "Drawing", unit="episode", delay=1)
+    stats = [picture_stats(_pictures(dataset, how, episode)) for episode in episodes]
+
+    def values(episode: int) -> list[dict[str, bytes | None]]:
+        return [{"bytes": _png(one), "path": None} for one in _pictures(dataset, how, dataset.episodes[episode])]
+
+    return AddedColumn(feature, stats, values)
+
+
+def _pictures(dataset: DatasetReader, how: SoundPicture, episode: EpisodeRows) -> Iterator[np.ndarray]:
+    """Those of an episode's frames, (height, width, 3) uint8 each. Their columns, which neighbours share, are made once."""
+    columns: list[np.ndarray] = []
+    for sound, n_heard in _contexts(dataset, how, episode):
+        columns = [*columns, how.columns(sound, n_heard)][-how.n_frames :]
+        yield how.picture(np.concatenate(columns))
+
+
+def _contexts(dataset: DatasetReader, how: SoundPicture, episode: EpisodeRows) -> Iterator[tuple[np.ndarray, int]]:
+    """For every frame the samples that its columns depend on, (context,), and how many of them belong to its episode."""
+    sound = dataset.sound(how.microphone, episode)
+    sound = np.concatenate([np.zeros(how.context, sound.dtype), sound])
+    for n_heard in range(how.samples_per_frame, (len(episode) + 1) * how.samples_per_frame, how.samples_per_frame):
+        yield sound[n_heard : n_heard + how.context], min(n_heard, how.context)
+
+
+def _png(picture: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG", compress_level=_COMPRESS_LEVEL)
+    return file.getvalue()

@@ -1,31 +1,34 @@
 """The sound of microphones that were recorded as cameras: from a dataset's pictures, and from the files of their sessions."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
-from lerobot_playbyear.audio.attach import AttachAudioConfig, AttachError
-from lerobot_playbyear.audio.attached_copy import sound_change, write_changed
-from lerobot_playbyear.audio.attached_sound import EpisodesSound, SpooledFile, raise_all
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, PutAside, raise_all
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
-from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
-from lerobot_playbyear.audio.sample_strip import Strip, n_kept, read_strip, read_timecode
-from lerobot_playbyear.audio.session_files import SESSIONS, SessionSound, find_session
+from lerobot_playbyear.audio.dataset_copy import AddedColumn
+from lerobot_playbyear.audio.microphone_pictures import (
+    SESSIONS,
+    SessionSound,
+    Strip,
+    audio_key_of,
+    find_session,
+    microphone_pictures,
+    n_kept,
+    read_strip,
+    read_timecode,
+)
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.features import IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
-from lerobot_playbyear.datasets.parquet import numpy_to_column
-from lerobot_playbyear.datasets.statistics import Stats, numeric_stats
-
-if TYPE_CHECKING:
-    from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.datasets.statistics import numeric_stats
 
 INTERVENTION = "intervention"
 """LeRobot's column of the frames that a person corrected."""
@@ -41,51 +44,19 @@ class _Frame:
     was_read: bool = True
 
 
-@dataclass
-class MicrophoneSound:
-    """The sound of a dataset's microphones.
-
-    Args:
-        sounds: One per microphone.
-        pictures: For each the feature of its pictures.
-        is_first: Of each episode (n,) bool: the first frame, and those after a pause.
-    """
-
-    sounds: list[EpisodesSound] = field(default_factory=list)
-    pictures: list[str] = field(default_factory=list)
-    is_first: list[np.ndarray] = field(default_factory=list)
-
-
-class IsFirstColumn:
-    """The column that says before which frames something was not recorded.
-
-    Args:
-        is_first: Of each episode (n,) bool.
-    """
-
-    rows_at_once = 2**20
-
-    def __init__(self, is_first: Sequence[np.ndarray]) -> None:
-        self.keys = [IS_FIRST]
-        self._is_first = is_first
-
-    def columns(self, runs: Sequence[tuple[int, int, int]], schema: pa.Schema) -> list[pa.Array]:
-        """Its values of some frames: of an episode, from one frame to before another."""
-        values = np.concatenate([self._is_first[episode][start:stop] for episode, start, stop in runs])
-        return [numpy_to_column(values, schema.field(IS_FIRST).type)]
-
-    def stats(self, episode: int) -> Stats:
-        """An episode's statistics."""
-        return numeric_stats({IS_FIRST: self._is_first[episode][:, None]}, {IS_FIRST: IS_FIRST_FEATURE})
-
-
-def read_camera_sound(cfg: AttachAudioConfig, dataset: "DatasetReader", scratch: Path) -> MicrophoneSound:
+def read_camera_sound(
+    cfg: AttachAudioConfig, dataset: DatasetReader, scratch: Path
+) -> tuple[dict[str, AddedColumn], dict[str, dict[str, Any]]]:
     """Reads the sound of all microphones, so that what is wrong is known before anything is written.
 
     Args:
         cfg: The options.
         dataset: The dataset that gets its sound.
         scratch: A folder for the sound, 2 bytes a sample.
+
+    Returns:
+        The columns of a copy: of each microphone its sound, and `is_first`, the first frames of episodes and those after a
+        pause. And what the `info` of the microphones' pictures says more.
 
     Raises:
         AttachError: There is no such microphone, or its samples are not there.
@@ -97,47 +68,34 @@ def read_camera_sound(cfg: AttachAudioConfig, dataset: "DatasetReader", scratch:
             f"The cameras of this dataset that are microphones without attached sound: {', '.join(keys) or 'none'}; wanted "
             f"{', '.join(chosen) or 'one'}. Sound that was recorded beside it is attached with --files or --session."
         )
-    found = MicrophoneSound()
+    added: dict[str, AddedColumn] = {}
+    is_first = [np.zeros(len(episode), bool) for episode in dataset.episodes]
     for key in chosen:
-        reader = _MicrophoneReader(cfg, dataset, key, scratch / key)
-        sound, is_first = reader.read()
-        found.sounds.append(sound)
-        found.pictures.append(key)
-        found.is_first = [own | other for own, other in zip(is_first, found.is_first or is_first, strict=True)]
-    for flags, by_person in zip(found.is_first, _by_person(dataset, [*map(len, found.is_first)]), strict=True):
+        columns, starts = _MicrophoneReader(cfg, dataset, key, scratch).read()
+        added.update(columns)
+        is_first = [own | other for own, other in zip(is_first, starts, strict=True)]
+    for flags, by_person in zip(is_first, _by_person(dataset), strict=True):
         flags[1:] |= by_person[:-1] & ~by_person[1:]
-    return found
+    stats = [numeric_stats({IS_FIRST: flags[:, None]}, {IS_FIRST: IS_FIRST_FEATURE})[IS_FIRST] for flags in is_first]
+    added[IS_FIRST] = AddedColumn(IS_FIRST_FEATURE, stats, is_first.__getitem__)
+    return added, {key: {MICROPHONE: audio_key_of(key)} for key in chosen}
 
 
-def _by_person(dataset: "DatasetReader", lengths: Sequence[int]) -> list[np.ndarray]:
+def _by_person(dataset: DatasetReader) -> list[np.ndarray]:
     """Which frames of each episode are corrections, (n,) bool: LeRobot's rollout resets the policy at every hand-back, however
     short the pause."""
     feature = dataset.meta.features.get(INTERVENTION)
     if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
-        return [np.zeros(length, bool) for length in lengths]
+        return [np.zeros(len(episode), bool) for episode in dataset.episodes]
     return [dataset.values(INTERVENTION, episode).astype(bool) for episode in dataset.episodes]
-
-
-def write_with_cameras(root: Path, target: Path, found: MicrophoneSound, fps: int) -> None:
-    """Writes a dataset with the sound of its microphones; `root` and `target` as for `write_with_sound`."""
-    change = sound_change(found.sounds, fps)
-    notes = {picture: {MICROPHONE: audio_key_of(picture)} for picture in found.pictures}
-    column = IsFirstColumn(found.is_first)
-    change = replace(
-        change,
-        notes=notes,
-        added={**change.added, IS_FIRST: IS_FIRST_FEATURE},
-        columns=[*change.columns, column],
-        stats=[{**own, **column.stats(i)} for i, own in enumerate(change.stats)],
-    )
-    write_changed(root, target, change)
 
 
 class _MicrophoneReader:
     """Reads one microphone."""
 
-    def __init__(self, cfg: AttachAudioConfig, dataset: "DatasetReader", key: str, scratch: Path) -> None:
-        self._dataset, self._key, self._scratch = dataset, key, scratch
+    def __init__(self, cfg: AttachAudioConfig, dataset: DatasetReader, key: str, scratch: Path) -> None:
+        self._dataset, self._key = dataset, key
+        self._sound = PutAside([audio_key_of(key)], scratch)
         # A stranger's pictures may name a session of this machine's own, and so its voices: they get those that are named.
         self._is_foreign = _came_from_the_hub(Path(dataset.root))
         own = [] if self._is_foreign else [SESSIONS]
@@ -149,45 +107,40 @@ class _MicrophoneReader:
         self._rate = 0  # of the column [Hz]
         self._steps: ControlStepSound | None = None
 
-    def read(self) -> tuple[EpisodesSound, list[np.ndarray]]:
-        """The sound of all episodes, and which of their frames are the first ones."""
-        self._scratch.mkdir(parents=True)
-        paths: list[Path] = []
-        is_first: list[np.ndarray] = []
-        for episode in tqdm(self._dataset.episodes, desc=f"Reading {self._key}", unit="episode"):
-            path, pictures = self._scratch / str(len(paths)), self._dataset.pictures(self._key, episode)
-            is_first.append(self._read_episode(len(paths), pictures, path))
-            paths.append(path)
+    def read(self) -> tuple[dict[str, AddedColumn], list[np.ndarray]]:
+        """The sound of all episodes, and which of their frames are the first ones, (n,) bool."""
+        is_first = [
+            self._read_episode(number, self._dataset.pictures(self._key, episode))
+            for number, episode in enumerate(tqdm(self._dataset.episodes, desc=f"Reading {self._key}", unit="episode"))
+        ]
         raise_all([f"{self._key}, {_listed(episodes)}: {error}" for error, episodes in self._errors.items()])
         self._check_pace()
         for session, (start, stop) in self._taken.items():
             file = self._files[session]
             assert file is not None
             print(f"{self._key}: {start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s of {file.path}")
-        size = self._rate // self._dataset.fps
-        return EpisodesSound(
-            self._rate, [audio_key_of(self._key)], size, [SpooledFile(path, 1) for path in paths]
-        ), is_first
+        return self._sound.columns(self._rate, self._dataset.fps), is_first
 
-    def _read_episode(self, episode: int, pictures: Iterator[np.ndarray], path: Path) -> np.ndarray:
-        """Writes an episode's sound to a file, and says what was exact. Returns which frames are the first ones, (n,) bool."""
+    def _read_episode(self, episode: int, pictures: Iterator[np.ndarray]) -> np.ndarray:
+        """Puts an episode's sound aside, and says what was exact. Returns which frames are the first ones, (n,) bool."""
+        blocks: list[np.ndarray] = []
         is_first: list[bool] = []
         self._spacing.append([])
         n_read = n_strips = 0
         if self._steps is not None:
             self._steps.reset()
         try:
-            with path.open("wb") as file:
-                for frame in _known(map(_read_frame, pictures), self._samples_per_frame):
-                    block, starts = self._sound_of(frame)
-                    file.write(block.astype("<i2").tobytes())
-                    is_first.append(starts)
-                    if self._steps is not None and self._steps.n_heard is not None and not starts:
-                        self._spacing[-1].append(self._steps.n_heard)
-                    n_read, n_strips = n_read + frame.was_read, n_strips + (frame.strip is not None)
+            for frame in _known(map(_read_frame, pictures), self._samples_per_frame):
+                block, starts = self._sound_of(frame)
+                blocks.append(block)
+                is_first.append(starts)
+                if self._steps is not None and self._steps.n_heard is not None and not starts:
+                    self._spacing[-1].append(self._steps.n_heard)
+                n_read, n_strips = n_read + frame.was_read, n_strips + (frame.strip is not None)
         except (ValueError, OSError) as error:
             self._errors.setdefault(str(error), []).append(episode)
             return np.zeros(0, bool)
+        self._sound.append(np.stack(blocks)[..., None])
         told = f"{n_strips} from the pictures, {len(is_first) - n_strips} from the session's file"
         if n_read < len(is_first):
             told += f"; {len(is_first) - n_read} timecodes could not be read and follow from their neighbours"
@@ -196,7 +149,7 @@ class _MicrophoneReader:
         tqdm.write(f"episode {episode}, {audio_key_of(self._key)}: {len(is_first)} frames, exact samples of {told}")
         return np.array(is_first)
 
-    def _sound_of(self, frame: "_Frame") -> tuple[np.ndarray, bool]:
+    def _sound_of(self, frame: _Frame) -> tuple[np.ndarray, bool]:
         strip = frame.strip or self._from_file(frame)
         rate = round(strip.sample_rate / self._dataset.fps) * self._dataset.fps
         if self._steps is None:
@@ -209,7 +162,7 @@ class _MicrophoneReader:
             )
         return self._steps.next(strip)
 
-    def _from_file(self, frame: "_Frame") -> Strip:
+    def _from_file(self, frame: _Frame) -> Strip:
         """What the strip would hold, from the session's file.
 
         Raises:
@@ -244,7 +197,7 @@ class _MicrophoneReader:
             )
         return file
 
-    def _samples_per_frame(self, frame: "_Frame") -> int:
+    def _samples_per_frame(self, frame: _Frame) -> int:
         """From one frame to the next, as it should be."""
         rate = frame.strip.sample_rate if frame.strip else self._file(frame.session).sample_rate
         return round(rate / self._dataset.fps)
@@ -267,7 +220,7 @@ class _MicrophoneReader:
                 logging.warning("%s: %s. Remove that episode with lerobot-edit-dataset.", self._key, error)
 
 
-def _read_frame(picture: np.ndarray) -> "_Frame | None":
+def _read_frame(picture: np.ndarray) -> _Frame | None:
     strip = read_strip(picture)
     if strip is not None:
         return _Frame(strip.session, strip.counter, strip)
@@ -275,7 +228,7 @@ def _read_frame(picture: np.ndarray) -> "_Frame | None":
     return None if code is None else _Frame(*code)
 
 
-def _known(frames: Iterator["_Frame | None"], size: Callable[["_Frame"], int]) -> Iterator["_Frame"]:
+def _known(frames: Iterator[_Frame | None], size: Callable[[_Frame], int]) -> Iterator[_Frame]:
     """All frames of an episode; those that could not be read lie evenly between their neighbours.
 
     Raises:

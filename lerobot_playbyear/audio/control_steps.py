@@ -15,28 +15,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_playbyear.audio.sample_strip import KEPT_S, Strip
-
-HALF = 16
-"""Samples before and after a moment that its resampled value depends on, and by how many the sound comes late."""
+from lerobot_playbyear.audio.audio_files import HALF, interpolate
+from lerobot_playbyear.audio.microphone_pictures import KEPT_S, Strip
 
 PAUSE_S = 0.5
 """Steps further apart than this do not belong together: a pause or a takeover lies between them [s]."""
 
 _SHORTEST, _LONGEST = 0.5, 2.0  # of a step, in steps
 _FASTEST, _SLOWEST, _USUAL = 0.75, 1.5, 0.1  # steps that are shorter or longer than meant, in steps
-_PHASES = 256
-
-
-def _kernels() -> np.ndarray:
-    """(_PHASES + 1, 2 * HALF): a windowed sinc for every fraction of a sample."""
-    fraction = np.arange(_PHASES + 1)[:, None] / _PHASES
-    distance = np.arange(1 - HALF, HALF + 1) - fraction
-    kernels = np.sinc(distance) * np.cos(np.pi * distance / (2 * HALF)) ** 2
-    return kernels / kernels.sum(axis=1, keepdims=True)
-
-
-_KERNELS = _kernels()
 
 
 class ControlStepSound:
@@ -78,7 +64,8 @@ class ControlStepSound:
         is_first = n is None or n > PAUSE_S * strip.sample_rate
         if n is None or not _SHORTEST * size <= n <= min(_LONGEST * size, kept - 2 * HALF):
             return strip.samples[kept - size - HALF : kept - HALF], is_first
-        return _resampled(strip.samples, n, size), is_first
+        places = kept - 1 - HALF - n + (np.arange(size) + 1) * (n / size)  # (S,), the last one ends with the step
+        return interpolate(strip.samples, places), is_first
 
 
 def _samples_between(last: Strip | None, strip: Strip) -> int | None:
@@ -87,18 +74,6 @@ def _samples_between(last: Strip | None, strip: Strip) -> int | None:
         return None
     n = strip.counter - last.counter
     return n if n >= 0 else None
-
-
-def _resampled(samples: np.ndarray, n: int, size: int) -> np.ndarray:
-    """The last `n` of some samples, `HALF` late, as `size` samples."""
-    place = len(samples) - 1 - HALF - n + (np.arange(size) + 1) * (n / size)  # (S,), the last one ends with the step
-    whole = np.floor(place).astype(np.int64)
-    phase = (place - whole) * _PHASES
-    index = phase.astype(np.int64)
-    share = (phase - index)[:, None]
-    kernel = (1 - share) * _KERNELS[index] + share * _KERNELS[index + 1]  # (S, 2 * HALF)
-    around = samples[whole[:, None] + np.arange(1 - HALF, HALF + 1)]
-    return np.clip(np.rint((kernel * around).sum(axis=1)), -32768, 32767).astype(np.int16)
 
 
 def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str, is_live: bool = False) -> None:

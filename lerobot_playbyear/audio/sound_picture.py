@@ -9,7 +9,7 @@ same samples give the same picture, whichever process makes it. Environments nee
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +35,7 @@ _FULL_SCALE = 32768.0  # int16 PCM
 _SHORTEST_SEGMENT_S = 0.04  # as in "Play it by Ear", appendix: 1,920 samples at 48 kHz
 _LONGEST_FFT = 2**18
 _LARGEST = 4096  # pixels along a side
+_ROLLING_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -135,9 +136,9 @@ class SoundPicture:
     def levels_of(self, segments: np.ndarray) -> np.ndarray:
         """The levels of columns, (n, height) [dB], from the samples behind each, (n, segment)."""
         wave = segments / _FULL_SCALE if segments.dtype.kind == "i" else segments.astype(np.float64)
-        spectrum = np.fft.rfft(wave * self._window, self._fft_size)
+        size, bins, weights, firsts = self._bank
+        spectrum = np.fft.rfft(wave * self._window, size)
         power = spectrum.real**2 + spectrum.imag**2  # (n, bins)
-        bins, weights, firsts = self._flat_bank
         bands = np.add.reduceat(power[:, bins] * weights, firsts, axis=1)
         return 10 * np.log10(bands + 10 ** (FLOOR_DB / 10))
 
@@ -193,32 +194,67 @@ class SoundPicture:
         window = np.sin(np.pi * np.arange(self.segment) / self.segment) ** 2  # Hann's, periodic
         return 2 * window / window.sum()
 
-    @property
-    def _fft_size(self) -> int:
-        return 2 * (self._bank_and_bins[1] - 1)
-
     @cached_property
-    def _flat_bank(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The bins of all bands one after the other, their weights, and where each band begins among them."""
-        bank = self._bank_and_bins[0]
-        bins = np.concatenate([first + np.arange(len(weights)) for first, weights in bank])
-        lengths = [len(weights) for _, weights in bank]
-        return bins, np.concatenate([weights for _, weights in bank]), np.cumsum([0, *lengths[:-1]])
-
-    @cached_property
-    def _bank_and_bins(self) -> tuple[list[tuple[int, np.ndarray]], int]:
-        """Each band's first bin and the weights of its bins, and how many bins there are: so many that no band is without."""
+    def _bank(self) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        """The size of the transform, so large that no band is without a bin; the bins of all bands one after the other, their
+        weights, and where each band begins among them."""
         size = 1 << (self.segment - 1).bit_length()
-        while True:
-            bank = mel_bank(self.height, size, self.sample_rate)
-            if all(len(weights) for _, weights in bank):
-                return bank, size // 2 + 1
+        bank = mel_bank(self.height, size, self.sample_rate)
+        while not all(len(weights) for _, weights in bank):
             size *= 2
             if size > _LONGEST_FFT:
                 raise self._error("height", "fewer bands")
+            bank = mel_bank(self.height, size, self.sample_rate)
+        bins = np.concatenate([first + np.arange(len(weights)) for first, weights in bank])
+        lengths = [len(weights) for _, weights in bank]
+        return size, bins, np.concatenate([weights for _, weights in bank]), np.cumsum([0, *lengths[:-1]])
 
     def _error(self, name: str, wanted: str) -> InputError:
         return InputError(f"The picture of '{self.microphone}': {name}={getattr(self, name)!r}; wanted {wanted}.")
+
+
+class RollingSpectrogram:
+    """The last two seconds of a microphone, drawn a few columns at a time: what is drawn once moves to the left.
+
+    Args:
+        sample_rate: [Hz].
+        height, width: Of the picture [pixels].
+        low_db, high_db: Levels that are black and white [dB].
+
+    Raises:
+        InputError: The picture is too large, or the levels are in another order.
+    """
+
+    def __init__(self, sample_rate: int, height: int, width: int, low_db: float, high_db: float) -> None:
+        wanted = width / _ROLLING_S
+        per_second = min((n for n in range(1, 4 * width) if sample_rate % n == 0), key=lambda n: abs(n - wanted))
+        self._hop = sample_rate // per_second
+        names = (AUDIO_PREFIX + "microphone", PICTURE_PREFIX + "microphone")
+        self._look = SoundPicture(
+            *names, sample_rate, per_second, height, width, 1, low_db, high_db, before_episode=(0,) * height
+        )
+        self._grey = np.zeros((height, width), np.uint8)
+        self._n_drawn = 0
+
+    def draw(self, counter: int, samples: Callable[[int, int], np.ndarray]) -> np.ndarray:
+        """The picture when `counter` samples had come.
+
+        Args:
+            samples: Gives those from one number to before another, (n,) int16.
+
+        Returns:
+            (height, width) uint8, low frequencies at the bottom, the newest sound at the right; it is drawn on later.
+        """
+        n, (_, width) = counter // self._hop, self._grey.shape
+        n_new = min(n - self._n_drawn, width)
+        if n_new > 0:
+            segment = self._look.segment
+            sound = samples((n - n_new + 1) * self._hop - segment, n * self._hop)
+            segments = np.lib.stride_tricks.sliding_window_view(sound, segment)[:: self._hop]  # (n_new, segment)
+            self._grey[:, : width - n_new] = self._grey[:, n_new:]
+            self._grey[:, width - n_new :] = self._look.pixels_of(self._look.levels_of(segments)).T[::-1]
+            self._n_drawn = n
+        return self._grey
 
 
 def mel_bank(n_bands: int, fft_size: int, sample_rate: int) -> list[tuple[int, np.ndarray]]:

@@ -1,7 +1,5 @@
 """Datasets with sound: their contract, and reading and writing them."""
 
-from lerobot_playbyear.datasets.audio_files import cut_into_frames, read_audio, resample, write_audio, write_wav
-from lerobot_playbyear.datasets.episode_clock import note_episode_start
 from lerobot_playbyear.datasets.features import (
     AUDIO_PREFIX,
     audio_feature,
@@ -17,11 +15,5 @@ __all__ = [
     "audio_keys",
     "check_audio_features",
     "check_dataset_files",
-    "cut_into_frames",
     "episode_waveform",
-    "note_episode_start",
-    "read_audio",
-    "resample",
-    "write_audio",
-    "write_wav",
 ]

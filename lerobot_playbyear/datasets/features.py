@@ -21,7 +21,7 @@ AUDIO_PREFIX = "observation.audio."
 """What the key of every microphone starts with."""
 
 AUDIO_DTYPE = "audio"
-"""Of a feature whose sound lies in files beside the frames, which is not our layout: see `audio_layout`."""
+"""Of a feature whose sound lies in files beside the frames, which is not our layout: see `audio.lerobot_audio`."""
 
 IS_FIRST = "is_first"
 """A column of datasets with pauses: the frames before which something was not recorded, each episode's first one included.

@@ -9,7 +9,7 @@ import av
 import numpy as np
 from PIL import Image, ImageDraw
 
-from lerobot_playbyear.datasets.audio_files import resample
+from lerobot_playbyear.audio.audio_files import resample
 
 _VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of FFmpeg has
 _AUDIO_CODECS = ("aac", "libmp3lame")

@@ -32,7 +32,8 @@ _BLANK = np.zeros((2, 480, 3), np.uint8)  # above the spectrogram of a dataset w
 
 _LISTEN = """```python
 from lerobot.datasets import LeRobotDataset
-from lerobot_playbyear.datasets import episode_waveform, write_audio
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.datasets import episode_waveform
 
 dataset = LeRobotDataset({repo_id})
 waveform, sample_rate = episode_waveform(dataset, 0, {microphone})  # int16

@@ -1,7 +1,7 @@
 """A microphone as a LeRobot camera: `--robot.cameras='{mic: {type: microphone, device: "USB Audio"}}'`.
 
 Its picture shows the spectrogram of the last two seconds, and carries the exact samples and their number (see
-`audio.sample_strip`).
+`audio.microphone_pictures`).
 """
 
 import logging
@@ -19,16 +19,17 @@ from draccus.utils import DecodingError
 from lerobot.cameras import Camera, CameraConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
-from lerobot_playbyear.audio.sample_strip import (
+from lerobot_playbyear.audio.microphone_pictures import (
+    SESSIONS,
     TIMECODE_HEIGHT,
     TIMECODE_WIDTH,
     Strip,
     n_kept,
     n_rows,
+    session_path,
     write_strip,
     write_timecode,
 )
-from lerobot_playbyear.audio.session_files import SESSIONS, session_path
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.microphones.card import KEPT_S, CardRecording, OpenCard, join_card, leave_card
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
@@ -186,7 +187,7 @@ class MicrophoneCamera(Camera):
             DeviceAlreadyConnectedError: It listens already.
             MicrophoneError: It cannot be opened, nothing comes from it, or its sound cannot be written.
         """
-        from lerobot_playbyear.audio.rolling_spectrogram import RollingSpectrogram
+        from lerobot_playbyear.audio.sound_picture import RollingSpectrogram
 
         if self._card is not None:
             raise DeviceAlreadyConnectedError(f"The microphone ({_name(self.config)}) is connected already.")

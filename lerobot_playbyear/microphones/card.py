@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_playbyear.audio.sample_strip import n_kept
+from lerobot_playbyear.audio.microphone_pictures import n_kept
 from lerobot_playbyear.datasets.features import to_pcm_s16
 from lerobot_playbyear.microphones.microphone import MicrophoneError
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_files import AudioFileError, read_audio, resample
+from lerobot_playbyear.audio.audio_files import AudioFileError, read_audio, resample
 from lerobot_playbyear.microphones.card import CHUNK_S
 from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_playbyear.datasets.audio_files import write_wav
+from lerobot_playbyear.audio.audio_files import write_audio
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.microphones.microphone import MicrophoneError
 from lerobot_playbyear.microphones.portaudio import (
@@ -150,7 +150,7 @@ def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
         print("\r\033[K", end="")
     if len(samples) == 0:
         raise MicrophoneError(microphone.problem or "nothing came from it")
-    path = write_wav(cfg.output_dir / f"microphone_{card.number}.wav", samples, rate)
+    path = write_audio(cfg.output_dir / f"microphone_{card.number}.wav", samples, rate)
     silent = "" if samples.any() else "; nothing but zeros: is it muted?"
     return f"loudest: {level_text(samples)}{silent}\n  {path}"
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_playbyear.audio.session_files import HEADER_BYTES
+from lerobot_playbyear.audio.microphone_pictures import HEADER_BYTES
 
 _FLUSH_S = 0.05
 _LARGEST = 2**32 - 1

@@ -18,7 +18,7 @@ from lerobot.processor import (
 from torch import Tensor
 
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
-from lerobot_playbyear.audio.sample_strip import Strip, read_strip
+from lerobot_playbyear.audio.microphone_pictures import Strip, read_strip
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_playbyear.datasets.audio_files import AudioFileError, audio_pieces, resample
+from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, resample
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 

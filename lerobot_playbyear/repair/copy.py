@@ -13,7 +13,7 @@ import pyarrow as pa
 from lerobot.datasets.compute_stats import sample_indices
 from lerobot.datasets.io_utils import write_json, write_tasks
 
-from lerobot_playbyear.datasets.episode_clock import renumber_episode_starts
+from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     EPISODES_DIR,

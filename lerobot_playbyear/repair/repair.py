@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import FolderLockedError, check_can_be_made, new_folder
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLockedError, check_can_be_made, new_folder
 from lerobot_playbyear.datasets.findings import Finding
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.journal import finish_journal, lock_dataset
@@ -108,6 +108,10 @@ def look(root: Path, like: Path | None = None) -> RepairReport:
     """What a repair would keep. Arguments and errors as for `repair_dataset`."""
     if not root.is_dir():
         raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
+    if like is not None and not (like / INFO_PATH).is_file():
+        raise InputError(
+            f"--like={like} holds no LeRobotDataset: it has no {INFO_PATH}. Give a dataset with the same settings."
+        )
     return RepairReport(survey(root, rescue=rescue, like=like))
 
 

@@ -96,7 +96,7 @@ def repair() -> None:
 
 @command()
 def attach_audio() -> None:
-    from lerobot_playbyear.audio.attach import AttachError, attach_audio
+    from lerobot_playbyear.audio.attach_audio import AttachError, attach_audio
 
     try:
         run_alone(attach_audio)

@@ -13,7 +13,7 @@ from lerobot.datasets.language import LANGUAGE_COLUMNS
 from torch import Tensor
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.audio_files import resample
+from lerobot_playbyear.audio.audio_files import resample
 from lerobot_playbyear.datasets.features import IS_FIRST, check_audio_features, samples_per_frame, to_pcm_s16
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.parquet import episode_bounds

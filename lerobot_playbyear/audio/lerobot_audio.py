@@ -10,8 +10,9 @@ import bisect
 import json
 import math
 import re
+from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -220,18 +221,16 @@ def _spans(root: Path, key: str, template: str, rows: pa.Table, latest_s: float)
             _time(of, "to_timestamp", end, start, latest_s)
         path = file_inside(root, template.format(audio_key=key, chunk_index=int(chunk), file_index=int(file)))
         spans.append(AudioSpan(path, float(start), None if end is None else float(end)))
-    starts: dict[Path, list[float]] = {}
-    for span in spans:
-        starts.setdefault(span.path, []).append(span.start_s)
-    for own in starts.values():
-        own.sort()
-    return [span if span.end_s is not None else _up_to_the_next(span, starts[span.path]) for span in spans]
+    starts: dict[Path, list[float]] = defaultdict(list)
+    for span in sorted(spans, key=lambda span: span.start_s):
+        starts[span.path].append(span.start_s)
+    return [replace(span, end_s=_end(span, starts[span.path])) for span in spans]
 
 
-def _up_to_the_next(span: AudioSpan, starts: list[float]) -> AudioSpan:
-    """A span without an end, which ends where the next one in its file begins, if there is one."""
+def _end(span: AudioSpan, starts: list[float]) -> float | None:
+    """Where a sound ends [s]: if that is not said, where the next one in its file begins, if there is one."""
     later = bisect.bisect_right(starts, span.start_s)
-    return AudioSpan(span.path, span.start_s, starts[later] if later < len(starts) else None)
+    return span.end_s if span.end_s is not None else starts[later] if later < len(starts) else None
 
 
 def _number(of: str, name: str, seen: Any, value: Any, least: int, most: int, wanted: str) -> int:

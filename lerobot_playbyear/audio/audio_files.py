@@ -1,36 +1,31 @@
 """Sound in files: WAV, FLAC and the sound tracks of videos in, WAV and FLAC out, and how a recording meets frames."""
 
+import itertools
 import math
-import wave
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import av
 import numpy as np
 
 from lerobot_playbyear.datasets.features import samples_per_frame, to_pcm_s16
 
+HALF = 16
+"""Samples before and after a moment that its interpolated value depends on."""
+
 _GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
 _SILENCE_AT_ONCE = 2**14  # samples
-_FLAC_BLOCK = 4096  # samples
+_CODECS = {".wav": "pcm_s16le", ".flac": "flac"}
+_BLOCK = 4096  # samples that are encoded at once
 _FILTER_WIDTH, _ROLLOFF = 64, 0.9475937167399596  # of the resampler
 _MOST_PHASES = 4096  # of its filter, which takes the square of them in memory
+_PHASES = 256  # between two samples, for which an interpolation's weights are known
+_PLACES_AT_ONCE = 2**14  # that are interpolated
 
 
 class AudioFileError(ValueError):
     """A sound file cannot be used; the message says why, and what to do."""
-
-
-class Channels(Protocol):
-    """What is needed of sound that may not be in memory: its shape (n, channels), and slices of it."""
-
-    @property
-    def shape(self) -> tuple[int, ...]: ...
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, span: slice, /) -> np.ndarray: ...
 
 
 def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
@@ -90,39 +85,6 @@ def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarr
         raise AudioFileError(f"{path} holds no samples.")
 
 
-def pcm_channels(waveform: np.ndarray) -> np.ndarray:
-    """Sound (n,) or (n, channels) as (n, channels) int16 PCM. Raises as `to_pcm_s16`, also where the shape is another."""
-    samples = to_pcm_s16(waveform)
-    if samples.ndim not in (1, 2):
-        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
-    return samples[:, None] if samples.ndim == 1 else samples
-
-
-def write_wav(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
-    """Write sound as a 16-bit WAV file.
-
-    Args:
-        path: The file to write; its folder is made.
-        waveform: (n,) or (n, channels), int16 PCM or floats in [-1, 1].
-        sample_rate: Samples per second [Hz].
-
-    Returns:
-        The path of the file.
-
-    Raises:
-        ValueError: If the samples are neither, or the shape is another.
-    """
-    samples = pcm_channels(waveform)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(samples.shape[1])
-        file.setsampwidth(2)
-        file.setframerate(sample_rate)
-        file.writeframes(np.ascontiguousarray(samples).astype("<i2").tobytes())
-    return path
-
-
 def write_audio(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:
     """Writes sound as 16-bit WAV or FLAC, as the file's name ends.
 
@@ -138,18 +100,19 @@ def write_audio(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Pat
         AudioFileError: The name ends otherwise.
         ValueError: The samples are neither, or the shape is another.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".wav":
-        return write_wav(path, waveform, sample_rate)
-    if path.suffix.lower() != ".flac":
+    path, samples = Path(path), to_pcm_s16(waveform)
+    ending = path.suffix.lower()
+    if ending not in _CODECS:
         raise AudioFileError(f"{path}: sound is written as .wav or .flac; choose such a name.")
-    samples = pcm_channels(waveform)
+    if samples.ndim not in (1, 2):
+        raise ValueError(f"Sound has shape {samples.shape}; wanted (n,) or (n, channels).")
+    samples = samples.reshape(len(samples), -1)
+    layout = {1: "mono", 2: "stereo"}.get(samples.shape[1], f"{samples.shape[1]}c")
     path.parent.mkdir(parents=True, exist_ok=True)
-    layout = "mono" if samples.shape[1] == 1 else "stereo" if samples.shape[1] == 2 else f"{samples.shape[1]}c"
-    with av.open(str(path), "w", format="flac") as container:
-        stream: Any = container.add_stream("flac", rate=sample_rate, layout=layout)
-        for start in range(0, len(samples), _FLAC_BLOCK):
-            block = np.ascontiguousarray(samples[start : start + _FLAC_BLOCK])
+    with av.open(str(path), "w", format=ending[1:], options={"fflags": "+bitexact"}) as container:
+        stream: Any = container.add_stream(_CODECS[ending], rate=sample_rate, layout=layout)
+        for start in range(0, len(samples), _BLOCK):
+            block = np.ascontiguousarray(samples[start : start + _BLOCK])
             frame = av.AudioFrame.from_ndarray(block.reshape(1, -1), format="s16", layout=layout)
             frame.sample_rate, frame.pts = sample_rate, start
             container.mux(stream.encode(frame))
@@ -168,7 +131,7 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
     Returns:
         As many seconds at the new rate, in the same form.
     """
-    if sample_rate == new_sample_rate:
+    if sample_rate == new_sample_rate or not len(waveform):
         return waveform
     import torch
     import torchaudio
@@ -196,118 +159,123 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
 def _resample_odd_rates(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np.ndarray:
     """(channels, n) float32 by FFmpeg's resampler, for rates with hardly a common divisor: it interpolates its filter."""
     n_samples = -(-waveform.shape[1] * new_sample_rate // sample_rate)
-    resampled = np.zeros((len(waveform), n_samples), np.float32)
-    for channel, values in enumerate(waveform):
-        resampler = av.AudioResampler(format="flt", layout="mono", rate=new_sample_rate)
-        parts = []
-        for first in range(0, len(values), sample_rate):
-            piece = np.ascontiguousarray(values[None, first : first + sample_rate])
-            frame = av.AudioFrame.from_ndarray(piece, format="flt", layout="mono")
-            frame.sample_rate, frame.pts = sample_rate, first
-            parts += [part.to_ndarray().reshape(-1) for part in resampler.resample(frame)]
-        parts += [part.to_ndarray().reshape(-1) for part in resampler.resample(None)]
-        values = np.concatenate(parts)[:n_samples]
-        resampled[channel, : len(values)] = values
-    return resampled
+    layout = f"{len(waveform)}c"
+    resampler = av.AudioResampler(format="fltp", layout=layout, rate=new_sample_rate)
+    frames: list[av.AudioFrame] = []
+    for first in range(0, waveform.shape[1], sample_rate):
+        piece = np.ascontiguousarray(waveform[:, first : first + sample_rate])
+        frame = av.AudioFrame.from_ndarray(piece, format="fltp", layout=layout)
+        frame.sample_rate, frame.pts = sample_rate, first
+        frames += resampler.resample(frame)
+    frames += resampler.resample(None)
+    found = np.concatenate([frame.to_ndarray() for frame in frames], axis=1)[:, :n_samples]
+    return np.pad(found, ((0, 0), (0, n_samples - found.shape[1])))
 
 
-class Resampled:
-    """Sound at another sample rate, as `resample` makes it, computed where it is indexed.
+def _kernels() -> np.ndarray:
+    """(_PHASES + 1, 2 * HALF): a windowed sinc for every fraction of a sample."""
+    fraction = np.arange(_PHASES + 1)[:, None] / _PHASES
+    distance = np.arange(1 - HALF, HALF + 1) - fraction
+    kernels = np.sinc(distance) * np.cos(np.pi * distance / (2 * HALF)) ** 2
+    return kernels / kernels.sum(axis=1, keepdims=True)
+
+
+_KERNELS = _kernels()
+
+
+def interpolate(samples: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """What sound is between its samples.
 
     Args:
-        sound: (n, channels) int16 PCM.
-        sample_rate: What it has [Hz].
-        new_sample_rate: What it shall have [Hz].
+        samples: (n,) int16.
+        places: (m,), each at least `HALF - 1` samples after the first and `HALF` before the last one.
+
+    Returns:
+        (m,) int16.
     """
-
-    def __init__(self, sound: Channels, sample_rate: int, new_sample_rate: int) -> None:
-        divisor = math.gcd(sample_rate, new_sample_rate)
-        self._sound, self._rates = sound, (sample_rate, new_sample_rate)
-        self._old, self._new = sample_rate // divisor, new_sample_rate // divisor
-        reach = _FILTER_WIDTH * self._old / (min(self._old, self._new) * _ROLLOFF)  # samples on each side of one
-        self._margin = math.ceil(reach / self._old + 1) * self._old
-        self.shape = (-(-len(sound) * self._new // self._old), sound.shape[1])
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, span: slice) -> np.ndarray:
-        start, stop, _ = span.indices(len(self))
-        if self._old == self._new or start >= stop:
-            return self._sound[start:stop]
-        first = start // self._new * self._old - self._margin
-        last = -(-stop // self._new) * self._old + self._margin
-        inside = self._sound[max(first, 0) : last]
-        padded = np.pad(inside, ((max(-first, 0), last - max(first, 0) - len(inside)), (0, 0)))
-        skipped = (self._margin // self._old) * self._new + start % self._new
-        return resample(padded, *self._rates)[skipped : skipped + stop - start]
+    whole = np.floor(places).astype(np.int64)
+    phase = (places - whole) * _PHASES
+    index = phase.astype(np.int64)
+    share = (phase - index)[:, None]
+    kernel = (1 - share) * _KERNELS[index] + share * _KERNELS[index + 1]  # (m, 2 * HALF)
+    around = samples[whole[:, None] + np.arange(1 - HALF, HALF + 1)]
+    return np.clip(np.rint((kernel * around).sum(axis=1)), -32768, 32767).astype(np.int16)
 
 
 def cut_into_frames(
-    waveform: np.ndarray, sample_rate: int, fps: int, n_frames: int, offset: float = 0.0, pad: bool = False
+    waveform: np.ndarray,
+    sample_rate: int,
+    fps: int,
+    n_frames: int,
+    offset: float = 0.0,
+    pad: bool = False,
+    new_sample_rate: int | None = None,
+    speed: float = 1.0,
 ) -> np.ndarray:
     """The blocks of sound that belong to an episode's frames: for each, what was heard since the frame before.
 
     The block of frame i ends when frame i is taken. What was heard before the file began, at most the first frame's
-    block when `offset` is 0, is silence.
+    block when `offset` is 0, is silence. Of a memory map of hours only the episode's part is read.
 
     Args:
-        waveform: (n,), the file's samples.
-        sample_rate: Its samples per second [Hz], a multiple of `fps`.
+        waveform: (n,) or (n, channels), the file's samples; int16 where they are to be resampled.
+        sample_rate: Its samples per second [Hz].
         fps: Frames per second [Hz].
         n_frames: The episode's length.
         offset: Where in the file the episode's first frame was taken [s]; negative if the file begins after it.
         pad: Fill what the file lacks at its beginning and its end with silence.
+        new_sample_rate: What the blocks shall have [Hz], a multiple of `fps`. None: `sample_rate`.
+        speed: Seconds of the file in a second of the frames' clock, in which `offset` is given; 1.001: the recorder's
+            clock is 0.1 % fast.
 
     Returns:
-        (n_frames, S), in the waveform's dtype.
+        (n_frames, S) or (n_frames, S, channels), in the waveform's dtype.
 
     Raises:
-        ValueError: The frame rate does not divide the sample rate.
+        ValueError: The frame rate does not divide the new sample rate.
         AudioFileError: The file begins too late or ends too early, and `pad` is off.
     """
-    cut = Cut(waveform[:, None], sample_rate, fps, n_frames, offset, pad)
-    return cut[:].reshape(n_frames, -1)
+    rate = new_sample_rate or sample_rate
+    size = samples_per_frame(rate, fps)
+    start = round(offset * rate) - size  # in samples of the new rate, as all but `first`, `last` and `margin`
+    stop = start + n_frames * size
+    old, new = sample_rate // math.gcd(sample_rate, rate), rate // math.gcd(sample_rate, rate)
+    n_steady = int((len(waveform) - 1) / speed) + 1 if len(waveform) else 0
+    n_there = -(-n_steady * new // old)
+    lacking = {"beginning": max(-start - size, 0), "end": max(stop - n_there, 0)}
+    if any(lacking.values()) and not pad:
+        lacks = [f"{missing / rate:.3f} s at its {end}" for end, missing in lacking.items() if missing]
+        raise AudioFileError(
+            f"it lasts {n_there / rate:.3f} s; {n_frames} frames at {fps} per second from {offset:.3f} s on "
+            f"need {' and '.join(lacks)} more. Correct the offset, or fill with silence: pad=true."
+        )
+    # The part begins where both rates have a sample, so that it is resampled as the whole would be.
+    margin = 0 if old == new else math.ceil(_FILTER_WIDTH / (min(old, new) * _ROLLOFF) + 1) * old
+    first = max(start // new * old - margin, 0)
+    last = min(-(-stop // new) * old + margin, n_steady)
+    part = resample(_without_drift(waveform, first, max(first, last), speed), sample_rate, rate)
+    skipped = first // old * new
+    inside = part[max(start - skipped, 0) : max(stop - skipped, 0)]
+    before = min(max(-start, 0), stop - start)
+    padding = [(before, stop - start - before - len(inside)), *[(0, 0)] * (waveform.ndim - 1)]
+    return np.pad(inside, padding).reshape(n_frames, size, *waveform.shape[1:])
 
 
-class Cut:
-    """The sound of an episode's frames, (n_frames * S, channels), as `cut_into_frames` has it, read where it is indexed.
-
-    Args:
-        sound: (n, channels), the file's samples.
-        sample_rate, fps, n_frames, offset, pad: As for `cut_into_frames`.
-
-    Raises:
-        ValueError, AudioFileError: As for `cut_into_frames`.
-    """
-
-    def __init__(
-        self, sound: Channels, sample_rate: int, fps: int, n_frames: int, offset: float = 0.0, pad: bool = False
-    ) -> None:
-        size = samples_per_frame(sample_rate, fps)
-        self._sound, self._start = sound, round(offset * sample_rate) - size
-        self.shape = (n_frames * size, sound.shape[1])
-        missing_before = max(-self._start - size, 0)
-        missing_after = max(self._start + n_frames * size - len(sound), 0)
-        if (missing_before or missing_after) and not pad:
-            lacks = [
-                f"{missing / sample_rate:.3f} s at its {end}"
-                for missing, end in ((missing_before, "beginning"), (missing_after, "end"))
-                if missing
-            ]
-            raise AudioFileError(
-                f"it lasts {len(sound) / sample_rate:.3f} s; {n_frames} frames at {fps} per second from {offset:.3f} s on "
-                f"need {' and '.join(lacks)} more. Correct the offset, or fill with silence: pad=true."
-            )
-
-    def __len__(self) -> int:
-        return self.shape[0]
-
-    def __getitem__(self, span: slice) -> np.ndarray:
-        start, stop, _ = (edge + self._start for edge in span.indices(len(self)))
-        found = self._sound[max(start, 0) : max(stop, 0)]
-        before = min(max(-start, 0), stop - start)
-        return np.pad(found, ((before, stop - start - before - len(found)), (0, 0)))
+def _without_drift(waveform: np.ndarray, first: int, last: int, speed: float) -> np.ndarray:
+    """The samples from `first` to before `last` that a recorder without drift would have made; sample 0 stays."""
+    if speed == 1 or first == last:
+        return np.asarray(waveform[first:last])
+    begin, end = int(first * speed) - HALF, int(last * speed) + HALF + 1
+    samples = np.asarray(waveform[max(begin, 0) : end])
+    before = max(-begin, 0)
+    padding = [(before, end - begin - before - len(samples)), *[(0, 0)] * (waveform.ndim - 1)]
+    channels = np.pad(samples, padding).reshape(end - begin, -1).T
+    edges = [*range(first, last, _PLACES_AT_ONCE), last]
+    steady = [
+        np.concatenate([interpolate(channel, np.arange(a, b) * speed - begin) for a, b in itertools.pairwise(edges)])
+        for channel in channels
+    ]
+    return np.stack(steady, axis=1).reshape(last - first, *waveform.shape[1:])
 
 
 def _to_samples(frame: Any) -> np.ndarray:

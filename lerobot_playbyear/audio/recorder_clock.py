@@ -1,15 +1,24 @@
-"""When a dataset's episodes were recorded: LeRobot's datasets say what time passed since an episode's first frame, and no more.
+"""When a dataset's episodes were recorded, and where these moments lie in a long recording of another clock.
 
-The times stand in a file of their own, which LeRobot leaves alone: `{"episodes": {"0": 1754400000.25, "1": ...}}`, for each
-episode when its first frame was taken, in seconds since 1970 or of another clock.
+LeRobot's datasets say what time passed since an episode's first frame, and no more. So the times stand in a file of their own,
+which LeRobot leaves alone: `{"episodes": {"0": 1754400000.25, "1": ...}}`, for each episode when its first frame was taken, in
+seconds since 1970 or of another clock.
+
+No two clocks run alike. A recorder that is 100 parts in a million fast is 0.36 s ahead after an hour, seven frames at 20 Hz.
+Two moments that are known on both clocks, such as a clap at the start and one at the end, say how fast it runs.
 """
 
+import contextlib
 import csv
 import json
 import math
+import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import write_atomically
@@ -17,12 +26,14 @@ from lerobot_playbyear.datasets.files import write_atomically
 CLOCK_PATH = "meta/playbyear_clock.json"
 """Where in a dataset's folder its episodes' times stand."""
 
+_MOST_DRIFT = 0.01  # beyond it a mark is wrong, not a clock
+_MARK = re.compile(r"\s*([-+.\deE]+)\s*=\s*([-+.\deE]+)\s*")
 _EPISODES = "episodes"
 _WANTED = f'wanted {{"{_EPISODES}": {{"0": <seconds>, "1": <seconds>}}}}'
 
 
 class ClockError(InputError):
-    """The times of episodes cannot be read; the message says why, and what to do."""
+    """The times of episodes, or the marks of two clocks, cannot be used; the message says why, and what to do."""
 
 
 def note_episode_start(root: str | Path, episode_index: int, unix_time_s: float) -> None:
@@ -43,32 +54,27 @@ def note_episode_start(root: str | Path, episode_index: int, unix_time_s: float)
     _write(Path(root) / CLOCK_PATH, starts)
 
 
-def renumber_episode_starts(root: str | Path, numbers: Mapping[int, int]) -> str | None:
+def renumber_episode_starts(root: str | Path, numbers: Mapping[int, int]) -> None:
     """Moves the times of episodes that got other numbers, and drops those of episodes that are gone.
+
+    Times that cannot be read stay as they are.
 
     Args:
         root: The folder of the dataset with the new numbers, which still has the times of the old ones.
         numbers: The new number of every episode that is still there.
 
-    Returns:
-        What is said of it; None: nothing was to be changed.
-
     Raises:
         OSError: The file cannot be read or written.
     """
-    try:
-        starts = read_episode_starts(root)
-        moved = {numbers[episode]: time_s for episode, time_s in (starts or {}).items() if episode in numbers}
-        if starts is None or moved == starts:
-            return None
-        _write(Path(root) / CLOCK_PATH, moved)
-        return f"{CLOCK_PATH} has the times of {len(moved)} episodes, by their new numbers; it had {len(starts)}"
-    except ClockError as error:
-        return f"{CLOCK_PATH} stays as it is, by the old numbers: {error}"
+    with contextlib.suppress(ClockError):
+        starts = read_episode_starts(root) or {}
+        moved = {numbers[episode]: time_s for episode, time_s in starts.items() if episode in numbers}
+        if moved != starts:
+            _write(Path(root) / CLOCK_PATH, moved)
 
 
 def _write(path: Path, starts: Mapping[int, float]) -> None:
-    for part in (path.parent, path, path.with_suffix(".partial")):
+    for part in (path.parent, path):
         if part.is_symlink():
             raise ClockError(f"{part} is a link; wanted one of the dataset's own. Put what it leads to in its place.")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -157,3 +163,66 @@ def _seconds(value: Any, of: str) -> float:
     if not math.isfinite(seconds):
         raise ClockError(f"{of} is {value!r}; wanted seconds. Correct it.")
     return seconds
+
+
+@dataclass(frozen=True)
+class ClockLine:
+    """Which time in a recording a time of the clock is: `sound_s = speed * (clock_s - origin_clock_s) + origin_sound_s`.
+
+    Args:
+        speed: Seconds of the recording in a second of the clock; 1.001: the recorder's clock is 0.1 % fast.
+        origin_clock_s: A moment on the clock [s].
+        origin_sound_s: The same moment in the recording [s].
+        error_s: How far the worst mark lies beside the line [s].
+    """
+
+    speed: float = 1.0
+    origin_clock_s: float = 0.0
+    origin_sound_s: float = 0.0
+    error_s: float = 0.0
+
+    def sound_time(self, clock_s: float) -> float:
+        """Where in the recording a moment of the clock lies [s]."""
+        return self.speed * (clock_s - self.origin_clock_s) + self.origin_sound_s
+
+
+def read_marks(text: str | None) -> ClockLine:
+    """The line through moments that are known on both clocks.
+
+    Args:
+        text: `2.31=1754400000.12, 1802.74=1754401800.55`: seconds in the recording = seconds on the clock, for each mark.
+            One mark says where the recording begins, two or more also how fast its clock runs. None: the clock is the
+            recording's own.
+
+    Raises:
+        ClockError: It is written otherwise, or no two clocks differ that much.
+    """
+    if text is None:
+        return ClockLine()
+    pairs = []
+    for part in text.split(","):
+        match = _MARK.fullmatch(part)
+        try:
+            pairs.append((float(match[1]), float(match[2])) if match else (math.nan, math.nan))
+        except ValueError:
+            pairs.append((math.nan, math.nan))
+        if not all(map(math.isfinite, pairs[-1])):
+            raise ClockError(
+                f"--marks: {part.strip()!r} is no mark; wanted seconds in the sound file = seconds on the clock, such as "
+                "2.31=1754400000.12, and a comma between two of them."
+            )
+    sound, clock = np.array(pairs).T
+    origin_clock, origin_sound = float(clock.mean()), float(sound.mean())
+    if len(pairs) == 1:
+        return ClockLine(1.0, origin_clock, origin_sound)
+    spread = clock - origin_clock
+    if len(set(clock.tolist())) < len(clock):
+        raise ClockError(f"--marks={text}: two marks have the same time on the clock; wanted different moments.")
+    speed = float(spread @ (sound - origin_sound) / (spread @ spread))
+    error = float(np.abs(sound - origin_sound - speed * spread).max())
+    if abs(speed - 1) > _MOST_DRIFT:
+        raise ClockError(
+            f"--marks={text}: {speed:.4f} seconds of sound in a second of the clock; wanted {1 - _MOST_DRIFT} to "
+            f"{1 + _MOST_DRIFT}: no two clocks differ that much. Each mark is seconds in the sound file = seconds on the clock."
+        )
+    return ClockLine(speed, origin_clock, origin_sound, error)

@@ -1,0 +1,538 @@
+"""`playbyear-attach-audio`: a copy of a LeRobotDataset with its sound in columns: from files, or from its own pictures.
+
+Where the sound of each episode is, says a `Source`: one for files of episodes, one for the recording of a session, one for the
+files of sound that a dataset has itself. Microphones that were recorded as cameras are in `camera_sound`.
+
+LeRobot is imported when the dataset's files have been looked at.
+"""
+
+import json
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, cut_into_frames, read_audio
+from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_layout
+from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature
+from lerobot_playbyear.datasets.files import (
+    EPISODES_DIR,
+    INFO_PATH,
+    check_can_be_made,
+    list_files,
+    new_folder,
+    scratch_folder,
+)
+from lerobot_playbyear.datasets.info import check_links
+from lerobot_playbyear.datasets.parquet import ParquetDamageError
+from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
+
+if TYPE_CHECKING:
+    from lerobot_playbyear.audio.dataset_copy import AddedColumn
+
+_MOST_ERRORS = 10  # that are listed
+_SPARE_S = 1.0  # of a file's sound behind what the episodes need
+_FORMATS = "mov,mp4,m4a,wav,flac,ogg,matroska,webm,mp3,aac"  # none of which names other files
+
+
+class AttachError(InputError):
+    """Sound cannot be attached; nothing was written."""
+
+
+@dataclass
+class AttachAudioConfig:
+    """Options of `playbyear-attach-audio`.
+
+    Args:
+        dataset: The dataset that gets sound; it is not changed. Without a root it may come from the Hub.
+        output: The copy with sound. Without a name: the dataset's name and folder with `_with_sound` behind them.
+        files: The sound of each episode, if each has a file: a path in which `{episode}` stands for the episode's number,
+            for example `sound/{episode:06d}.wav`. WAV, FLAC, or a film whose sound track is taken.
+        session: One file with the sound of the whole session, in place of `files`; or, where a microphone was recorded as a
+            camera, a folder with the files of its sessions, if these are not where the microphone left them.
+        clock: When each episode's first frame was taken [s]: a table (CSV) of episode and seconds, or JSON. None: the
+            dataset says so itself, in `meta/playbyear_clock.json`.
+        marks: Moments that are known in the session's file and on that clock, such as a clap at the start and one at the
+            end: `2.31=1754400000.12, 1802.74=1754401800.55`. None: the clock's seconds are the file's.
+        microphone: What the microphone is called: the column is `observation.audio.<microphone>`. For files of
+            several channels, a name for each, separated by commas. None: "microphone"; of those that were recorded as cameras,
+            all.
+        channel: Take only this channel of the files, counted from 0.
+        offset: Where in its file each episode's first frame was taken [s]; negative where the file begins after it. None:
+            0, or as the dataset says of its own files.
+        offsets: A JSON file with a list of offsets [s], one per episode, in addition to `offset`.
+        sample_rate: Resample to this rate [Hz]. None keeps the files' own.
+        pad: Fill what a file lacks at its beginning or its end with silence; otherwise that is an error.
+    """
+
+    dataset: DatasetPlace
+    output: DatasetPlace = field(default_factory=lambda: DatasetPlace(""))
+    files: str | None = None
+    session: Path | None = None
+    clock: Path | None = None
+    marks: str | None = None
+    microphone: str | None = None
+    channel: int | None = None
+    offset: float | None = None
+    offsets: Path | None = None
+    sample_rate: int | None = None
+    pad: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.output.repo_id:
+            root = self.output.root or (self.dataset.root and f"{Path(self.dataset.root)}_with_sound")
+            self.output = DatasetPlace(f"{self.dataset.repo_id}_with_sound", root)
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Of one episode: a recording in which its sound is, (n, channels) int16, and where.
+
+    Args:
+        samples, sample_rate: The recording [Hz].
+        start_s: When the episode's first frame was taken [s], on the clock of the frames.
+        speed: Seconds of the recording in a second of that clock.
+    """
+
+    samples: np.ndarray
+    sample_rate: int
+    start_s: float
+    speed: float = 1.0
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the sound of a dataset's episodes is.
+
+    Args:
+        keys: The columns that it becomes, one per channel.
+        named: What an episode is called where its sound is wrong.
+        recording: Gives that of an episode.
+        is_own: Whether the dataset has it in files of its own: nobody chose their rate, so the nearest that fits is taken.
+    """
+
+    keys: list[str]
+    named: Callable[[int], str]
+    recording: Callable[[int], Recording]
+    is_own: bool = False
+
+
+class PutAside:
+    """The sound of all episodes, in files, until it is known that nothing is wrong with it and a copy is written.
+
+    Args:
+        keys: The columns.
+        folder: For the files, 2 bytes a sample.
+    """
+
+    def __init__(self, keys: Sequence[str], folder: Path) -> None:
+        self._keys, self._folder = keys, folder
+        self._stats: dict[str, list[dict[str, np.ndarray]]] = {key: [] for key in keys}
+
+    def append(self, blocks: np.ndarray) -> None:
+        """Adds an episode: (n_frames, S, columns) int16."""
+        from lerobot_playbyear.datasets.statistics import sound_stats
+
+        for channel, key in enumerate(self._keys):
+            np.save(self._file(key, len(self._stats[key])), blocks[..., channel])
+            self._stats[key].append(sound_stats(blocks[..., channel]))
+
+    def columns(self, sample_rate: int, fps: int) -> "dict[str, AddedColumn]":
+        """All that was added, as columns of a copy."""
+        from lerobot_playbyear.audio.dataset_copy import AddedColumn
+
+        def column(key: str) -> AddedColumn:
+            return AddedColumn(
+                audio_feature(sample_rate, fps), self._stats[key], lambda episode: np.load(self._file(key, episode))
+            )
+
+        return {key: column(key) for key in self._keys}
+
+    def _file(self, key: str, episode: int) -> Path:
+        return self._folder / f"{key}-{episode}.npy"
+
+
+def attach_audio(cfg: AttachAudioConfig) -> Path:
+    """Copies a dataset and adds its microphones: from files, from its own files, or those that were recorded as cameras.
+
+    Args:
+        cfg: The options.
+
+    Returns:
+        The copy's folder. It is there only when it is complete.
+
+    Raises:
+        AttachError: Naming every episode whose sound is missing, too short, or of another kind.
+        InputError: The copy's folder cannot be made, before any sound is read.
+        OSError: The copy cannot be written.
+    """
+    root = cfg.dataset.folder
+    has_own_files = cfg.files is None and cfg.session is None and has_audio_files(root)
+    _check_source(cfg, has_own_files)
+    target = output_folder(cfg.output)
+    removed: list[str] = []
+    notes: dict[str, dict[str, Any]] = {}
+    with scratch_folder() as folder:
+        scratch = Path(folder)
+        if has_own_files:
+            layout = read_layout(cfg.dataset.repo_id, root, cfg.offset)
+            sources = [_own_files(track, layout.lengths, layout.fps, scratch) for track in layout.tracks]
+            removed = [track.key for track in layout.tracks]
+            added = _read(sources, layout.lengths, layout.fps, cfg, scratch)
+            n_episodes = len(layout.lengths)
+        else:
+            dataset = open_for_copy(cfg.dataset)
+            root, n_episodes = Path(dataset.root), dataset.meta.total_episodes
+            if _is_in_dataset(cfg):
+                from lerobot_playbyear.audio.camera_sound import read_camera_sound
+
+                added, notes = read_camera_sound(cfg, dataset, scratch)
+            else:
+                source = (_session if cfg.files is None else _files)(cfg, dataset, _keys(cfg, dataset), scratch)
+                lengths = [int(length) for length in dataset.meta.episodes["length"]]
+                added = _read([source], lengths, dataset.fps, cfg, scratch)
+        write_new_dataset(root, target, added, removed, notes)
+    heard = [
+        f"{key} at {own.feature['info']['sample_rate']} Hz"
+        for key, own in added.items()
+        if key.startswith(AUDIO_PREFIX)
+    ]
+    print(f"\nDataset: {target} ({n_episodes} episodes with {', '.join(heard)})")
+    return target
+
+
+def write_new_dataset(
+    root: Path,
+    target: Path,
+    added: "Mapping[str, AddedColumn]",
+    removed: Collection[str] = (),
+    notes: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
+    """Writes a dataset made from another, which is there only when it is complete and on the disk itself.
+
+    Args:
+        root: The other's folder.
+        target: Its folder, which is not there yet.
+        added, removed, notes: In what it differs; see `write_copy`.
+
+    Raises:
+        AttachError: A table of the other is damaged.
+        OSError: Something cannot be read or written.
+    """
+    from lerobot_playbyear.audio.dataset_copy import write_copy
+
+    try:
+        with new_folder(target) as unfinished:
+            write_copy(root, unfinished, added, removed, notes)
+    except ParquetDamageError as error:
+        raise AttachError(f"{error} Repair it first: playbyear-repair --root={root}") from error
+
+
+def output_folder(place: DatasetPlace) -> Path:
+    """Where a new dataset is to be written.
+
+    Raises:
+        AttachError: Something is there already.
+        InputError: It cannot be made.
+    """
+    target = place.folder
+    if target.exists():
+        raise AttachError(f"{target} is there already. Choose another --output.root, or delete it.")
+    check_can_be_made(target, f"--output.root={target}")
+    return target
+
+
+def open_for_copy(place: DatasetPlace) -> DatasetReader:
+    """Opens a dataset of which a copy is to be made: no link leads out of it, and its tables of episodes are whole.
+
+    Raises:
+        AttachError: There is none, or it is not so.
+    """
+    if place.root is not None and not (Path(place.root) / INFO_PATH).is_file():
+        raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
+    try:
+        dataset = DatasetReader(place.repo_id, place.root)
+        from lerobot_playbyear.audio.dataset_copy import read_named_table
+
+        check_links(Path(dataset.root))  # the copy would hold what they lead to
+        for path in list_files(Path(dataset.root), f"{EPISODES_DIR}/*/*.parquet"):
+            read_named_table(path, ["length"])  # LeRobot looks at no checksum
+        return dataset
+    except ParquetDamageError as error:
+        raise AttachError(f"{error} Repair it first: playbyear-repair --root={dataset.root}") from error
+    except Exception as error:  # also what the Hub's client raises
+        raise AttachError(f"The dataset '{place.repo_id}' in {place.folder} cannot be opened: {error}") from error
+
+
+def raise_all(errors: list[str]) -> None:
+    """Ends with what is wrong with sound, the first of it where it is much.
+
+    Raises:
+        AttachError: If there is anything.
+    """
+    if errors:
+        more = f"\n  ... and {len(errors) - _MOST_ERRORS} more" if len(errors) > _MOST_ERRORS else ""
+        raise AttachError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
+
+
+# What the options say
+
+
+def _is_in_dataset(cfg: AttachAudioConfig) -> bool:
+    return cfg.files is None and (cfg.session is None or cfg.session.is_dir())
+
+
+def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
+    """Whether the options say where the sound is, and in one way."""
+    if cfg.files is not None and cfg.session is not None:
+        raise AttachError(
+            "--files has the sound of each episode, --session that of all; both are given. Give one of them."
+        )
+    if _is_in_dataset(cfg):
+        own = ("the dataset's own files", "offset", "sample_rate", "pad")
+        source, *taken = (
+            own if has_own_files else ("microphones that were recorded as cameras", "session", "microphone")
+        )
+        for option in fields(AttachAudioConfig):
+            value = getattr(cfg, option.name)
+            if option.name not in ("dataset", "output", *taken) and value != option.default:
+                raise AttachError(
+                    f"--{option.name}={value} is for --files and one --session=FILE, not for {source}. Leave it out, or say "
+                    "where the files are."
+                )
+    if cfg.files is not None and "{episode" not in cfg.files:
+        raise AttachError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
+    for name in ("clock", "marks"):
+        if cfg.session is None and getattr(cfg, name) is not None:
+            raise AttachError(f"--{name}={getattr(cfg, name)} is for --session. Leave it out.")
+
+
+def _keys(cfg: AttachAudioConfig, dataset: DatasetReader) -> list[str]:
+    names = [name.strip() for name in ("microphone" if cfg.microphone is None else cfg.microphone).split(",")]
+    keys = [name if name.startswith(AUDIO_PREFIX) else AUDIO_PREFIX + name for name in names]
+    for key in keys:
+        if "/" in key or key == AUDIO_PREFIX or keys.count(key) > 1:
+            raise AttachError(f"--microphone={cfg.microphone}: give each microphone a name of its own, without '/'.")
+        if key in dataset.meta.features:
+            raise AttachError(f"'{key}' is in the dataset already. Give another --microphone.")
+    if cfg.channel is not None and len(keys) > 1:
+        raise AttachError(f"--channel={cfg.channel} is for one microphone; --microphone names {len(keys)}.")
+    return keys
+
+
+def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
+    """The offset of each episode [s], from the options.
+
+    Raises:
+        AttachError: `offsets` is no list of as many numbers.
+    """
+    offset = cfg.offset or 0.0
+    if cfg.offsets is None:
+        return [offset] * n_episodes
+    try:
+        values = [float(value) for value in json.loads(cfg.offsets.read_text())]
+    except (OSError, ValueError, TypeError) as error:
+        raise AttachError(f"--offsets={cfg.offsets} is no list of numbers in JSON: {error}") from error
+    if len(values) != n_episodes:
+        raise AttachError(f"--offsets={cfg.offsets} has {len(values)} values; the dataset has {n_episodes} episodes.")
+    return [offset + value for value in values]
+
+
+# Where sound is
+
+
+def _read(
+    sources: Sequence[Source], lengths: Sequence[int], fps: int, cfg: AttachAudioConfig, scratch: Path
+) -> "dict[str, AddedColumn]":
+    """Cuts the sound of all episodes, so that what is wrong with it is known before anything is written.
+
+    Raises:
+        AttachError: Naming every episode whose sound is missing, too short or of another kind.
+    """
+    if cfg.sample_rate is not None and (cfg.sample_rate <= 0 or cfg.sample_rate % fps):
+        raise AttachError(f"--sample_rate={cfg.sample_rate}: wanted a multiple of {fps} frames per second.")
+    errors: list[str] = []
+    found: list[tuple[PutAside, dict[int, int]]] = []  # and the episode in which each rate comes first
+    for source in sources:
+        sound, first_with = PutAside(source.keys, scratch), dict[int, int]()
+        for episode, length in enumerate(tqdm(lengths, desc="Reading sound", unit="episode")):
+            try:
+                heard = source.recording(episode)
+                rate = _new_rate(cfg, heard.sample_rate, fps, source.is_own)
+                first_with.setdefault(rate, episode)
+                own = (heard.samples, heard.sample_rate, fps, length, heard.start_s)
+                sound.append(cut_into_frames(*own, cfg.pad, rate, heard.speed))
+            except (AudioFileError, ValueError) as error:
+                errors.append(f"{source.named(episode)}{error}")
+        if len(first_with) > 1:
+            each = ", ".join(f"{rate} Hz (episode {first_with[rate]})" for rate in sorted(first_with))
+            errors.append(f"the files have different sample rates, {each}. Give --sample_rate to resample them.")
+        found.append((sound, first_with))
+    raise_all(errors)
+    return {key: column for sound, rates in found for key, column in sound.columns(next(iter(rates)), fps).items()}
+
+
+def _new_rate(cfg: AttachAudioConfig, own_rate: int, fps: int, is_own: bool = False) -> int:
+    """The rate that sound of the rate `own_rate` is to have [Hz].
+
+    Raises:
+        AudioFileError: The frame rate does not divide it.
+    """
+    rate, nearest = cfg.sample_rate or own_rate, max(1, round(own_rate / fps)) * fps
+    if rate % fps and not is_own:
+        raise AudioFileError(
+            f"it has {own_rate} samples per second, which is no multiple of {fps} frames per second. "
+            f"Resample it, for example with --sample_rate={nearest}."
+        )
+    return nearest if rate % fps else rate
+
+
+def _files(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], _: Path) -> Source:
+    """A file for each episode."""
+    offsets = _offsets(cfg, dataset.meta.total_episodes)
+    pattern = str(cfg.files)
+
+    def path_of(episode: int) -> str:
+        try:
+            return str(Path(pattern.format(episode=episode)))
+        except (KeyError, IndexError, ValueError) as error:
+            raise AttachError(
+                f"--files={pattern} cannot be filled in: {error}. Only {{episode}} may stand in it."
+            ) from error
+
+    def recording(episode: int) -> Recording:
+        samples, rate = read_audio(path_of(episode))
+        return Recording(_choose_channels(cfg, samples, len(keys)), rate, offsets[episode])
+
+    return Source(keys, lambda episode: f"episode {episode}, {path_of(episode)}: ", recording)
+
+
+def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], scratch: Path) -> Source:
+    """One recording of a whole session, and the times when the episodes began."""
+    line = read_marks(cfg.marks)
+    n_episodes = dataset.meta.total_episodes
+    starts, offsets = _starts(cfg, Path(dataset.root), n_episodes), _offsets(cfg, n_episodes)
+    path = Path(str(cfg.session))
+    try:
+        pieces = ((_choose_channels(cfg, samples, len(keys)), rate) for samples, rate in audio_pieces(path))
+        samples, rate = _decoded(pieces, scratch / "session")
+        _new_rate(cfg, rate, dataset.fps)
+    except (AudioFileError, ValueError) as error:
+        raise AttachError(f"Nothing was written. {path}: {error}") from error
+    print(
+        f"{path}: its clock runs at {line.speed:.6f} of the episodes' clock ({(line.speed - 1) * 1e6:+.0f} parts in a "
+        f"million); the marks fit to {line.error_s * 1000:.1f} ms."
+    )
+
+    def recording(episode: int) -> Recording:
+        first_frame_s = line.sound_time(starts[episode]) + offsets[episode]
+        return Recording(samples, rate, first_frame_s / line.speed, line.speed)
+
+    def named(episode: int) -> str:
+        return f"episode {episode}, which began at {starts[episode]:.3f} s of the clock: in {path} "
+
+    return Source(keys, named, recording)
+
+
+def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
+    """When each episode began, on the clock [s]."""
+    if cfg.clock is not None:
+        try:
+            known: dict[int, float] | None = read_clock(cfg.clock)
+        except OSError as error:
+            raise ClockError(f"--clock={cfg.clock} cannot be read: {error}") from error
+    else:
+        known = read_episode_starts(root)
+    source = cfg.clock or root / CLOCK_PATH
+    if known is None:
+        raise AttachError(
+            f"Nothing says when the episodes began: there is no {source}. Give --clock=times.csv with lines "
+            "episode,seconds: for each episode when its first frame was taken."
+        )
+    missing = [episode for episode in range(n_episodes) if episode not in known]
+    if missing:
+        named = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
+        raise AttachError(
+            f"{source} has no time for episode {named}; the dataset has {n_episodes} episodes. Add it, counted from 0."
+        )
+    return [known[episode] for episode in range(n_episodes)]
+
+
+def _own_files(track: AudioTrack, lengths: Sequence[int], fps: int, scratch: Path) -> Source:
+    """A microphone's files beside the frames, of several episodes each."""
+    decoded: dict[Path, tuple[np.ndarray, int] | AudioFileError] = {}
+    needed_s: dict[Path, float] = {}  # to where in each file; one may decode to more than a disk holds
+    for span, length in zip(track.spans, lengths, strict=True):
+        end_s = span.start_s + track.start_time_s + length / fps + _SPARE_S
+        needed_s[span.path] = max(end_s, needed_s.get(span.path, 0.0))
+
+    def recording(episode: int) -> Recording:
+        span = track.spans[episode]
+        if span.path not in decoded:
+            try:
+                pieces = _checked_pieces(track, span.path, needed_s[span.path])
+                decoded[span.path] = _decoded(pieces, scratch / f"{track.key}-file-{len(decoded)}")
+            except AudioFileError as error:
+                decoded[span.path] = error
+        found = decoded[span.path]
+        if isinstance(found, AudioFileError):
+            raise found
+        samples, rate = found
+        stop = len(samples) if span.end_s is None else round(span.end_s * rate)
+        return Recording(samples[round(span.start_s * rate) : stop], rate, track.start_time_s)
+
+    def named(episode: int) -> str:
+        return f"'{track.key}', episode {episode}, {track.spans[episode].path}: "
+
+    return Source(column_names(track), named, recording, is_own=True)
+
+
+def _checked_pieces(track: AudioTrack, path: Path, last_s: float) -> Iterator[tuple[np.ndarray, int]]:
+    """A file's sound up to a time, which is what the feature says.
+
+    Raises:
+        AudioFileError: It is not, or cannot be decoded.
+    """
+    n_samples = 0
+    for samples, rate in audio_pieces(path, _FORMATS):
+        if samples.shape[1] != track.n_channels:
+            raise AudioFileError(
+                f"it has {samples.shape[1]} channels; the feature's shape says {track.n_channels}. Correct meta/info.json."
+            )
+        if track.sample_rate not in (None, rate):
+            raise AudioFileError(
+                f"it has {rate} samples per second; the feature's info says {track.sample_rate}. Correct meta/info.json."
+            )
+        if n_samples > last_s * rate:
+            return
+        yield samples, rate
+        n_samples += len(samples)
+
+
+def _decoded(pieces: Iterator[tuple[np.ndarray, int]], path: Path) -> tuple[np.ndarray, int]:
+    """A recording that may be hours long, as a memory map (n, channels) int16 of the file `path`; and its rate [Hz]."""
+    n_channels = rate = 0
+    with path.open("wb") as file:
+        for samples, own_rate in pieces:
+            file.write(samples.astype("<i2").tobytes())
+            n_channels, rate = samples.shape[1], own_rate
+    return np.memmap(path, "<i2", "r").reshape(-1, n_channels), rate
+
+
+def _choose_channels(cfg: AttachAudioConfig, samples: np.ndarray, n_microphones: int) -> np.ndarray:
+    n_channels = samples.shape[1]
+    if cfg.channel is not None:
+        if not 0 <= cfg.channel < n_channels:
+            raise AudioFileError(f"it has {n_channels} channels; there is no --channel={cfg.channel}.")
+        return samples[:, [cfg.channel]]
+    if n_channels != n_microphones:
+        raise AudioFileError(
+            f"it has {n_channels} channels, and --microphone names {n_microphones}. Choose one with --channel=0, or "
+            "name a microphone for each, separated by commas."
+        )
+    return samples

@@ -1,0 +1,162 @@
+"""A copy of a dataset with more columns: every other file as it is."""
+
+import json
+import shutil
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from lerobot.datasets.feature_utils import get_hf_features_from_features
+from lerobot.datasets.io_utils import load_stats
+from lerobot.utils.constants import DEFAULT_FEATURES
+from tqdm import tqdm
+
+from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, take_over
+from lerobot_playbyear.datasets.info import read_info
+from lerobot_playbyear.datasets.parquet import (
+    DataFile,
+    ParquetDamageError,
+    column_to_numpy,
+    episode_bounds,
+    numpy_to_column,
+    read_table,
+    write_rows,
+    write_tables,
+)
+from lerobot_playbyear.datasets.statistics import add_stats, with_stats, write_stats
+from lerobot_playbyear.datasets.survey import STATS_PATH
+
+_SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
+_DATA, _EPISODES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet"
+
+
+@dataclass
+class AddedColumn:
+    """A feature that a copy has more.
+
+    Args:
+        feature: As LeRobot describes it.
+        stats: Its statistics in each episode.
+        values: Of an episode the values of all its frames: an array (n, ...), or what Arrow makes a column of.
+    """
+
+    feature: Mapping[str, Any]
+    stats: Sequence[Mapping[str, np.ndarray]]
+    values: Callable[[int], np.ndarray | list]
+
+
+def write_copy(
+    root: Path,
+    target: Path,
+    added: Mapping[str, AddedColumn],
+    removed: Collection[str] = (),
+    notes: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
+    """Writes a dataset with more columns.
+
+    Args:
+        root: The dataset.
+        target: An empty folder.
+        added: The columns, by their keys; all of the same episodes.
+        removed: Features with files of sound in whose place they come.
+        notes: What the `info` of other features says more.
+
+    Raises:
+        ParquetDamageError: A table is damaged, or names other frames than there are values for.
+        OSError: Something cannot be read or written.
+    """
+    info = read_info(root)
+    features = {key: feature for key, feature in info["features"].items() if key not in removed}
+    for key, more in (notes or {}).items():
+        features[key] = {**features[key], "info": {**(features[key].get("info") or {}), **more}}
+    own = {key: feature for key, feature in features.items() if key not in DEFAULT_FEATURES}
+    info["features"] = {**own, **{key: dict(column.feature) for key, column in added.items()}, **features}
+    if removed:
+        info = {name: value for name, value in info.items() if name not in ("audio_path", "audio_files_size_in_mb")}
+    shaped = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}
+    schema = get_hf_features_from_features(shaped).arrow_schema
+    episodes = [dict(zip(added, own, strict=True)) for own in zip(*(a.stats for a in added.values()), strict=True)]
+    files = [path for path in entries_below(root) if path.is_file() and path.relative_to(root).parts[0] not in _SCRATCH]
+    for path in tqdm(files, desc="Writing", unit="file"):
+        name = path.relative_to(root)
+        if name.parts[0] == AUDIO_FOLDER and any(key in name.parts for key in removed):
+            continue
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        if fits(name, _DATA):
+            _write_frames(path, target / name, schema, added, removed)
+        elif fits(name, _EPISODES):
+            _write_rows(path, target / name, episodes, removed)
+        elif not fits(name, INFO_PATH, STATS_PATH):
+            # Nobody changes a film in place; of a user's own files that is not known.
+            (take_over if name.parts[0] == "videos" else shutil.copyfile)(path, target / name)
+    known = {key: stats for key, stats in (load_stats(root) or {}).items() if key not in removed}
+    write_stats({**known, **add_stats(None, episodes)}, target)
+    (target / INFO_PATH).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+
+
+def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
+    """As `read_table`; the error names the file."""
+    try:
+        return read_table(path, columns)
+    except ParquetDamageError as error:
+        raise ParquetDamageError(f"{path} is damaged: {error}.") from error
+
+
+def _write_frames(
+    source: Path,
+    target: Path,
+    schema: pa.Schema,
+    added: Mapping[str, AddedColumn],
+    removed: Collection[str],
+) -> None:
+    file = DataFile(source)
+    metadata = file.schema.metadata or {}
+    if b"huggingface" in metadata:
+        metadata = {**metadata, **(schema.metadata or {})}
+    kept = [column for column in file.schema if column.name not in removed]
+    target_schema = pa.schema([*kept, *(schema.field(key) for key in added)], metadata)
+
+    def tables() -> Iterator[pa.Table]:
+        for _, table in file.row_groups():
+            try:
+                if isinstance(table, ParquetDamageError):
+                    raise table
+                for start, stop in zip(*episode_bounds(column_to_numpy(table.column("episode_index"))), strict=True):
+                    frames = table.slice(start, stop - start)
+                    columns = [frames.column(column.name) for column in kept]
+                    columns += [_values(frames, column, schema.field(key).type) for key, column in added.items()]
+                    yield pa.Table.from_arrays(columns, schema=target_schema)
+            except ValueError as error:
+                raise ParquetDamageError(f"{source} is damaged: {error}.") from error
+
+    write_tables(target, tables(), target_schema)
+
+
+def _values(frames: pa.Table, column: AddedColumn, kind: pa.DataType) -> pa.Array:
+    """A new column of frames that follow each other in one episode."""
+    episode = frames.column("episode_index")[0].as_py()
+    numbers = column_to_numpy(frames.column("frame_index"))
+    first, last = int(numbers[0]), int(numbers[-1])
+    values = column.values(episode) if 0 <= episode < len(column.stats) else []
+    if not 0 <= first <= last < len(values) or (np.diff(numbers) != 1).any():
+        raise ValueError(
+            f"it holds frames {first} to {last} of episode {episode}, for which meta/episodes counts {len(values)}"
+        )
+    own = values[first : last + 1]
+    return numpy_to_column(own, kind) if isinstance(own, np.ndarray) else pa.array(own, kind)
+
+
+def _write_rows(source: Path, target: Path, stats: Sequence[Mapping], removed: Collection[str]) -> None:
+    rows = read_named_table(source)
+    episodes = rows.column("episode_index").to_pylist()
+    for episode in episodes:
+        if not isinstance(episode, int) or not 0 <= episode < len(stats):
+            raise ParquetDamageError(f"{source} is damaged: it names episode {episode} of {len(stats)}.")
+    prefixes = tuple(f"{folder}/{key}/" for key in removed for folder in ("stats", AUDIO_FOLDER))
+    rows = rows.select([name for name in rows.column_names if not name.startswith(prefixes)])
+    rows = with_stats(rows, [dict(stats[episode]) for episode in episodes])
+    write_rows(rows.replace_schema_metadata(None), target)
