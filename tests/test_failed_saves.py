@@ -17,7 +17,7 @@ from recording_factory import FEATURES, FILM, FPS, REPO_ID, RICH_FEATURES, diffe
 from lerobot_playbyear.datasets import durable, episode_files, files
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter
 from lerobot_playbyear.datasets.survey import survey
-from lerobot_playbyear.episodes.saving import save_or_ask
+from lerobot_playbyear.episodes.frames import save_or_ask
 
 ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
 TWO_FILMS = {**RICH_FEATURES, FILM + "2": RICH_FEATURES[FILM]}

@@ -34,18 +34,31 @@ def command(interrupted: int | str = 130, flag: str = "") -> Callable[[Callable[
         def run() -> None:
             sys.argv[1:] = [f"{option}=true" if option == flag else option for option in sys.argv[1:]]
             answer_at_once(f"playbyear-{work.__name__.replace('_', '-')}")
+            from draccus.utils import ParsingError
+
             from lerobot_playbyear.datasets.errors import PlaybyearError
 
             try:
                 work()
             except (PlaybyearError, MemoryError) as error:
                 sys.exit(f"error: {str(error) or 'there is not enough memory'}")
+            except ParsingError as error:
+                sys.exit(f"error: {_reason(error)}")
             except KeyboardInterrupt:
                 sys.exit(interrupted)
 
         return run
 
     return decorate
+
+
+def _reason(error: BaseException) -> BaseException:
+    """Why draccus refuses options: where their own class refuses them, it names the class, and hides what that says."""
+    causes = [error]
+    while causes[-1].__cause__ is not None:
+        causes.append(causes[-1].__cause__)
+    refusals = (cause for cause in causes if str(cause).startswith("Couldn't instantiate class"))
+    return next((refusal.__cause__ for refusal in refusals if refusal.__cause__), error)
 
 
 def short_help(command: str) -> str:
@@ -112,17 +125,16 @@ def run_alone[Result](work: Callable[[Any], Result], parse: Callable[[type], Any
         parse: Reads the options for such a configuration. None: without LeRobot.
 
     Raises:
-        InputError: An option has no meaning.
+        InputError, draccus.ParsingError: An option has no meaning.
     """
     import draccus
-    from draccus.utils import DecodingError
 
     from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.hub.client import be_patient
 
     be_patient()
     (argument,) = inspect.signature(work).parameters.values()
-    with errors_of_input(DecodingError, OSError):
+    with errors_of_input(OSError):
         cfg = (parse or draccus.parse)(argument.annotation)
     return work(cfg)
 
