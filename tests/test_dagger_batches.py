@@ -121,23 +121,6 @@ def test_every_intervention_frame_is_learned_from_alike():
     assert relative.max() < 2
 
 
-def test_an_episode_appended_while_training_goes_on_is_drawn():
-    interventions = store([10], "xxxxxx....", first=N_DEMONSTRATIONS)
-    batches = BalancedBatches(windows(4), store([40]), interventions, batch_size=8)
-    new = [
-        {
-            "action": np.array([5000.0], np.float32),
-            "observation.state": np.zeros(2, np.float32),
-            "intervention": np.array([True]),
-        }
-    ] * 6
-    interventions.append_episode(new)
-    batches.take_in(interventions)
-    drawn = torch.cat([supervised(batches.batch(number)) for number in range(20)])
-    assert (drawn == 5000).any()
-    assert ((drawn >= N_DEMONSTRATIONS) & (drawn < 5000)).any()
-
-
 def test_a_batch_is_given_by_its_number_alone():
     first, again = (
         BalancedBatches(windows(4), store([40]), store([len(ATTEMPTS)], ATTEMPTS), 8, seed=3) for _ in range(2)

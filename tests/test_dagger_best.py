@@ -56,9 +56,12 @@ def test_the_best_evaluation_keeps_its_weights(tmp_path, gives, monkeypatch, cap
     assert best == last
     assert not third.exists()
     assert "Best:" not in capfd.readouterr().out
+    gives += [50]
+    best, last = go_on("--episodes=7")
+    assert best != last
     shutil.rmtree(best)  # to make room
     gives += [40]
-    best, last = go_on("--episodes=7")
+    best, last = go_on("--episodes=8")
     assert best == last
 
 

@@ -64,9 +64,6 @@ def precision_of_its_own():
     AcceleratorState._reset_state(True)
 
 
-run = run_in_process
-
-
 # Number formats
 
 
@@ -120,7 +117,7 @@ def test_both_trainers_compute_in_it_and_keep_their_weights_in_float32(script, n
 
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}", f"--output_dir={tmp_path / 'out'}")
     hook = nn.modules.module.register_module_forward_hook(note)
-    run(script, *NOISY, *data, "--policy.device=cpu", "--policy.use_amp=true", "--steps=1")
+    run_in_process(script, *NOISY, *data, "--policy.device=cpu", "--policy.use_amp=true", "--steps=1")
     hook.remove()
     assert computed == {torch.bfloat16}
     weights = load_file(tmp_path / "out/checkpoints/last" / MODEL).values()
@@ -197,11 +194,11 @@ def flatten(lstm):
 
 def test_a_training_saves_its_checkpoints_and_is_resumed(noise, tmp_path, monkeypatch):
     data = ("--policy.device=cpu", "--dataset.repo_id=tests/noise", f"--dataset.root={noise}")
-    run(train, *NOISY, *data, "--steps=2", f"--output_dir={tmp_path / 'plain'}")
+    run_in_process(train, *NOISY, *data, "--steps=2", f"--output_dir={tmp_path / 'plain'}")
     monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
-    run(train, *NOISY, *data, "--steps=2", "--save_freq=1", f"--output_dir={tmp_path / 'out'}")
+    run_in_process(train, *NOISY, *data, "--steps=2", "--save_freq=1", f"--output_dir={tmp_path / 'out'}")
     half = tmp_path / "out/checkpoints/000001/pretrained_model/train_config.json"
-    run(train, "--resume=true", f"--config_path={half}", f"--output_dir={tmp_path / 'resumed'}")
+    run_in_process(train, "--resume=true", f"--config_path={half}", f"--output_dir={tmp_path / 'resumed'}")
 
     plain = load_file(tmp_path / "plain/checkpoints/last" / MODEL)
     for folder in ("out", "resumed"):
@@ -248,12 +245,12 @@ def actions_of(checkpoint: Path, device: str, n_frames: int = 4) -> torch.Tensor
 @both_trainers
 def test_a_training_saves_resumes_and_acts(device, script, dtype, noise, tmp_path):
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}", f"--policy.dtype={dtype}")
-    run(
+    run_in_process(
         script, *NOISY, *data, f"--policy.device={device}", "--steps=4", "--save_freq=2", f"--output_dir={tmp_path}/out"
     )
     checkpoints = tmp_path / "out/checkpoints"
     half = checkpoints / "000002"
-    run(
+    run_in_process(
         script,
         "--resume=true",
         f"--config_path={half / 'pretrained_model/train_config.json'}",

@@ -8,7 +8,6 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from lerobot.policies.factory import make_policy as make_policy_for
 from lerobot.policies.factory import make_pre_post_processors
 from support.policy import (
@@ -287,30 +286,6 @@ def test_a_rollout_with_another_sample_rate_is_refused():
 
 
 # Checkpoints
-
-
-def test_checkpoints_hold_weights_statistics_and_optimizer(tmp_path):
-    policy = make_policy(n_supervised_steps=2)
-    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
-    policy.train()
-    for _ in range(2):
-        policy.forward(batch_of(policy))[0].backward()
-        optimizer.step()
-    policy.eval()
-    policy.save_pretrained(tmp_path)
-    save_optimizer_state(optimizer, tmp_path)
-    again = PlaybyearPolicy.from_pretrained(tmp_path)
-    assert not again.training
-    assert policy.state_dict().keys() == again.state_dict().keys()
-    assert any("spectrogram" in key and "mean" in key for key in again.state_dict())
-    for name, value in policy.state_dict().items():
-        torch.testing.assert_close(again.state_dict()[name], value, rtol=0, atol=0)
-    with torch.no_grad():
-        batch = batch_of(policy)
-        torch.testing.assert_close(again.predict_run(batch), policy.predict_run(batch), rtol=0, atol=1e-6)
-    resumed = policy.config.get_optimizer_preset().build(again.get_optim_params())
-    load_optimizer_state(resumed, tmp_path)
-    assert len(resumed.state_dict()["state"]) == len(list(policy.parameters()))
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path):

@@ -63,19 +63,6 @@ def test_windows_are_those_of_lerobot_as_bytes_and_pcm(root, episodes):
         assert torch.equal(values, expected[key]), key
 
 
-def test_only_the_keys_asked_for_are_read_and_what_is_not_there_is_named(root):
-    dataset = open_stock(root)
-    store = EpisodeStore.from_dataset(dataset, keys=["action"], device="cpu")
-
-    assert set(store.keys) == {"action", "index", "episode_index", "frame_index", "task_index", "timestamp"}
-    with pytest.raises(ValueError, match=r"holds no 'observation.state'"):
-        store.windows([0], {"observation.state": [0]})
-    with pytest.raises(ValueError, match=r"has no 'observation.audio.table'; it has"):
-        EpisodeStore.from_dataset(dataset, keys=["observation.audio.table"])
-    with pytest.raises(IndexError, match="the store has 38"):
-        store.windows([38], {"action": [0]})
-
-
 def test_appended_episodes_are_as_good_as_read_ones(tmp_path):
     features = dataset_features(image_size=16)
     rng = np.random.default_rng(1)
@@ -97,27 +84,6 @@ def test_appended_episodes_are_as_good_as_read_ones(tmp_path):
         ours, theirs = (s.windows([i], DELTAS) for s in (store, expected))
         assert ours.pop("task") == theirs.pop("task")
         assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
-
-
-def test_a_bad_episode_is_refused_and_leaves_the_store_as_it_was(tmp_path):
-    store = EpisodeStore.from_dataset(make_dataset(tmp_path / "noise", (4,), image_size=8), device="cpu")
-    features = dataset_features(image_size=8)
-    good = random_frame(features, np.random.default_rng(0))
-    bad_frames = {
-        "'action' is missing in frame 0": {key: value for key, value in good.items() if key != "action"},
-        "'observation.state' holds NaN": {**good, "observation.state": np.full(7, np.nan, np.float32)},
-        r"'action' has shape \(3,\)": {**good, "action": np.zeros(3, np.float32)},
-        "'observation.images.front' has dtype": {**good, CAMERA: np.zeros((8, 8, 3), np.float32)},
-    }
-
-    for message, frame in bad_frames.items():
-        with pytest.raises(ValueError, match=message):
-            store.append_episode([frame])
-    with pytest.raises(ValueError, match="without frames"):
-        store.append_episode([])
-
-    assert len(store) == 4
-    assert store.n_episodes == 1
 
 
 # On the disk
