@@ -19,10 +19,9 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from lerobot_playbyear.training import EpisodeStore, RunSampler, run_weights
-from lerobot_playbyear.training.acceleration import fuse, prefer_channels_last
 from lerobot_playbyear.training.batches import PolicyWindows, prefetched
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.learner import load_training_state, make_learner
+from lerobot_playbyear.training.learner import fuse, load_training_state, make_learner, prefer_channels_last
 from lerobot_playbyear.training.report import Figures
 
 pytestmark = pytest.mark.usefixtures("one_thread")
