@@ -150,7 +150,7 @@ class Scripted(Expert):
         return self.verdicts.get(self.n)
 
 
-def scene(expert=None, n_steps=40):
+def scene(expert=None, n_steps=20):
     env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=n_steps)
     policy = PlaybyearPolicy.from_pretrained(trained())
     processors = make_pre_post_processors(policy.config, str(trained()))

@@ -52,7 +52,7 @@ def _finished():
 def test_a_policy_acts_as_in_lerobots_rollout():
     env, actor, expert = scene()
     episode = play(env, actor, seed=5, expert=expert)
-    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=40)
+    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=20)
     policy = PlaybyearPolicy.from_pretrained(trained()).eval()
     own = make_pre_post_processors(policy.config, str(trained()))
     vec = make_env(env_cfg)["playbyear"][0]
@@ -173,7 +173,12 @@ def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_pat
         monkeypatch.setattr(sys, "argv", ["lerobot", *map(str, args)])
         function()
 
-    evaluation = ("--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path / 'eval'}")
+    evaluation = (
+        "--env.episode_length=5",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
     run(lerobot_eval.eval_main, f"--policy.path={policy}", *ENV, *evaluation)
     assert (tmp_path / "eval/eval_info.json").exists()
     data = ("--dataset.repo_id=tests/corrections", f"--dataset.root={finished / 'corrections'}", "--num_workers=0")

@@ -51,7 +51,7 @@ class Telling(Scripted):
 
 
 def attempt(expert, seed=5, **options):
-    """An attempt of 40 steps; the steps in which the expert acted, and the episode."""
+    """An attempt of 20 steps; the steps in which the expert acted, and the episode."""
     env, actor, _ = scene(**options)
     episode = play(env, actor, seed=seed, expert=expert)
     env.close()
@@ -102,7 +102,7 @@ def test_the_tasks_script_acts_from_the_first_step_if_it_is_told_to():
 
 
 def test_where_no_gate_is_the_script_shows_what_the_policy_failed_in():
-    env = env_spec(PlaybyearEnvConfig(task="TellApart-v1")).make()
+    env = env_spec(PlaybyearEnvConfig(task="TellApart-v1", image_size=16)).make()
     expert = ScriptedExpertConfig().make(env)
     showing = Showing(expert)
     still = SimpleNamespace(reset=lambda env: None, act=lambda observation: np.zeros(4, np.float32))
