@@ -1,8 +1,10 @@
 """What every command does around its work: answer at once what needs no imports, read its options, say what went wrong."""
 
+import contextlib
 import difflib
 import functools
 import inspect
+import io
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -141,6 +143,7 @@ def run_alone[Result](work: Callable[[Any], Result], parse: Callable[[type], Any
 
 def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
     """The same with LeRobot's parser, once LeRobot knows all plugins."""
+    from draccus.utils import ParsingError
     from lerobot.configs import parser
     from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -148,7 +151,17 @@ def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
         def options(cfg: kind) -> Any:  # type: ignore[valid-type]
             return cfg
 
-        return parser.wrap()(options)()
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(said):
+                return parser.wrap()(options)()
+        except SystemExit as end:
+            if isinstance(end.__context__, ParsingError):  # LeRobot prints it, without its reason, and ends the process
+                said.truncate(0)
+                raise end.__context__ from end.__context__.__cause__
+            raise
+        finally:
+            sys.stderr.write(said.getvalue())
 
     register_third_party_plugins()
     return run_alone(work, parse)
