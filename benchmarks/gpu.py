@@ -96,7 +96,7 @@ def updates(options: list[str], plain: bool = False) -> list[Row]:
     sampler = RunSampler(run_weights(store, windows.n_windows))
 
     def batch() -> dict:
-        return windows.batch(store, sampler.draw(cfg.batch_size))
+        return windows.batch(store, sampler.draw(cfg.batch_size, parts.step))
 
     def update() -> None:
         parts.update(batch(), cfg.optimizer.grad_clip_norm)

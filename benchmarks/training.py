@@ -23,8 +23,8 @@ from torch import nn
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.optimization import computes_bfloat16
-from lerobot_playbyear.training.acceleration import keep_freed_memory
 from lerobot_playbyear.training.command_line import RECIPES
+from lerobot_playbyear.training.learner import keep_freed_memory
 
 REFERENCE_WINDOWS = 4  # per update; its cost per window does not depend on it
 RUNS = 2  # per update

@@ -2,9 +2,9 @@
 
     python benchmarks/windows.py
 
-Pictures that move, of 84 px, sound of 16 kHz, 20 Hz. Three ways to batches of the same windows, in turns: LeRobot's
-(`LeRobotDataset[i]`, collated, in this process), the store returning exactly those tensors, and the store as training uses it:
-bytes and 16-bit sound, and of each key only the frames that the policy looks at. The limit is copying as many bytes.
+Pictures that move, of 84 px, sound of 16 kHz, 20 Hz. Two ways to batches of the same windows, in turns: LeRobot's
+(`LeRobotDataset[i]`, collated, in this process), and the store as training uses it: bytes and 16-bit sound, and of each key
+only the frames that the policy looks at. The limit is copying as many bytes.
 """
 
 import argparse
@@ -62,10 +62,9 @@ def measure_reading(root: Path, turns: int) -> list[Row]:
     n_bytes = sum(value.nbytes for value in batch.values() if isinstance(value, Tensor))
     source, target = np.random.default_rng(0).integers(0, 256, (2, 64 * n_bytes), np.uint8)
 
-    n_batches = {"same": 4, "compact": 100, "copy": 64, "stock": 1}
+    n_batches = {"compact": 100, "copy": 64, "stock": 1}
     works: dict[str, Callable[[], object]] = {
         "stock": drawing(lambda i: default_collate([stock[j] for j in i]), len(stock), n_batches["stock"]),
-        "same": drawing(lambda i: store.windows(i, full, as_lerobot=True), len(stock), n_batches["same"]),
         "compact": drawing(lambda i: store.windows(i, compact), len(stock), n_batches["compact"]),
         "copy": lambda: np.copyto(target, source),
     }
@@ -74,7 +73,6 @@ def measure_reading(root: Path, turns: int) -> list[Row]:
     what, beside = f"dataset windows, {WINDOW} frames, ", ("windows/s", "stock LeRobotDataset", rates["stock"])
     return [
         Row(what + "as training uses them", rates["compact"], *beside, "copying as many bytes", rates["copy"]),
-        Row(what + "LeRobot's very tensors", rates["same"], *beside),
     ]
 
 

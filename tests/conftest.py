@@ -6,8 +6,8 @@ import os
 from pathlib import Path
 
 import pytest
+from support import shared
 from support.commands import Commands, remember_docstrings
-from support.shared import ENV, TINY, once, run_in_process
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -30,43 +30,28 @@ def one_thread():
     torch.set_num_threads(n_threads)
 
 
-@pytest.fixture(scope="session")
-def shared(tmp_path_factory) -> Path:
-    """A folder that all processes of this run of the tests share; see `once`."""
+@pytest.fixture(scope="session", autouse=True)
+def _one_folder_for_all_processes(tmp_path_factory):
     folder = tmp_path_factory.getbasetemp()
-    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+    shared.FOLDER = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
 
 @pytest.fixture(scope="session")
-def noise(shared) -> Path:
+def noise() -> Path:
     """A dataset of noise with sound, 20 Hz and pictures of 16 pixels: episodes of 12, 17 and 9 frames. Copy it to change it."""
     from dataset_factory import make_dataset
 
-    return once(shared, "noise", lambda root: make_dataset(root, image_size=16))
+    return shared.once("noise", lambda root: make_dataset(root, image_size=16))
 
 
 @pytest.fixture(scope="session")
-def recorded(shared) -> Path:
-    """A dataset of two episodes of the expert in `ENV`. Copy it to change it."""
-    from lerobot_playbyear.scripts.commands import record as main
-
-    def record(root: Path) -> None:
-        data = ("--dataset.repo_id=tests/demos", f"--dataset.root={root}", "--dataset.num_episodes=2")
-        assert run_in_process(main, *ENV, *data, "--num_workers=0") is None
-
-    return once(shared, "recorded", record)
+def recorded() -> Path:
+    return shared.recorded()
 
 
 @pytest.fixture(scope="session")
-def trained(recorded, shared) -> Path:
-    """A checkpoint, `pretrained_model`, of the policy `TINY` after two updates on `recorded`: it does nothing well."""
-    from lerobot_playbyear.scripts.commands import train as main
-
-    def train(folder: Path) -> None:
-        data = ("--dataset.repo_id=tests/demos", f"--dataset.root={recorded}")
-        assert run_in_process(main, *TINY, *data, "--steps=2", f"--output_dir={folder}") is None
-
-    return once(shared, "trained", train) / "checkpoints/000002/pretrained_model"
+def trained() -> Path:
+    return shared.trained()
 
 
 @pytest.fixture(scope="session")

@@ -1,41 +1,35 @@
-"""A small policy, its demonstrations and the command line of `playbyear-dagger`, for tests of HG-DAgger."""
+"""An expert of a few steps and the command line of `playbyear-dagger`, for tests of HG-DAgger."""
 
 import json
 import sys
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset
+from lerobot.policies import make_pre_post_processors
+from safetensors.torch import load_file
+from support.shared import ENV, once, recorded, trained
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict, run_dagger
 from lerobot_playbyear.dagger.config import with_saved_options
-from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
+from lerobot_playbyear.dagger.run_folder import RunFolder
+from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.policy_actor import PolicyActor
+from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
-from lerobot_playbyear.training.train import train
 
-ENV = ("--env.type=playbyear", "--env.task=OccludedGrasp-v1", "--env.image_size=16")
 QUICK = ("--expert.type=test_quick", "--env.episode_length=12")
 """Attempts of a few steps, of which every third is not worth keeping."""
 
 SMALL = ("--updates_per_episode=2", "--warmup_episodes=1", "--batch_size=4", "--eval_every=0")
-_TINY_POLICY = (
-    "--policy.type=playbyear",
-    "--policy.device=cpu",
-    "--policy.push_to_hub=false",
-    "--policy.image_size=16",
-    "--policy.vision_width=4",
-    "--policy.audio_window_s=0.9",
-    "--policy.n_memory_steps=2",
-    "--policy.n_supervised_steps=4",
-    "--policy.hidden_size=32",
-)
+FINISHED = ("--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1", "--eval.batch_size=1")
+"""A run of three kept attempts with an evaluation before, after the second round, and at the end."""
 
 
 @ExpertConfig.register_subclass("test_quick")
@@ -69,28 +63,17 @@ class Quick(Expert):
         return Verdict.SUCCESS if self.is_success else Verdict.FAILURE
 
 
-@cache
-def base_folder() -> Path:
-    """A folder with `demos`, two episodes of the expert, and `policy`, a checkpoint after two updates: it does nothing well."""
-    folder = Path(mkdtemp(prefix="dagger_"))
-    demos = RecordDatasetConfig("tests/demos", str(folder / "demos"), num_episodes=2)
-    record(RecordConfig(PlaybyearEnvConfig(image_size=16), demos, num_workers=0))
-    data = ("--dataset.repo_id=tests/demos", f"--dataset.root={folder / 'demos'}", "--num_workers=0")
-    run = ("--steps=2", "--batch_size=2", f"--output_dir={folder / 'train'}")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["train", *_TINY_POLICY, *data, *run])
-        parser.wrap()(train)()
-    (folder / "policy").symlink_to(folder / "train/checkpoints/last/pretrained_model")
-    return folder
+def finished() -> Path:
+    """The folder of a run that ended: `out` and `corrections`. Copy it to change it."""
+    return once("finished", lambda folder: dagger(folder, *QUICK, *FINISHED))
 
 
 def arguments(folder: Path, *options: str, env: tuple[str, ...] = ENV) -> list[str]:
     """The command line of a small run in `folder`; later options win."""
-    base = base_folder()
     given = [
-        f"--policy.path={base / 'policy'}",
+        f"--policy.path={trained()}",
         "--demos.repo_id=tests/demos",
-        f"--demos.root={base / 'demos'}",
+        f"--demos.root={recorded()}",
         "--interventions.repo_id=tests/corrections",
         f"--interventions.root={folder / 'corrections'}",
         f"--output_dir={folder / 'out'}",
@@ -139,3 +122,88 @@ def seeds(folder: Path) -> list[int]:
     dataset = corrections(folder)
     values = column(dataset, "seed").ravel()
     return [int(values[row["dataset_from_index"]]) for row in dataset.meta.episodes]
+
+
+# Attempts without a run
+
+
+class Scripted(Expert):
+    """Takes over in chosen steps, asks the task's expert what to do, and remembers it."""
+
+    def __init__(self, steps=(), verdicts=None):
+        self.steps, self.verdicts = steps, verdicts or {}
+
+    def reset(self, env):
+        self.n, self.actions = -1, {}
+        self.script = env.unwrapped.scripted_expert()
+
+    def wants_control(self, observation, policy_action):
+        self.n += 1
+        self.wanted = self.script.act()
+        return self.n in self.steps
+
+    def act(self):
+        self.actions[self.n] = self.wanted
+        return self.wanted
+
+    def verdict(self):
+        return self.verdicts.get(self.n)
+
+
+def scene(expert=None, n_steps=20):
+    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=n_steps)
+    policy = PlaybyearPolicy.from_pretrained(trained())
+    processors = make_pre_post_processors(policy.config, str(trained()))
+    return env_spec(env_cfg).make(), PolicyActor(policy, env_cfg, *processors), expert or Scripted()
+
+
+# Runs that are stopped
+
+
+def weights(folder):
+    return load_file(folder / "out/checkpoints/last/pretrained_model/model.safetensors")
+
+
+def figures(folder):
+    """All figures but times, and where they stand; a recovered attempt has no times anyway."""
+    lines = [{key: value for key, value in line.items() if not key.endswith("_s")} for line in metrics(folder)]
+    return [{key: value for key, value in line.items() if key != "recovered"} for line in lines]
+
+
+def assert_ended_alike(folder, expected):
+    assert seeds(folder) == seeds(expected)
+    for key in ("action", "intervention", "observation.state", "observation.audio.gripper"):
+        np.testing.assert_array_equal(column(corrections(folder), key), column(corrections(expected), key))
+    ours, theirs = weights(folder), weights(expected)
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+    assert figures(folder) == figures(expected)
+    assert state(folder) == state(expected)
+    assert {path.name for path in (folder / "out").iterdir()} == {path.name for path in (expected / "out").iterdir()}
+    names = [{path.name for path in (f / "out/checkpoints").iterdir()} for f in (folder, expected)]
+    assert names[0] == names[1]
+
+
+class PowerCut(BaseException):
+    """Stops the run at a chosen moment, so that no clean-up of its own runs."""
+
+
+def cut_power(monkeypatch, owner, name, after):
+    """Lets `owner.name` work `after` times; the next call stops the run before it does anything."""
+    calls, real = iter(range(10**6)), getattr(owner, name)
+
+    def wrapped(*args, **kwargs):
+        if next(calls) == after:
+            raise PowerCut
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(owner, name, wrapped)
+
+
+def assert_a_power_cut_changes_nothing(folder, expected, run, after, owner=RunFolder, name="commit"):
+    """A run that is stopped there, and goes on, ends as one that was not."""
+    with pytest.MonkeyPatch.context() as patch:
+        cut_power(patch, owner, name, after)
+        with pytest.raises(PowerCut):
+            dagger(folder, *run)
+    command("--resume=true", f"--output_dir={folder / 'out'}")
+    assert_ended_alike(folder, expected)

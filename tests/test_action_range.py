@@ -17,7 +17,6 @@ from lerobot.policies import make_pre_post_processors
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training import train as loop
-from lerobot_playbyear.training.command_line import preset_options
 from lerobot_playbyear.training.learner import Learner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -131,48 +130,12 @@ def test_an_action_outside_the_demonstrations_is_learned_only_within_the_range(a
     torch.testing.assert_close(action, torch.tensor([learned, 0.5]), atol=0.03, rtol=0)
 
 
-def n_updates_until_it_closes(action_range: float) -> int:
-    """After a hand was open in all of many updates, and is to close from then on."""
-    torch.manual_seed(0)
-    config = small_config(action_range=action_range)
-    policy, (before, _) = PlaybyearPolicy(config), processors(config)
-    optimizer = torch.optim.SGD(policy.parameters(), 0.3)  # as far as the slope goes: Adam would make it steep again
-    n_updates = 0
-    for wanted in [-1.0] * 400 + [1.0] * 100:
-        action = torch.tensor([1.0, wanted]).expand(8, 1, 2)
-        batch = before({"observation.state": torch.randn(8, 10, 3), "action": action})
-        n_updates += wanted > 0
-        if n_updates and policy.predict_run(batch)[:, -1, 1].mean() > 0:
-            break
-        optimizer.zero_grad()
-        policy.forward(batch)[0].backward()
-        optimizer.step()
-    return n_updates
-
-
-def test_a_hand_that_was_always_open_learns_to_close_where_the_range_is_wider_than_its_actions():
-    """Towards the ends of `tanh` nothing is learned any more, and -1 is one."""
-    assert 2 * n_updates_until_it_closes(
-        float(preset_options("cpu")["policy.action_range"])
-    ) < n_updates_until_it_closes(1.0)
-
-
-def test_a_range_of_one_is_the_papers_tanh():
-    torch.manual_seed(0)
-    config = small_config()
-    policy = PlaybyearPolicy(config)
-    encodings = torch.randn(3, 10, config.embedding_size)
-    head = policy.model.memory_head
-    assert torch.equal(head(encodings)[:, 0], torch.tanh(head.head(head.lstm(encodings)[0][:, -1])))
-
-
 # What is said
 
 
 def told(caplog, config, actions, stats=None, names=None):
     """What a policy with these options says of actions; None if it says nothing."""
-    own = config if isinstance(config, PlaybyearConfig) else small_config()
-    preprocessor = make_pre_post_processors(own, dataset_stats=stats)[0] if stats else processors(own)[0]
+    preprocessor = make_pre_post_processors(config, dataset_stats=stats)[0] if stats else processors(config)[0]
     accelerator = SimpleNamespace(unwrap_model=lambda policy: policy)
     caplog.clear()
     Learner(accelerator, SimpleNamespace(config=config), None, None, preprocessor, None, names).warn_of_reach(
@@ -190,7 +153,6 @@ def test_shares_are_told_by_dimension_and_what_would_reach_them(caplog):
     assert "--policy.action_range=2.2" in text
     assert told(caplog, small_config(), actions[:2]) is None
     assert told(caplog, small_config(action_range=2.2), actions) is None
-    assert told(caplog, SimpleNamespace(), actions) is None  # other policies reach everything
 
 
 def test_what_never_moved_in_the_demonstrations_is_told_apart(caplog):
@@ -204,23 +166,6 @@ def test_what_never_moved_in_the_demonstrations_is_told_apart(caplog):
     assert "in 100.0 % of 2 frames" in text
     assert "--policy.action_range=88" in text
     assert "hardly moves" not in text
-
-
-def test_a_single_action_is_told_like_several(caplog):
-    """LeRobot keeps a column of shape (1,) as plain numbers."""
-    stats = {"action": {"min": torch.tensor([0.0]), "max": torch.tensor([2.0])}}
-    assert "'action[0]' in 25.0 % of 4 frames" in told(caplog, small_config(), [0.0, 1.0, 2.0, 2.5], stats)
-    assert told(caplog, small_config(), [0.0, 1.0], stats) is None
-
-
-def test_training_says_it_where_a_standard_deviation_is_the_end(base, tmp_path, capfd):
-    """With statistics of mean and standard deviation tanh would end at one of it."""
-    data = ("--dataset.repo_id=tests/reach", f"--dataset.root={base / 'demos'}")
-    mapping = '--policy.normalization_mapping={"STATE": "MEAN_STD", "ACTION": "MEAN_STD"}'
-    run_training("--policy.type=playbyear", mapping, *data, f"--output_dir={tmp_path / 'out'}")
-    (message,) = warnings(capfd)
-    assert "the dataset 'tests/reach'" in message
-    assert all(f"'{name}' in " in message for name in FEATURES["action"]["names"])
 
 
 def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wider_policy_takes_them(

@@ -78,18 +78,6 @@ def test_a_checkpoint_keeps_it_all_and_one_with_heads_acts_without_them(tmp_path
         assert torch.equal(step_through(other, [episode]), step_through(policy, [episode]))
 
 
-def test_in_bfloat16_it_learns_the_same():
-    """The preset `cpu` learns in it where the processor can; energies and targets stay exact."""
-    losses = []
-    for enabled in (False, True):
-        policy = make_policy(**HEADS, **INPUTS, use_vision=False)
-        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
-            losses.append(policy.forward(batch_of(policy))[1])
-    for name, value in losses[0].items():
-        assert losses[1][name].dtype == torch.float32
-        torch.testing.assert_close(losses[1][name], value, rtol=0.05, atol=0.01)
-
-
 # What the network reads besides
 
 
@@ -112,33 +100,6 @@ def test_displacements_are_in_normalised_units_times_their_gain():
     state = batch[STATE][:, -policy.config.memory_steps :]
     displacement = read[0][..., policy.config.embedding_size :]
     torch.testing.assert_close(displacement, 10 * (state - state[:, -1:]), atol=1e-4, rtol=1e-4)
-
-
-def test_a_reader_reads_the_displacement_of_the_frame_that_it_chooses():
-    policy = make_policy(memory_displacement_gain=10.0, low_dimensional_gain=4.0, memory_readers=1).eval()
-    head, n_fused, n = policy.model.memory_head, policy.config.embedding_size, policy.config.memory_steps
-    frames = torch.randn(2, n + 1, head.lstm.input_size)
-    frames[..., 0], frames[0, 2, 0], frames[1, 1, 0] = 0.0, 1.0, 1.0  # the frames with a touch
-    lstm_alone = head.recall(frames)  # a new reader reads nothing
-    with torch.no_grad():
-        head.recollection.score.weight.zero_()[0, 0] = 30.0
-        torch.nn.init.eye_(head.recollection.read.weight)
-    read = head.recall(frames) - lstm_alone  # (2, 2, D)
-    felt = 2.5 * frames[..., n_fused:]
-    touched = torch.stack([felt[0, 2], felt[1, 1]])
-    for window in range(2):
-        displacement = touched - felt[:, n - 1 + window]
-        torch.testing.assert_close(read[:, window, : felt.shape[2]], displacement, atol=1e-3, rtol=1e-4)
-
-
-def test_where_nothing_is_felt_there_is_nothing_to_compare():
-    config = make_config(**SMALL, memory_displacement_gain=10.0, memory_readers=2)
-    del config.input_features[STATE]
-    policy = PlaybyearPolicy(config).eval()
-    assert policy.model.memory_head.lstm.input_size == config.embedding_size
-    episode = make_episode(3, config, N_FRAMES)
-    last = policy.predict_run(run_ending_at(episode, N_FRAMES - 1, config))[:, -1]
-    torch.testing.assert_close(step_through(policy, [episode])[:, -1], last, atol=1e-5, rtol=0)
 
 
 def test_an_envelope_keeps_how_loud_it_was():
@@ -185,16 +146,6 @@ def test_heads_are_used_neither_for_a_held_out_loss_nor_to_act():
     with torch.no_grad():
         assert policy.forward(batch_of(policy))[1] == {}
         step_through(policy, [make_episode(3, policy.config, 3)])
-
-
-def test_the_network_begins_as_without_heads():
-    plain, with_heads = (
-        PlaybyearPolicy((torch.manual_seed(4), make_config(**(SMALL | options)))[1]) for options in ({}, HEADS)
-    )
-    assert plain.model.auxiliary is None
-    weights = with_heads.model.state_dict()
-    assert all(torch.equal(weights[name], value) for name, value in plain.model.state_dict().items())
-    assert any(name.startswith("auxiliary") for name in weights)
 
 
 def test_sample_weights_get_every_part_of_the_loss_per_item():
@@ -274,9 +225,3 @@ def test_the_balance_is_who_hears_an_onset_louder_and_needs_two_ears():
     assert for_left < 0.02 < 3 < for_right
     assert errors([0.0, math.log(100.0)]) == pytest.approx([for_right, for_left], abs=0.05)
     assert make_policy(auxiliary_balance=1.0).model.auxiliary is None
-
-
-def test_a_deaf_policy_learns_as_if_nobody_had_asked_for_what_needs_sound():
-    deaf, asked = make_policy(use_audio=False), make_policy(use_audio=False, **HEADS)
-    assert asked.model.auxiliary is None
-    torch.testing.assert_close(asked.state_dict(), deaf.state_dict(), rtol=0, atol=0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gym_playbyear.environment import TaskEnv
-from gym_playbyear.registry import OptionError, make_definition
+from gym_playbyear.registry import make_definition
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.tasks.arena import TABLE_TOP, loose_box
 from gym_playbyear.terminations import Success
@@ -133,52 +133,6 @@ def test_no_episode_depends_on_the_one_before():
         np.testing.assert_array_equal(worn.data.qpos, fresh.data.qpos)
         scenes.add(float(worn.model.body("wall").quat[0]))
     assert len(scenes) == 2
-
-
-def test_forces_of_the_hands_parts_are_known_of_loose_things_alone():
-    env = TaskEnv(task(block("a"), Prop("wall", WALL, "table")), sound="none")
-    env.reset_physics(seed=0)
-    assert env.hand_forces("a").shape[1:] == (len(env.definition.arm.touching), 3)
-    with pytest.raises(ValueError, match=r"loose things with a material alone \(a\), 'wall' is none"):
-        env.hand_forces("wall")
-
-
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
-        (
-            "OccludedGrasp-v1",
-            {"cube_positon": (0, 0.1)},
-            "cube_positon=.*the task's options of reset are cube_position, cube_",
-        ),
-        ("OccludedGrasp-v1", {"cube_position": (0, 0.9)}, "cube_position=.*on the table, nearer than 0.4 m"),
-        ("OccludedPickPlace-v1", {"bin_position": 0.1}, "bin_position=.*give x and y"),
-        ("TellApart-v1", {"pouch_position": (np.nan, 0)}, "pouch_position"),
-        ("KeyBag-Easy-v1", {"botom": 0.1}, "botom=0.1 .*bottom, contents_position"),
-    ],
-)
-def test_a_misspelt_option_of_reset_and_an_impossible_place_are_refused(name, options, message):
-    env = TaskEnv(name, sound="none")
-    with pytest.raises(OptionError, match=message):
-        env.reset_physics(seed=0, options=options)
-
-
-def test_a_material_of_what_is_not_there_is_refused():
-    def place(env, options) -> dict:
-        env.materials["aa"] = "glass"
-        return put_on_table(env, options)
-
-    env = TaskEnv(replace(task(block("a")), initialize_episode=place), image_size=8)
-    with pytest.raises(ValueError, match=r"materials names \['aa'\], .*there are a, hand, left_finger, link5"):
-        env.reset_physics(seed=0)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"), [({"horizon": 0}, "horizon=0 .*at least 1"), ({"task": lambda: 3}, "an int|a int")]
-)
-def test_what_is_no_task_and_no_time_is_refused(options, message):
-    with pytest.raises(OptionError, match=message):
-        TaskEnv(**{"task": task(block("a")), "sound": "none", **options})
 
 
 @pytest.mark.parametrize("n_environments", [6, pytest.param(40, marks=pytest.mark.slow)])

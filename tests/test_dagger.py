@@ -1,5 +1,6 @@
 """HG-DAgger: attempts, what is recorded of them, rounds, checkpoints that LeRobot's commands take."""
 
+import shutil
 import sys
 from dataclasses import dataclass
 
@@ -7,15 +8,16 @@ import numpy as np
 import pytest
 import torch
 from dagger_factory import (
-    ENV,
     QUICK,
+    Scripted,
     arguments,
-    base_folder,
     column,
     command,
     corrections,
     dagger,
+    finished,
     metrics,
+    scene,
     seeds,
     state,
 )
@@ -24,6 +26,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot.scripts.lerobot_eval import rollout
 from safetensors.torch import load_file
+from support.shared import ENV, trained
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
@@ -31,63 +34,27 @@ from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.methods import Method
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
-from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
-from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory):
-    """A run of three kept attempts with an evaluation before, after the second round, and at the end."""
-    folder = tmp_path_factory.mktemp("dagger")
-    seed = "--episode_seed=10007"  # of the next seed, 10011, the task's own expert makes something, and few of those before
-    dagger(folder, *QUICK, seed, "--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1")
-    return folder
+@pytest.fixture(scope="module", name="finished")
+def _finished():
+    return finished()
 
 
 # Attempts
 
 
-class Scripted(Expert):
-    """Takes over in chosen steps, asks the task's expert what to do, and remembers it."""
-
-    def __init__(self, steps=(), verdicts=None):
-        self.steps, self.verdicts = steps, verdicts or {}
-
-    def reset(self, env):
-        self.n, self.actions = -1, {}
-        self.script = env.unwrapped.scripted_expert()
-
-    def wants_control(self, observation, policy_action):
-        self.n += 1
-        self.wanted = self.script.act()
-        return self.n in self.steps
-
-    def act(self):
-        self.actions[self.n] = self.wanted
-        return self.wanted
-
-    def verdict(self):
-        return self.verdicts.get(self.n)
-
-
-def scene(expert=None, n_steps=40):
-    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=n_steps)
-    policy = PlaybyearPolicy.from_pretrained(base_folder() / "policy")
-    processors = make_pre_post_processors(policy.config, str(base_folder() / "policy"))
-    return env_spec(env_cfg).make(), PolicyActor(policy, env_cfg, *processors), expert or Scripted()
-
-
 def test_a_policy_acts_as_in_lerobots_rollout():
     env, actor, expert = scene()
     episode = play(env, actor, seed=5, expert=expert)
-    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=40)
-    policy = PlaybyearPolicy.from_pretrained(base_folder() / "policy").eval()
-    own = make_pre_post_processors(policy.config, str(base_folder() / "policy"))
+    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=20)
+    policy = PlaybyearPolicy.from_pretrained(trained()).eval()
+    own = make_pre_post_processors(policy.config, str(trained()))
     vec = make_env(env_cfg)["playbyear"][0]
     result = rollout(vec, policy, *make_env_pre_post_processors(env_cfg, policy.config), *own, seeds=[5])
     vec.close()
@@ -97,7 +64,7 @@ def test_a_policy_acts_as_in_lerobots_rollout():
     assert not episode.interventions.any()
 
 
-def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted():
+def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the_policy_remembers_it_all():
     expert = Scripted(steps=range(4, 9))
     env, actor, _ = scene()
     episode = play(env, actor, seed=5, expert=expert)
@@ -108,15 +75,8 @@ def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted():
     for t, action in enumerate(episode.actions):
         np.testing.assert_array_equal(observation["agent_pos"], episode.observations[t]["agent_pos"])
         observation, _, terminated, truncated, _ = env.step(action)
-    env.close()
     assert terminated or truncated
     assert len(episode) == t + 1
-
-
-def test_the_policy_remembers_the_steps_in_which_the_expert_acted():
-    """Its action after a correction is that of a policy that saw the corrected steps."""
-    env, actor, _ = scene()
-    episode = play(env, actor, seed=5, expert=Scripted(steps=range(4, 9)))
     actor.reset(env)
     seen = [actor.act(observation) for observation in episode.observations[:-1]]
     env.close()
@@ -162,6 +122,17 @@ def test_a_run_collects_learns_saves_and_evaluates(finished):
         assert line["total_s"] == pytest.approx(sum(line[part] for part in parts), rel=0.2)
     assert {path.name for path in (finished / "out/checkpoints").iterdir()} == {"000002", "000004", "last", "best"}
     assert {(finished / "out/checkpoints" / name).resolve().name for name in ("last", "best")} == {"000004"}
+    check_normalisation_is_kept(finished / "out/checkpoints/last/pretrained_model")
+
+
+def test_figures_of_the_field_stand_in_every_line(finished):
+    attempts, last = metrics(finished, "attempt"), metrics(finished, "round")[-1]
+    cost = {"n_expert_steps": 3, "n_takeovers": 1, "takeover_steps": [3], "n_switches": 2, "person_seconds": 0.4}
+    assert all({key: line[key] for key in cost} == cost for line in attempts)
+    n = len(attempts)
+    assert (last["expert_steps"], last["takeovers"], last["switches"]) == (3 * n, n, 2 * n)
+    assert last["autonomy"] == pytest.approx(5 / 8)
+    assert [line["expert_steps"] for line in metrics(finished, "eval")][::2] == [0, 3 * n]
 
 
 def test_the_dataset_is_a_plain_one_of_successes_with_corrections(finished):
@@ -180,7 +151,7 @@ def test_the_dataset_is_a_plain_one_of_successes_with_corrections(finished):
 
 def check_normalisation_is_kept(tuned):
     """Of actions, low-dimensional observations and sound. Batch norm's averages are the network's, and follow its weights."""
-    base = base_folder() / "policy"
+    base = trained()
     files = sorted(path.name for path in base.glob("policy_*processor*.safetensors"))
     assert files
     for name in files:
@@ -195,10 +166,6 @@ def check_normalisation_is_kept(tuned):
     assert any(key.endswith("weight") for key in changed)
 
 
-def test_normalisation_stays_the_checkpoints_for_sound_too(finished):
-    check_normalisation_is_kept(finished / "out/checkpoints/last/pretrained_model")
-
-
 def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_path, monkeypatch):
     policy = finished / "out/checkpoints/last/pretrained_model"
 
@@ -206,7 +173,12 @@ def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_pat
         monkeypatch.setattr(sys, "argv", ["lerobot", *map(str, args)])
         function()
 
-    evaluation = ("--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path / 'eval'}")
+    evaluation = (
+        "--env.episode_length=5",
+        "--eval.n_episodes=1",
+        "--eval.batch_size=1",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
     run(lerobot_eval.eval_main, f"--policy.path={policy}", *ENV, *evaluation)
     assert (tmp_path / "eval/eval_info.json").exists()
     data = ("--dataset.repo_id=tests/corrections", f"--dataset.root={finished / 'corrections'}", "--num_workers=0")
@@ -225,25 +197,15 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
     assert all(rates[1:] == sorted(rates[1:], reverse=True) and rates[-1] < 0.05 for rates in rounds[1:])
     assert [rates[0] for rates in rounds] == pytest.approx([0.25, 0.82, 0.64, 0.46, 0.28, 0.1])
     assert rounds[5][0] < last[0]
+    recorded = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), learning_rate=1.0, warmup_updates=0)
+    recorded.episodes, recorded.updates = 0, 50  # from recorded corrections it falls once
+    assert [recorded.rate(step, step % 10, 10) for step in (0, 25, 49)] == pytest.approx([1.0, 0.5, 0.001], abs=1e-3)
     appended = [cfg.rate(10 * done, 0, 10, n_before=5) for done in range(3)]  # two rounds
     assert appended == pytest.approx([0.25, 0.55, 0.1])
     cfg.anneal = False
     assert cfg.rate(17, 7, 10) == 1
-
-
-def test_from_recorded_corrections_alone_the_rate_falls_once():
-    cfg = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), learning_rate=1.0, warmup_updates=0)
-    cfg.episodes, cfg.updates, cfg.updates_per_episode = 0, 50, 10
-    rates = [cfg.rate(step, step % 10, 10) for step in range(50)]
-    assert rates == sorted(rates, reverse=True)
-    assert (rates[0], rates[25], rates[-1]) == pytest.approx((1.0, 0.5, 0.001), abs=1e-3)
-
-
-def test_without_a_rate_the_policy_says_it():
-    cfg = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), policy=PlaybyearConfig(optimizer_lr=2e-3))
-    assert cfg.training().optimizer.lr == cfg.largest_rate == 2e-3
-    cfg.learning_rate = 1e-4
-    assert cfg.training().optimizer.lr == cfg.largest_rate == 1e-4
+    cfg.policy, cfg.learning_rate = PlaybyearConfig(optimizer_lr=2e-3), None
+    assert cfg.training().optimizer.lr == cfg.largest_rate == 2e-3  # without a rate the policy says it
 
 
 # Who is kept
@@ -287,36 +249,17 @@ class Verdicts(Expert):
         return Verdict.SUCCESS if self._is("successes") else Verdict.FAILURE
 
 
-def test_only_successes_with_an_intervention_are_kept_and_the_others_counted(tmp_path):
-    choices = ("--expert.type=test_verdicts", "--expert.successes=11+12+14+15", "--expert.acts=10+12+13+14+15")
-    options = ("--expert.discarded=14", "--episode_seed=10", "--episodes=2")
-    dagger(tmp_path, *choices, *options)
+def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_and_none_of_an_evaluation(tmp_path):
+    choices = ("--expert.type=test_verdicts", "--expert.successes=11+12+14+17", "--expert.acts=10+12+13+14+17")
+    evaluation = ("--seed=15", "--eval.n_episodes=2", "--eval.batch_size=2")
+    dagger(tmp_path, *choices, "--expert.discarded=14", "--episode_seed=10", "--episodes=2", *evaluation)
 
-    assert seeds(tmp_path) == [12, 15]
+    assert seeds(tmp_path) == [12, 17]
     counts = {key: state(tmp_path)[key] for key in ("attempts", "kept", "failed", "unneeded", "discarded")}
     assert counts == {"attempts": 6, "kept": 2, "failed": 2, "unneeded": 1, "discarded": 1}
-    assert [line["outcome"] for line in metrics(tmp_path, "attempt")] == [
-        "failed",
-        "unneeded",
-        "kept",
-        "failed",
-        "discarded",
-        "kept",
-    ]
-
-
-def test_seeds_are_consecutive_and_none_of_the_evaluations(tmp_path):
-    choices = ("--expert.type=test_verdicts", "--expert.successes=8+13", "--expert.acts=8+13")
-    dagger(
-        tmp_path,
-        *choices,
-        "--episode_seed=8",
-        "--seed=10",
-        "--eval.n_episodes=3",
-        "--eval.batch_size=3",
-        "--episodes=2",
-    )
-    assert [line["seed"] for line in metrics(tmp_path, "attempt")] == [8, 9, 13]
+    outcomes = ["failed", "unneeded", "kept", "failed", "discarded", "kept"]
+    told = [(line["seed"], line["outcome"]) for line in metrics(tmp_path, "attempt")]
+    assert told == list(zip([10, 11, 12, 13, 14, 17], outcomes, strict=True))
 
 
 def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
@@ -327,23 +270,15 @@ def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
     assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
 
 
-def test_attempts_of_which_none_can_be_kept_are_told_as_what_they_were(tmp_path, capfd):
-    choices = ("--expert.type=test_verdicts", "--expert.successes=10+11", "--expert.acts=12")
-    dagger(tmp_path, *choices, "--episode_seed=10", "--episodes=5", "--max_attempts=3")
-    printed = "".join(capfd.readouterr())
-    assert "None of 3 attempts in a row could be kept: 2 needed no help, 1 failed, and 0 were thrown away." in printed
-    assert "No update was made: no attempt was kept.\nGo on:" in printed
-
-
 def test_an_expert_that_rescues_nothing_is_an_error(tmp_path):
     with pytest.raises(PlaybyearError, match="3 of 3 attempts in a row failed in spite of the expert"):
         dagger(tmp_path, "--expert.type=test_verdicts", "--max_attempts=3")
 
 
 def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
-    before = seeds(finished)
-    dagger(finished, "--episodes=4", "--env.episode_length=200", f"--output_dir={tmp_path / 'out'}")
-    after = seeds(finished)
+    shutil.copytree(finished / "corrections", tmp_path / "corrections")
+    dagger(tmp_path, *QUICK, "--episodes=4")
+    before, after = seeds(finished), seeds(tmp_path)
     assert after[:3] == before
     assert len(after) == 4
     assert after[3] > max(before)

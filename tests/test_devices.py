@@ -4,7 +4,6 @@ What needs a GPU is skipped where there is none.
 """
 
 import json
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -15,27 +14,22 @@ import torch
 import yaml
 from accelerate.state import AcceleratorState
 from dagger_factory import QUICK, command, dagger
-from dataset_factory import make_dataset
 from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
-from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_train
-from lerobot.utils.import_utils import register_third_party_plugins
 from mps_operators import COMPOSITES, IN_PLACE_OF_OTHERS, KERNELS
-from safetensors import safe_open
 from safetensors.torch import load_file
 from support.policy import (
     Waits,
-    batch_of,
     make_config,
     make_episode,
-    make_policy,
     move_to_card,
     on_card,
     run_ending_at,
     without_cudnn,
 )
+from support.shared import TINY, run_in_process
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -44,7 +38,6 @@ from lerobot_playbyear.policy.image_augmentation import Augmentation, sample
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy, RecentFrames
 from lerobot_playbyear.policy.optimization import training_dtype
 from lerobot_playbyear.training import train as loop
-from lerobot_playbyear.training.learner import make_accelerator
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -53,22 +46,8 @@ both_trainers = pytest.mark.parametrize(
     "script", [train, lerobot_train.train], ids=["playbyear-train", "lerobot-train"]
 )
 
-TINY = (
-    "--policy.type=playbyear",
-    "--policy.push_to_hub=false",
-    "--policy.image_size=16",
-    "--policy.vision_width=4",
-    "--policy.audio_window_s=0.9",
-    "--policy.n_memory_steps=2",
-    "--policy.n_supervised_steps=2",
-    "--policy.hidden_size=32",
-    "--policy.audio_noise_db=0",
-    "--num_workers=0",
-    "--batch_size=2",
-    "--log_freq=1",
-    "--seed=3",
-)
 USUAL = {"audio_noise_db": 0.0, "low_dimensional_noise": 0.03, "n_supervised_steps": 3}
+NOISY = (*TINY, "--policy.audio_noise_db=0", "--log_freq=1", "--seed=3")
 EVERYTHING = USUAL | {
     **{"auxiliary_onset": 0.1, "auxiliary_way": 0.1, "audio_envelope_gain": 0.3, "audio_colour_db": 3.0},
     **{"memory_displacement_gain": 10.0, "memory_readers": 2, "low_dimensional_offset": 0.1},
@@ -83,21 +62,6 @@ def precision_of_its_own():
     AcceleratorState._reset_state(True)
     yield
     AcceleratorState._reset_state(True)
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    register_third_party_plugins()
-    root = tmp_path_factory.mktemp("data") / "noise"
-    make_dataset(root, (12, 17), image_size=16)
-    return root
-
-
-def run(script, *arguments):
-    """A training script in this process, as the command line would."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["train", *map(str, arguments)])
-        script()
 
 
 # Number formats
@@ -130,11 +94,6 @@ def test_a_format_that_a_device_lacks_becomes_float32_with_a_word(caplog, device
     assert f"'{device}' cannot train in {asked}" in caplog.text
 
 
-@pytest.mark.parametrize(("options", "expected"), [({}, "no"), ({"dtype": "bfloat16"}, "bf16")])
-def test_the_trainers_of_this_package_take_the_format(options, expected):
-    assert make_accelerator(make_config(**options)).mixed_precision == expected
-
-
 def test_a_file_keeps_what_was_asked_for_and_not_what_one_machine_made_of_it(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": True}, raising=False)
     for options in ({"use_amp": True}, {"dtype": "auto"}, {"dtype": "float16"}):
@@ -149,16 +108,16 @@ def test_a_file_keeps_what_was_asked_for_and_not_what_one_machine_made_of_it(tmp
 
 
 @both_trainers
-def test_both_trainers_compute_in_it_and_keep_their_weights_in_float32(script, root, tmp_path):
+def test_both_trainers_compute_in_it_and_keep_their_weights_in_float32(script, noise, tmp_path):
     computed = set()
 
     def note(module, inputs, output):
         if isinstance(module, nn.Linear):
             computed.add(output.dtype)
 
-    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={root}", f"--output_dir={tmp_path / 'out'}")
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}", f"--output_dir={tmp_path / 'out'}")
     hook = nn.modules.module.register_module_forward_hook(note)
-    run(script, *TINY, *data, "--policy.device=cpu", "--policy.use_amp=true", "--steps=1")
+    run_in_process(script, *NOISY, *data, "--policy.device=cpu", "--policy.use_amp=true", "--steps=1")
     hook.remove()
     assert computed == {torch.bfloat16}
     weights = load_file(tmp_path / "out/checkpoints/last" / MODEL).values()
@@ -233,75 +192,13 @@ def flatten(lstm):
         weight.data = part.view_as(weight)
 
 
-@pytest.fixture
-def one_buffer(monkeypatch):
+def test_a_training_saves_its_checkpoints_and_is_resumed(noise, tmp_path, monkeypatch):
+    data = ("--policy.device=cpu", "--dataset.repo_id=tests/noise", f"--dataset.root={noise}")
+    run_in_process(train, *NOISY, *data, "--steps=2", f"--output_dir={tmp_path / 'plain'}")
     monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
-
-
-def storages(policy):
-    return {weight.untyped_storage().data_ptr() for weight in policy.model.memory_head.lstm.parameters()}
-
-
-def test_a_policy_whose_lstm_lies_in_one_buffer_is_saved_as_any_other(tmp_path, one_buffer):
-    policy = make_policy()
-    policy.to("cpu")
-    assert len(storages(policy)) == 1
-
-    policy.save_pretrained(tmp_path)
-
-    with safe_open(tmp_path / "model.safetensors", "pt") as file:
-        assert set(file.keys()) == policy.state_dict().keys()
-        for name, value in policy.state_dict().items():
-            assert torch.equal(file.get_tensor(name), value)
-    size = sum(value.numel() * value.element_size() for value in policy.state_dict().values())
-    assert (tmp_path / "model.safetensors").stat().st_size < size + 2**15  # no weight drags the whole buffer along
-
-
-def test_a_checkpoint_is_read_into_a_policy_whose_lstm_lies_in_one_buffer(tmp_path, monkeypatch):
-    policy = make_policy()
-    policy.save_pretrained(tmp_path)
-    monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
-
-    again = PlaybyearPolicy.from_pretrained(tmp_path)
-
-    assert len(storages(again)) == 1
-    for name, value in policy.state_dict().items():
-        assert torch.equal(again.state_dict()[name], value)
-    with torch.no_grad():
-        batch = batch_of(policy)
-        torch.testing.assert_close(again.predict_run(batch), policy.predict_run(batch), rtol=0, atol=1e-6)
-
-
-def test_the_optimizer_of_such_a_policy_is_saved_and_goes_on(tmp_path, one_buffer):
-    policy = make_policy(n_supervised_steps=2).train()
-    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
-    for _ in range(2):
-        policy.forward(batch_of(policy))[0].backward()
-        optimizer.step()
-
-    policy.save_pretrained(tmp_path)
-    save_optimizer_state(optimizer, tmp_path)
-    again = PlaybyearPolicy.from_pretrained(tmp_path).train()
-    resumed = load_optimizer_state(again.config.get_optimizer_preset().build(again.get_optim_params()), tmp_path)
-
-    for parameter, its_like in zip(policy.parameters(), again.parameters(), strict=True):
-        ours, theirs = optimizer.state[parameter], resumed.state[its_like]
-        assert all(torch.equal(ours[key], theirs[key]) for key in ours)
-    gradients = [torch.randn_like(parameter) for parameter in policy.parameters()]
-    for each, its_optimizer in ((policy, optimizer), (again, resumed)):
-        for parameter, gradient in zip(each.parameters(), gradients, strict=True):
-            parameter.grad = gradient.clone()
-        its_optimizer.step()
-    assert all(torch.equal(a, b) for a, b in zip(policy.parameters(), again.parameters(), strict=True))
-
-
-def test_a_training_saves_its_checkpoints_and_is_resumed(root, tmp_path, monkeypatch):
-    data = ("--policy.device=cpu", "--dataset.repo_id=tests/noise", f"--dataset.root={root}")
-    run(train, *TINY, *data, "--steps=2", f"--output_dir={tmp_path / 'plain'}")
-    monkeypatch.setattr(nn.RNNBase, "flatten_parameters", flatten)
-    run(train, *TINY, *data, "--steps=2", "--save_freq=1", f"--output_dir={tmp_path / 'out'}")
+    run_in_process(train, *NOISY, *data, "--steps=2", "--save_freq=1", f"--output_dir={tmp_path / 'out'}")
     half = tmp_path / "out/checkpoints/000001/pretrained_model/train_config.json"
-    run(train, "--resume=true", f"--config_path={half}", f"--output_dir={tmp_path / 'resumed'}")
+    run_in_process(train, "--resume=true", f"--config_path={half}", f"--output_dir={tmp_path / 'resumed'}")
 
     plain = load_file(tmp_path / "plain/checkpoints/last" / MODEL)
     for folder in ("out", "resumed"):
@@ -346,12 +243,14 @@ def actions_of(checkpoint: Path, device: str, n_frames: int = 4) -> torch.Tensor
 @on_devices
 @pytest.mark.parametrize("dtype", ["float32", "auto", "float16"])
 @both_trainers
-def test_a_training_saves_resumes_and_acts(device, script, dtype, root, tmp_path):
-    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={root}", f"--policy.dtype={dtype}")
-    run(script, *TINY, *data, f"--policy.device={device}", "--steps=4", "--save_freq=2", f"--output_dir={tmp_path}/out")
+def test_a_training_saves_resumes_and_acts(device, script, dtype, noise, tmp_path):
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}", f"--policy.dtype={dtype}")
+    run_in_process(
+        script, *NOISY, *data, f"--policy.device={device}", "--steps=4", "--save_freq=2", f"--output_dir={tmp_path}/out"
+    )
     checkpoints = tmp_path / "out/checkpoints"
     half = checkpoints / "000002"
-    run(
+    run_in_process(
         script,
         "--resume=true",
         f"--config_path={half / 'pretrained_model/train_config.json'}",

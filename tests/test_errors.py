@@ -27,6 +27,8 @@ BASE = {
     "record": f"playbyear-record {' '.join(ENV)} --dataset.repo_id=t/new --dataset.root={{out}}/new --num_workers=0",
     "train": f"playbyear-train {' '.join(TINY)} --dataset.repo_id=t/noise --dataset.root={{noise}} --steps=1 "
     "--output_dir={out}/train",
+    "train act": "playbyear-train --policy.type=act --policy.push_to_hub=false --dataset.repo_id=t/noise "
+    "--dataset.root={noise} --output_dir={out}/train",
     "dagger": f"playbyear-dagger {' '.join(ENV)} --policy.path={{policy}} --demos.repo_id=tests/demos "
     "--demos.root={demos} --interventions.repo_id=t/corrections --interventions.root={out}/corrections --eval_every=0 "
     "--batch_size=4 --warmup_episodes=1 --updates_per_episode=2 --output_dir={out}/dagger",
@@ -61,7 +63,7 @@ train | -dataset.repo_id | --dataset.repo_id is needed
 record | -env.type | --env.type is needed
 repair | --dry-run=true | did you mean --dry_run?
 # Places
-record | --dataset.root={noise} | {noise} already holds a dataset | resume=true
+record | --dataset.root={noise} | {noise} already holds a dataset | --resume=true
 record | --dataset.root={full} --resume=true | {full} is not empty and holds no dataset
 record | --dataset.root={file}/new | Cannot write | {file}
 record | --dataset.root={truncated} --resume=true | {truncated} | damaged | playbyear-repair --root={truncated}
@@ -126,6 +128,8 @@ record | --env.task=TellApart-v1 '--env.task_options={{contents: gravel}}' | gra
 record | --env.spectrogram={out}/no | {out}/no | cannot be read
 record | --env.spectrogram={noise} | {noise} | names no pictures of sound
 # Recording
+record | --dataset.num_episodes=0 | --dataset.num_episodes=0: give at least 1
+record | --seed=-1 | --seed=-1: give 0 or more
 record | --dataset.rgb_encoder.vcodec=h264 | --dataset.rgb_encoder | give --dataset.video=true
 record | --expert.type=test | --expert.type | test | scripted
 record | --expert.type=teleop --expert.speed=0 | speed=0
@@ -136,6 +140,7 @@ record | --expert.type=teleop --expert.takeover_key=e | takeover_key='e': it mea
 record | --expert.type=teleop --expert.takeover=press | takeover='press' | give hold or toggle
 record | --expert.type=teleop | No window can be opened (DISPLAY='')
 # Training
+train act | --steps=1 | --policy.type=act | --policy.type=playbyear | lerobot-train
 train | --preset=tpu | --preset=tpu is not known | cpu | gpu | paper
 train | --preset=paper --policy.type=act | --preset=paper is for --policy.type=playbyear, not for act
 train | --store=tape | --store=tape is not known: wanted one of memory, disk, auto
@@ -144,6 +149,9 @@ train | --dataset.image_transforms.enable=true | --dataset.image_transforms.enab
 train | --dataset.root={slow} | 10 frames per second | configured for 20 | --policy.fps=10
 train | --dataset.root={deaf} | observation.audio | --policy.use_audio=false
 train | --policy.sample_rate=48001 | sample_rate / fps = 48001 / 20
+train | --policy.action_range=0 | --policy.action_range must be above 0 and finite, got 0
+train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be at least 1, got 0
+dagger | --policy.fps=0 | --policy.fps must be at least 1, got 0
 train | --policy.audio_window_s=0.5 | audio_window_s | too few for 4 convolutions
 train | --policy.audio_encoder=nobody | --policy.audio_encoder=nobody | spectrogram_cnn | lerobot_policy_
 train | --policy.vision_encoder=nobody | --policy.vision_encoder=nobody | resnet18 | lerobot_policy_

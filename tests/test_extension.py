@@ -19,8 +19,7 @@ from support.policy import MICROPHONE, make_config, make_episode, make_policy, r
 from torch import nn
 
 from lerobot_playbyear.dagger import ExpertConfig
-from lerobot_playbyear.policy.extension import register_audio_encoder, register_vision_encoder
-from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.extension import register_vision_encoder
 from lerobot_playbyear.policy.processor_playbyear import make_playbyear_pre_post_processors
 from lerobot_playbyear.scripts.commands import train
 
@@ -151,9 +150,3 @@ def test_a_vision_encoder_of_another_package_learns_and_acts():
     assert step_through(policy, [episode]).shape == (1, 3, 4)
     with pytest.raises(ValueError, match="'test_colours' is registered already, by test_extension"):
         register_vision_encoder("test_colours")(Colours)
-
-
-def test_an_encoder_without_a_size_is_refused():
-    register_audio_encoder("test_sizeless")(lambda config: nn.Flatten())
-    with pytest.raises(ValueError, match=r"test_sizeless: Flatten has no `embedding_size`"):
-        PlaybyearPolicy(make_config(audio_encoder="test_sizeless"))

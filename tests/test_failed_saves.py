@@ -20,7 +20,7 @@ from support.recording import add_episode, assert_recorded, everything, write, w
 from lerobot_playbyear.datasets import durable, episode_files, files
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, has_dataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError
-from lerobot_playbyear.episodes.saving import save_or_ask
+from lerobot_playbyear.episodes.frames import save_or_ask
 from lerobot_playbyear.repair import repair_dataset
 
 TWO_FILMS = {**RICH_FEATURES, FILM + "2": RICH_FEATURES[FILM]}

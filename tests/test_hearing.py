@@ -69,17 +69,6 @@ def test_statistics_come_from_the_episode_only_and_what_precedes_it_is_the_avera
     torch.testing.assert_close(inside.std(dim=(0, 2)), torch.ones(160), rtol=0.02, atol=0)
 
 
-def test_kept_statistics_stand_still_in_training_which_then_hears_what_acting_does():
-    spectrogram = make_spectrogram(16000)
-    loud, begun = 5 * noise(2, 32000), torch.ones(2, 32000, dtype=torch.bool)
-    spectrogram.train()(noise(2, 32000), begun)
-    before = {name: buffer.clone() for name, buffer in spectrogram.state_dict().items()}
-    spectrogram.keeps_statistics = True
-    in_training = spectrogram.train()(loud, begun)
-    assert torch.equal(in_training, spectrogram.eval()(loud, begun))
-    assert all(torch.equal(buffer, before[name]) for name, buffer in spectrogram.state_dict().items())
-
-
 def test_integers_are_pcm_at_full_scale_and_floats_are_already_scaled():
     half = torch.full((1, 8), 16384)
     for dtype in (torch.int16, torch.int64):
@@ -95,11 +84,6 @@ def test_sound_that_cannot_be_is_refused_with_its_key(value, message):
     wave[1, 3] = value
     with pytest.raises(ValueError, match=rf"observation\.audio\.gripper.*{message}"):
         to_float_wave(wave, "observation.audio.gripper")
-
-
-def test_a_sample_rate_too_low_for_the_bins_is_refused():
-    with pytest.raises(ValueError, match="at least 8000 Hz, got 6000"):
-        make_spectrogram(6000)
 
 
 @pytest.mark.parametrize(("sample_rate", "fps"), [(16000, 20), (48000, 30), (16000, 5)])
@@ -125,12 +109,6 @@ def test_with_the_step_of_the_preset_neighbouring_windows_share_all_columns(samp
     _, hop = segment_and_hop(sample_rate, SEGMENT_S, hop_s)
     shared = SharedStretches(35, sample_rate // fps, 2 * sample_rate, hop)
     assert (shared.period, shared.n_stretches) == (1, 1)
-
-
-def test_sound_that_is_taken_apart_to_fit_a_cache_gives_the_same_bits():
-    wave, ear = 0.1 * torch.randn(9, 400_000, generator=torch.Generator().manual_seed(0)), make_spectrogram(48000)
-    assert torch.equal(ear.power(wave), torch.cat([ear.power(row[None]) for row in wave]))
-    assert torch.equal(ear.power(wave), ear._power(wave))
 
 
 # Noise and other microphones in training
@@ -188,13 +166,6 @@ def test_excerpts_come_from_every_recording_at_one_loudness_and_from_all_over(re
     assert set(pitch_of(found).tolist()) == {500.0, 1500.0}
     torch.testing.assert_close(found.square().mean(dim=1).sqrt(), torch.ones(200), rtol=0, atol=0.02)
     assert len(found[:, 0].unique()) > 10  # phases of the tones
-
-
-def test_a_recording_that_is_shorter_than_an_excerpt_repeats(tmp_path):
-    write_audio(tmp_path / "click.wav", tone(1000, RATE, seconds=0.25)[:, None], RATE)
-    found = RecordedNoise(tmp_path, RATE).excerpts(3, RATE)
-    torch.testing.assert_close(found[:, : RATE // 2], found[:, RATE // 2 :])
-    assert (pitch_of(found) == 1000).all()
 
 
 def augmentation(**options):

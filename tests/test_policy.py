@@ -1,7 +1,6 @@
 """The policy: its configuration, training and rollout as one function, checkpoints, the paper's network, and what acts."""
 
 import copy
-import pickle
 from types import SimpleNamespace
 
 import pytest
@@ -9,8 +8,6 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.optim.optimizers import load_optimizer_state, save_optimizer_state
-from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.factory import make_policy as make_policy_for
 from lerobot.policies.factory import make_pre_post_processors
 from support.policy import (
@@ -90,27 +87,6 @@ def test_two_seconds_are_as_many_frames_as_the_frame_rate_says(fps, frames):
 def test_a_dataset_that_does_not_fit_is_refused(options, meta, message):
     with pytest.raises(ValueError, match=message):
         make_policy_for(PlaybyearConfig(**TINY, **options), ds_meta=dataset_meta(**meta))
-
-
-def test_what_cannot_be_learned_from_is_refused():
-    config = make_config()
-    config.output_features = {}
-    with pytest.raises(ValueError, match="no 'action'"):
-        PlaybyearPolicy(config)
-    with pytest.raises(ValueError, match=r"No camera.*use_vision=false"):
-        PlaybyearPolicy(make_config(cameras=()))
-
-
-def test_the_checkpoint_of_another_policy_is_refused():
-    features = {"observation.environment_state": PolicyFeature(FeatureType.ENV, (3,))}
-    outputs = {"action": PolicyFeature(FeatureType.ACTION, (4,))}
-    with pytest.raises(ValueError, match=r"'act'.*'playbyear'"):
-        PlaybyearPolicy(ACTConfig(input_features=features, output_features=outputs, device="cpu"))
-
-
-def test_lerobots_metadata_of_another_frame_rate_is_refused():
-    with pytest.raises(ValueError, match=r"--policy\.fps=30"):
-        PlaybyearPolicy(make_config(), dataset_meta=SimpleNamespace(fps=30))
 
 
 def test_only_low_dimensional_observations_and_the_action_are_normalised(tmp_path):
@@ -196,20 +172,6 @@ def test_two_environments_in_one_batch_equal_each_alone():
     torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
 
 
-@torch.no_grad()
-def test_the_past_matters_exactly_as_far_as_the_windows_reach():
-    policy = make_policy(n_supervised_steps=1)
-    config = policy.config
-    episode = make_episode(seed=5, config=config, n_frames=80)
-    before = policy.predict_run(run_ending_at(episode, 79, config))
-    key = "observation.audio.gripper"
-    oldest = 79 - (config.memory_steps - 1) - (config.audio_frames - 1)
-    episode[key][oldest - 1] = 0
-    torch.testing.assert_close(policy.predict_run(run_ending_at(episode, 79, config)), before, atol=0, rtol=0)
-    episode[key][oldest] = 0
-    assert not torch.equal(policy.predict_run(run_ending_at(episode, 79, config)), before)
-
-
 def test_every_frame_is_encoded_once():
     policy = make_policy(n_supervised_steps=6)
     seen: list[int] = []
@@ -241,21 +203,6 @@ def test_noise_on_low_dimensional_observations_is_for_training_alone():
         torch.testing.assert_close(policy.predict_run(batch), policy.predict_run(batch), atol=0, rtol=0)
         policy.train()
         assert not torch.equal(policy.predict_run(batch), policy.predict_run(batch))
-
-
-@pytest.mark.parametrize("n_supervised_steps", [1, 4])
-def test_longer_histories_than_needed_change_nothing(n_supervised_steps):
-    policy = make_policy(n_supervised_steps=n_supervised_steps)
-    config = policy.config
-    batch = batch_of(policy, lasts=(3, 30))
-    needed = {"observation.state": config.n_run_frames, "action": n_supervised_steps}
-    needed["observation.images.front"], needed[MICROPHONE] = config.n_image_frames, config.n_audio_frames
-    short = {name: value[:, -needed[name.removesuffix("_is_pad")] :] for name, value in batch.items()}
-    with torch.no_grad():
-        assert policy.forward(short)[0] == policy.forward(batch)[0]
-    short[MICROPHONE] = short[MICROPHONE][:, 1:]
-    with pytest.raises(ValueError, match=rf"{MICROPHONE}.*{config.n_audio_frames} frames"):
-        policy.forward(short)
 
 
 def test_cameras_microphones_and_states_of_any_number_and_size():
@@ -319,16 +266,6 @@ def test_a_sense_that_is_switched_off_does_not_matter(option, prefix):
         assert policy.forward(without)[0] == policy.forward(batch)[0]
 
 
-def test_without_memory_only_the_newest_image_and_embedding_count():
-    policy = make_policy(use_memory=False, n_supervised_steps=1, image_size=64)
-    batch = batch_of(policy)
-    with torch.no_grad():
-        before = policy.predict_run(batch)
-        batch["observation.images.front"][:, :-1] = 0
-        batch["observation.state"][:, :-1] = 0
-        torch.testing.assert_close(policy.predict_run(batch), before, rtol=0, atol=0)
-
-
 def test_a_renamed_observation_that_lost_its_padding_flags_is_still_padded():
     """`--rename_map` renames an observation but not its flags."""
     policy = make_policy(n_supervised_steps=2)
@@ -340,16 +277,6 @@ def test_a_renamed_observation_that_lost_its_padding_flags_is_still_padded():
         torch.testing.assert_close(policy.predict_run(renamed), expected, rtol=0, atol=0)
 
 
-def test_sample_weights_get_one_loss_per_item():
-    policy = make_policy(n_supervised_steps=3)
-    batch = batch_of(policy, lasts=(1, 30))
-    with torch.no_grad():
-        losses, _ = policy.forward(batch, reduction="none")
-        for item, loss in enumerate(losses):
-            alone = {key: value[item : item + 1] for key, value in batch.items()}
-            torch.testing.assert_close(policy.forward(alone)[0], loss)
-
-
 def test_a_rollout_with_another_sample_rate_is_refused():
     policy = make_policy()
     frame = {key: torch.zeros(1, *feature.shape) for key, feature in policy.config.input_features.items()}
@@ -359,30 +286,6 @@ def test_a_rollout_with_another_sample_rate_is_refused():
 
 
 # Checkpoints
-
-
-def test_checkpoints_hold_weights_statistics_and_optimizer(tmp_path):
-    policy = make_policy(n_supervised_steps=2)
-    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
-    policy.train()
-    for _ in range(2):
-        policy.forward(batch_of(policy))[0].backward()
-        optimizer.step()
-    policy.eval()
-    policy.save_pretrained(tmp_path)
-    save_optimizer_state(optimizer, tmp_path)
-    again = PlaybyearPolicy.from_pretrained(tmp_path)
-    assert not again.training
-    assert policy.state_dict().keys() == again.state_dict().keys()
-    assert any("spectrogram" in key and "mean" in key for key in again.state_dict())
-    for name, value in policy.state_dict().items():
-        torch.testing.assert_close(again.state_dict()[name], value, rtol=0, atol=0)
-    with torch.no_grad():
-        batch = batch_of(policy)
-        torch.testing.assert_close(again.predict_run(batch), policy.predict_run(batch), rtol=0, atol=1e-6)
-    resumed = policy.config.get_optimizer_preset().build(again.get_optim_params())
-    load_optimizer_state(resumed, tmp_path)
-    assert len(resumed.state_dict()["state"]) == len(list(policy.parameters()))
 
 
 def test_a_checkpoint_that_does_not_fit_is_refused(tmp_path):
@@ -481,40 +384,12 @@ def test_all_frames_of_a_run_share_one_draw_and_runs_differ():
     assert augmented.max() <= 1
 
 
-def test_a_rotated_wide_image_keeps_its_right_angles():
-    """Three corners of a square in the middle of a 2:1 image, followed through a rotation."""
-    torch.manual_seed(3)
-    images = torch.zeros(1, 1, 3, 60, 120)
-    corners = [(20, 50), (20, 70), (40, 50)]
-    turned = NO_AUGMENTATION | {"augmentation_degrees": 30.0}
-    found = []
-    for row, column in corners:
-        torch.manual_seed(3)
-        dot = images.clone()
-        dot[..., row - 1 : row + 2, column - 1 : column + 2] = 1.0
-        dot = Augmentation(make_config(**turned))(dot, 120)[0, 0, 0]
-        grid = torch.arange(120.0)
-        # Back to pixels of the original: the height was stretched by two.
-        found.append(torch.stack([(dot.sum(1) @ grid) / dot.sum() / 2, (dot.sum(0) @ grid) / dot.sum()]))
-    across, down = found[1] - found[0], found[2] - found[0]
-    assert abs(across[0]) > 1  # it was turned
-    assert abs(across @ down) / 20**2 < 0.02
-    torch.testing.assert_close(across.norm(), torch.tensor(20.0), rtol=0.02, atol=0)
-
-
 def test_shrinking_averages_instead_of_skipping_pixels():
     stripes = torch.zeros(1, 1, 3, 96, 96)
     stripes[..., ::2] = 1.0
     plain = Augmentation(make_config(**NO_AUGMENTATION))
     for shrunk in (resize(stripes, 32), plain(stripes, 32)):
         torch.testing.assert_close(shrunk, torch.full_like(shrunk, 0.5), rtol=0, atol=0.1)
-
-
-@pytest.mark.parametrize(("height", "size"), [(40, 40), (40, 90), (60, 32)])
-def test_augmentation_without_strength_is_resizing(height, size):
-    images = torch.rand(2, 3, 3, height, 40)
-    plain = Augmentation(make_config(**NO_AUGMENTATION))(images, size)
-    torch.testing.assert_close(plain, resize(images, size), rtol=0, atol=1e-4)
 
 
 def test_brightness_and_hue_leave_grey_grey():
@@ -650,19 +525,3 @@ def test_single_pixels_are_learned_from_in_full_precision(size, in_bfloat16):
     assert (embeddings.dtype is torch.bfloat16) == in_bfloat16
     if not in_bfloat16:
         torch.testing.assert_close(embeddings, reference)
-
-
-def test_what_acts_can_be_copied_and_pickled():
-    encoder = FoldedVisionEncoder(VisionEncoder(3, 8)).eval()
-    pictures = torch.rand(1, 9, 64, 64)
-    with torch.no_grad():
-        acting = encoder(pictures)
-    assert encoder._folded._packed is not None
-    others = (
-        copy.deepcopy(encoder),
-        pickle.loads(pickle.dumps(encoder)),
-    )  # as a test alone: nothing here loads pickles
-    for other in others:
-        assert other._folded._packed is None
-        with torch.no_grad():
-            torch.testing.assert_close(other(pictures), acting)

@@ -1,8 +1,6 @@
 """`playbyear-record`: what is on disk, and what is said when it cannot be."""
 
 import multiprocessing
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,17 +12,15 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs import EnvConfig
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.datasets import audio_feature
-from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import PlaybyearError
-from lerobot_playbyear.episodes import frames, saving
+from lerobot_playbyear.episodes import frames
 from lerobot_playbyear.episodes.environment import RolloutError, env_spec
 from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.recording.record import RecordConfig, RecordDatasetConfig, record
 
 
 def config(root: Path, num_episodes: int = 2, **options) -> RecordConfig:
-    env = options.pop("env", None) or PlaybyearEnvConfig()
+    env = options.pop("env", None) or PlaybyearEnvConfig(image_size=16)
     dataset = RecordDatasetConfig("test/recorded", str(root), num_episodes, video=options.pop("video", False))
     return RecordConfig(env, dataset, num_workers=options.pop("num_workers", 0), **options)
 
@@ -51,7 +47,7 @@ def test_the_dataset_holds_what_the_contract_says(recorded):
     dataset = load(recorded)
     own = {key: (f["dtype"], tuple(f["shape"])) for key, f in dataset.features.items()}
     expected = {
-        "observation.images.front": ("image", (84, 84, 3)),
+        "observation.images.front": ("image", (16, 16, 3)),
         "observation.state": ("float32", (7,)),
         "observation.audio.gripper": ("int16", (800,)),
         "action": ("float32", (4,)),
@@ -73,7 +69,7 @@ def test_frame_t_is_the_observation_at_t_and_the_action_taken_then(recorded):
     dataset = load(recorded)
     end = dataset.meta.episodes[0]["dataset_to_index"]
     rows = [dataset[i] for i in range(end)]
-    env = env_spec(PlaybyearEnvConfig()).make()
+    env = env_spec(PlaybyearEnvConfig(image_size=16)).make()
     observation, _ = env.reset(seed=int(rows[0]["seed"]))
     for i, row in enumerate(rows):
         pixels = (row["observation.images.front"].permute(1, 2, 0) * 255).round().numpy().astype(np.uint8)
@@ -104,7 +100,9 @@ def test_resuming_a_complete_dataset_changes_nothing(recorded):
 
 def test_only_successes_are_kept_and_seeds_count_the_attempts(tmp_path):
     """With a horizon that only quick episodes meet, the seeds of the others are missing."""
-    root = record(config(tmp_path / "dataset", num_episodes=3, env=PlaybyearEnvConfig(episode_length=88)))
+    root = record(
+        config(tmp_path / "dataset", num_episodes=3, env=PlaybyearEnvConfig(image_size=16, episode_length=88))
+    )
     dataset = load(root)
     seeds = sorted(set(column(root, "seed").ravel().tolist()))
     assert len(seeds) == 3
@@ -115,7 +113,7 @@ def test_only_successes_are_kept_and_seeds_count_the_attempts(tmp_path):
 
 def test_video_and_two_microphones(tmp_path):
     env = PlaybyearEnvConfig(microphones=["gripper", "table"], sample_rate=48000)
-    root = record(config(tmp_path / "dataset", num_episodes=2, env=env, video=True))
+    root = record(config(tmp_path / "dataset", num_episodes=1, env=env, video=True))
     dataset = load(root)
     item = dataset[len(dataset) - 1]
     assert item["observation.images.front"].shape == (3, 84, 84)
@@ -126,41 +124,9 @@ def test_video_and_two_microphones(tmp_path):
 # What goes wrong, each with one clear error
 
 
-def test_an_existing_dataset_is_not_touched_without_resume(recorded):
-    with pytest.raises(PlaybyearError, match=r"already holds a dataset.*resume=true"):
-        record(config(recorded))
-
-
-def test_resuming_with_other_settings_names_the_difference(recorded):
-    with pytest.raises(PlaybyearError, match=r"observation\.audio\.gripper is int16 \(800,\) at 16000 Hz there and"):
-        record(config(recorded, 4, resume=True, env=PlaybyearEnvConfig(sample_rate=48000)))
-    with pytest.raises(ValueError, match="fps is 20 there and 30 here"):
-        DurableWriter(
-            "test/recorded", recorded, 30, {"observation.audio.gripper": audio_feature(1500, 30)}, resume=True
-        )
-
-
-def test_a_folder_with_other_files_is_refused(tmp_path):
-    (tmp_path / "thesis.tex").write_text("")
-    with pytest.raises(PlaybyearError, match="is not empty and holds no dataset"):
-        record(config(tmp_path, resume=True))
-
-
-def test_a_folder_that_cannot_be_made(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(PlaybyearError, match="Cannot write"):
-        record(config(tmp_path / "file" / "dataset"))
-
-
 def test_an_expert_that_never_succeeds(tmp_path):
     with pytest.raises(PlaybyearError, match="failed 20 times in a row"):
-        record(config(tmp_path / "dataset", env=PlaybyearEnvConfig(episode_length=3)))
-
-
-def test_an_environment_that_does_not_start_says_why(tmp_path):
-    env = PlaybyearEnvConfig(microphones=["ceiling"])
-    with pytest.raises(PlaybyearError, match=r"does not start.*ceiling"):
-        record(config(tmp_path / "dataset", env=env, num_workers=1))
+        record(config(tmp_path / "dataset", env=PlaybyearEnvConfig(image_size=16, sound="none", episode_length=3)))
 
 
 def test_without_an_opengl_library_it_says_what_to_install(tmp_path, monkeypatch):
@@ -225,20 +191,9 @@ def test_a_fault_of_the_program_shows_where_it_happened(tmp_path, monkeypatch):
 
 
 def test_an_environment_that_breaks_its_word_in_the_middle_is_an_error_of_input(tmp_path, monkeypatch):
-    def frames_of(*args):
-        return [{**frame, "action": frame["action"][:-1]} for frame in frames.episode_frames(*args)]
+    def frames_of(*args, real=frames.episode_frames):
+        return [{**frame, "action": frame["action"][:-1]} for frame in real(*args)]
 
-    monkeypatch.setattr(saving, "episode_frames", frames_of)
+    monkeypatch.setattr(frames, "episode_frames", frames_of)
     with pytest.raises(PlaybyearError, match="action"):
         record(config(tmp_path / "dataset"))
-
-
-@pytest.mark.slow
-def test_the_command_prints_one_line_for_an_unknown_task(tmp_path):
-    program = "from lerobot_playbyear.scripts.commands import record; record()"
-    command = [sys.executable, "-c", program, "--env.type=playbyear", "--env.task=Nope-v0"]
-    command += ["--dataset.repo_id=a/b", f"--dataset.root={tmp_path}"]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert result.returncode != 0
-    assert "OccludedGrasp-v1, OccludedPickPlace-v1" in result.stderr
-    assert "Traceback" not in result.stderr

@@ -8,9 +8,9 @@ import lerobot
 import lerobot_operator  # noqa: F401  (LeRobot finds the arm of joints then)
 import numpy as np
 import pytest
-from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_rollout
+from support.shared import TINY, run_in_process
 
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
@@ -18,13 +18,7 @@ from lerobot_playbyear.datasets import audio_feature
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.training.train import train
-
-TINY = (
-    *("--policy.type=playbyear", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.image_size=16"),
-    *("--policy.vision_width=4", "--policy.audio_window_s=0.9", "--policy.n_memory_steps=2"),
-    *("--policy.n_supervised_steps=4", "--policy.hidden_size=32"),
-)
+from lerobot_playbyear.scripts.commands import train
 
 
 @pytest.fixture(scope="module")
@@ -55,18 +49,16 @@ def arm_dataset(tmp_path_factory):
     return folder / "arm"
 
 
-@pytest.fixture
-def policy(arm_dataset, tmp_path, monkeypatch):
-    """Makes a policy that knows nothing, with these options."""
+def train_on(arm_dataset, folder, *options):
+    """A policy that knows nothing, with these options."""
+    data = ("--dataset.repo_id=tests/arm", f"--dataset.root={arm_dataset}")
+    assert run_in_process(train, *TINY, *data, "--steps=1", f"--output_dir={folder}", *options) is None
+    return folder / "checkpoints/last/pretrained_model"
 
-    def make(*options):
-        data = ("--dataset.repo_id=tests/arm", f"--dataset.root={arm_dataset}", "--num_workers=0")
-        run = ("--steps=1", "--batch_size=2", f"--output_dir={tmp_path / 'train'}")
-        monkeypatch.setattr(sys, "argv", ["train", *TINY, *data, *run, *options])
-        parser.wrap()(train)()
-        return tmp_path / "train/checkpoints/last/pretrained_model"
 
-    return make
+@pytest.fixture(scope="module")
+def policy(arm_dataset, tmp_path_factory):
+    return train_on(arm_dataset, tmp_path_factory.mktemp("policy") / "train")
 
 
 @pytest.fixture
@@ -94,12 +86,11 @@ def rollout(monkeypatch, policy, *options):
 
 
 def test_a_policy_that_hears_says_that_there_is_no_sound_and_moves_nothing(policy, told, monkeypatch):
-    checkpoint = policy()
     with pytest.raises(InputError, match=r"hears 'gripper'.*the cameras are front.*type: microphone"):
-        rollout(monkeypatch, checkpoint)
+        rollout(monkeypatch, policy)
     assert told == []
     with pytest.raises(ValueError, match="RTC inference is not supported by policy type 'playbyear'"):
-        rollout(monkeypatch, checkpoint, "--inference.type=rtc")
+        rollout(monkeypatch, policy, "--inference.type=rtc")
 
 
 def microphone(folder: Path) -> str:
@@ -136,7 +127,7 @@ def test_a_policy_hears_on_a_robot_what_its_recording_holds(strategy, policy, to
         dataset = ("--dataset.repo_id=tests/rollout_heard", "--dataset.no_stamp=true", f"--dataset.root={root}")
         fixed = ("--dataset.video=false", "--dataset.push_to_hub=false", "--dataset.fps=20")
         options += [*dataset, *fixed, *RECORDED[strategy]]
-    rollout(monkeypatch, policy(), microphone(tmp_path), *options)
+    rollout(monkeypatch, policy, microphone(tmp_path), *options)
     assert len(told) >= len(heard) >= 15
     if strategy in RECORDED:
         target = attach_audio(AttachAudioConfig(DatasetPlace("tests/rollout_heard", str(root))))
@@ -147,8 +138,8 @@ def test_a_policy_hears_on_a_robot_what_its_recording_holds(strategy, policy, to
 
 
 @pytest.mark.slow
-def test_a_policy_that_does_not_hear_acts(policy, told, monkeypatch):
-    rollout(monkeypatch, policy("--policy.use_audio=false"))
+def test_a_policy_that_does_not_hear_acts(arm_dataset, told, monkeypatch, tmp_path):
+    rollout(monkeypatch, train_on(arm_dataset, tmp_path / "train", "--policy.use_audio=false"))
     assert 5 <= len(told) <= 11
     assert all(sorted(action) == ["elbow.pos", "gripper.pos", "shoulder.pos"] for action in told)
     assert np.isfinite([list(action.values()) for action in told]).all()

@@ -152,26 +152,6 @@ def test_a_rate_that_rises_because_the_run_shall_be_longer_is_said(script, train
     assert state["_last_lr"] == [pytest.approx(1e-5)]
 
 
-def test_a_rate_that_has_fallen_to_nothing_and_stays_there_is_no_jump(caplog):
-    schedule = PlaybyearConfig(scheduler_final_share=0.0).get_scheduler_preset()
-
-    def planned(n_steps):
-        return schedule.build(torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1e-3), n_steps)
-
-    ended = planned(4)
-    for _ in range(4):
-        ended.optimizer.step()
-        ended.step()
-    planned(4).load_state_dict(ended.state_dict())
-    assert "rises" not in caplog.text
-    planned(8).load_state_dict(ended.state_dict())
-    assert "rises from 0 to 0.0005" in caplog.text
-
-
-def test_a_constant_rate_needs_no_plan():
-    assert PlaybyearConfig(scheduler_warmup_share=0, scheduler_final_share=1).get_scheduler_preset() is None
-
-
 @pytest.mark.parametrize("n_steps", [20, 100_000])
 def test_the_learning_rate_warms_up_and_decays_within_any_number_of_steps(n_steps):
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))])

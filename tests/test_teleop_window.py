@@ -8,9 +8,10 @@ from importlib.util import find_spec
 import gymnasium as gym
 import numpy as np
 import pytest
-from dagger_factory import arguments, base_folder, column, corrections, metrics
+from dagger_factory import arguments, column, corrections, metrics
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
+from support.shared import trained
 from virtual_screen import MISSING, VirtualScreen, wait_for
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -110,8 +111,8 @@ class Remembering(PolicyActor):
 
 
 def make_actor(env_cfg):
-    policy = PlaybyearPolicy.from_pretrained(base_folder() / "policy")
-    return Remembering(policy, env_cfg, *make_pre_post_processors(policy.config, str(base_folder() / "policy")))
+    policy = PlaybyearPolicy.from_pretrained(trained())
+    return Remembering(policy, env_cfg, *make_pre_post_processors(policy.config, str(trained())))
 
 
 def test_an_override_is_recorded_on_exactly_the_held_frames_and_the_arm_moves_as_the_keys_say(screen):

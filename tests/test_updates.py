@@ -13,21 +13,21 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.scripts.lerobot_train import update_policy
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from safetensors.torch import load_file
+from support import shared
 from support.policy import Waits, move_to_card, on_card, without_cudnn
-from test_train_command import TINY
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from lerobot_playbyear.training import EpisodeStore, RunSampler, run_weights
-from lerobot_playbyear.training.acceleration import compile_networks, fuse, prefer_channels_last
 from lerobot_playbyear.training.batches import PolicyWindows, prefetched
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.learner import load_training_state, make_learner
+from lerobot_playbyear.training.learner import fuse, load_training_state, make_learner, prefer_channels_last
 from lerobot_playbyear.training.report import Figures
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-NOISY = ("--policy.n_supervised_steps=4", "--policy.audio_noise_db=6", "--steps=20")
+TINY = shared.TINY
+NOISY = ("--policy.audio_noise_db=6", "--steps=20")
 
 
 @pytest.fixture(scope="module")
@@ -189,11 +189,6 @@ def test_a_compiled_policy_learns_the_same(make, batches):
     _, parts = make("--compile=true")
     assert learn(parts, batches(parts), 3) == pytest.approx(expected, rel=1e-3)
     assert weights(parts).keys() == weights(plain).keys()
-
-
-def test_only_our_policy_is_compiled():
-    with pytest.raises(ValueError, match=r"--compile=true is for --policy\.type=playbyear"):
-        compile_networks(torch.nn.Linear(1, 1))
 
 
 def test_batches_come_ahead_in_order_and_a_failure_comes_with_its_batch():

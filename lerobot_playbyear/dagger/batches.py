@@ -5,7 +5,6 @@ or ends where an item does, so actions are masked one by one, by LeRobot's `acti
 are learned from as there are actions that the expert chose, and all weigh the same.
 """
 
-import abc
 import logging
 from typing import Any
 
@@ -24,8 +23,8 @@ _IS_PAD = f"{ACTION}_is_pad"
 Batch = dict[str, Any]
 
 
-class Batches(abc.ABC):
-    """Draws batches from two stores.
+class BalancedBatches:
+    """Draws batches of which one half are demonstrations, and the other what the expert chose.
 
     Each batch has random numbers of its own, seeded with the seed and its number: resuming needs that number alone.
 
@@ -35,6 +34,7 @@ class Batches(abc.ABC):
         attempts: Whole attempts, with the column `intervention`. None while there are none.
         batch_size: Runs per batch, even.
         seed: Of the random numbers.
+        n_skipped: Frames at the beginning of every correction that are not learned from, see `frames_learned_from`.
 
     Raises:
         InputError: Nothing of `attempts` can be learned from.
@@ -47,58 +47,20 @@ class Batches(abc.ABC):
         attempts: EpisodeStore | None,
         batch_size: int,
         seed: int = 0,
+        n_skipped: int = 0,
     ) -> None:
-        self._windows, self._batch_size, self._seed = windows, batch_size, seed
+        self._windows, self._batch_size, self._seed, self._n_skipped = windows, batch_size, seed, n_skipped
         self._demonstrations, self._attempts = demonstrations, attempts
         self._from_demonstrations = RunSampler(run_weights(demonstrations, windows.n_windows), seed)
         if attempts is not None:
             self.take_in(attempts)
 
-    @abc.abstractmethod
     def take_in(self, attempts: EpisodeStore) -> None:
         """Take in a store of attempts, or the episodes that were appended to it since the last time.
 
         Raises:
             InputError: Nothing of it can be learned from.
         """
-
-    @abc.abstractmethod
-    def batch(self, number: int) -> Batch:
-        """The batch of that number, counted from 0, as `PolicyWindows.batch` gives it.
-
-        `action_is_pad` (B, K) is also true where an action is not to be learned.
-        """
-
-    @abc.abstractmethod
-    def halves(self, number: int) -> tuple[Batch, Batch]:
-        """A batch of demonstrations and one of attempts, to tell their losses apart."""
-
-    def is_learned(self, attempts: EpisodeStore) -> Tensor:
-        """Which frames of attempts are learned from, (N,) bool."""
-        return frames_by_expert(attempts)
-
-
-class BalancedBatches(Batches):
-    """Half demonstrations, half of what the expert chose.
-
-    Args:
-        windows, demonstrations, attempts, batch_size, seed: As `Batches`.
-        n_skipped: Frames at the beginning of every correction that are not learned from, see `frames_learned_from`.
-    """
-
-    def __init__(
-        self,
-        windows: PolicyWindows,
-        demonstrations: EpisodeStore,
-        attempts: EpisodeStore | None,
-        batch_size: int,
-        seed: int = 0,
-        n_skipped: int = 0,
-    ) -> None:
-        self._n_skipped, self._n_half = n_skipped, batch_size // 2
-        super().__init__(windows, demonstrations, attempts, batch_size, seed)
-
-    def take_in(self, attempts: EpisodeStore) -> None:
         self._learned = self.is_learned(attempts)
         weights = intervention_run_weights(attempts, self._windows.n_windows, self._learned)
         if not weights.any():
@@ -109,13 +71,19 @@ class BalancedBatches(Batches):
         self._attempts, self._from_attempts = attempts, RunSampler(weights, self._seed + 1)
 
     def batch(self, number: int) -> Batch:
+        """The batch of that number, counted from 0, as `PolicyWindows.batch` gives it.
+
+        `action_is_pad` (B, K) is also true where an action is not to be learned.
+        """
         return joined(*self.halves(number))
 
     def halves(self, number: int) -> tuple[Batch, Batch]:
+        """A batch of demonstrations and one of attempts, which also tells their losses apart."""
         assert self._attempts is not None
-        last = self._from_attempts.draw(self._n_half, number)
+        n_half = self._batch_size // 2
+        last = self._from_attempts.draw(n_half, number)
         corrections = self._windows.batch(self._attempts, last)
-        shown = self._windows.batch(self._demonstrations, self._from_demonstrations.draw(self._n_half, number))
+        shown = self._windows.batch(self._demonstrations, self._from_demonstrations.draw(n_half, number))
         is_shown = ~shown[_IS_PAD]  # (B/2, K)
         frames = (last.unsqueeze(1) + torch.tensor(self._windows.action_deltas)).clamp(min=0)  # (B/2, K)
         by_expert = self._learned[frames].to(is_shown.device) & ~corrections[_IS_PAD]
@@ -125,6 +93,7 @@ class BalancedBatches(Batches):
         return shown, corrections
 
     def is_learned(self, attempts: EpisodeStore) -> Tensor:
+        """Which frames of attempts are learned from, (N,) bool."""
         return frames_learned_from(attempts, self._n_skipped)
 
     def _generator(self, number: int) -> torch.Generator:
@@ -132,7 +101,7 @@ class BalancedBatches(Batches):
         return torch.Generator().manual_seed(int(seed))
 
 
-class JoinedBatches(Batches):
+class JoinedBatches(BalancedBatches):
     """Demonstrations that were there and attempts that are demonstrations: every frame alike, as if they were one dataset."""
 
     def take_in(self, attempts: EpisodeStore) -> None:

@@ -12,7 +12,7 @@ from lerobot.configs.default import DatasetConfig, EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
 
 from lerobot_playbyear.dagger import robot_gated  # noqa: F401  (registers --method.type=robot_gated)
-from lerobot_playbyear.dagger.methods import HgDaggerConfig, MethodConfig
+from lerobot_playbyear.dagger.methods import HgDagger, Method
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.experts import ExpertConfig, ScriptedExpertConfig
@@ -80,7 +80,7 @@ class DaggerConfig:
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
     expert: ExpertConfig = field(default_factory=ScriptedExpertConfig)
-    method: MethodConfig = field(default_factory=HgDaggerConfig)
+    method: Method = field(default_factory=HgDagger)
     skip_s: float | None = None
     new_weights: bool = False
     episodes: int = 25

@@ -14,9 +14,8 @@ from lerobot_playbyear.datasets import check_dataset_files
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
-from lerobot_playbyear.episodes.frames import INTERVENTION, SEED
+from lerobot_playbyear.episodes.frames import INTERVENTION, SEED, save_episode
 from lerobot_playbyear.episodes.play import Episode
-from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.training.store import EpisodeStore
 
 

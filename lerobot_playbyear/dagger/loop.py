@@ -13,7 +13,7 @@ import torch
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_playbyear.compat import get_step_identifier
-from lerobot_playbyear.dagger.batches import Batches
+from lerobot_playbyear.dagger.batches import BalancedBatches
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.methods import Method
@@ -69,7 +69,7 @@ class Loop:
     windows: PolicyWindows
     demonstrations: EpisodeStore
     corrections: Corrections
-    batches: Batches
+    batches: BalancedBatches
     report: Report
     scene: Scene | None
     method: Method

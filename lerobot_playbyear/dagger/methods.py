@@ -1,10 +1,9 @@
 """The methods of interactive imitation, `--method.type`: who acts when, and what is kept and learned from.
 
-A method of your own is a subclass of `Method` with what it does otherwise than HG-DAgger, and a configuration that makes it,
-registered under a name for `--method.type`.
+A method of your own is a subclass of `Method` with what it does otherwise than HG-DAgger, registered under a name for
+`--method.type`; its options are fields of a dataclass.
 """
 
-import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -13,7 +12,7 @@ import draccus
 import gymnasium as gym
 import numpy as np
 
-from lerobot_playbyear.dagger.batches import BalancedBatches, Batches, JoinedBatches
+from lerobot_playbyear.dagger.batches import BalancedBatches, JoinedBatches
 from lerobot_playbyear.episodes.experts import Expert
 from lerobot_playbyear.episodes.play import Episode, Observation, Verdict
 from lerobot_playbyear.training.store import EpisodeStore
@@ -25,18 +24,21 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class MethodConfig(draccus.ChoiceRegistry, abc.ABC):
-    """Options of a method, `--method.*`. Subclasses register with `@MethodConfig.register_subclass("name")`.
+class Method(draccus.ChoiceRegistry):
+    """HG-DAgger; others override what they do otherwise, and register with `@Method.register_subclass("name")`.
 
     Attributes:
         is_watched: A person who corrects has to watch all of every attempt.
         needs_judge: The expert has to say when it takes over.
         skips_beginnings: Corrections have a beginning that is not learned from by default, `--skip_s`.
+        shows_failures: Where an attempt fails, the scene is set up again with the same seed, and the expert demonstrates the
+            task in it from the first step on.
     """
 
     is_watched: ClassVar[bool] = True
     needs_judge: ClassVar[bool] = True
     skips_beginnings: ClassVar[bool] = True
+    shows_failures: ClassVar[bool] = False
 
     @property
     def type(self) -> str:
@@ -48,21 +50,6 @@ class MethodConfig(draccus.ChoiceRegistry, abc.ABC):
 
     def check(self) -> None:
         """Raise an InputError if an option is out of its range."""
-
-    @abc.abstractmethod
-    def make(self) -> "Method":
-        """Makes the method."""
-
-
-class Method:
-    """HG-DAgger; others override what they do otherwise.
-
-    Attributes:
-        shows_failures: Where an attempt fails, the scene is set up again with the same seed, and the expert demonstrates the
-            task in it from the first step on.
-    """
-
-    shows_failures = False
 
     def beside(self, expert: Expert) -> Expert:
         """Who sits beside the policy: the expert, or somebody who speaks for it."""
@@ -115,56 +102,39 @@ class Method:
         windows: "PolicyWindows",
         demonstrations: EpisodeStore,
         corrections: EpisodeStore | None,
-    ) -> Batches:
+    ) -> BalancedBatches:
         """What is learned from: half demonstrations, half of what the expert chose in corrections."""
         n_skipped = cfg.n_skipped(demonstrations.fps)
         return BalancedBatches(windows, demonstrations, corrections, cfg.batch_size, cfg.seed, n_skipped)
 
 
-@MethodConfig.register_subclass("hg_dagger")
+@Method.register_subclass("hg_dagger")
 @dataclass
-class HgDaggerConfig(MethodConfig):
+class HgDagger(Method):
     """The expert takes over and hands back as it likes (Kelly et al., 2019)."""
 
-    def make(self) -> Method:
-        return Method()
 
-
-@MethodConfig.register_subclass("no_handback")
+@Method.register_subclass("no_handback")
 @dataclass
-class NoHandbackConfig(MethodConfig):
-    """The expert takes over as it likes and acts to the end: an attempt holds one correction (as in RaC, Hu et al., 2025)."""
-
-    def make(self) -> Method:
-        return NoHandback()
-
-
 class NoHandback(Method):
-    """An attempt ends with its correction."""
+    """The expert takes over as it likes and acts to the end: an attempt holds one correction (as in RaC, Hu et al., 2025)."""
 
     def beside(self, expert: Expert) -> Expert:
         return Staying(expert)
 
 
-@MethodConfig.register_subclass("redo")
+@Method.register_subclass("redo")
 @dataclass
-class RedoConfig(MethodConfig):
-    """Where the policy fails, the scene is set up again, and the expert demonstrates the task in it from the first step on."""
-
-    needs_judge: ClassVar[bool] = False
-    skips_beginnings: ClassVar[bool] = False
-
-    def make(self) -> Method:
-        return Redo()
-
-
 class Redo(Method):
     """Demonstrations of the scenes that the policy fails in; they weigh as much as those that are there, frame by frame.
 
-    The policy tries first, until the expert would take over or the attempt ends.
+    The policy tries first, until the expert would take over or the attempt ends. Where it fails, the scene is set up again, and
+    the expert demonstrates the task in it from the first step on.
     """
 
-    shows_failures = True
+    needs_judge: ClassVar[bool] = False
+    skips_beginnings: ClassVar[bool] = False
+    shows_failures: ClassVar[bool] = True
 
     def beside(self, expert: Expert) -> Expert:
         self._expert = Showing(expert)
@@ -179,7 +149,7 @@ class Redo(Method):
         windows: "PolicyWindows",
         demonstrations: EpisodeStore,
         corrections: EpisodeStore | None,
-    ) -> Batches:
+    ) -> BalancedBatches:
         return JoinedBatches(windows, demonstrations, corrections, cfg.batch_size, cfg.seed)
 
 

@@ -38,7 +38,8 @@ class Report(Progress):
         state.wandb_run_id = training.wandb.run_id = self._wandb.cfg.run_id if self._wandb else None
         self._cfg, self._folder, self._state = cfg, folder, state
         self.success = state.success
-        self.totals = Totals.of(folder.metrics())
+        self._lines = folder.metrics()
+        self.totals = Totals.of(self._lines)
 
     def doing(self, what: str) -> None:
         """What the run is at, behind the bar."""
@@ -64,7 +65,8 @@ class Report(Progress):
         place = {"attempt": state.attempts, "round": state.round, "step": state.step}
         line = {"kind": kind, **place, **figures}
         self._folder.append_metrics(line)
-        self.totals.add(line)
+        self._lines.append(line)
+        self.totals = Totals.of(self._lines)
         self._to_wandb(kind, {name: value for name, value in (place | figures).items() if not isinstance(value, list)})
 
 
@@ -93,52 +95,42 @@ def attempt_figures(by_expert: np.ndarray, fps: float, is_watched: bool) -> dict
     }
 
 
-@dataclass
+@dataclass(frozen=True)
 class Totals:
-    """What all attempts of a run cost so far.
+    """What attempts cost together.
 
     Attributes:
-        attempts, steps: Made in all.
+        attempts: How many there were.
         expert_steps: In which the expert acted.
         takeovers, switches: Of control.
         person_seconds: Of a person's time.
+        autonomy: Share of the steps in which the policy acted; 1 without an attempt.
+        mean_takeover_steps: Steps of a takeover; 0 without one.
     """
 
-    attempts: int = 0
-    steps: int = 0
-    expert_steps: int = 0
-    takeovers: int = 0
-    switches: int = 0
-    person_seconds: float = 0.0
+    attempts: int
+    expert_steps: int
+    takeovers: int
+    switches: int
+    person_seconds: float
+    autonomy: float
+    mean_takeover_steps: float
 
     @classmethod
     def of(cls, lines: Iterable[Mapping[str, Any]]) -> "Totals":
         """Those of the lines of `metrics.jsonl` that are attempts; other lines do not matter."""
-        totals = cls()
-        for line in lines:
-            totals.add(line)
-        return totals
-
-    def add(self, line: Mapping[str, Any]) -> None:
-        """Counts one more line."""
-        if line.get("kind") != "attempt":
-            return
-        self.attempts += 1
-        self.steps += line["n_frames"]
-        self.expert_steps += line["n_expert_steps"]
-        self.takeovers += line["n_takeovers"]
-        self.switches += line["n_switches"]
-        self.person_seconds = round(self.person_seconds + line["person_seconds"], 2)
-
-    @property
-    def autonomy(self) -> float:
-        """Share of the steps in which the policy acted; 1 before the first."""
-        return 1 - self.expert_steps / self.steps if self.steps else 1.0
-
-    @property
-    def mean_takeover_steps(self) -> float:
-        """Steps of a takeover, on average; 0 without one."""
-        return self.expert_steps / self.takeovers if self.takeovers else 0.0
+        attempts = [line for line in lines if line.get("kind") == "attempt"]
+        names = ("n_frames", "n_expert_steps", "n_takeovers", "n_switches", "person_seconds")
+        steps, expert_steps, takeovers, switches, seconds = (sum(line[name] for line in attempts) for name in names)
+        return cls(
+            len(attempts),
+            expert_steps,
+            takeovers,
+            switches,
+            person_seconds=round(seconds, 2),
+            autonomy=1 - expert_steps / steps if steps else 1.0,
+            mean_takeover_steps=expert_steps / takeovers if takeovers else 0.0,
+        )
 
 
 def round_figures(lines: Sequence[Mapping[str, Any]], number: int) -> dict[str, Any]:

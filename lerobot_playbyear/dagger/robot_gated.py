@@ -14,7 +14,7 @@ from torch import Tensor
 from lerobot_playbyear.dagger.batches import frames_by_expert
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.gate_model import GateModel, Played, Thresholds, thresholds_for
-from lerobot_playbyear.dagger.methods import Method, MethodConfig, Showing
+from lerobot_playbyear.dagger.methods import Method, Showing
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.experts import Expert
 from lerobot_playbyear.episodes.frames import SEED
@@ -31,10 +31,12 @@ _N_LATEST = 20  # attempts from which thresholds are set
 _RUNS = 16  # that are encoded together
 
 
-@MethodConfig.register_subclass("robot_gated")
+@Method.register_subclass("robot_gated")
 @dataclass
-class RobotGatedConfig(MethodConfig):
+class RobotGated(Method):
     """The robot asks. A script then acts to the end; a person is called, takes over when they like, and hands back likewise.
+
+    In `state.method` it keeps how the round began, and the seeds of the scenes that were shown.
 
     Attributes:
         intervention_share: Of the steps in which it shall ask; the thresholds follow from it, anew in every round.
@@ -57,21 +59,13 @@ class RobotGatedConfig(MethodConfig):
         if self.rollouts < 1:
             raise InputError(f"--method.rollouts={self.rollouts}: give at least 1.")
 
-    def make(self) -> Method:
-        return RobotGated(self)
-
-
-class RobotGated(Method):
-    """See `RobotGatedConfig`. In `state.method` it keeps how the round began, and the seeds of the scenes that were shown."""
-
-    def __init__(self, config: RobotGatedConfig) -> None:
-        self._config = config
+    def __post_init__(self) -> None:
         self._others: Corrections | None = None
         self._fitted_round = -1
         self._seconds = 0.0  # that the gate took to learn
 
     def beside(self, expert: Expert) -> Expert:
-        self.shows_failures = self._config.redo_failed and not expert.decides
+        self.shows_failures = self.redo_failed and not expert.decides  # type: ignore[misc]
         self._expert = Asked(expert, self)
         return self._expert
 
@@ -88,7 +82,7 @@ class RobotGated(Method):
     @property
     def is_alone(self) -> bool:
         state = self._state
-        return state.to_show is None and state.attempts - state.discarded - len(self._shown) < self._config.rollouts
+        return state.to_show is None and state.attempts - state.discarded - len(self._shown) < self.rollouts
 
     @property
     def _shown(self) -> list[int]:
@@ -115,7 +109,7 @@ class RobotGated(Method):
             if each.is_visited:
                 self._traces[each.seed] = self._model.trace(each)
         latest = [self._traces[seed] for seed in sorted(self._traces)[-_N_LATEST:]]
-        self._thresholds = thresholds_for(latest, self._config.intervention_share)
+        self._thresholds = thresholds_for(latest, self.intervention_share)
         self._seconds = time.perf_counter() - start
 
     def _fit(self, before_seed: int) -> None:

@@ -3,38 +3,36 @@
 import logging
 import os
 import shlex
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import torch
-from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs import FeatureType, PreTrainedConfig, parser
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import init_logging
 
 from lerobot_playbyear.dagger.batches import frames_by_expert
-from lerobot_playbyear.dagger.checks import (
-    check_action_range,
-    check_alike,
-    check_dataset,
-    check_expert,
-    check_places,
-    check_policy,
-)
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.loop import Loop, Scene
 from lerobot_playbyear.dagger.report import Report, Totals
 from lerobot_playbyear.dagger.run_folder import BEST_LINK, RunFolder, RunState
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.features import differences
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.episodes.environment import env_facts, env_spec
+from lerobot_playbyear.episodes.experts import Expert, ExpertError
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.push import METRICS_NAME, PushOptions, check_name, push_policy, warn_without_login
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import PolicyWindows, dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.learner import Learner, make_learner
+from lerobot_playbyear.training.learner import Learner, check_dataset_suits, make_learner
 from lerobot_playbyear.training.train import read_store
 
 
@@ -58,7 +56,7 @@ def run_dagger(cfg: DaggerConfig) -> Path:
     with ExitStack() as stack:
         with errors_of_input(FileNotFoundError, MemoryError):
             cfg.check()
-            check_places(cfg)
+            _check_places(cfg)
             folder = RunFolder(cfg.output_dir)
             stack.enter_context(folder.locked())
             state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
@@ -102,9 +100,9 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
         overrides = state.policy_overrides = [*state.policy_overrides, *overrides]
     cfg.policy = PreTrainedConfig.from_pretrained(source, cli_overrides=overrides)
     cfg.policy.pretrained_path = source  # type: ignore[assignment]
-    check_policy(cfg.policy)
+    _check_policy(cfg.policy)
     if overrides:
-        check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
+        _check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise InputError(
             "--policy.push_to_hub=true needs a name: give --policy.repo_id, or --policy.push_to_hub=false."
@@ -125,10 +123,10 @@ def _followed(policy: str) -> str:
 
 def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack) -> Loop:
     """What the run needs, checked; `stack` closes it."""
-    assert cfg.policy is not None
+    assert isinstance(cfg.policy, PlaybyearConfig)
     demos = DatasetReader(cfg.demos.repo_id, cfg.demos.root)
-    check_dataset(cfg.policy, demos.meta, cfg.rename_map)
-    method = cfg.method.make()
+    _check_dataset(cfg.policy, demos.meta, cfg.rename_map)
+    method = cfg.method
     stack.callback(method.close)
     env = expert = None
     if cfg.is_online and cfg.env is not None:
@@ -136,7 +134,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         stack.callback(env.close)
         expert = cfg.expert.make(env)
         stack.callback(expert.close)
-        check_expert(cfg, expert)
+        _check_expert(cfg, expert)
         expert = method.beside(expert)
     corrections = Corrections(cfg.interventions)
     stack.callback(corrections.close)
@@ -145,7 +143,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         features, fps, what = dataset_features(facts), facts.fps, f"--env.type={cfg.env.type}"
     else:
         features, fps, what = corrections.meta.features, corrections.meta.fps, "the corrections"
-    check_alike(dataset_names(cfg.policy, cfg.rename_map).values(), demos.meta, features, fps, what)
+    _check_alike(dataset_names(cfg.policy, cfg.rename_map).values(), demos.meta, features, fps, what)
 
     training = _training_options(cfg, folder, state)
     learner = make_learner(training, demos.meta, keep_normalization=True)
@@ -271,3 +269,133 @@ def _why_none(cfg: DaggerConfig, state: RunState) -> str:
             "--updates_per_episode=0. To learn from all attempts give --episodes=0 --updates=N and another --output_dir"
         )
     return f"--warmup_episodes={cfg.warmup_episodes} is more than the dataset holds"
+
+
+# Whether policy, demonstrations, corrections and environment go together
+
+
+def _check_places(cfg: DaggerConfig) -> None:
+    """Refuse what would be found out only once data were mixed.
+
+    Raises:
+        InputError: Attempts would be written among the demonstrations.
+    """
+    demos, interventions = (source.folder.resolve() for source in (cfg.demos, cfg.interventions))
+    if cfg.is_online and demos == interventions:
+        raise InputError(
+            f"--demos and --interventions are the same dataset, {demos}: attempts would be written among the demonstrations, "
+            "with what the policy did wrong in them. Give --interventions.repo_id and --interventions.root of their own."
+        )
+    if (
+        cfg.is_online
+        and cfg.output_dir.resolve().is_relative_to(interventions)
+        and not (interventions / "meta").exists()
+    ):
+        raise InputError(
+            f"--output_dir={cfg.output_dir} lies in the folder of --interventions, {interventions}, where a dataset is to be "
+            "made: give another one."
+        )
+
+
+def _check_policy(policy: PreTrainedConfig) -> None:
+    """Refuse what only `playbyear` learns from corrections.
+
+    Raises:
+        InputError: It is another policy, or several processes were started.
+    """
+    if not isinstance(policy, PlaybyearConfig):
+        raise InputError(
+            f"--policy.path is of the type '{policy.type}': playbyear-dagger corrects policies of --policy.type=playbyear. "
+            "For others collect with LeRobot's lerobot-rollout --strategy.type=dagger, and learn with lerobot-train."
+        )
+    n_processes = int(os.environ.get("WORLD_SIZE", "1"))
+    if n_processes > 1:
+        raise InputError(
+            f"{n_processes} processes were started, and playbyear-dagger works in one: start it without accelerate launch."
+        )
+
+
+def _check_dataset(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str]) -> None:
+    """Refuse a dataset that the policy was not made for.
+
+    Raises:
+        ValueError: Frames per second, a missing feature, a shape, or a sample rate; what was seen and what is wanted.
+    """
+    check_dataset_suits(policy, meta, rename_map)
+    names = dataset_names(policy, rename_map)
+    for key, feature in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
+        name = names.get(key, key)
+        if name not in meta.features:
+            raise InputError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
+        seen_rate = (meta.features[name].get("info") or {}).get("sample_rate")
+        rate = policy.sample_rate
+        if rate is not None and seen_rate is not None and seen_rate != rate:
+            raise InputError(
+                f"'{name}' was recorded at {seen_rate} Hz in the dataset '{meta.repo_id}', and the policy was trained with "
+                f"{rate} Hz: use data recorded at {rate} Hz, or train a policy for {seen_rate} Hz first."
+            )
+        seen, wanted = tuple(meta.features[name]["shape"]), tuple(feature.shape)
+        same = sorted(seen) == sorted(wanted) if feature.type is FeatureType.VISUAL else seen == wanted
+        if not same:
+            raise InputError(
+                f"'{name}' has shape {seen} in the dataset '{meta.repo_id}', and the policy was trained with {wanted}: use "
+                "the data that it was trained with, or data recorded alike."
+            )
+
+
+def _check_alike(
+    keys: Iterable[str], demos: LeRobotDatasetMetadata, other: Mapping[str, Mapping[str, Any]], fps: int, what: str
+) -> None:
+    """Refuse what cannot share a batch with the demonstrations.
+
+    Args:
+        keys: The observations that matter; the action always does.
+        demos: The demonstrations' metadata.
+        other: Features of a dataset, or of what the environment would write.
+        fps: Their frames per second.
+        what: What `other` is, for the message.
+
+    Raises:
+        InputError: With every difference.
+    """
+    found = [f"fps is {demos.fps} there and {fps} here"] if demos.fps != fps else []
+    found += differences(demos.features, other, [*keys, ACTION], pictures_as_stored=False)
+    if found:
+        raise InputError(
+            f"The demonstrations '{demos.repo_id}' and {what} differ: {'; '.join(found)}. Record with the same "
+            "settings, or choose the environment's options (--env.*) as they were in the demonstrations."
+        )
+
+
+def _check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig) -> None:
+    """Refuse a policy whose actions would all become larger, or smaller, before it has learned anything.
+
+    Args:
+        policy: As it shall be improved.
+        trained: As its checkpoint says.
+
+    Raises:
+        InputError: Their action ranges differ.
+    """
+    wanted, seen = (getattr(config, "action_range", None) for config in (policy, trained))
+    if wanted != seen:
+        raise InputError(
+            f"--policy.action_range={wanted}: the policy was trained with {seen}, and would act differently from now on. "
+            f"Train it on its demonstrations first: playbyear-train --policy.path={policy.pretrained_path} "
+            f"--policy.action_range={wanted}."
+        )
+
+
+def _check_expert(cfg: DaggerConfig, expert: Expert) -> None:
+    """Refuse an expert that cannot do what the method asks of it.
+
+    Raises:
+        ExpertError: It never takes over by itself.
+    """
+    if cfg.method.needs_judge and not expert.judges:
+        task = getattr(cfg.env, "task", None)
+        raise ExpertError(
+            f"--env.task={task} has a script that demonstrates, and none that says when a policy has to be corrected "
+            f"(`intervention_gate()`): --method.type={cfg.method.type} needs one. Give --method.type=redo, which demonstrates "
+            "the scenes that the policy fails in, or an expert of your own with --expert.type (examples/own_expert.py)."
+        )

@@ -281,12 +281,12 @@ class DurableWriter:
         if (self.root / JOURNAL).exists():
             return (
                 f"Episode {index} is complete on disk, but could not be moved to its place in {self.root}: {reason}. "
-                "It is there as soon as save_episode is called again, or the dataset is opened with resume=true, and the "
+                "It is there as soon as save_episode is called again, or the dataset is opened with --resume=true, and the "
                 "cause is gone."
             )
         return (
             f"Episode {index} could not be written to {self.root}: {reason}. The {index} episodes before it are complete. "
-            "Once the cause is gone, call save_episode again; a program that has ended goes on with resume=true, and "
+            "Once the cause is gone, call save_episode again; a program that has ended goes on with --resume=true, and "
             "records this episode again."
         )
 
@@ -306,7 +306,7 @@ def check_root(root: Path, *, resume: bool) -> None:
     if has_dataset(root) or (root / JOURNAL).is_file():
         if not resume:
             raise FileExistsError(
-                f"{root} already holds a dataset. Append to it with resume=true, or choose another root."
+                f"{root} already holds a dataset. Append to it with --resume=true, or choose another root."
             )
     elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
         raise FileExistsError(f"{root} is not empty and holds no dataset. Choose another root.")

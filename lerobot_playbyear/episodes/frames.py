@@ -1,5 +1,8 @@
-"""What a dataset holds of an episode: its features, and its frames."""
+"""What a dataset holds of an episode: its features and its frames, and how they are saved."""
 
+import contextlib
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,8 @@ from lerobot.utils.constants import (
     SUCCESS,
 )
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.durable import DurableWriter
+from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature
 from lerobot_playbyear.episodes.environment import EnvFacts
 from lerobot_playbyear.episodes.play import Episode, Observation
@@ -79,6 +83,61 @@ def episode_frames(episode: Episode, features: dict[str, dict[str, Any]]) -> lis
         frame["task"] = episode.task
         frames.append(frame)
     return frames
+
+
+def save_episode(episode: Episode, writer: DurableWriter) -> list[dict[str, Any]]:
+    """Appends an episode to a dataset.
+
+    Where that fails, such as on a full disk, and somebody sits at the terminal, it is tried as often as they want: a person may
+    have made the episode by hand.
+
+    Returns:
+        Its frames, as the dataset holds them.
+
+    Raises:
+        DatasetWriteError: It could not be written; the dataset is as it was before.
+    """
+    frames = episode_frames(episode, writer.features)
+    save_or_ask(writer, frames)
+    return frames
+
+
+def save_or_ask(writer: DurableWriter, frames: Sequence[dict[str, Any]]) -> None:
+    """Saves an episode; where that fails and somebody sits at the terminal, as often as they want it.
+
+    Args:
+        writer: Without an episode in progress.
+        frames: All frames of the episode.
+
+    Raises:
+        DatasetWriteError: It could not be written, and nobody is there to make room, or they gave it up.
+    """
+    try:
+        for frame in frames:
+            writer.add_frame(frame)
+        while True:
+            try:
+                writer.save_episode()
+                return
+            except DatasetWriteError as error:
+                if not _wants_again(error):
+                    raise
+    except DatasetWriteError:
+        with contextlib.suppress(DatasetWriteError):  # what got through would be the beginning of the next episode
+            writer.discard_episode()
+        raise
+
+
+def _wants_again(error: DatasetWriteError) -> bool:
+    """Asks at the terminal whether to try again; where there is none nobody wants it."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        return False
+    print(f"\n{error}", file=sys.stderr)
+    try:
+        answer = input("Press Enter to save it again once there is room, or type q to give it up: ")
+    except EOFError:
+        return False
+    return answer.strip().lower() != "q"
 
 
 def next_seed(root: Path, seed: int) -> int:

@@ -19,10 +19,9 @@ from lerobot_playbyear.datasets.durable import DurableWriter, check_root
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input
 from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
 from lerobot_playbyear.episodes.experts import ExpertConfig, ScriptedExpertConfig
-from lerobot_playbyear.episodes.frames import dataset_features, next_seed
+from lerobot_playbyear.episodes.frames import dataset_features, next_seed, save_episode
 from lerobot_playbyear.episodes.play import Episode, Observation, Verdict, play
 from lerobot_playbyear.episodes.pool import RolloutPool
-from lerobot_playbyear.episodes.saving import save_episode
 from lerobot_playbyear.hub.push import PushOptions, check_name, push_dataset, warn_without_login
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
@@ -204,9 +203,9 @@ def _record_episodes(cfg: RecordConfig, demonstrations: Demonstrations, writer: 
 
 def _check_options(cfg: RecordConfig) -> None:
     if cfg.dataset.num_episodes < 1:
-        raise InputError(f"dataset.num_episodes={cfg.dataset.num_episodes}: give at least 1.")
+        raise InputError(f"--dataset.num_episodes={cfg.dataset.num_episodes}: give at least 1.")
     if cfg.seed < 0:
-        raise InputError(f"seed={cfg.seed}: give 0 or more.")
+        raise InputError(f"--seed={cfg.seed}: give 0 or more.")
     if not isinstance(cfg.expert, ScriptedExpertConfig | TeleopExpertConfig):
         raise InputError(
             f"--expert.type={cfg.expert.type} corrects a policy and does not demonstrate: give scripted or teleop."

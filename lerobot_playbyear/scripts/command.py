@@ -1,8 +1,10 @@
 """What every command does around its work: answer at once what needs no imports, read its options, say what went wrong."""
 
+import contextlib
 import difflib
 import functools
 import inspect
+import io
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -34,18 +36,31 @@ def command(interrupted: int | str = 130, flag: str = "") -> Callable[[Callable[
         def run() -> None:
             sys.argv[1:] = [f"{option}=true" if option == flag else option for option in sys.argv[1:]]
             answer_at_once(f"playbyear-{work.__name__.replace('_', '-')}")
+            from draccus.utils import ParsingError
+
             from lerobot_playbyear.datasets.errors import PlaybyearError
 
             try:
                 work()
             except (PlaybyearError, MemoryError) as error:
                 sys.exit(f"error: {str(error) or 'there is not enough memory'}")
+            except ParsingError as error:
+                sys.exit(f"error: {_reason(error)}")
             except KeyboardInterrupt:
                 sys.exit(interrupted)
 
         return run
 
     return decorate
+
+
+def _reason(error: BaseException) -> BaseException:
+    """Why draccus refuses options: where their own class refuses them, it names the class, and hides what that says."""
+    causes = [error]
+    while causes[-1].__cause__ is not None:
+        causes.append(causes[-1].__cause__)
+    refusals = (cause for cause in causes if str(cause).startswith("Couldn't instantiate class"))
+    return next((refusal.__cause__ for refusal in refusals if refusal.__cause__), error)
 
 
 def short_help(command: str) -> str:
@@ -112,23 +127,23 @@ def run_alone[Result](work: Callable[[Any], Result], parse: Callable[[type], Any
         parse: Reads the options for such a configuration. None: without LeRobot.
 
     Raises:
-        InputError: An option has no meaning.
+        InputError, draccus.ParsingError: An option has no meaning.
     """
     import draccus
-    from draccus.utils import DecodingError
 
     from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.hub.client import be_patient
 
     be_patient()
     (argument,) = inspect.signature(work).parameters.values()
-    with errors_of_input(DecodingError, OSError):
+    with errors_of_input(OSError):
         cfg = (parse or draccus.parse)(argument.annotation)
     return work(cfg)
 
 
 def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
     """The same with LeRobot's parser, once LeRobot knows all plugins."""
+    from draccus.utils import ParsingError
     from lerobot.configs import parser
     from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -136,7 +151,17 @@ def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
         def options(cfg: kind) -> Any:  # type: ignore[valid-type]
             return cfg
 
-        return parser.wrap()(options)()
+        said = io.StringIO()
+        try:
+            with contextlib.redirect_stderr(said):
+                return parser.wrap()(options)()
+        except SystemExit as end:
+            if isinstance(end.__context__, ParsingError):  # LeRobot prints it, without its reason, and ends the process
+                said.truncate(0)
+                raise end.__context__ from end.__context__.__cause__
+            raise
+        finally:
+            sys.stderr.write(said.getvalue())
 
     register_third_party_plugins()
     return run_alone(work, parse)

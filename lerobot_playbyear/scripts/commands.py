@@ -19,10 +19,7 @@ def train() -> None:
     from lerobot_playbyear.training.command_line import apply_preset, with_long_store
 
     sys.argv[1:] = apply_preset(with_long_store(sys.argv[1:]))
-    from lerobot_playbyear.training.acceleration import keep_freed_memory
     from lerobot_playbyear.training.config import PlaybyearTrainConfig
-
-    keep_freed_memory()
 
     def train(cfg: PlaybyearTrainConfig) -> None:
         check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
@@ -37,10 +34,8 @@ def train() -> None:
 def dagger() -> None:
     from lerobot_playbyear.dagger.config import DaggerConfig, with_saved_options
     from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
-    from lerobot_playbyear.training.acceleration import keep_freed_memory
     from lerobot_playbyear.training.command_line import with_long_store
 
-    keep_freed_memory()
     sys.argv[1:] = with_saved_options(with_long_store(sys.argv[1:]))
 
     def correct(cfg: DaggerConfig) -> None:

@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import LeRobotDatasetMetadata, resolve_delta_timestamps
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_playbyear.datasets import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.training.columns import features_at, sample_rate_in
-from lerobot_playbyear.training.store import EpisodeStore
+from lerobot_playbyear.training.store import EpisodeStore, features_at, sample_rate_in
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -50,7 +48,7 @@ def make_batches(
         seed: Of the draws.
         first: Number of the first batch; a run that goes on continues with that of its next update.
     """
-    sampler = RunSampler(run_weights(store, windows.n_windows, windows.n_dropped), seed)
+    sampler = RunSampler(run_weights(store, windows.n_windows), seed)
     n_items, share = (
         batch_size * accelerator.num_processes,
         slice(accelerator.process_index, None, accelerator.num_processes),
@@ -99,7 +97,7 @@ class RunSampler:
         return self._frames[position.clamp_(max=len(self._frames) - 1)]
 
 
-def run_weights(store: EpisodeStore, n_windows: int = 1, n_dropped: int = 0) -> Tensor:
+def run_weights(store: EpisodeStore, n_windows: int = 1) -> Tensor:
     """How often to draw the run that ends at each frame, so that all frames are learned from alike.
 
     Runs that would reach before the episode are not drawn. Only one run holds the first frame, and only one the last, whereas
@@ -108,16 +106,12 @@ def run_weights(store: EpisodeStore, n_windows: int = 1, n_dropped: int = 0) -> 
     Args:
         store: The episodes.
         n_windows: K, the windows per run.
-        n_dropped: How many of the last frames of every episode no run reaches; an episode no longer is not drawn at all.
 
     Returns:
         (N,) float64, 0 for frames at which no run ends.
     """
     weights = torch.zeros(len(store), dtype=torch.float64)
-    for start, whole_end in zip(store.starts, store.ends, strict=True):
-        end = whole_end - n_dropped
-        if end <= start:
-            continue
+    for start, end in zip(store.starts, store.ends, strict=True):
         k = min(n_windows, end - start)
         weights[start + k - 1 : end] = 1
         weights[start + k - 1] += (k - 1) / 2
@@ -126,10 +120,7 @@ def run_weights(store: EpisodeStore, n_windows: int = 1, n_dropped: int = 0) -> 
 
 
 class PolicyWindows:
-    """Cuts the batches a policy trains on out of stores.
-
-    The policy `playbyear` gets its observations only as far back as each is looked at, as bytes and 16-bit sound;
-    other policies get exactly what LeRobot's data loader would give them.
+    """Cuts the batches a policy trains on out of stores: observations as far back as each is looked at, bytes and 16-bit sound.
 
     Args:
         policy: The policy's configuration, complete with its features.
@@ -137,34 +128,24 @@ class PolicyWindows:
         rename_map: The dataset's names of observations, with what the policy calls them.
 
     Attributes:
-        image_size: Height and width at which the policy looks at pictures [pixels]; None: as they are recorded.
+        image_size: Height and width at which the policy looks at pictures [pixels].
         n_windows: Windows per item that lie in a run of frames, K.
-        n_dropped: How many of the last frames of every episode the policy does not learn from, its `drop_n_last_frames`.
-        action_deltas: Where the actions of an item lie, in frames from its last or, of a chunk, its first one; empty for a
-            policy that learns single actions.
+        action_deltas: Where the actions of an item lie, in frames from its last one.
     """
 
     def __init__(
-        self, policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
+        self, policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
     ) -> None:
         self._meta = meta
-        self._as_lerobot = not isinstance(policy, PlaybyearConfig)
-        if isinstance(policy, PlaybyearConfig):
-            names = dataset_names(policy, rename_map)
-            self._deltas = {names[key]: list(range(1 - n, 1)) for key, n in _history(policy).items()}
-            self._deltas[ACTION] = list(policy.action_delta_indices)
-        else:
-            timestamps = resolve_delta_timestamps(policy, meta) or {}
-            self._deltas = {key: [round(t * meta.fps) for t in times] for key, times in timestamps.items()}
-        self.image_size = policy.image_size if isinstance(policy, PlaybyearConfig) else None
-        self.n_windows: int = getattr(policy, "n_supervised_steps", 1)
-        self.n_dropped: int = getattr(policy, "drop_n_last_frames", None) or 0
-        self.action_deltas: list[int] = self._deltas.get(ACTION, [])
+        names = dataset_names(policy, rename_map)
+        self._deltas = {names[key]: list(range(1 - n, 1)) for key, n in _history(policy).items()}
+        self._deltas[ACTION] = self.action_deltas = list(policy.action_delta_indices)
+        self.image_size, self.n_windows = policy.image_size, policy.n_supervised_steps
 
     @property
-    def keys(self) -> list[str] | None:
-        """The features that a store has to hold; None means all that it can."""
-        return None if self._as_lerobot else list(self._deltas)
+    def keys(self) -> list[str]:
+        """The features that a store has to hold."""
+        return list(self._deltas)
 
     @property
     def sample_rates(self) -> dict[str, int]:
@@ -172,25 +153,12 @@ class PolicyWindows:
         rates = {key: sample_rate_in(self._meta.features[key]) for key in audio_keys(self._meta.features)}
         return {key: rate for key, rate in rates.items() if rate is not None}
 
-    def check_lengths(self, reader: DatasetReader) -> None:
-        """Refuse a dataset of which no frame would be drawn.
-
-        Raises:
-            ValueError: No episode is longer than what the policy drops of each.
-        """
-        longest = max(map(len, reader.episodes), default=0)
-        if longest <= self.n_dropped:
-            raise ValueError(
-                f"--policy.drop_n_last_frames={self.n_dropped} leaves no frame of '{reader.repo_id}', whose longest "
-                f"episode has {longest}; wanted fewer than that. Give less, or a dataset with longer episodes."
-            )
-
     def batch(self, store: EpisodeStore, last_frames: Tensor) -> dict[str, Any]:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""
-        return store.windows(last_frames, self._deltas, as_lerobot=self._as_lerobot)
+        return store.windows(last_frames, self._deltas)
 
 
-def dataset_names(policy: PreTrainedConfig, rename_map: Mapping[str, str] | None = None) -> dict[str, str]:
+def dataset_names(policy: PlaybyearConfig, rename_map: Mapping[str, str] | None = None) -> dict[str, str]:
     """What the dataset calls each observation of the policy."""
     original = {renamed: key for key, renamed in (rename_map or {}).items()}
     return {key: original.get(key, key) for key in policy.input_features or {}}
@@ -205,7 +173,7 @@ def _history(policy: PlaybyearConfig) -> dict[str, int]:
     }
 
 
-def learned_meta(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata) -> LeRobotDatasetMetadata:
+def learned_meta(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata) -> LeRobotDatasetMetadata:
     """The metadata that a policy is made for: sound at the rate at which it is learned from.
 
     Returns:
@@ -214,7 +182,7 @@ def learned_meta(policy: PreTrainedConfig, meta: LeRobotDatasetMetadata) -> LeRo
     Raises:
         ValueError: The frame rate does not divide the policy's sample rate.
     """
-    if not (isinstance(policy, PlaybyearConfig) and policy.use_audio and policy.sample_rate is not None):
+    if not policy.use_audio or policy.sample_rate is None:
         return meta
     features = features_at(meta.features, dict.fromkeys(audio_keys(meta.features), policy.sample_rate), meta.fps)
     changed = [key for key in features if features[key] is not meta.features[key]]

@@ -1,7 +1,6 @@
 """What `playbyear-train` can be told: all of `lerobot-train`'s options, and a few of its own."""
 
 import json
-import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -101,8 +100,6 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         own = (path if path.is_dir() else path.parent) / OWN_CONFIG_NAME
         if own.is_file():
             content = json.loads(own.read_text())
-            if unknown := {name: content.pop(name) for name in sorted(content.keys() - {*_OWN_FIELDS})}:
-                logging.warning(f"{own} has options that there are no longer; they are left out: {unknown}")
             saved = flatten_dict(content, sep=".").items()
             missing = {k: v for k, v in saved if v is not None and parser.parse_arg(k, cli_args) is None}
             given = [f"--{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in missing.items()]

@@ -1,7 +1,9 @@
 """What learns, made as lerobot-train makes it: its updates, its checkpoints, and what it cannot learn."""
 
+import ctypes
 import logging
 import math
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,8 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 from accelerate import Accelerator
-from accelerate.utils import DistributedDataParallelKwargs, InitProcessGroupKwargs
-from lerobot.configs import NormalizationMode, PreTrainedConfig
+from accelerate.utils import InitProcessGroupKwargs
+from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.optim import load_optimizer_state, load_scheduler_state
@@ -23,9 +25,8 @@ from lerobot.processor import PolicyProcessorPipeline, TransitionKey, create_tra
 from lerobot.utils.constants import ACTION, OBS_STR, TRAINING_STATE_DIR, TRAINING_STEP
 from lerobot.utils.io_utils import load_json
 from lerobot.utils.random_utils import load_rng_state
-from lerobot.utils.utils import has_method
-from torch import Tensor
-from torch.optim import Optimizer
+from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
 
 from lerobot_playbyear.compat import (
     eval_policy_all,
@@ -38,8 +39,8 @@ from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
+from lerobot_playbyear.policy.networks import VisionEncoder
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
-from lerobot_playbyear.training.acceleration import compile_networks, fuse, prefer_channels_last
 from lerobot_playbyear.training.batches import dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
@@ -48,6 +49,10 @@ _PATIENCE = timedelta(days=7)  # others wait while one evaluates or decodes a da
 
 _TOLERANCE = 0.01  # of the range of actions: what is learned a hundredth too small is not worth a word
 _SLACK = 1.1  # tanh gets to its ends only slowly
+_M_TRIM_THRESHOLD, _M_TOP_PAD, _M_MMAP_MAX = -1, -2, -4  # glibc's malloc.h
+_TOP_PAD = 256 * 2**20  # bytes
+_CONVOLUTION_DIMENSIONS = 4  # of its weights
+
 _LARGEST = 10.0  # what is normalised and would need more than this has not been demonstrated at all
 
 
@@ -96,8 +101,6 @@ class Learner:
         self.optimizer.zero_grad()
         if self.scheduler is not None:
             self.scheduler.step()
-        if has_method(self.unwrapped, "update"):  # a policy with buffers of its own
-            self.unwrapped.update()
         self.step += 1
         figures = {
             **(figures or {}),
@@ -176,15 +179,14 @@ class Learner:
     def warn_of_reach(self, actions: Tensor, what: str) -> None:
         """Logs which actions the policy cannot learn, if there are any, and what to do.
 
-        The policy `playbyear` ends at `action_range` times the normalised range of the actions that its statistics were made
-        of. Other policies are taken to have no end.
+        The policy ends at `action_range` times the normalised range of the actions that its statistics were made of.
 
         Args:
             actions: (N, n_actions), as recorded; (N,) of a single one, as LeRobot keeps it.
             what: What they are, for the message.
         """
         config = self.unwrapped.config
-        if not isinstance(config, PlaybyearConfig) or len(actions) == 0:
+        if len(actions) == 0:
             return
         actions = actions.reshape(len(actions), -1)
         needed = self._normalized(actions).abs().cpu()  # (N, n_actions)
@@ -240,11 +242,12 @@ def make_learner(
         ValueError: If the dataset does not suit the policy, before the policy is made.
         InputError: If the recordings of noise that it learns with cannot be used.
     """
-    if cfg.policy is None:
-        raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
+    assert isinstance(cfg.policy, PlaybyearConfig)
+    keep_freed_memory()
     check_dataset_suits(cfg.policy, meta, cfg.rename_map)
     policy = make_policy(cfg=cfg.policy, ds_meta=meta, rename_map=cfg.rename_map)
-    if keep_normalization and isinstance(policy, PlaybyearPolicy):
+    assert isinstance(policy, PlaybyearPolicy)
+    if keep_normalization:
         policy.keep_normalization()
     accelerator = accelerator or make_accelerator(cfg.policy)
     stats = None if cfg.resume or keep_normalization else meta.stats
@@ -268,22 +271,13 @@ def make_learner(
     return Learner(accelerator, policy, optimizer, scheduler, preprocessor, postprocessor, names, step)
 
 
-def make_accelerator(policy: PreTrainedConfig) -> Accelerator:
+def make_accelerator(policy: PlaybyearConfig) -> Accelerator:
     """The Accelerator that lerobot-train makes for a policy: its device, its precision, and the processes launched."""
-    mixed_precision = _DTYPES.get(getattr(policy, "dtype", ""))
-    if not hasattr(policy, "dtype") and policy.use_amp:
-        dtype = torch.get_autocast_dtype(torch.device(str(policy.device)).type)
-        mixed_precision = {torch.bfloat16: "bf16", torch.float16: "fp16"}[dtype]
-    handlers = [
-        # Every parameter of ours is part of every update; of other policies, who knows.
-        DistributedDataParallelKwargs(find_unused_parameters=not isinstance(policy, PlaybyearConfig)),
-        InitProcessGroupKwargs(timeout=_PATIENCE),
-    ]
     return Accelerator(
         step_scheduler_with_optimizer=False,
-        mixed_precision=mixed_precision,
+        mixed_precision=_DTYPES.get(policy.dtype or ""),
         cpu=policy.device == "cpu",
-        kwargs_handlers=handlers,
+        kwargs_handlers=[InitProcessGroupKwargs(timeout=_PATIENCE)],
     )
 
 
@@ -336,18 +330,17 @@ def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: Any) 
 
 
 def check_dataset_suits(
-    policy: PreTrainedConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
+    policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename_map: Mapping[str, str] | None = None
 ) -> None:
     """Refuse a dataset whose frame rate or features a policy was not made for.
 
     Raises:
         ValueError: Naming what was seen, what is wanted, and what to do.
     """
-    fps = getattr(policy, "fps", None)
-    if fps is not None and fps != meta.fps:
+    if policy.fps != meta.fps:
         raise ValueError(
-            f"The dataset '{meta.repo_id}' has {meta.fps} frames per second, and the policy is configured for {fps}: "
-            f"give --policy.fps={meta.fps}, or a dataset recorded at {fps}."
+            f"The dataset '{meta.repo_id}' has {meta.fps} frames per second, and the policy is configured for {policy.fps}: "
+            f"give --policy.fps={meta.fps}, or a dataset recorded at {policy.fps}."
         )
     missing = [key for key in dataset_names(policy, rename_map).values() if key not in meta.features]
     if missing:
@@ -385,3 +378,83 @@ def _make_processors(
         pretrained_revision=getattr(config, "pretrained_revision", None),
         **kwargs,
     )
+
+
+# What makes updates faster and changes nothing that is learned (docs/scale.md)
+
+
+def keep_freed_memory() -> None:
+    """Makes glibc keep freed memory for the next update instead of giving it back to the system after every one.
+
+    The network's intermediate results are megabytes each and are freed at every update; handing their pages back and forth
+    takes a quarter of an update's time on a CPU. Without glibc nothing happens.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform.startswith("linux") else None
+    if mallopt is not None:
+        for parameter, value in ((_M_MMAP_MAX, 0), (_M_TRIM_THRESHOLD, 2**31 - 1), (_M_TOP_PAD, _TOP_PAD)):
+            mallopt(parameter, value)
+
+
+def prefer_channels_last(policy: nn.Module, optimizer: Optimizer) -> None:
+    """Lays the weights of convolutions out as a GPU's tensor cores read them, and the optimizer's state with them.
+
+    Checkpoints stay as they are: safetensors saves contiguous tensors alone, and so the optimizer hands its state out.
+
+    Args:
+        policy: Whatever learns.
+        optimizer: Of its parameters; it may have a state already.
+    """
+    policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer.register_state_dict_post_hook(_contiguous)
+    optimizer.register_load_state_dict_post_hook(_like_parameters)
+    _like_parameters(optimizer)
+
+
+def fuse(optimizer: Optimizer) -> None:
+    """Makes Adam's step one kernel. Its state need not lie on the host, so nothing waits for it.
+
+    Checkpoints do not say so: LeRobot resumes none whose options have other types than the optimizer's, which were not set.
+    """
+    if not isinstance(optimizer, Adam):
+        return
+    optimizer.register_state_dict_post_hook(_as_if_not_fused)
+    optimizer.register_load_state_dict_post_hook(_fused)
+    _fused(optimizer)
+
+
+def compile_networks(policy: PlaybyearPolicy) -> None:
+    """Compiles the encoders and the head when they are first used; names of weights stay."""
+    network = policy.model
+    parts: list[nn.Module] = [network.fusion, network.memory_head.head]
+    parts += [encoder.network for encoder in network.modules() if isinstance(encoder, VisionEncoder)]
+    if policy.config.use_audio:
+        parts += network.hearing.values()
+    for part in parts:
+        part.compile()
+
+
+def _contiguous(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    def saved(values: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value.contiguous() if isinstance(value, Tensor) else value for key, value in values.items()}
+
+    return {**state, "state": {number: saved(values) for number, values in state["state"].items()}}
+
+
+def _like_parameters(optimizer: Optimizer) -> None:
+    for parameter, values in optimizer.state.items():
+        for key, value in values.items():
+            if isinstance(value, Tensor) and value.dim() == _CONVOLUTION_DIMENSIONS:
+                values[key] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
+
+
+def _fused(optimizer: Optimizer) -> None:
+    for group in optimizer.param_groups:
+        group["fused"] = True
+        for parameter in group["params"]:
+            state = optimizer.state.get(parameter, {})
+            if "step" in state:
+                state["step"] = state["step"].to(parameter.device)
+
+
+def _as_if_not_fused(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "param_groups": [{**group, "fused": None} for group in state["param_groups"]]}

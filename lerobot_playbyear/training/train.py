@@ -22,6 +22,7 @@ from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.hub.push import PushOptions, check_name, push_policy, warn_without_login
+from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import (
     PolicyWindows,
     first_of_each_task,
@@ -29,11 +30,10 @@ from lerobot_playbyear.training.batches import (
     make_batches,
     runs_of_each_frame,
 )
-from lerobot_playbyear.training.columns import choose_place
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.learner import Learner, make_accelerator, make_learner, noise_seed
 from lerobot_playbyear.training.report import Report, is_due, print_results
-from lerobot_playbyear.training.store import EpisodeStore
+from lerobot_playbyear.training.store import EpisodeStore, choose_place
 
 _OUTPUTS = "outputs/train"  # in which LeRobot makes folders for runs without a name
 
@@ -54,7 +54,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     init_logging()
     with errors_of_input(FileNotFoundError, MemoryError):
         _check(cfg)
-        assert cfg.policy is not None
+        assert isinstance(cfg.policy, PlaybyearConfig)
         accelerator = make_accelerator(cfg.policy)
         if not accelerator.is_main_process:
             logging.getLogger().setLevel(logging.ERROR)
@@ -70,7 +70,6 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         if cfg.seed is not None and is_shared:
             set_seed(noise_seed(cfg.seed, accelerator.process_index, learner.step))  # each its own
         windows = PolicyWindows(learner.unwrapped.config, meta, cfg.rename_map)
-        windows.check_lengths(reader)
         store = read_store(reader, windows, cfg, is_shared)
         held_out_loss = None
         if held_out is not None and cfg.eval_steps > 0:
@@ -129,6 +128,11 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
     check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     if cfg.policy is None:
         raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
+    if not isinstance(cfg.policy, PlaybyearConfig):
+        raise ValueError(
+            f"--policy.type={cfg.policy.type}: playbyear-train trains policies of --policy.type=playbyear alone; give that, "
+            "or use lerobot-train."
+        )
     if cfg.policy.push_to_hub:
         check_name("policy.repo_id", str(cfg.policy.repo_id))
         warn_without_login()

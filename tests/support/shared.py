@@ -27,6 +27,10 @@ TINY = (
 """The smallest policy that learns from them, and a training that takes a second."""
 
 
+FOLDER = Path()
+"""What all processes of this run of the tests share; `conftest.py` says where it is."""
+
+
 def run_in_process(main: Callable[[], Any], *arguments: str | Path) -> Any:
     """Run a command in this process. Returns what `main` returns, or the exit status or message that it ended with."""
     with pytest.MonkeyPatch.context() as patch:
@@ -37,11 +41,32 @@ def run_in_process(main: Callable[[], Any], *arguments: str | Path) -> Any:
             return end.code
 
 
-def once(folder: Path, name: str, make: Callable[[Path], Any]) -> Path:
-    """The folder `name` in `folder`, made by the first process that asks for it."""
-    place, made = folder / name, folder / f"{name}.made"
-    with FileLock(folder / f"{name}.lock"):
+def once(name: str, make: Callable[[Path], Any]) -> Path:
+    """The folder of this name, made by the first process that asks for it."""
+    place, made = FOLDER / name, FOLDER / f"{name}.made"
+    with FileLock(FOLDER / f"{name}.lock"):
         if not made.exists():
             make(place)
             made.touch()
     return place
+
+
+def recorded() -> Path:
+    """A dataset of two episodes of the expert in `ENV`. Copy it to change it."""
+    from lerobot_playbyear.scripts.commands import record
+
+    data = ("--dataset.repo_id=tests/demos", "--dataset.num_episodes=2", "--num_workers=0")
+    return once("demos", lambda root: _succeeds(record, *ENV, *data, f"--dataset.root={root}"))
+
+
+def trained() -> Path:
+    """A checkpoint, `pretrained_model`, of the policy `TINY` after two updates on `recorded`: it does nothing well."""
+    from lerobot_playbyear.scripts.commands import train
+
+    data = ("--dataset.repo_id=tests/demos", f"--dataset.root={recorded()}", "--steps=2")
+    run = once("trained", lambda folder: _succeeds(train, *TINY, *data, f"--output_dir={folder}"))
+    return run / "checkpoints/000002/pretrained_model"
+
+
+def _succeeds(main: Callable[[], Any], *arguments: str) -> None:
+    assert run_in_process(main, *arguments) is None
