@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,11 @@ class AttemptsFile(gym.Wrapper):
         self._seed: int | None = None
         self._n_steps, self._is_over = 0, False
 
+    @classmethod
+    def around(cls, make: Callable[[], gym.Env], path: str) -> "AttemptsFile":
+        """The environment that `make` makes, with its file."""
+        return cls(make(), path)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         self._seed, self._n_steps, self._is_over = seed, 0, False
         return self.env.reset(seed=seed, options=options)
@@ -53,12 +57,3 @@ def _can_be_told(value: Any) -> bool:
 
 def _plain(value: Any) -> Any:
     return value if isinstance(value, str) else np.asarray(value).tolist()
-
-
-def with_attempts_file(make: Callable[[], gym.Env], path: str | None) -> Callable[[], gym.Env]:
-    """What makes an environment that keeps such a file, if one is named, from what makes it without; it can be pickled."""
-    return make if path is None else partial(_make, make, path)
-
-
-def _make(make: Callable[[], gym.Env], path: str) -> gym.Env:
-    return AttemptsFile(make(), path)

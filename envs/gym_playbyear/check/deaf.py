@@ -160,9 +160,8 @@ class DeafScript:
 
     def __init__(self, facts: TaskFacts, rng: np.random.Generator):
         self.facts, self.rng = facts, rng
-        self.reach = (
-            facts.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
-        )  # from hand to cube, when an open finger touches
+        # From hand to cube, when an open finger touches.
+        self.reach = facts.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
         self._closes = False
         self._last_change = -(10**6)  # step of the gripper's last change of command
         self._sent: np.ndarray = np.zeros(3)  # where the hand was sent [m, world], as the arm's controller reckons it

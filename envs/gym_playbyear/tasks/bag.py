@@ -223,10 +223,7 @@ _MADE = {
 }
 CONTENTS_KINDS = tuple(_MADE)
 # What crackles when it bends: the packet, and sweets in their wrappers. Joints, and factors on their speed.
-_BENDS = {
-    "chips": (("fold", 1.0),),
-    "candies": tuple((f"sweet_{k}", 0.5) for k in range(4)),
-}
+_BENDS = {"chips": (("fold", 1.0),), "candies": tuple((f"sweet_{k}", 0.5) for k in range(4))}
 _LOUDNESS = {"cloth": 0.05, "sponge": 0.05}  # of 1: nearly mute
 
 
