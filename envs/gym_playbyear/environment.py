@@ -159,11 +159,9 @@ class TaskEnv(gym.Env):
 
     def _describe_observation(self) -> spaces.Dict:
         size = (self._image_size, self._image_size, 3)
-        pictures: dict[str, spaces.Space] = {
-            camera.name: spaces.Box(0, 255, size, np.uint8) for camera in self.definition.cameras
-        }
+        cameras = [camera.name for camera in self.definition.cameras]
         observation: dict[str, spaces.Space] = {
-            "pixels": spaces.Dict(pictures),
+            "pixels": spaces.Dict({camera: spaces.Box(0, 255, size, np.uint8) for camera in cameras}),
             "agent_pos": spaces.Box(-np.inf, np.inf, (7,), np.float32),
         }
         if self._synthesizer is not None:
@@ -187,13 +185,10 @@ class TaskEnv(gym.Env):
         Raises:
             AttributeError: The task has none; `hasattr` tells.
         """
-        if self.definition.gate is None:
+        make = self.definition.gate
+        if make is None:
             raise AttributeError(f"{self.task} has no intervention gate.")
-        return self._make_gate
-
-    def _make_gate(self) -> Any:
-        assert self.definition.gate is not None
-        return self.definition.gate(self, self.definition.expert(self))
+        return lambda: make(self, self.scripted_expert())
 
     def blind_baselines(self) -> dict[str, Any]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""

@@ -8,6 +8,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+_PLAIN = "biufU"  # NumPy's kinds of truth values, numbers and texts: what JSON has, too
+
 
 class AttemptsFile(gym.Wrapper):
     """Appends one line of JSON to a file at the end of every attempt.
@@ -43,17 +45,9 @@ class AttemptsFile(gym.Wrapper):
         _, _, terminated, truncated, info = outcome
         if (terminated or truncated) and not self._is_over:
             self._is_over = True
-            told = {key: _plain(value) for key, value in info.items() if _can_be_told(value)}
+            values = {key: np.asarray(value) for key, value in info.items()}
+            told = {key: value.tolist() for key, value in values.items() if value.dtype.kind in _PLAIN}
             line = json.dumps({"seed": self._seed, "steps": self._n_steps, **told})
             with self._path.open("a") as file:
                 file.write(line + "\n")  # one write: lines of several processes do not mix
         return outcome
-
-
-def _can_be_told(value: Any) -> bool:
-    """Whether it is a text, a number or a truth value, or numbers: what JSON has, too."""
-    return isinstance(value, str) or np.asarray(value).dtype.kind in "biuf"
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, str) else np.asarray(value).tolist()
