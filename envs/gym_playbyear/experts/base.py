@@ -57,8 +57,7 @@ class StagedGate:
     """The scripted expert beside a policy: says at every step who acts, and acts.
 
     A gate of a task says what it looks at (`_look`), when to take over (`_find_reason`), and where the expert begins then
-    (`_take_over`, which also sets `_hands_back_at`). Whoever decides in its place calls `take_over` and `hand_back`, and asks
-    for a `label` where the policy acts.
+    (`_take_over`, which also sets `_hands_back_at`). Whoever decides in its place calls `take_over` and `hand_back`.
 
     Args:
         env: The unwrapped environment, after `reset`.
@@ -81,7 +80,6 @@ class StagedGate:
         self._hands_back_at = max(self.stages.values()) + 1
         self._last_action: np.ndarray | None = None
         self._is_told = False  # somebody else says until when the expert acts
-        self._labelled: str | None = None  # the mistake that the last label was for
         self._places: deque[np.ndarray] = deque(maxlen=self.still[0] + 1)
 
     def wants_control(self, policy_action: np.ndarray) -> bool:
@@ -98,7 +96,7 @@ class StagedGate:
             self.reason = None  # the stage that went wrong is done: the policy may go on
         if self.reason is None:
             self.reason = self._find_reason(action)
-            if self.reason is not None and self.reason != self._labelled:
+            if self.reason is not None:
                 self._begin()
         self._last_action = action
         self._n_steps += 1
@@ -123,17 +121,6 @@ class StagedGate:
         """The policy acts again; the next mistake is a new one."""
         self.reason, self._is_told = None, False
 
-    def label(self) -> np.ndarray:
-        """What the expert would do now, (4,), although the policy acts. Call it after `wants_control`, in every step.
-
-        Every step is judged anew, because the expert does not lead the hand: it is set to where the hand is.
-        """
-        if self.reason is None or self.reason == self._labelled:
-            self._follow()
-        action = self.act()
-        self.reason, self._labelled = None, self.reason
-        return action
-
     def _begin(self) -> None:
         self._places.clear()
         self._take_over()
@@ -142,9 +129,6 @@ class StagedGate:
         """Whether the hand stands still, for as long as it was looked at since the expert began last."""
         is_full = len(self._places) == self._places.maxlen
         return is_full and bool(np.linalg.norm(self._places[-1] - self._places[0]) < self.still[1])
-
-    def _follow(self) -> None:
-        """Sets the expert to what the policy is doing by itself; a task's gate that can tell says how."""
 
     def _look(self) -> None:
         raise NotImplementedError

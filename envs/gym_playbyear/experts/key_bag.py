@@ -309,12 +309,3 @@ class BagGate(StagedGate):
         """(2,) the middle of where the things may lie on their side [m, world]: who heard a touch knows no more."""
         things = middle_of(self.env)[:2]
         return min(self.env.definition.numbers.middles, key=lambda middle: float(np.linalg.norm(middle - things)))
-
-    def _follow(self) -> None:
-        phase, stage = self.expert.phase, _STAGES[self.expert.phase]
-        if self._holds() and stage < LIFT:
-            self.expert.begin_at("lift")
-        elif phase == "enter" and self.env.eef_position[2] <= RIM:
-            self.expert.begin_at("descend")
-        elif stage == SEARCH and phase != "enter" and self.env.eef_position[2] > RIM:
-            self.expert.begin_at("enter")

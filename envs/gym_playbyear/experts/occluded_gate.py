@@ -74,12 +74,6 @@ class InterventionGate(StagedGate):
             self.expert.phase = "approach"  # a new search begins as the first did: in silence
         return super().act()
 
-    def label(self) -> np.ndarray:
-        """See `StagedGate`. An expert that does not lead the hand shows nothing anew: it brings no cube back."""
-        if self.expert.phase == "bring_back":
-            self.expert.begin_at(self._fitting_phase())
-        return super().label()
-
     # What there is to see
 
     def _look(self) -> None:
@@ -269,14 +263,6 @@ class InterventionGate(StagedGate):
         self._hands_back_at = GRASP if is_searching else max(LIFT, _STAGES[phase] + 1)
         if self.reason in ("opens", "misplaces") or brings_back:
             self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
-
-    def _follow(self) -> None:
-        phase, now = self._fitting_phase(), _STAGES[self.expert.phase]
-        found = phase in ("dwell", "grasp") and now == SEARCH and self.expert.phase != "sweep"
-        if found or _STAGES[phase] > max(now, GRASP):
-            self.expert.begin_at(phase)
-        elif _STAGES[phase] == now == SEARCH:
-            self.expert.phase = phase  # its speeds stay those of this search
 
     def _fitting_phase(self) -> str:
         if self._holds():
