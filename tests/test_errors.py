@@ -231,7 +231,7 @@ policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memo
 task | sound: loud | sound='loud'
 task | sample_rate: 16001 | 16001
 task | image_size: 2 | image_size=2
-task | horizon: 0 | horizon=0 | at least 1
+task | horizon: 0 | horizon=0 | 1 or more
 task | microphones: [hat] | 'hat' | name at least one of gripper
 task | cube_material: jelly | cube_material='jelly' is not known
 task | variant: paper | variant='paper' is not known: OccludedGrasp-v1 has no such option
