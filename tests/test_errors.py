@@ -168,7 +168,7 @@ dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbye
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
 dagger | --env.image_size=20 | observation.images.front is picture (16, 16, 3) there and picture (20
 dagger | --env.sound=none | observation.audio.gripper is int16 | there and absent here
-dagger | --env.microphones=[ceiling] | `env.microphones`: ['ceiling'] | name at least one of gripper
+dagger | --env.microphones=[ceiling] | `microphones`: ['ceiling'] | name at least one of gripper
 dagger | --demos.root={slow} | has 10 frames per second, and the policy is configured for 20
 dagger | --demos.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
 dagger | --demos.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)
