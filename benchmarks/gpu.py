@@ -9,6 +9,7 @@ format. In five updates `torch.cuda.set_sync_debug_mode("warn")` tells the lines
 """
 
 import argparse
+import itertools
 import shlex
 import sys
 import time
@@ -93,10 +94,10 @@ def updates(options: list[str], plain: bool = False) -> list[Row]:
     parts = make_learner(cfg, dataset.meta)
     device, windows = parts.accelerator.device, PolicyWindows(parts.policy.config, dataset.meta)
     store = EpisodeStore.from_dataset(dataset, windows.keys)
-    sampler = RunSampler(run_weights(store, windows.n_windows))
+    sampler, numbers = RunSampler(run_weights(store, windows.n_windows)), itertools.count()
 
     def batch() -> dict:
-        return windows.batch(store, sampler.draw(cfg.batch_size, parts.step))
+        return windows.batch(store, sampler.draw(cfg.batch_size, next(numbers)))
 
     def update() -> None:
         parts.update(batch(), cfg.optimizer.grad_clip_norm)

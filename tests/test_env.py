@@ -15,7 +15,6 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from virtual_screen import MISSING, VirtualScreen, wait_for
 
 from gym_playbyear import TASKS
-from gym_playbyear.check.report import outcomes
 
 CUBE_TASKS = tuple(task for task in TASKS if task.startswith("Occluded"))
 STAY = np.array([0, 0, 0, -1], np.float32)
@@ -57,22 +56,14 @@ def test_observation_contract(task):
     env.close()
 
 
-def test_force_proxy_replaces_sound():
-    env = make("OccludedGrasp-v1", sound="contact_force")
-    observation, _ = env.reset(seed=0)
-    assert observation["contact_force"].shape == (6,)
-    assert not any(key.startswith("audio.") for key in observation)
-    env.close()
-
-
 @pytest.mark.parametrize("task", TASKS)
 def test_same_seed_same_bytes(task):
-    env = make(task)
+    env = make(task, image_size=16)
 
     def record():
         observations = [env.reset(seed=5)[0]]
         expert = env.unwrapped.scripted_expert()
-        observations += [env.step(expert.act())[0] for _ in range(40)]
+        observations += [env.step(expert.act())[0] for _ in range(15)]
         heard = [key for key in observations[0] if key.startswith("audio.")]
         return [(o["pixels"]["front"], o["agent_pos"], *(o[key] for key in heard)) for o in observations]
 
@@ -127,11 +118,6 @@ def test_camera_never_sees_the_resting_cube(task):
     env.close()
 
 
-@pytest.mark.parametrize("task", CUBE_TASKS)
-def test_expert_succeeds(task):
-    assert all(attempt.success for attempt in outcomes(task, "expert", range(10)))
-
-
 def test_touch_is_heard_in_its_frame_and_nothing_before():
     env = make("OccludedGrasp-v1")
     for seed in range(3):
@@ -151,21 +137,6 @@ def test_reset_options_place_cube_and_bin():
     np.testing.assert_allclose(env.unwrapped.position("cube")[:2], (0.0, 0.2), atol=1e-3)
     np.testing.assert_allclose(env.unwrapped.position("bin")[:2], (0.0, -0.2))
     env.close()
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sound": "loud"}, "sound='loud'"),
-        ({"variant": "easy"}, "variant='easy'"),
-        ({"sample_rate": 16001}, "16001"),
-        ({"microphones": ("hat",)}, "hat"),
-        ({"image_size": 2}, "image_size=2"),
-    ],
-)
-def test_bad_options_are_named(options, message):
-    with pytest.raises(ValueError, match=message):
-        make("OccludedGrasp-v1", **options)
 
 
 def test_bad_action_is_named():
@@ -233,9 +204,9 @@ def play(env: gym.Env, gate, n_steps: int) -> list[dict]:
 
 
 @pytest.mark.parametrize("copied", COPIES)
-@pytest.mark.parametrize("task", CUBE_TASKS)
-def test_a_copy_of_a_running_episode_goes_on_alike_and_by_itself(task, copied):
-    env = make(task)
+def test_a_copy_of_a_running_episode_goes_on_alike_and_by_itself(copied):
+    """With its gate, its expert and its sound."""
+    env = make("OccludedPickPlace-v1", image_size=16)
     env.reset(seed=3)
     gate = env.unwrapped.intervention_gate()
     for _ in range(120):
@@ -258,19 +229,6 @@ def test_a_copy_before_the_first_episode_plays_the_same_one(copied):
     env = make()
     other = COPIES[copied](env)
     assert_same([env.reset(seed=1)[0]], [other.reset(seed=1)[0]])
-
-
-def test_an_expert_is_copied_with_its_environment():
-    env = make()
-    env.reset(seed=0)
-    expert = env.unwrapped.scripted_expert()
-    other = copy.deepcopy(expert)
-    assert other.env is not env.unwrapped
-    assert other.rng is other.env.expert_rng
-    for one in (expert, other):
-        for _ in range(5):
-            one.env.step(one.act())
-    np.testing.assert_array_equal(expert.env.eef_position, other.env.eef_position)
 
 
 NEED_AN_EPISODE: dict[str, Callable] = {
@@ -300,17 +258,10 @@ def test_a_closed_environment_refuses_and_opens_nothing(call, was_reset):
         env.render()
     env.close()
     env.close()
-    with pytest.raises(ClosedEnvironmentError, match=r"closed.*reset\(\)"):
-        NEED_AN_EPISODE[call](env)
+    for one in (env, copy.deepcopy(env)):
+        with pytest.raises(ClosedEnvironmentError, match=r"closed.*reset\(\)"):
+            NEED_AN_EPISODE[call](one)
     assert (env._cameras, env._people) == ({}, None)
-
-
-def test_a_copy_of_a_closed_environment_is_closed():
-    env = make().unwrapped
-    env.reset(seed=0)
-    env.close()
-    with pytest.raises(ClosedEnvironmentError):
-        copy.deepcopy(env).step(STAY)
 
 
 def test_reset_opens_a_closed_environment_anew():
@@ -378,13 +329,9 @@ for cube in (-0.25, 0.25):
 """
 
 
-_RED, _BLUE = 0, 2
-
-
-def spot_on(picture: np.ndarray, colour: int, before: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Row and column of the cube (red) or panel (blue), in shares of the screen; None: there is none, or it is where it was."""
-    own, others = picture[..., colour].astype(int), np.delete(picture, colour, axis=-1).max(axis=-1)
-    found = np.argwhere(own - others > 80)
+def spot_on(picture: np.ndarray, before: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Row and column of the red cube, in shares of the screen; None: there is none, or it is where it was."""
+    found = np.argwhere(picture[..., 0].astype(int) - picture[..., 1:].max(axis=-1) > 80)
     if len(found) < 25:
         return None
     row, column = found.mean(axis=0) / picture.shape[:2]
@@ -392,23 +339,22 @@ def spot_on(picture: np.ndarray, colour: int, before: tuple[float, float] | None
 
 
 @needs_screen
-@pytest.mark.parametrize(("task", "colour"), [("OccludedGrasp-v1", _BLUE), ("OccludedGrasp-v1", _RED)])
-def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen, task, colour):
+def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen):
     """The program does not close it: a window that is open when the process ends must not crash it either."""
     process = subprocess.Popen(
-        [sys.executable, "-c", _WATCH, task],
+        [sys.executable, "-c", _WATCH, "OccludedGrasp-v1"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         env={**screen.environment, "MUJOCO_GL": "egl"},
     )
-    env = make(task, sound="none")
+    env = make(sound="none")
     place = None
     for cube in (-0.25, 0.25):
         measured = json.loads(process.stdout.readline())
         unseen = env.reset(seed=0, options={"cube_position": (0.0, cube)})[0]["agent_pos"]
         assert measured == unseen.tolist()
-        place = wait_for(lambda before=place: spot_on(screen.picture(), colour, before))
+        place = wait_for(lambda before=place: spot_on(screen.picture(), before))
         process.stdin.write("\n")
         process.stdin.flush()
     env.close()

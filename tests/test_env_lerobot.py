@@ -1,7 +1,7 @@
 """`--env.type=playbyear`: what LeRobot's commands get from the environments."""
 
 import re
-from dataclasses import replace
+from pathlib import Path
 
 import draccus
 import numpy as np
@@ -12,13 +12,12 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.envs import make_env, make_env_pre_post_processors, preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies import make_policy_config
-from lerobot.processor import PolicyProcessorPipeline, ProcessorStepRegistry
+from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import rollout
 from torch import nn
 
-from gym_playbyear import ALL_TASKS
-from gym_playbyear.registry import make_definition
-from lerobot_env_playbyear import PcmToFloatProcessorStep, PlaybyearEnvConfig
+from lerobot_env_playbyear import PlaybyearEnvConfig
+from lerobot_env_playbyear import config as config_module
 from lerobot_playbyear.recording.record import RecordConfig
 
 
@@ -87,16 +86,6 @@ def test_the_policy_receives_sound_between_minus_one_and_one(policy_config):
     np.testing.assert_array_equal(observation["observation.state"].numpy(), raw["agent_pos"])
 
 
-def test_pcm_at_its_limits():
-    step = ProcessorStepRegistry.get("playbyear_pcm_to_float")()
-    assert isinstance(step, PcmToFloatProcessorStep)
-    pipeline = PolicyProcessorPipeline(steps=[step])
-    pcm = torch.tensor([[-32768.0, 0.0, 16384.0]])
-    result = pipeline({"observation.audio.table": pcm, "observation.state": pcm})
-    assert result["observation.audio.table"].tolist() == [[-1.0, 0.0, 0.5]]
-    assert result["observation.state"].tolist() == pcm.tolist()
-
-
 def test_lerobots_rollout_sees_the_experts_succeed(policy_config):
     config = PlaybyearEnvConfig(visualization_width=64, visualization_height=64)
     vec = vector_env(config, n_envs=2)
@@ -129,67 +118,38 @@ def test_environments_in_processes_of_their_own_see_the_same():
     np.testing.assert_array_equal(alone["audio.gripper"], together["audio.gripper"])
 
 
-def test_options_reach_the_environment():
-    sizes = {"image_size": 32, "visualization_width": 96, "visualization_height": 96}
-    config = PlaybyearEnvConfig(
-        task="OccludedGrasp-v1", task_options={"cube_material": "tin"}, episode_length=7, **sizes
-    )
-    vec = vector_env(config)
-    vec.reset(seed=0)
-    assert vec.call("_max_episode_steps") == (7,)
-    assert vec.call("render")[0].shape == (96, 96, 3)
-    assert vec.single_observation_space["pixels"]["front"].shape == (32, 32, 3)
-    vec.close()
-
-
-def test_rates_and_microphones_that_are_not_given_are_the_tasks(monkeypatch):
-    usual = make_definition("OccludedGrasp-v1", {})
-    slow = replace(usual, name="Slow-v1", control_hz=5, sample_rate=48000, microphones=("gripper", "table"))
-    monkeypatch.setitem(ALL_TASKS._own, "Slow-v1", slow)
-    config = PlaybyearEnvConfig(task="Slow-v1")
-    assert (config.fps, config.sample_rate, config.microphones) == (5, 48000, ["gripper", "table"])
-    assert config.features["audio.table"].shape == (9600,)
-    with pytest.raises(DecodingError, match="5 Hz"):
-        PlaybyearEnvConfig(task="Slow-v1", fps=20)
-
-
-def test_the_pouch_is_found_with_its_own_rate_and_options():
+def test_options_reach_the_environment_and_rates_that_are_not_given_are_the_tasks():
     config = draccus.parse(
         RecordConfig,
         args=["--env.type=playbyear", "--env.task=TellApart-v1", "--env.task_options={contents: peanuts}",
-              "--env.image_size=16", "--env.episode_length=1", "--dataset.repo_id=a/b"],
+              "--env.image_size=16", "--env.episode_length=1", "--env.visualization_width=96",
+              "--env.visualization_height=96", "--dataset.repo_id=a/b"],
     ).env  # fmt: skip
     assert (config.fps, config.features["audio.gripper"].shape) == (5, (3200,))
     vec = vector_env(config)
     observation, _ = vec.reset(seed=[0])
     assert observation["audio.gripper"].shape == (1, 3200)
+    assert observation["pixels"]["front"].shape == (1, 16, 16, 3)
+    assert vec.call("render")[0].shape == (96, 96, 3)
     *_, infos = vec.step(np.zeros((1, 4), np.float32))
     assert infos["final_info"]["contents"][0] == "peanuts"
     vec.close()
 
 
-@pytest.mark.parametrize(
-    ("argument", "wanted"),
-    [
-        ("task=Nope-v0", "OccludedGrasp-v1, OccludedPickPlace-v1"),
-        ("sound=loud", "waveform, contact_force, none"),
-        ("task_options={cube_material: jelly}", "cube, glass, tin"),
-        ("sample_rate=16001", "a multiple of 20"),
-        ("fps=30", "20 Hz"),
-        ("microphones=[]", "at least one"),
-        ("visualization_width=100", "square"),
-        ("image_size=4", "8 or more"),
-        ("noise_level=-1", "0 (silent) or more"),
-        ("render_mode=video", "rgb_array, human"),
-        ("episode_length=0", "1 or more"),
-        ("room_noise_level=8", "name a WAV file"),
-        ("sound=none microphone_response=phone", "no sound that it could change"),
-    ],
-)
-def test_a_wrong_option_says_what_would_work(argument, wanted):
-    options = [f"--env.{option}" for option in re.split(r"(?<!:) ", argument)]
-    with pytest.raises(DecodingError) as error:
-        draccus.parse(RecordConfig, args=["--env.type=playbyear", *options, "--dataset.repo_id=a/b"])
-    name = re.split(r"(?<!:) ", argument)[-1].split("=")[0]
-    assert f"env.{name}" in str(error.value)
-    assert wanted in str(error.value)
+def test_rates_and_ears_are_the_tasks_own():
+    config = PlaybyearEnvConfig(task="KeyBag-Hard-v1", task_options={"contents": "pens"})
+    assert (config.fps, config.sample_rate, config.samples_per_frame) == (5, 48000, 9600)
+    assert {key for key in config.features if "audio" in key} == {"audio.left_finger", "audio.right_finger"}
+    assert config.features["audio.left_finger"].shape == (9600,)
+    with pytest.raises(DecodingError, match="5 Hz"):
+        PlaybyearEnvConfig(task="KeyBag-Hard-v1", fps=20)
+
+
+def test_pictures_of_sound_want_the_policys_distribution_which_nothing_here_imports(monkeypatch):
+    monkeypatch.setattr(config_module, "entry_points", lambda group: ())
+    with pytest.raises(DecodingError, match=r"env\.spectrogram.*install lerobot_policy_playbyear"):
+        PlaybyearEnvConfig(spectrogram="outputs/demos")
+    sources = [path.read_text() for path in (Path(__file__).parents[1] / "envs").rglob("*.py")]
+    assert not any(
+        re.search(r"^\s*(from|import) lerobot_(playbyear|policy_playbyear)", source, re.M) for source in sources
+    )

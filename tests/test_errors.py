@@ -112,7 +112,7 @@ record | --env.sound=loud | `env.sound`: 'loud' | waveform, contact_force, none
 record | --env.sample_rate=16001 | `env.sample_rate`: 16001 | a multiple of 20
 record | --env.fps=30 | `env.fps`: 30 | give 20, or leave it out
 record | --env.microphones=[] | env.microphones | at least one
-record | --env.microphones=[ceiling] | does not start | ceiling | gripper
+record | --env.microphones=[ceiling] | `env.microphones`: ['ceiling'] | name at least one of gripper
 record | --env.visualization_width=100 | `env.visualization_width`: 100 | square
 record | --env.image_size=4 | `env.image_size`: 4 | 8 or more
 record | --env.noise_level=-1 | `env.noise_level`: -1.0 | 0 (silent) or more
@@ -177,7 +177,7 @@ dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbye
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
 dagger | --env.image_size=20 | observation.images.front is picture (16, 16, 3) there and picture (20
 dagger | --env.sound=none | observation.audio.gripper is int16 | there and absent here
-dagger | --env.microphones=[ceiling] | does not start | ceiling
+dagger | --env.microphones=[ceiling] | `microphones`: ['ceiling'] | name at least one of gripper
 dagger | --demos.root={slow} | has 10 frames per second, and the policy is configured for 20
 dagger | --demos.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
 dagger | --demos.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)
@@ -239,9 +239,10 @@ policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memo
 task | sound: loud | sound='loud'
 task | sample_rate: 16001 | 16001
 task | image_size: 2 | image_size=2
-task | horizon: 0 | horizon=0 | at least 1
+task | horizon: 0 | horizon=0 | 1 or more
 task | microphones: [hat] | 'hat' | name at least one of gripper
 task | cube_material: jelly | cube_material='jelly' is not known
+task | variant: paper | variant='paper' is not known: OccludedGrasp-v1 has no such option
 task | room: {noise: no.wav} | room_noise='no.wav' | no such file
 task | room: {noise_level: -1.0} | room_noise_level=-1.0
 task | room: {response: vinyl} | response='vinyl' | flat, phone, dull, boomy

@@ -1,10 +1,7 @@
-"""Another package adds an encoder, a step for microphones and an expert by name: the example, installed as any other."""
+"""Other packages add an encoder, a step for microphones, an expert and a source of sound by name: the examples, installed."""
 
 import json
-import shutil
-import subprocess
 import sys
-import zipfile
 from pathlib import Path
 
 import draccus
@@ -15,31 +12,34 @@ import torch
 from dataset_factory import make_dataset
 from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
+from support.distributions import install_example, longest_file
 from support.policy import MICROPHONE, make_config, make_episode, make_policy, run_ending_at, step_through
 from torch import nn
 
+from lerobot_playbyear.audio.microphone_pictures import read_strip
 from lerobot_playbyear.dagger import ExpertConfig
+from lerobot_playbyear.microphones import MicrophoneCamera, MicrophoneCameraConfig, MicrophoneError
 from lerobot_playbyear.policy.extension import register_vision_encoder
 from lerobot_playbyear.policy.processor_playbyear import make_playbyear_pre_post_processors
 from lerobot_playbyear.scripts.commands import train
 
-EXAMPLE = Path(__file__).parent.parent / "examples" / "extension"
 THEIRS = {"audio_encoder": "spectrogram_gru", "audio_steps": ("remove_offset",)}
-BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
 
 
 @pytest.fixture(scope="module", autouse=True)
 def installed(tmp_path_factory):
-    """Builds the example's wheel and unpacks it where Python finds distributions, as an installer does."""
-    folder = tmp_path_factory.mktemp("extension")
-    shutil.copytree(EXAMPLE, folder / "source")
-    subprocess.run([sys.executable, "-c", BUILD, str(folder)], cwd=folder / "source", check=True, capture_output=True)
-    with zipfile.ZipFile(next(folder.glob("*.whl"))) as wheel:
-        wheel.extractall(folder / "site")
+    site = tmp_path_factory.mktemp("extension") / "site"
+    for example in ("extension", "own_microphone"):
+        install_example(example, site)
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(folder / "site")
+        patch.syspath_prepend(site)
         register_third_party_plugins()
         yield
+
+
+@pytest.mark.parametrize("example", ["extension", "own_microphone"])
+def test_the_examples_are_short(example):
+    assert longest_file(example) < 100
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,27 @@ def test_their_expert_takes_over_when_it_is_loud():
     wants = [expert.wants_control(heard, np.zeros(4)) for heard in (observation, loud, observation, observation)]
     assert wants == [False, True, True, False]
     assert env.action_space.contains(expert.act())
+
+
+_SEVENS = """import sys, time
+while True:
+    sys.stdout.buffer.write(bytes([7, 0]) * {channels} * ({sample_rate} // 100)); sys.stdout.flush(); time.sleep(0.01)"""
+
+
+def test_their_microphone_is_heard_and_says_what_it_cannot_start(tmp_path):
+    """A program, which a process of its own runs, prints nothing but samples of 7."""
+    (tmp_path / "sevens.py").write_text(_SEVENS.replace("{channels}", "2").replace("{sample_rate}", "16000"))
+    options = {"sample_rate": 16000, "save_to": "none", "source": "program"}
+    camera = MicrophoneCamera(
+        MicrophoneCameraConfig(**options, device=f"{sys.executable} {tmp_path / 'sevens.py'}", channel=1)
+    )
+    camera.connect()
+    try:
+        assert set(np.unique(read_strip(camera.read_latest()).samples)) == {7}
+    finally:
+        camera.disconnect()
+    with pytest.raises(MicrophoneError, match=r"'no_such_program' does not start: .*Give `device` a command"):
+        MicrophoneCamera(MicrophoneCameraConfig(**options, device="no_such_program")).connect()
 
 
 def test_a_vision_encoder_of_another_package_learns_and_acts():

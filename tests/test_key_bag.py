@@ -1,36 +1,29 @@
 """Keys in a bag: hidden from the camera, found by touch, heard; what ends an attempt, and what else can be in the bag."""
 
-from dataclasses import replace
+import itertools
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from support.playing import STILL, Still, finish, make
 
 from gym_playbyear.experts.key_bag import BagExpert
-from gym_playbyear.panda import Proprioception, SensorNoise
-from gym_playbyear.tasks.bag import BAG, CONTENTS, CONTENTS_KINDS, HALF_SIZE, RIM, middle_of, points_of
-from lerobot_env_playbyear import PlaybyearEnvConfig
+from gym_playbyear.tasks.bag import BAG, CONTENTS, CONTENTS_KINDS, HALF_SIZE, RIM, middle_of
 
 EASY, HARD = "KeyBag-Easy-v1", "KeyBag-Hard-v1"
-STILL = np.array([0.0, 0.0, 0.0, -1.0])
 
 
-def make(task: str, **options):
-    return gym.make(f"gym_playbyear/{task}", **options).unwrapped
-
-
-def play(env, seed: int):
-    """The expert's episode without observations: how it ended, and its number of steps."""
-    env.reset_physics(seed=seed)
-    expert, steps, done = env.scripted_expert(), 0, False
-    while not done:
-        _, terminated, truncated, info = env.step_physics(expert.act())
-        steps, done = steps + 1, terminated or truncated
-    return info, steps
+def points_of(env) -> np.ndarray:
+    """Corners of the boxes around all that is in the bag (N, 3) [m, world]."""
+    model, data = env.model, env.data
+    parts = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body(CONTENTS).id)
+    corners = np.array(list(itertools.product((-1, 1), repeat=3)))
+    local = model.geom_aabb[parts, None, :3] + corners * model.geom_aabb[parts, None, 3:]  # (G, 8, 3)
+    turned = np.einsum("gij,gpj->gpi", data.geom_xmat[parts].reshape(-1, 3, 3), local)
+    return (data.geom_xpos[parts][:, None] + turned).reshape(-1, 3)
 
 
 def test_the_camera_sees_no_keys_before_they_are_lifted():
-    world, twin = make(HARD, sound="none"), make(HARD, sound="none", hidden_object=False)
+    world, twin = make(HARD, image_size=84), make(HARD, image_size=84, hidden_object=False)
     for seed in (0, 1):
         first, second = world.reset(seed=seed)[0], twin.reset(seed=seed)[0]
         expert = world.scripted_expert()
@@ -43,13 +36,11 @@ def test_the_camera_sees_no_keys_before_they_are_lifted():
                 break
         else:
             raise AssertionError("the expert touched nothing")
-    world.close()
-    twin.close()
 
 
 @pytest.mark.parametrize("kind", CONTENTS_KINDS)
 def test_whatever_lies_in_the_bag_is_below_what_the_camera_sees(kind):
-    env = make(EASY, sound="none", contents=kind)
+    env = make(EASY, contents=kind)
     eye = env.model.camera("front").pos
     x, y = HALF_SIZE
     for seed in range(2):
@@ -61,24 +52,16 @@ def test_whatever_lies_in_the_bag_is_below_what_the_camera_sees(kind):
         assert (eye[2] + share * (points[:, 2] - eye[2]) < RIM).all()
 
 
-@pytest.mark.parametrize("task", [EASY, HARD])
-def test_the_expert_takes_the_keys_out(task):
-    env = make(task, sound="none")
-    for seed in range(2):
-        info, _ = play(env, seed)
-        assert info["end"] == "success"
-        assert middle_of(env)[2] > RIM
-
-
 @pytest.mark.parametrize("kind", [kind for kind in CONTENTS_KINDS if kind != "keys"])
 def test_the_expert_takes_other_things_out(kind):
-    env = make(EASY, sound="none", contents=kind)
-    assert play(env, 2001)[0]["end"] == "success"
+    env = make(EASY, contents=kind)
+    env.reset_physics(seed=2001)
+    assert finish(env, env.scripted_expert())["end"] == "success"
     assert middle_of(env)[2] > RIM
 
 
 def test_what_is_too_long_for_the_fingers_lies_across_them():
-    env = make(EASY, sound="none", contents="pens")
+    env = make(EASY, contents="pens")
     extents = []
     for seed in range(6):
         env.reset_physics(seed=seed)
@@ -87,7 +70,7 @@ def test_what_is_too_long_for_the_fingers_lies_across_them():
 
 
 def test_what_ends_an_attempt():
-    env = make(EASY, sound="none")
+    env = make(EASY)
     for expected, options, actions in (
         ("torn", {"bottom": 0.06}, [(0, 0, -0.4, -1)]),
         ("groped", {}, [(0, 0, 0, 1), (0, 0, 0, -1)]),
@@ -102,7 +85,7 @@ def test_what_ends_an_attempt():
 
 
 def test_walls_bend_visibly_and_crackle():
-    env = make(EASY, noise_level=0.0, hidden_object=False)
+    env = make(EASY, sound="waveform", noise_level=0.0, hidden_object=False, image_size=84)
     picture = env.reset(seed=0, options={"bottom": 0.03})[0]["pixels"]["front"].astype(int)
     for _ in range(8):
         env.step_physics(np.array([0, 0, -0.4, -1.0]))
@@ -116,7 +99,6 @@ def test_walls_bend_visibly_and_crackle():
     assert louder > 10 * np.abs(still.astype(float)).mean() + 10
     changed = np.abs(observation["pixels"]["front"].astype(int) - picture).max(axis=-1) > 20
     assert changed[45:, 60:].sum() > 10  # below the hand, where only the bag is
-    env.close()
 
 
 def centroid(samples: np.ndarray, rate: int) -> float:
@@ -128,7 +110,7 @@ def centroid(samples: np.ndarray, rate: int) -> float:
 
 
 def test_keys_sound_other_than_the_bag():
-    env = make(HARD, noise_level=0.0, image_size=8, microphones=("gripper",))
+    env = make(HARD, sound="waveform", noise_level=0.0, microphones=("gripper",))
     bag, keys = [], []
     for seed in range(2):
         env.reset(seed=seed)
@@ -143,7 +125,6 @@ def test_keys_sound_other_than_the_bag():
             observation = env.step(np.array([-0.3, -0.3, -0.3, -1.0]))[0]
             if env.contact_forces[f"gripper-{BAG}"] > 0.1:
                 bag.append(observation["audio.gripper"].astype(float))
-    env.close()
     assert len(bag) > 2
     heard_keys, heard_bag = ([centroid(block, 48000) for block in blocks] for blocks in (keys, bag))
     assert np.median(heard_keys) > np.median(heard_bag) + 300
@@ -151,7 +132,7 @@ def test_keys_sound_other_than_the_bag():
 
 def test_one_hears_the_bottom():
     """Pressed as slowly as the expert does; at the usual background, and beside the keys."""
-    env, louder = make(EASY, image_size=8), []
+    env, louder = make(EASY, sound="waveform"), []
     for seed in range(4):
         observation, peaks = env.reset(seed=seed, options={"contents_position": (-0.05, -0.10), "bottom": 0.06})[0], []
         while env.contact_forces[f"gripper-{BAG}"] < 0.5:
@@ -159,13 +140,12 @@ def test_one_hears_the_bottom():
             observation = env.step(np.array([0.0, 0.0, down, -1.0]))[0]
             peaks.append(np.abs(observation["audio.gripper"].astype(float)).max())
         louder.append(20 * np.log10(peaks[-1] / np.median(peaks[-9:-1])))
-    env.close()
     assert np.median(louder) > 20  # dB
     assert min(louder) > 10
 
 
 def test_one_hears_which_finger_touches_the_keys():
-    env, louder = make(HARD, image_size=8), []
+    env, louder = make(HARD, sound="waveform"), []
     for seed in (3, 4, 5):
         for side, near, far in ((-1, "left_finger", "right_finger"), (1, "right_finger", "left_finger")):
             env.reset(seed=seed, options={"contents_position": (0.0, side * 0.033)})
@@ -177,7 +157,6 @@ def test_one_hears_which_finger_touches_the_keys():
             while expert.phase != "lower":
                 env.step(expert.act())
             assert side * env.eef_position[1] > 0.01  # the expert went there
-    env.close()
     assert min(louder) > 1.5
     assert np.median(louder) > 4
 
@@ -198,21 +177,17 @@ class Felt:
 
 @pytest.mark.parametrize("task", [EASY, HARD])
 def test_the_expert_acts_on_what_it_felt_alone(task):
-    env, solved = make(task, sound="none"), 0
+    env, solved = make(task), 0
     for seed in range(4):
         env.reset_physics(seed=seed)
-        expert, done = BagExpert(Felt(env)), False
-        while not done:
-            _, terminated, truncated, info = env.step_physics(expert.act())
-            done = terminated or truncated
-        solved += info["is_success"]
+        solved += finish(env, BagExpert(Felt(env)))["is_success"]
     assert solved >= 3
 
 
 def test_the_force_that_stands_for_sound_is_felt_wherever_the_keys_lie():
     """They lie up to 10 cm above the table, where the cube tasks' proxy is silent because their cube was lifted."""
     for bottom in (0.03, 0.095):
-        env, info = make(EASY, sound="contact_force", image_size=8), {"is_success": False}
+        env, info = make(EASY, sound="contact_force"), {"is_success": False}
         for seed in range(1, 6):  # the expert does not solve every scene, and processors round differently
             observation, _ = env.reset(seed=seed, options={"bottom": bottom})
             expert, touches, over = env.scripted_expert(), [], False
@@ -232,7 +207,7 @@ def test_a_cloth_is_mute():
     """To touch it is much quieter than to touch keys."""
     levels = {}
     for kind in ("keys", "cloth"):
-        env, heard = make(EASY, noise_level=0.0, image_size=8, contents=kind), []
+        env, heard = make(EASY, sound="waveform", noise_level=0.0, contents=kind), []
         for seed in range(4):
             env.reset(seed=seed)
             expert = env.scripted_expert()
@@ -242,77 +217,42 @@ def test_a_cloth_is_mute():
                     heard.append(np.square(observation["audio.gripper"].astype(float)).mean())
                     break
         levels[kind] = np.median(heard)  # a finger may meet the bag in the same step, which crackles
-        env.close()
     assert levels["cloth"] < 0.2 * levels["keys"]
 
 
 def test_a_bad_policy_is_corrected():
-    """Someone who closes far above the keys, and waits."""
-    env = make(EASY, sound="none")
+    """Someone who waits far above the keys."""
+    env = make(EASY)
     rescued = 0
     for seed in range(4):
         env.reset_physics(seed=seed)
-        gate, done, info = env.intervention_gate(), False, {}
-        while not done:
-            action = gate.act() if gate.wants_control(STILL) else STILL
-            _, terminated, truncated, info = env.step_physics(action)
-            done = terminated or truncated
-        rescued += info["is_success"]
+        rescued += finish(env, Still(), env.intervention_gate())["is_success"]
     assert rescued >= 1
 
 
+class PressesOn:
+    """Comes down as the expert does, and then presses on; with something in the hand it lifts it."""
+
+    def __init__(self, env):
+        self.env, self.expert = env, env.scripted_expert()
+
+    def act(self) -> np.ndarray:
+        if self.env.finger_positions.sum() < 0.9 * self.env.definition.arm.max_opening:
+            return np.array([0, 0, 0.4 if self.env.eef_position[2] < RIM + 0.05 else 0, 1.0])
+        return self.expert.act() if self.expert.phase in ("enter", "descend") else np.array([0, 0, -0.08, -1.0])
+
+
 def test_who_lands_on_the_keys_and_goes_on_is_led_beside_them():
-    """Someone who comes down as the expert does, and then presses on; with something in the hand they lift it."""
-    env = make(HARD, sound="none")
+    env = make(HARD)
     rescued = 0
     for seed in range(4):
         env.reset_physics(seed=seed)
-        policy, gate, done, info = env.scripted_expert(), env.intervention_gate(), False, {}
-        while not done:
-            if env.finger_positions.sum() < 0.9 * env.definition.arm.max_opening:
-                action = np.array([0, 0, 0.4, 1.0]) if env.eef_position[2] < RIM + 0.05 else np.array([0, 0, 0, 1.0])
-            elif policy.phase in ("enter", "descend"):
-                action = policy.act()
-            else:
-                action = np.array([0, 0, -0.08, -1.0])
-            action = gate.act() if gate.wants_control(action) else action
-            _, terminated, truncated, info = env.step_physics(action)
-            done = terminated or truncated
+        info = finish(env, PressesOn(env), env.intervention_gate())
         rescued += info["is_success"] and info["n_closings"] == 1  # beside them, at once
     assert rescued >= 3
 
 
 def test_a_policy_as_good_as_the_expert_is_left_alone():
-    env = make(EASY, sound="none")
+    env = make(EASY)
     env.reset_physics(seed=2)
-    policy, gate, by_expert, done = env.scripted_expert(), env.intervention_gate(), [], False
-    while not done:
-        action = policy.act()
-        by_expert.append(gate.wants_control(action))
-        _, terminated, truncated, _ = env.step_physics(gate.act() if by_expert[-1] else action)
-        done = terminated or truncated
-    assert np.mean(by_expert) < 0.2
-
-
-def test_lerobot_takes_the_tasks_own_rates():
-    config = PlaybyearEnvConfig(task=HARD, task_options={"contents": "pens"})
-    assert (config.fps, config.sample_rate, config.samples_per_frame) == (5, 48000, 9600)
-    assert {key for key in config.features if "audio" in key} == {"audio.left_finger", "audio.right_finger"}
-    assert config.features["audio.left_finger"].shape == (9600,)
-    assert PlaybyearEnvConfig(task=EASY).features["audio.gripper"].shape == (9600,)
-
-
-def test_the_hands_measured_place_wanders_by_itself_and_draws_nothing_of_the_usual_numbers():
-    noise = SensorNoise()
-    plain = Proprioception(noise, 5)
-    wandering = Proprioception(replace(noise, wander=0.0006), 5, np.random.default_rng(1))
-    streams = np.random.default_rng(0), np.random.default_rng(0)
-    true, errors = np.array([0.5, 0, 0.2, 0.02, 0.02, 0, 0]), []
-    for _ in range(4000):
-        usual, off = plain.measure(true, streams[0]), wandering.measure(true, streams[1])
-        np.testing.assert_array_equal(usual[3:], off[3:])
-        errors.append(off[:3] - usual[:3])
-    assert 0.0005 < np.std(errors) < 0.0007
-    series = np.array(errors)[:, 2]
-    kept = np.corrcoef(series[:-1], series[1:])[0, 1]
-    assert np.exp(-0.1) - 0.06 < kept < np.exp(-0.1) + 0.04
+    assert finish(env, env.scripted_expert(), env.intervention_gate())["by_expert"].mean() < 0.2

@@ -4,19 +4,16 @@ import copy
 import itertools
 import subprocess
 import sys
-import tempfile
 from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from draccus.utils import DecodingError
 from lerobot.envs.configs import EnvConfig  # noqa: F401  (registers LeRobot's own environments first)
 from scipy import signal
 from scipy.io import wavfile
 
 from gym_playbyear.registry import OptionError
-from gym_playbyear.room import _recording
 from gym_playbyear.sound import BACKGROUND_RMS
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.policy.sound_augmentation import RecordedNoise
@@ -36,7 +33,7 @@ def chirp(tmp_path):
 
 def heard(room, microphone="gripper", seed=3, **options):
     """Everything but sound, and the sound (n,) in [-1, 1], of some random steps."""
-    env = gym.make(TASK, room=room, **options)
+    env = gym.make(TASK, image_size=16, room=room, **options)
     observation, _ = env.reset(seed=seed)
     others, sound = [], [observation.pop(f"audio.{microphone}")]
     others.append(observation)
@@ -62,18 +59,6 @@ def test_a_recording_is_added_at_its_level_and_goes_on_from_step_to_step(chirp):
     )  # the recording, once around
     np.testing.assert_allclose(added[8000:], added[: len(added) - 8000], atol=1.1 / 32767)  # and again
     assert np.abs(np.diff(added)).max() < 0.02 * 8  # no clicks between steps
-
-
-def test_a_recording_with_an_offset_is_as_loud_as_one_without():
-    time = np.arange(8000) / 16000
-    tone = 0.05 * np.sin(2 * np.pi * 400 * time)
-    recordings = []
-    for offset in (0.0, 0.5):
-        with tempfile.TemporaryDirectory() as folder:
-            path = f"{folder}/tone.wav"
-            wavfile.write(path, 16000, (32767 * (tone + offset)).astype(np.int16))
-            recordings.append(_recording(path, 16000))
-    np.testing.assert_allclose(recordings[0], recordings[1], atol=2e-3)
 
 
 def test_the_usual_background_is_as_loud_as_the_unit_says():
@@ -128,25 +113,11 @@ def test_what_cannot_be_is_refused_with_option_and_value(tmp_path):
     wavfile.write(silent, 16000, np.zeros(1000, np.int16))
     broken.write_text("no sound")
     for room, message in [
-        ({"noise": str(tmp_path / "none.wav")}, r"room_noise='.*none.wav'.*no such file"),
         ({"noise": str(silent)}, "it is silent"),
         ({"noise": str(broken)}, "cannot be read as a WAV file"),
-        ({"noise_level": -1.0}, "room_noise_level=-1.0"),
-        ({"response": "vinyl"}, "response='vinyl'.*flat, phone, dull, boomy"),
     ]:
         with pytest.raises(OptionError, match=message):
             gym.make(TASK, room=room)
-
-
-def test_lerobots_options_make_the_same_room(chirp):
-    config = PlaybyearEnvConfig(
-        task="OccludedGrasp-v1", room_noise=chirp, room_noise_level=4.0, microphone_response="dull"
-    )
-    assert config.gym_kwargs["room"] == {"noise": chirp, "noise_level": 4.0, "response": "dull"}
-    assert PlaybyearEnvConfig(task="OccludedGrasp-v1").gym_kwargs["room"] is None
-    for options in ({"room_noise": "none.wav"}, {"microphone_response": "vinyl"}, {"room_noise_level": -2.0}):
-        with pytest.raises(DecodingError, match="does not work"):
-            PlaybyearEnvConfig(task="OccludedGrasp-v1", **options)
 
 
 NOISES = ("hum", "speech_like", "music_like", "clatter", "hammering", "typing", "tool")
@@ -167,7 +138,7 @@ def test_the_recordings_of_the_example_suit_environment_and_policy(tmp_path):
         power = signal.welch(samples / 32768, rate, nperseg=4096)[1]
         spectra.append(power / power.sum())
         config = PlaybyearEnvConfig(task="OccludedGrasp-v1", room_noise=path)
-        env = gym.make(TASK, room=config.gym_kwargs["room"], noise_level=0.0)
+        env = gym.make(TASK, image_size=8, room=config.gym_kwargs["room"], noise_level=0.0)
         seen = [env.reset(seed=0)[0], *(env.step(np.zeros(4))[0] for _ in range(10))]  # some make pauses
         assert max(np.abs(frame["audio.gripper"]).max() for frame in seen) > 5
         env.close()

@@ -7,11 +7,10 @@ import pickle
 import mujoco
 import numpy as np
 import pytest
-from scipy import signal
 
 from experiments import sound_physics
 from experiments.sound_scenes import Scene, box_on_table, box_pulled, centroid, level, two_fingers
-from gym_playbyear.contacts import ContactPair, Contacts, add_sensors
+from gym_playbyear.contacts import ContactPair, Contacts
 from gym_playbyear.sound import Bending, Synthesizer
 
 PAIRS = [
@@ -115,13 +114,6 @@ def test_the_first_step_of_a_contact_has_the_speed_of_the_impact(timestep):
     assert speed[np.flatnonzero(force)[0]] == pytest.approx(0.3, rel=1e-3)
 
 
-def test_a_resting_box_presses_with_its_weight_and_does_not_move():
-    last = box_on_table().contacts(0.5)[-1]
-    assert last.normal_force.mean() == pytest.approx(0.128 * 9.81, rel=0.01)
-    assert np.abs(last.slip_speed).max() < 1e-3
-    assert last.tangential_force.max() < 0.01
-
-
 def test_a_box_that_is_pulled_slips_with_the_speed_of_the_pull_and_feels_friction():
     last = box_pulled(0.1, 3.0).contacts(0.5)[-1]
     touching = last.normal_force[:, 0] > 0
@@ -148,34 +140,6 @@ def test_fingers_that_meet_click_once_and_those_that_open_do_not():
     scene.data.ctrl[:] = 0.05
     opening = scene.contacts(1.0)[2:]
     assert not any(c.normal_force.any() for c in opening)
-
-
-def test_a_body_with_all_that_hangs_on_it_is_one_side():
-    spec = mujoco.MjSpec()
-    spec.worldbody.add_body(name="table").add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1])
-    hand = spec.worldbody.add_body(name="hand", pos=[0, 0, 0.049])
-    hand.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
-    hand.add_body(name="finger", pos=[0, 0, -0.03]).add_geom(size=[0.02, 0, 0])
-    pairs = [ContactPair(("hand", "table"), ("gripper", "table"), subtrees=(True, False))]
-    add_sensors(spec, pairs)
-    scene = Scene(spec.compile(), pairs)
-    assert scene.contacts(0.1)[0].normal_force.any()
-
-
-@pytest.mark.parametrize(
-    ("pairs", "message"),
-    [
-        ([ContactPair(("box", "table"), ("cube", "table"))] * 2, r"same bodies: box\|table"),
-        ([ContactPair(("box", "moon"), ("cube", "table"))], "'moon'"),
-        ([ContactPair(("box", "table"), ("cube", "table"), stop="hinge")], "'hinge'"),
-    ],
-)
-def test_unusable_pairs_are_refused(pairs, message):
-    spec = mujoco.MjSpec()
-    for name in ("box", "table"):
-        spec.worldbody.add_body(name=name)
-    with pytest.raises(ValueError, match=message):
-        add_sensors(spec, pairs)
 
 
 # Episodes
@@ -223,17 +187,6 @@ def test_episodes_differ_in_level_and_pitch_if_they_shall(randomise, least, most
     assert least <= np.std([level(wave) for wave in waves]) <= most
     peaks = [np.argmax(np.abs(np.fft.rfft(wave))) for wave in waves]
     assert (np.std(peaks) / np.mean(peaks) > 0.05) == randomise
-
-
-def test_randomised_noise_has_another_tilt_in_every_episode():
-    tilts = []
-    for seed in range(6):
-        power = signal.welch(
-            hear(synth(seed=seed, noise_level=20.0), nothing(2.0))["gripper"] / 32768.0, 16000, nperseg=2048
-        )
-        heard = (power[0] > 300) & (power[0] < 6000)
-        tilts.append(-np.polyfit(np.log10(power[0][heard]), np.log10(power[1][heard]), 1)[0])
-    assert -0.1 < min(tilts) < max(tilts) - 0.4 < 1.0
 
 
 def touched_things(seeds):
@@ -346,16 +299,6 @@ def test_a_sound_in_the_air_arrives_later_the_farther_it_comes():
     assert onsets[1] - onsets[0] == pytest.approx(1 / 343, abs=2e-4)
 
 
-def test_a_blow_that_arrives_in_the_next_step_is_heard_there():
-    made = Synthesizer(PAIRS, ("room",), 16000, 100, 0.002, 0.0, randomise=False)
-    contacts, ear = touch(nothing(0.01), RESTING, 0.008, speed=0.5), {"room": np.array([3.0, 0, 0])}
-    blocks = [
-        made.step(each, np.zeros(5), np.zeros(5), ear)["room"] for each in (contacts, nothing(0.01), nothing(0.01))
-    ]
-    assert not blocks[0].any()
-    assert blocks[1].any()
-
-
 # Bags
 
 
@@ -372,34 +315,8 @@ def test_a_bag_crackles_more_the_faster_it_bends_and_not_at_all_at_rest():
     assert frames.max() > np.median(frames) + 15  # clicks, not noise
 
 
-def test_what_does_not_crackle_cannot_bend():
+def test_what_does_not_crackle_cannot_bend_and_a_simulation_that_diverged_is_told():
     with pytest.raises(ValueError, match=r"names cube; bodies that crackle: bag"):
         hear(synth(), nothing(0.05), bending={"cube": Bending(np.zeros(25), np.zeros(3))})
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"sample_rate": 16001}, r"sample_rate 16001 is not a multiple of control_hz 20"),
-        ({"sample_rate": 4000}, "sample_rate is 4000.*at least 8000"),
-        ({"physics_dt": 0.003}, r"physics_dt 0\.003.*0\.002"),
-        ({"microphones": ("ceiling",)}, "ceiling.*gripper"),
-        ({"microphones": ()}, "at least one"),
-        ({"noise_level": -1.0}, "noise_level is -1.0"),
-        ({"pairs": [ContactPair(("a", "b"), ("cube", "jelly"))]}, "'jelly'"),
-    ],
-)
-def test_unusable_options_are_refused(changes, message):
-    usual = {"pairs": PAIRS, "microphones": ("gripper",), "sample_rate": 16000, "control_hz": 20, "physics_dt": 0.002}
-    with pytest.raises(ValueError, match=message):
-        Synthesizer(**(usual | changes))
-
-
-def test_wrong_or_diverged_contacts_are_refused():
-    made, ear, still = synth(), {"gripper": np.zeros(3)}, np.zeros(25)
-    with pytest.raises(ValueError, match=r"\(10, 4\); wanted \(25, 4\)"):
-        made.step(nothing(0.02), still, still, ear)
-    with pytest.raises(ValueError, match="lacks gripper"):
-        made.step(nothing(0.05), still, still, {})
-    with pytest.raises(ValueError, match="not finite"):
-        made.step(touch(nothing(0.05), LEFT, 0.0, speed=np.nan), still, still, ear)
+    with pytest.raises(ValueError, match="not finite: the simulation diverged; reduce physics_dt"):
+        hear(synth(), touch(nothing(0.05), LEFT, 0.0, speed=np.nan))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gym_playbyear.environment import TaskEnv
-from gym_playbyear.rendering import PeopleScene
+from gym_playbyear.rendering import PeopleView
 
 TASKS = ("OccludedGrasp-v1", "OccludedPickPlace-v1", "TellApart-v1", "KeyBag-Hard-v1")
 
@@ -21,7 +21,7 @@ def make(task: str, **options) -> TaskEnv:
 @pytest.mark.parametrize("task", TASKS)
 def test_everything_is_seen_where_it_is(task):
     env = make(task)
-    stage = PeopleScene(env.definition, 64)
+    stage = PeopleView(env.definition, 64)
     for seed in (0, 1):
         env.reset_physics(seed=seed)
         expert = env.scripted_expert()
@@ -36,7 +36,7 @@ def test_everything_is_seen_where_it_is(task):
 def test_the_simulation_and_the_policys_scene_hold_none_of_it(task):
     env = make(task)
     assert (env.model.nmesh, env.model.nmat, env.model.ntex) == (0, 0, 1)  # one texture: the sky
-    stage = PeopleScene(env.definition, 64).model
+    stage = PeopleView(env.definition, 64).model
     assert stage.nmesh > 15
     added = stage.geom_type == mujoco.mjtGeom.mjGEOM_MESH
     assert not (stage.geom_contype[added] | stage.geom_conaffinity[added]).any()

@@ -156,24 +156,17 @@ def add_sensors(spec: mujoco.MjSpec, pairs: Sequence[ContactPair], heard: bool =
         spec: The model.
         pairs: Of bodies.
         heard: Whether speeds and places are measured, too, for `ContactReader.read`.
-
-    Raises:
-        ValueError: If two pairs have the same bodies, or the model has no such body or joint.
     """
-    names = [pair.name for pair in pairs]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"Contact pairs with the same bodies: {', '.join(twice)}. Give each pair of bodies once.")
     for body in dict.fromkeys(body for pair in pairs for body in pair.bodies):
-        if spec.body(body) is None:
-            raise ValueError(f"A contact pair names body '{body}', which the model does not have.")
         for name, kind in _FRAME_SENSORS.items() if heard else ():
             spec.add_sensor(name=_sensor(name, body), type=kind, objtype=mujoco.mjtObj.mjOBJ_XBODY, objname=body)
     for pair in pairs:
         if not pair.stop:
             _add_contact(spec, pair, heard)
         elif heard:
-            _add_stop(spec, pair, pair.stop)
+            for name, kind in _STOP_SENSORS.items():
+                joint = {"objtype": mujoco.mjtObj.mjOBJ_JOINT, "objname": pair.stop}
+                spec.add_sensor(name=_sensor(name, pair.name), type=kind, **joint)
 
 
 def add_net_force(spec: mujoco.MjSpec, body: str) -> str:
@@ -270,13 +263,6 @@ def _add_contact(spec: mujoco.MjSpec, pair: ContactPair, heard: bool) -> None:
         sensor.objtype, sensor.reftype = kinds
         sensor.objname, sensor.refname = pair.bodies
         sensor.intprm[:3] = (fields, reduce, 1)
-
-
-def _add_stop(spec: mujoco.MjSpec, pair: ContactPair, joint: str) -> None:
-    if spec.joint(joint) is None:
-        raise ValueError(f"The contact pair {pair.name} names joint '{joint}', which the model does not have.")
-    for name, kind in _STOP_SENSORS.items():
-        spec.add_sensor(name=_sensor(name, pair.name), type=kind, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=joint)
 
 
 def _stop_columns(model: mujoco.MjModel, pair: ContactPair) -> tuple[np.ndarray, np.ndarray, float]:

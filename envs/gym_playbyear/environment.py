@@ -14,11 +14,11 @@ from mujoco import rollout
 
 from gym_playbyear.contacts import ContactReader, TaskContacts, add_net_force, add_sensors
 from gym_playbyear.panda import Proprioception
-from gym_playbyear.registry import OptionError, ResetOptions, check_option, make_definition
+from gym_playbyear.registry import OptionError, check_option, check_spelling, make_definition
 from gym_playbyear.rendering import PeopleView, SceneRenderer
 from gym_playbyear.room import Room
 from gym_playbyear.scene import compose
-from gym_playbyear.sound import Bending, Synthesizer
+from gym_playbyear.sound import ALL_MICROPHONES, Bending, Synthesizer
 from gym_playbyear.task import Task
 
 SOUND_MODES = ("waveform", "contact_force", "none")
@@ -80,20 +80,15 @@ class TaskEnv(gym.Env):
         **task_options: Any,
     ):
         self.definition = definition = make_definition(task, task_options)
-        check_option("sound", sound, SOUND_MODES)
-        check_option("render_mode", render_mode, (None, *self.metadata["render_modes"]))
-        if image_size < 8:
-            raise ValueError(f"image_size={image_size} is too small: give at least 8 pixels.")
+        self.microphones = definition.microphones if microphones is None else tuple(microphones)
+        self._sample_rate = int(sample_rate or definition.sample_rate)
+        self._max_episode_steps = int(definition.horizon if horizon is None else horizon)
+        self._check(sound, render_mode, noise_level, {"image_size": (image_size, 8), "render_size": (render_size, 1)})
         self.task, self.task_description = definition.name, definition.description
         self.control_hz = definition.control_hz
         self.metadata = {**self.metadata, "render_fps": definition.control_hz}
-        if horizon is not None and horizon < 1:
-            raise OptionError("horizon", horizon, "give at least 1 step, or None for the task's own")
-        self._max_episode_steps = int(definition.horizon if horizon is None else horizon)
         self.render_mode, self._render_size = render_mode, render_size
         self._image_size, self._hidden_object = image_size, hidden_object
-        self.microphones = tuple(microphones or definition.microphones)
-        self._sample_rate = int(sample_rate or definition.sample_rate)
         self.shown: dict[str, Any] = {}
         self.secrets: dict[str, Any] = {}
         self.materials: dict[str, str] = {}
@@ -143,13 +138,30 @@ class TaskEnv(gym.Env):
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = self._describe_observation()
 
+    def _check(
+        self, sound: str, render_mode: str | None, noise_level: float, sizes: dict[str, tuple[int, int]]
+    ) -> None:
+        """Raises OptionError for what cannot be used; `sizes`: by their names, each with its least value."""
+        check_option("sound", sound, SOUND_MODES)
+        check_option("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        for name, (size, least) in {**sizes, "horizon": (self._max_episode_steps, 1)}.items():
+            if size < least:
+                raise OptionError(name, size, f"give {least} or more")
+        hz = self.definition.control_hz
+        if self._sample_rate < 8000 or self._sample_rate % hz:
+            wanted = f"give a multiple of {hz} from 8000 on, such as 16000 or 48000: each step holds as many samples"
+            raise OptionError("sample_rate", self._sample_rate, wanted)
+        names, known = self.microphones, tuple(ALL_MICROPHONES)
+        if sound == "waveform" and (not names or len(set(names)) < len(names) or not set(names) <= set(known)):
+            raise OptionError("microphones", names, f"name at least one of {', '.join(known)}, each only once")
+        if not 0 <= noise_level < np.inf:
+            raise OptionError("noise_level", noise_level, "give 0 (silent) or more")
+
     def _describe_observation(self) -> spaces.Dict:
         size = (self._image_size, self._image_size, 3)
-        pictures: dict[str, spaces.Space] = {
-            camera.name: spaces.Box(0, 255, size, np.uint8) for camera in self.definition.cameras
-        }
+        cameras = [camera.name for camera in self.definition.cameras]
         observation: dict[str, spaces.Space] = {
-            "pixels": spaces.Dict(pictures),
+            "pixels": spaces.Dict({camera: spaces.Box(0, 255, size, np.uint8) for camera in cameras}),
             "agent_pos": spaces.Box(-np.inf, np.inf, (7,), np.float32),
         }
         if self._synthesizer is not None:
@@ -173,13 +185,10 @@ class TaskEnv(gym.Env):
         Raises:
             AttributeError: The task has none; `hasattr` tells.
         """
-        if self.definition.gate is None:
+        make = self.definition.gate
+        if make is None:
             raise AttributeError(f"{self.task} has no intervention gate.")
-        return self._make_gate
-
-    def _make_gate(self) -> Any:
-        assert self.definition.gate is not None
-        return self.definition.gate(self, self.definition.expert(self))
+        return lambda: make(self, self.scripted_expert())
 
     def blind_baselines(self) -> dict[str, Any]:
         """Scripts that know what the camera shows and have no sense of contact, by name; used like `scripted_expert`."""
@@ -207,16 +216,18 @@ class TaskEnv(gym.Env):
         self.data.ctrl[:] = self._controller.hold()
         self.secrets, self.materials = {}, {}
         self.model.body_pos[:], self.model.body_quat[:] = self._usual_places
-        asked = ResetOptions(options or {})
-        self.shown = self.definition.initialize_episode(self, asked)
-        asked.check_spelling()
+        check_spelling("reset(options)", options or {}, self.definition.reset_options)
+        self.shown = self.definition.initialize_episode(self, options or {})
         self._expert_rng = np.random.default_rng(self.np_random.integers(2**63))
         if self._synthesizer is not None:
             rng = np.random.default_rng(self.np_random.integers(2**63))
             self._synthesizer.reset(rng, self.materials)
             if self._room is not None:
                 self._room.reset(rng)
-        self._sensors = self._fresh_sensors()
+        # What wanders in the arm's sensors draws nothing from `np_random`.
+        seeds: Any = self.np_random.bit_generator.seed_seq
+        sensors_rng = np.random.default_rng(seeds.spawn(1)[0])
+        self._sensors = Proprioception(self.definition.sensors, self.control_hz, sensors_rng)
         self._n_steps = 0
         mujoco.mj_forward(self.model, self.data)
         hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)
@@ -351,11 +362,6 @@ class TaskEnv(gym.Env):
         if self._proxy is None or self.position(str(name))[2] > self._proxy_silent_above:
             return np.zeros(6, np.float32)
         return self._rollout_sensors[0][:, self._proxy : self._proxy + 6].mean(axis=0).astype(np.float32)
-
-    def _fresh_sensors(self) -> Proprioception:
-        """The arm's sensors in a new episode. What wanders in them draws nothing from `np_random`."""
-        seeds: Any = self.np_random.bit_generator.seed_seq
-        return Proprioception(self.definition.sensors, self.control_hz, np.random.default_rng(seeds.spawn(1)[0]))
 
     # The true state, for scripts
 

@@ -69,10 +69,14 @@ class Panda:
 
     def spec(self) -> mujoco.MjSpec:
         """The arm alone, with its servos."""
-        return mujoco.MjSpec.from_string(
-            f"""<mujoco><compiler angle="radian" autolimits="true"/><default>{ARM_DEFAULT_XML}</default>
-            <worldbody>{arm_body_xml(self)}</worldbody>{arm_actuator_xml(self)}</mujoco>"""
-        )
+        return mujoco.MjSpec.from_string(f"""
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <default>
+    <default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>
+  </default>
+  <worldbody>{_bodies(self)}</worldbody>{_drives(self)}
+</mujoco>""")
 
     def controller(self, control_hz: int, physics_dt: float) -> "CartesianController":
         """What moves it, for so many control steps per second and physics steps of so many seconds."""
@@ -143,7 +147,7 @@ def _hand_xml(max_opening: float) -> str:
       </body>"""
 
 
-def arm_body_xml(config: Panda) -> str:
+def _bodies(config: Panda) -> str:
     """MJCF of the arm's body tree: base, seven links, hand, two fingers. Its nine joints come first in the model."""
     body = ""
     for (name, pos, quat, limits), (mass, com, inertia), (start, end, radius) in _LINKS:
@@ -159,7 +163,7 @@ def arm_body_xml(config: Panda) -> str:
     </body>"""
 
 
-def arm_actuator_xml(config: Panda) -> str:
+def _drives(config: Panda) -> str:
     """MJCF of the joint servos (seven positions) and of the fingers' drive (one position, both fingers coupled)."""
     servos = "".join(
         f'<position name="{link[0][0]}" joint="{link[0][0]}" kp="{kp}" kv="{kv}" forcerange="{-limit} {limit}"/>'
@@ -173,11 +177,6 @@ def arm_actuator_xml(config: Panda) -> str:
   </actuator>"""
 
 
-ARM_DEFAULT_XML = (
-    '<default class="robot"><geom contype="1" conaffinity="0" rgba="0.92 0.92 0.92 1" mass="0"/></default>'
-)
-
-
 class CartesianController:
     """Turns the 4-number action into servo targets: a damped-least-squares inverse kinematics with fixed orientation.
 
@@ -189,9 +188,7 @@ class CartesianController:
         self.config, self._physics_dt = config, physics_dt
         self.n_substeps = round(1 / (control_hz * physics_dt))
         self._cooldown_steps = round(config.gripper_cooldown * control_hz)
-        xml = f"""<mujoco><compiler angle="radian"/><default>{ARM_DEFAULT_XML}</default>
-            <worldbody>{arm_body_xml(config)}</worldbody></mujoco>"""
-        self._model = mujoco.MjModel.from_xml_string(xml)
+        self._model = config.spec().compile()
         self._data = mujoco.MjData(self._model)
         self._site = self._model.site("tcp").id
         self._jacobian = np.zeros((6, self._model.nv))
@@ -324,9 +321,7 @@ class Proprioception:
         self._fingers: np.ndarray | None = None
         self._wander: np.ndarray | None = None
         self._wander_rng = wander_rng or np.random.default_rng(0)
-        self._kept = float(
-            np.exp(-1 / (noise.wander_seconds * rate_hz))
-        )  # of the wandering error, by the next measurement
+        self._kept = float(np.exp(-1 / (noise.wander_seconds * rate_hz)))  # of that error, by the next measurement
 
     def measure(self, true: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """What the sensors say of the true values, (7,) float32.

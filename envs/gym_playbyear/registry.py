@@ -107,42 +107,21 @@ class OptionError(ValueError):
         self.option, self.wanted = option, wanted
 
 
-class ResetOptions(dict[str, Any]):
-    """Options of `reset`, which know what a task's `initialize_episode` asked for:
-    nobody is to think that a misspelt one had an effect.
-
-    Those of others, such as LeRobot's wrappers, pass.
-    """
-
-    def __init__(self, options: Mapping[str, Any]):
-        super().__init__(options)
-        self._asked: dict[str, None] = {}
-
-    def __getitem__(self, name: str) -> Any:
-        self._asked[name] = None
-        return super().__getitem__(name)
-
-    def __contains__(self, name: object) -> bool:
-        self._asked[str(name)] = None
-        return super().__contains__(name)
-
-    def get(self, name: str, default: Any = None) -> Any:
-        self._asked[name] = None
-        return super().get(name, default)
-
-    def check_spelling(self) -> None:
-        """Raises OptionError for one that nobody asked for and that is spelt like one that was asked for."""
-        for name in self.keys() - self._asked.keys():
-            if get_close_matches(name, self._asked, n=1, cutoff=0.75):
-                known = ", ".join(self._asked)
-                raise OptionError(f"reset(options) {name}", self[name], f"the task's options of reset are {known}")
-
-
 def check_option(name: str, value: Any, allowed: Iterable) -> None:
     """Raises OptionError if an option has none of the values that it may have."""
     allowed = tuple(allowed)
     if value not in allowed:
         raise OptionError(name, value, f"choose one of {', '.join(map(str, allowed))}")
+
+
+def check_spelling(where: str, options: Mapping[str, Any], known: Iterable[str]) -> None:
+    """Raises OptionError for one that is spelt nearly like one that is known: nobody is to think that it had an effect.
+
+    Others pass: LeRobot's wrappers have options of their own.
+    """
+    for name, value in options.items():
+        if name not in known and get_close_matches(name, known, n=1, cutoff=0.75):
+            raise OptionError(f"{where} {name}", value, f"the task's options of reset are {', '.join(known)}")
 
 
 def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str, Any]) -> Task:

@@ -87,44 +87,8 @@ class Window:
 
 
 class PeopleView:
-    """Pictures and a window for people; opened when they are first asked for.
-
-    Args:
-        task: The task.
-        size: Height and width of the picture [pixels].
-        hidden_object: As for `compose`.
-    """
-
-    def __init__(self, task: Task, size: int, hidden_object: bool):
-        self._scene = PeopleScene(task, size, hidden_object)
-        self._size = size
-        self._renderer: SceneRenderer | None = None
-        self._window: Window | None = None
-
-    def picture(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-        """The simulation's state as a picture (size, size, 3) uint8."""
-        self._scene.follow(model, data)
-        if self._renderer is None:
-            self._renderer = SceneRenderer(self._scene.model, self._size, shadows=True)
-        return self._renderer.render(self._scene.data, PEOPLE_CAMERA.name)
-
-    def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Shows the simulation's state in a window."""
-        self._scene.follow(model, data)
-        if self._window is None:
-            self._window = Window(self._scene.model, self._scene.data)
-        self._window.update()
-
-    def close(self) -> None:
-        """Closes window and OpenGL."""
-        for resource in (self._renderer, self._window):
-            if resource is not None:
-                resource.close()
-
-
-class PeopleScene:
-    """A task's scene for people: the same motion, with shapes and light for the eye. Physics, and what the policy's cameras
-    see, know nothing of it.
+    """A task's scene for people: the same motion, with shapes and light for the eye, as pictures and in a window. Physics, and
+    what the policy's cameras see, know nothing of it.
 
     Args:
         task: The task.
@@ -132,7 +96,7 @@ class PeopleScene:
         hidden_object: As for `compose`.
 
     Attributes:
-        model, data: To draw from, after `follow`.
+        model, data: What is drawn, after `follow`.
     """
 
     def __init__(self, task: Task, size: int, hidden_object: bool = True):
@@ -140,6 +104,9 @@ class PeopleScene:
         add_visuals(spec, task)
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
+        self._size = size
+        self._renderer: SceneRenderer | None = None  # opened when they are first asked for
+        self._window: Window | None = None
 
     def follow(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Puts everything where it is in the simulation."""
@@ -147,3 +114,23 @@ class PeopleScene:
         self.data.qpos[:] = data.qpos
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_camlight(self.model, self.data)
+
+    def picture(self, model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+        """The simulation's state as a picture (size, size, 3) uint8."""
+        self.follow(model, data)
+        if self._renderer is None:
+            self._renderer = SceneRenderer(self.model, self._size, shadows=True)
+        return self._renderer.render(self.data, PEOPLE_CAMERA.name)
+
+    def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        """Shows the simulation's state in a window."""
+        self.follow(model, data)
+        if self._window is None:
+            self._window = Window(self.model, self.data)
+        self._window.update()
+
+    def close(self) -> None:
+        """Closes window and OpenGL."""
+        for resource in (self._renderer, self._window):
+            if resource is not None:
+                resource.close()

@@ -77,6 +77,8 @@ class Task:
         initialize_episode: `initialize_episode(env, options)` draws places from `env.np_random`, sets them with `env.set_pose`,
             and returns what the camera shows of the episode, in numbers by name (`hidden_range`, ...): `env.shown`. What only
             sound tells it puts into `env.secrets`, and what props are made of this time into `env.materials`.
+        reset_options: Names of what `initialize_episode` understands in `options`; others that are spelt nearly like them are
+            refused.
         success: When the task is solved.
         terminations: By what an attempt fails, in order; their names appear in `info["end"]`.
         expert: `expert(env)` makes the scripted expert: `act()` gives the next action.
@@ -108,6 +110,7 @@ class Task:
     success: Success
     expert: Callable[[Any], Any]
     horizon: int
+    reset_options: tuple[str, ...] = ()
     terminations: tuple[Termination, ...] = ()
     early_action: EarlyAction = field(default_factory=EarlyAction)
     gate: Callable[[Any, Any], Any] | None = None
@@ -126,3 +129,11 @@ class Task:
     force_proxy_of: str | None = None
     numbers: Any = None
     limits: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        steps = 1.0 / (self.control_hz * self.physics_dt)
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6 * steps:
+            raise ValueError(
+                f"{self.name}: physics_dt={self.physics_dt} s does not divide a control step of 1/{self.control_hz} s into "
+                "whole physics steps: change one of the two, for example to 0.002 and 20."
+            )

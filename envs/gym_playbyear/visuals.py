@@ -218,45 +218,41 @@ def _frame(axis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 _, _Y, _Z = np.eye(3)
 
-_SHELLS: dict[str, list[list[np.ndarray]]] = {
-    "link1": [[disc((0, 0, -0.14), _Z, 0.060, 0.050), disc((0, 0, 0), _Y, 0.062, 0.056, 0.012)]],
-    "link2": [[disc((0, 0, 0), _Z, 0.060, 0.063, 0.012), disc((0, -0.115, 0), _Y, 0.056, 0.012)]],
-    "link3": [[disc((0, 0, -0.14), _Z, 0.056, 0.045), disc((0.0825, 0, 0), _Y, 0.058, 0.052, 0.012)]],
-    "link4": [[disc((0, 0, 0), _Z, 0.056, 0.060, 0.012), disc((-0.0825, 0.105, 0), _Y, 0.054, 0.015)]],
-    "link5": [
-        [disc((0, 0, -0.225), _Z, 0.054, 0.03), disc((0, 0.025, -0.06), _Z, 0.040, 0.02, 0.012)],
-        [disc((0, 0.02, -0.10), _Z, 0.040, 0.02, 0.012), disc((0, 0, 0), _Y, 0.046, 0.048, 0.012)],
-    ],
-    "link6": [[disc((0, 0, 0), _Z, 0.045, 0.054, 0.012), disc((0.088, 0.005, 0), _Y, 0.043, 0.035, 0.012)]],
-    "link7": [[disc((0, 0, 0.072), _Z, 0.041, 0.026, 0.010)]],
-}
-_RINGS: dict[str, list[np.ndarray]] = {  # dark, at the joints
-    "base": [disc((0, 0, 0.142), _Z, 0.058, 0.006, 0.002)],
-    "link2": [disc((0, 0, 0), _Z, 0.045, 0.0655, 0.003), disc((0, -0.130, 0), _Y, 0.0535, 0.006, 0.002)],
-    "link4": [disc((0, 0, 0), _Z, 0.042, 0.0625, 0.003), disc((-0.0825, 0.123, 0), _Y, 0.0515, 0.008, 0.002)],
-    "link6": [disc((0, 0, 0), _Z, 0.033, 0.0565, 0.003), disc((0.088, -0.034, 0), _Y, 0.0385, 0.012, 0.002)],
-    "link7": [disc((0, 0, 0.1005), _Z, 0.036, 0.008, 0.002)],
-}
+# Of each shell: the body, and what it is drawn around.
+_SHELLS = (
+    ("base", [disc((-0.03, 0, 0.03), _Z, 0.075, 0.03), disc((0, 0, 0.10), _Z, 0.060, 0.036)]),
+    ("link1", [disc((0, 0, -0.14), _Z, 0.060, 0.050), disc((0, 0, 0), _Y, 0.062, 0.056, 0.012)]),
+    ("link2", [disc((0, 0, 0), _Z, 0.060, 0.063, 0.012), disc((0, -0.115, 0), _Y, 0.056, 0.012)]),
+    ("link3", [disc((0, 0, -0.14), _Z, 0.056, 0.045), disc((0.0825, 0, 0), _Y, 0.058, 0.052, 0.012)]),
+    ("link4", [disc((0, 0, 0), _Z, 0.056, 0.060, 0.012), disc((-0.0825, 0.105, 0), _Y, 0.054, 0.015)]),
+    ("link5", [disc((0, 0, -0.225), _Z, 0.054, 0.03), disc((0, 0.025, -0.06), _Z, 0.040, 0.02, 0.012)]),
+    ("link5", [disc((0, 0.02, -0.10), _Z, 0.040, 0.02, 0.012), disc((0, 0, 0), _Y, 0.046, 0.048, 0.012)]),
+    ("link6", [disc((0, 0, 0), _Z, 0.045, 0.054, 0.012), disc((0.088, 0.005, 0), _Y, 0.043, 0.035, 0.012)]),
+    ("link7", [disc((0, 0, 0.072), _Z, 0.041, 0.026, 0.010)]),
+    ("hand", [rounded_box((0, 0, 0.033), (0.028, 0.100, 0.026), 0.012), disc((0, 0, 0.008), _Z, 0.038, 0.008)]),
+)  # fmt: skip
+_RINGS = (
+    ("base", [disc((0, 0, 0.142), _Z, 0.058, 0.006, 0.002)]),
+    ("link2", [disc((0, 0, 0), _Z, 0.045, 0.0655, 0.003)]),
+    ("link2", [disc((0, -0.130, 0), _Y, 0.0535, 0.006, 0.002)]),
+    ("link4", [disc((0, 0, 0), _Z, 0.042, 0.0625, 0.003)]),
+    ("link4", [disc((-0.0825, 0.123, 0), _Y, 0.0515, 0.008, 0.002)]),
+    ("link6", [disc((0, 0, 0), _Z, 0.033, 0.0565, 0.003)]),
+    ("link6", [disc((0.088, -0.034, 0), _Y, 0.0385, 0.012, 0.002)]),
+    ("link7", [disc((0, 0, 0.1005), _Z, 0.036, 0.008, 0.002)]),
+)  # fmt: skip
 
 
 def _show_arm(spec: mujoco.MjSpec, base_height: float) -> None:
     """Replaces the arm's plain shapes; its base stands so high above the floor [m]. The faces of its fingers stay."""
-    for name in ("base", *_SHELLS, "hand", "left_finger", "right_finger"):
+    for name in (*dict(_SHELLS), "left_finger", "right_finger"):
         for geom in spec.body(name).geoms:
             geom.rgba[3] = 0.0
-    for name, shells in _SHELLS.items():
-        for parts in shells:
-            shell(spec, spec.body(name), parts, "plastic", _WHITE)
-    for name, rings in _RINGS.items():
-        for ring in rings:
-            shell(spec, spec.body(name), [ring], "rubber", _GREY)
+    for shells, finish, colour in ((_SHELLS, "plastic", _WHITE), (_RINGS, "rubber", _GREY)):
+        for name, parts in shells:
+            shell(spec, spec.body(name), parts, finish, colour)
     base, half = spec.body("base"), base_height / 2
-    shell(
-        spec, base, [disc((-0.03, 0, 0.03), _Z, 0.075, 0.03), disc((0, 0, 0.10), _Z, 0.060, 0.036)], "plastic", _WHITE
-    )
     seen(base, type=_BOX, size=(0.065, 0.065, half), pos=(-0.05, 0, -half), material="paint", rgba=_STEEL)
-    hand = rounded_box((0, 0, 0.033), (0.028, 0.100, 0.026), 0.012)
-    shell(spec, spec.body("hand"), [hand, disc((0, 0, 0.008), _Z, 0.038, 0.008)], "plastic", _WHITE)
     for name, sign in (("left_finger", 1), ("right_finger", -1)):
         half, inside = spec.geom(name).size[2], sign * FINGER_THICKNESS / 2
         root = rounded_box((0, sign * 0.0105, 0.010), (FINGER_WIDTH / 2, 0.0095, 0.008), 0.0015)

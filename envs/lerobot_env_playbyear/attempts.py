@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+
+_PLAIN = "biufU"  # NumPy's kinds of truth values, numbers and texts: what JSON has, too
 
 
 class AttemptsFile(gym.Wrapper):
@@ -29,6 +30,11 @@ class AttemptsFile(gym.Wrapper):
         self._seed: int | None = None
         self._n_steps, self._is_over = 0, False
 
+    @classmethod
+    def around(cls, make: Callable[[], gym.Env], path: str) -> "AttemptsFile":
+        """The environment that `make` makes, with its file."""
+        return cls(make(), path)
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         self._seed, self._n_steps, self._is_over = seed, 0, False
         return self.env.reset(seed=seed, options=options)
@@ -39,26 +45,9 @@ class AttemptsFile(gym.Wrapper):
         _, _, terminated, truncated, info = outcome
         if (terminated or truncated) and not self._is_over:
             self._is_over = True
-            told = {key: _plain(value) for key, value in info.items() if _can_be_told(value)}
+            values = {key: np.asarray(value) for key, value in info.items()}
+            told = {key: value.tolist() for key, value in values.items() if value.dtype.kind in _PLAIN}
             line = json.dumps({"seed": self._seed, "steps": self._n_steps, **told})
             with self._path.open("a") as file:
                 file.write(line + "\n")  # one write: lines of several processes do not mix
         return outcome
-
-
-def _can_be_told(value: Any) -> bool:
-    """Whether it is a text, a number or a truth value, or numbers: what JSON has, too."""
-    return isinstance(value, str) or np.asarray(value).dtype.kind in "biuf"
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, str) else np.asarray(value).tolist()
-
-
-def with_attempts_file(make: Callable[[], gym.Env], path: str | None) -> Callable[[], gym.Env]:
-    """What makes an environment that keeps such a file, if one is named, from what makes it without; it can be pickled."""
-    return make if path is None else partial(_make, make, path)
-
-
-def _make(make: Callable[[], gym.Env], path: str) -> gym.Env:
-    return AttemptsFile(make(), path)

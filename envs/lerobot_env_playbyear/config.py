@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
 import torch
@@ -17,16 +18,16 @@ from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline,
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE, OBS_STR
 
 from gym_playbyear import register_tasks
-from gym_playbyear.environment import SOUND_MODES
+from gym_playbyear.environment import TaskEnv
 from gym_playbyear.registry import OptionError, PluginError, make_definition
-from gym_playbyear.room import RESPONSES
 from gym_playbyear.task import Task
-from lerobot_env_playbyear.attempts import with_attempts_file
+from lerobot_env_playbyear.attempts import AttemptsFile
 
-if TYPE_CHECKING:  # of the other distribution, which is needed for these pictures alone
-    from lerobot_playbyear.audio.sound_picture import SoundPicture
-
-RENDER_MODES = ("rgb_array", "human")
+SPECTROGRAM = "lerobot_env_playbyear.spectrogram"
+"""Group of entry points, by which another distribution brings pictures of sound: a module with `pictures_for` and
+`with_sound_pictures`, as `lerobot_playbyear.episodes.spectrogram_env` has them. Nothing here imports it otherwise."""
+_OPTIONS = {"horizon": "episode_length", "render_size": "visualization_width", "response": "microphone_response"}
+"""What options of the environment are called here."""
 _STATE_DIM, _ACTION_DIM, _FORCE_DIM = 7, 4, 6
 OBS_AUDIO_PREFIX = OBS_PREFIX + "audio."
 PCM_FULL_SCALE = 32768.0  # int16: samples are in [-32768, 32767]
@@ -181,10 +182,9 @@ class PlaybyearEnvConfig(EnvConfig):
             **self.gym_kwargs,
         )
         if self.spectrogram is not None:
-            from lerobot_playbyear.episodes.spectrogram_env import with_sound_pictures
-
-            make = with_sound_pictures(make, self._sound_pictures())
-        make = with_attempts_file(make, self.attempts_file)
+            make = self._spectrograms().with_sound_pictures(make, self._sound_pictures())
+        if self.attempts_file is not None:
+            make = partial(AttemptsFile.around, make, self.attempts_file)
         factories = [freeze_after_episode_end(make) for _ in range(n_envs)]
         vec: gym.vector.VectorEnv
         if use_async_envs and n_envs > 1:
@@ -204,28 +204,24 @@ class PlaybyearEnvConfig(EnvConfig):
         return {"noise": self.room_noise, "noise_level": self.room_noise_level, "response": self.microphone_response}
 
     def _definition(self) -> Task:
-        try:
-            return make_definition(self.task or "", self.task_options)
-        except OptionError as error:
-            name = error.option if hasattr(self, error.option) else "task_options"
-            raise self._error(name, error.wanted) from error
-        except PluginError as error:
-            raise self._error("task", str(error).rstrip(".")) from error
+        return self._asked(lambda: make_definition(self.task or "", self.task_options))
 
-    def _sound_pictures(self) -> "list[SoundPicture]":
+    def _spectrograms(self) -> Any:
+        """What makes pictures of sound; of another distribution."""
+        points = tuple(entry_points(group=SPECTROGRAM))
+        if not points:
+            raise self._error("spectrogram", "install lerobot_policy_playbyear, which makes the pictures")
+        return points[0].load()
+
+    def _sound_pictures(self) -> list[Any]:
         if self.spectrogram is None:
             return []
-        try:
-            from lerobot_playbyear.datasets.errors import InputError
-            from lerobot_playbyear.episodes.spectrogram_env import pictures_for
-        except ImportError as error:
-            raise self._error("spectrogram", "install lerobot_policy_playbyear, which makes the pictures") from error
         rates = dict.fromkeys(self.microphones or [], self.sample_rate)
+        cameras = [camera.name for camera in self._definition().cameras]
+        makes = self._spectrograms()
         try:
-            return pictures_for(
-                self.spectrogram, rates, self.fps, [camera.name for camera in self._definition().cameras]
-            )
-        except InputError as error:
+            return makes.pictures_for(self.spectrogram, rates, self.fps, cameras)
+        except ValueError as error:
             raise self._error("spectrogram", str(error).rstrip(".")) from error
 
     def _check(self) -> None:
@@ -234,44 +230,28 @@ class PlaybyearEnvConfig(EnvConfig):
         self.fps, self.sample_rate = self.fps or hz, self.sample_rate or definition.sample_rate
         if self.microphones is None:
             self.microphones = list(definition.microphones)
-        if self.sound not in SOUND_MODES:
-            raise self._error("sound", f"choose one of {', '.join(SOUND_MODES)}")
         if self.fps != hz:
             raise self._error("fps", f"{self.task} is controlled at {hz} Hz, give {hz}, or leave it out")
-        if self.sample_rate <= 0 or self.sample_rate % self.fps:
-            raise self._error(
-                "sample_rate",
-                f"each of the {self.fps} frames per second must hold the same number of samples; "
-                f"give a multiple of {self.fps}, such as 16000 or 48000",
-            )
-        if self.sound == "waveform" and (not self.microphones or len(set(self.microphones)) < len(self.microphones)):
-            raise self._error("microphones", "give at least one name and each only once")
-        if self.microphone_response not in RESPONSES:
-            raise self._error("microphone_response", f"choose one of {', '.join(RESPONSES)}")
-        for name in ("room_noise", "microphone_response"):
-            if self.sound != "waveform" and getattr(self, name) not in (None, "flat"):
-                raise self._error(
-                    name, f"--env.sound={self.sound} has no sound that it could change; leave one of them out"
-                )
-        if self.room_noise is not None and not Path(self.room_noise).is_file():
-            raise self._error("room_noise", "there is no such file, give a WAV file")
-        if self.room_noise is None and self.room_noise_level != 1.0:
-            raise self._error("room_noise_level", "no noise plays in the room; name a WAV file with --env.room_noise")
-        if self.attempts_file is not None and Path(self.attempts_file).is_dir():
-            raise self._error("attempts_file", "it is a folder, give a file in it, such as attempts.jsonl")
-        if not 0 <= self.room_noise_level < float("inf"):
-            raise self._error("room_noise_level", "give 0 (silent) or more")
-        if self.spectrogram is not None and self.sound != "waveform":
-            raise self._error("spectrogram", f"--env.sound={self.sound} has no sound to show; leave one of them out")
-        for name, least in (("image_size", 8), ("visualization_width", 1), ("episode_length", 1)):
-            if getattr(self, name) is not None and getattr(self, name) < least:
-                raise self._error(name, f"give {least} or more")
-        if not 0 <= self.noise_level < float("inf"):
-            raise self._error("noise_level", "give 0 (silent) or more")
-        if self.render_mode not in RENDER_MODES:
-            raise self._error("render_mode", f"choose one of {', '.join(RENDER_MODES)}")
         if self.visualization_width != self.visualization_height:
             raise self._error("visualization_width", "the picture is square: give both sides the same")
+        if self.attempts_file is not None and Path(self.attempts_file).is_dir():
+            raise self._error("attempts_file", "it is a folder, give a file in it, such as attempts.jsonl")
+        for name in ("room_noise", "microphone_response", "spectrogram"):
+            if self.sound != "waveform" and getattr(self, name) not in (None, "flat"):
+                raise self._error(name, f"--env.sound={self.sound} has no sound for it; leave one of them out")
+        if self.room_noise is None and self.room_noise_level != 1.0:
+            raise self._error("room_noise_level", "no noise plays in the room; name a WAV file with --env.room_noise")
+        self._asked(lambda: TaskEnv(self.task or "", **self.gym_kwargs))  # whose messages tell what works
+
+    def _asked[T](self, what: Callable[[], T]) -> T:
+        """What the tasks answer; their complaint names the option of this configuration."""
+        try:
+            return what()
+        except OptionError as error:
+            name = _OPTIONS.get(error.option, error.option)
+            raise self._error(name if hasattr(self, name) else "task_options", error.wanted) from error
+        except PluginError as error:
+            raise self._error("task", str(error).rstrip(".")) from error
 
     def _error(self, name: str, what_to_do: str) -> DecodingError:
         # Not a ValueError: draccus hides a ValueError of __post_init__ behind a traceback, and prints this as one line.

@@ -4,19 +4,22 @@
     playbyear-record --env.type=playbyear --env.task=StopAtTheTin-v1 --dataset.repo_id=me/tin --dataset.num_episodes=50
     lerobot-eval --env.type=playbyear --env.task=StopAtTheTin-v1 --policy.path=...
 
-`pyproject.toml` names task and material as entry points; nothing else has to know of them.
+`pyproject.toml` names task, material and a microphone, which other tasks can use too, as entry points; nothing else has to know
+of them.
 """
 
 import numpy as np
 
 from gym_playbyear.panda import ACTION_SCALE, Panda
 from gym_playbyear.sound.materials import TINPLATE, cup, ringing
+from gym_playbyear.sound.microphones import Microphone
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.tasks.arena import FRONT_CAMERA, TABLE, TABLE_TOP, WALL_COLOUR, box
 from gym_playbyear.terminations import Shoved, Success
 
 RADIUS, HALF_HEIGHT = 0.025, 0.025  # m
 TIN_CAN = ringing(TINPLATE, cup(TINPLATE, RADIUS, 0.0003, (2, 3, 4, 5)), support=30.0)
+BASE = Microphone({"table": 0.7, "link1": 1.0}, hum=3.0)  # at the arm's foot: --env.microphones='[gripper, base]'
 RANGE = (-0.1, 0.25)  # m: where along the wall it may stand
 SWEEP_HEIGHT, NEAR = 0.03, 0.01  # m
 TIN = Prop(

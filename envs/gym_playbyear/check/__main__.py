@@ -30,7 +30,6 @@ def main() -> int:
     parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments.adversaries")
     parser.add_argument("--output", type=Path, help="a JSON file for the results; a check that was stopped goes on")
     arguments = parser.parse_args()
-    given = {"horizon": arguments.horizon}
     progress = None
     if arguments.output:  # before the hours that it takes
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
@@ -43,7 +42,7 @@ def main() -> int:
         twin=not arguments.no_twin,
         jobs=arguments.jobs,
         learned=[json.loads(path.read_text()) for path in arguments.learned],
-        options={name: value for name, value in given.items() if value is not None},
+        options={} if arguments.horizon is None else {"horizon": arguments.horizon},
         progress=progress,
     )
     print(as_text(report))

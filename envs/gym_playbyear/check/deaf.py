@@ -94,7 +94,6 @@ class DeafTask:
         self._touches = [pair for pair in self.env.contact_forces if pair in hidden]
         self._sensors = Proprioception(definition.sensors, hz)
         self._rng = np.random.default_rng(0)
-        self._n_steps = 0
         self.has_touched = False
 
     def begin(self, seed: int, **options: Any) -> DeafView:
@@ -109,14 +108,12 @@ class DeafTask:
         self._sensors = Proprioception(
             self.env.definition.sensors, self.facts.control_hz, np.random.default_rng([seed, _WANDER_STREAM])
         )
-        self._n_steps = 0
         self.has_touched = False
         return self._view()
 
     def advance(self, action: np.ndarray) -> tuple[DeafView, bool, dict[str, Any]]:
         """One step. Returns the view, whether the episode is over, and the environment's `info` with how it ended in `end`."""
         _, terminated, truncated, info = self.env.step_physics(action)
-        self._n_steps += 1
         self.has_touched |= self.touch_force > _UNTOUCHED
         return self._view(), terminated or truncated, info
 
@@ -136,7 +133,7 @@ class DeafTask:
 
     def _view(self) -> DeafView:
         shown = {name: np.array(value, dtype=float) for name, value in self.env.camera_numbers().items()}
-        return DeafView(self._sensors.measure(self.env.true_proprioception(), self._rng), shown, self._n_steps)
+        return DeafView(self._sensors.measure(self.env.true_proprioception(), self._rng), shown, self.env._n_steps)
 
 
 Actions = Generator[np.ndarray, None, None]
@@ -160,9 +157,8 @@ class DeafScript:
 
     def __init__(self, facts: TaskFacts, rng: np.random.Generator):
         self.facts, self.rng = facts, rng
-        self.reach = (
-            facts.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
-        )  # from hand to cube, when an open finger touches
+        # From hand to cube, when an open finger touches.
+        self.reach = facts.max_opening / 2 + FINGER_THICKNESS + CUBE_HALF_SIZE
         self._closes = False
         self._last_change = -(10**6)  # step of the gripper's last change of command
         self._sent: np.ndarray = np.zeros(3)  # where the hand was sent [m, world], as the arm's controller reckons it

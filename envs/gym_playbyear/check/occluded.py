@@ -14,15 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from gym_playbyear.check.deaf import (
-    FAST,
-    GRASP_HEIGHT,
-    TRAVEL_HEIGHT,
-    Actions,
-    DeafScript,
-    ScriptMaker,
-    TaskFacts,
-)
+from gym_playbyear.check.deaf import FAST, GRASP_HEIGHT, TRAVEL_HEIGHT, Actions, DeafScript, ScriptMaker, TaskFacts
 from gym_playbyear.panda import FINGER_THICKNESS, FINGER_WIDTH, TIP_BELOW_HAND
 from gym_playbyear.tasks.arena import CUBE_HALF_SIZE
 
@@ -63,13 +55,11 @@ class CubeBelief:
             hand: Along the line [m], one or (...,).
             opening: Between the fingers [m].
         """
-        offset = np.abs(
-            np.asarray(hand)[..., None, None] - self.places[:, None]
-        )  # (..., places, 1): by symmetry one finger
+        # By symmetry of one finger (..., places, 1).
+        offset = np.abs(np.asarray(hand)[..., None, None] - self.places[:, None])
         inner, outer = opening / 2, opening / 2 + FINGER_THICKNESS
-        gap = (
-            np.maximum(offset - outer, inner - offset) - self.extents + self.slides
-        )  # negative where it rests on the cube
+        # Negative where it rests on the cube.
+        gap = np.maximum(offset - outer, inner - offset) - self.extents + self.slides
         return _MISTAKE + (1 - 2 * _MISTAKE) / (1 + np.exp(np.clip(gap / _SOFTNESS, -50, 50)))
 
     def between(self, hand: float | np.ndarray, opening: float) -> np.ndarray:
@@ -261,10 +251,8 @@ class TappingScript(DeafScript):
 
 
 _NUDGE_STEP = 0.008  # m: what the hand covers per control step
-_SPARE, _FURTHER = (
-    0.003,
-    0.002,
-)  # m: how much less than is allowed the cube is moved; how far past its place the fingers close
+_SPARE = 0.003  # m: so much less than is allowed the cube is moved
+_FURTHER = 0.002  # m: so far past its place the fingers close
 _RUN_UP = 0.014  # m before the nearest possible cube
 _BACK_OFF = 0.004  # m
 

@@ -1,5 +1,6 @@
 """What the scripts share: motions, pauses and noise; and who acts in a step, the expert or a policy, and for how long."""
 
+from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
@@ -56,8 +57,7 @@ class StagedGate:
     """The scripted expert beside a policy: says at every step who acts, and acts.
 
     A gate of a task says what it looks at (`_look`), when to take over (`_find_reason`), and where the expert begins then
-    (`_take_over`, which also sets `_hands_back_at`). Whoever decides in its place calls `take_over` and `hand_back`, and asks
-    for a `label` where the policy acts.
+    (`_take_over`, which also sets `_hands_back_at`). Whoever decides in its place calls `take_over` and `hand_back`.
 
     Args:
         env: The unwrapped environment, after `reset`.
@@ -69,6 +69,8 @@ class StagedGate:
 
     stages: Mapping[str, int]
     """Of each of the expert's phases, in the order in which a task goes through them."""
+    still: tuple[int, float]
+    """Steps in which a hand that moves less than so far [m] stands still."""
 
     def __init__(self, env: Any, expert: Any):
         self.env, self.expert = env, expert
@@ -78,7 +80,7 @@ class StagedGate:
         self._hands_back_at = max(self.stages.values()) + 1
         self._last_action: np.ndarray | None = None
         self._is_told = False  # somebody else says until when the expert acts
-        self._labelled: str | None = None  # the mistake that the last label was for
+        self._places: deque[np.ndarray] = deque(maxlen=self.still[0] + 1)
 
     def wants_control(self, policy_action: np.ndarray) -> bool:
         """Whether the expert acts in this step. Call it once per step, before the step.
@@ -88,13 +90,14 @@ class StagedGate:
         """
         action = np.asarray(policy_action, dtype=float)
         self._look()
+        self._places.append(self.env.eef_position)
         is_done = self.stages[self.expert.phase] >= self._hands_back_at and not self._is_told
         if self.reason is not None and is_done:
             self.reason = None  # the stage that went wrong is done: the policy may go on
         if self.reason is None:
             self.reason = self._find_reason(action)
-            if self.reason is not None and self.reason != self._labelled:
-                self._take_over()
+            if self.reason is not None:
+                self._begin()
         self._last_action = action
         self._n_steps += 1
         return self.reason is not None
@@ -111,26 +114,21 @@ class StagedGate:
             until_told: Until `hand_back`; otherwise until the stage in which it begins is done.
         """
         self.reason = self.reason or "asked"
-        self._take_over()
+        self._begin()
         self._is_told = until_told
 
     def hand_back(self) -> None:
         """The policy acts again; the next mistake is a new one."""
         self.reason, self._is_told = None, False
 
-    def label(self) -> np.ndarray:
-        """What the expert would do now, (4,), although the policy acts. Call it after `wants_control`, in every step.
+    def _begin(self) -> None:
+        self._places.clear()
+        self._take_over()
 
-        Every step is judged anew, because the expert does not lead the hand: it is set to where the hand is.
-        """
-        if self.reason is None or self.reason == self._labelled:
-            self._follow()
-        action = self.act()
-        self.reason, self._labelled = None, self.reason
-        return action
-
-    def _follow(self) -> None:
-        """Sets the expert to what the policy is doing by itself; a task's gate that can tell says how."""
+    def _is_still(self) -> bool:
+        """Whether the hand stands still, for as long as it was looked at since the expert began last."""
+        is_full = len(self._places) == self._places.maxlen
+        return is_full and bool(np.linalg.norm(self._places[-1] - self._places[0]) < self.still[1])
 
     def _look(self) -> None:
         raise NotImplementedError

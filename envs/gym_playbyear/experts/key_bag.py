@@ -106,9 +106,8 @@ class BagExpert(Script):
 
     def _descend(self):
         if self._feels_contents():
-            return self._touched(
-                (self._side() or self.turn) * (np.mean(self.env.definition.numbers.sideways) + self.ASIDE)
-            )
+            sideways = np.mean(self.env.definition.numbers.sideways) + self.ASIDE
+            return self._touched((self._side() or self.turn) * sideways)
         if self._feels_bottom(self.BOTTOM_FORCE):
             self._bottom = self._touched_at = float(self.env.eef_position[2])
             self.phase, self._way = "search", [self.turn * 0.03, -self.turn * 0.03]
@@ -163,12 +162,8 @@ class BagExpert(Script):
     def _lower(self):
         height = self.env.eef_position[2]
         lowest = self._bottom if self._bottom is not None else self._touched_at - self.DEEP + 0.003
-        is_low = height < self._touched_at + 0.012
-        if (
-            (is_low and self._feels_bottom(self.FIRM))
-            or height < lowest - 0.003
-            or self.env.contact_forces[_GRIP] > self.LANDED
-        ):
+        is_at_bottom = height < self._touched_at + 0.012 and self._feels_bottom(self.FIRM)
+        if is_at_bottom or height < lowest - 0.003 or self.env.contact_forces[_GRIP] > self.LANDED:
             return self._begin_grasp()
         guess = self._bottom if self._bottom is not None else self._touched_at - 0.014
         speed = np.clip(0.25 * (height - guess), *self.LOWERING)  # slower the nearer the bottom may be
@@ -253,7 +248,6 @@ PUSH_FORCE, PUSH_STEP = 12.0, 0.003  # the hand presses this hard, and would go 
 EMPTY_STEPS = 2  # for so long the fingers hold nothing
 MEMORY_STEPS = 10  # how long a touch is heard
 MISSED_HEIGHT = 0.07  # the hand is so far above the bag's bottom after it
-STILL_STEPS, STILL_DISTANCE = 18, 0.01  # the hand moved less in so many steps
 SEARCH_STEPS, GRASP_STEPS = 48, 38  # left of the episode without a touch; without a grasp
 
 
@@ -261,18 +255,17 @@ class BagGate(StagedGate):
     """The gate of the bag; see `StagedGate`."""
 
     stages = _STAGES
+    still = (18, 0.01)
 
     def __init__(self, env, expert: BagExpert):
         super().__init__(env, expert)
         self._empty_for, self._height_at_touch = 0, 0.0
-        self._places: list[np.ndarray] = []
 
     def _look(self) -> None:
         if self.env.contact_forces[f"gripper-{CONTENTS}"] > self.expert.CONTACT_FORCE:
             self._touched_at, self._height_at_touch = self._n_steps, float(self.env.eef_position[2])
         empty = self.env.finger_positions.sum() < self.expert.EMPTY
         self._empty_for = self._empty_for + 1 if empty else 0
-        self._places = [*self._places[-STILL_STEPS:], self.env.eef_position]
 
     def _height(self) -> float:
         """Of the fingers' tips above the bag's bottom [m]."""
@@ -298,13 +291,8 @@ class BagGate(StagedGate):
         }
         return next((reason for reason, applies in checks.items() if applies), None)
 
-    def _is_still(self) -> bool:
-        is_full = len(self._places) > STILL_STEPS
-        return is_full and bool(np.linalg.norm(self._places[-1] - self._places[0]) < STILL_DISTANCE)
-
     def _take_over(self) -> None:
         """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
-        self._places = []
         heard = self._touched_at is not None and self._n_steps - self._touched_at <= MEMORY_STEPS
         if self._holds():
             self.expert.begin_at("lift")
@@ -321,12 +309,3 @@ class BagGate(StagedGate):
         """(2,) the middle of where the things may lie on their side [m, world]: who heard a touch knows no more."""
         things = middle_of(self.env)[:2]
         return min(self.env.definition.numbers.middles, key=lambda middle: float(np.linalg.norm(middle - things)))
-
-    def _follow(self) -> None:
-        phase, stage = self.expert.phase, _STAGES[self.expert.phase]
-        if self._holds() and stage < LIFT:
-            self.expert.begin_at("lift")
-        elif phase == "enter" and self.env.eef_position[2] <= RIM:
-            self.expert.begin_at("descend")
-        elif stage == SEARCH and phase != "enter" and self.env.eef_position[2] > RIM:
-            self.expert.begin_at("enter")

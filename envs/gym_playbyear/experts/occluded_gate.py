@@ -11,8 +11,6 @@ where it was lifted, and then to the tray: where a way ends is learned from the 
 correction, Hu et al., "RaC", 2025).
 """
 
-from collections import deque
-
 import numpy as np
 
 from gym_playbyear.experts.base import StagedGate
@@ -23,29 +21,17 @@ from gym_playbyear.tasks.arena import CUBE_HALF_SIZE, LINE_X, MAX_SHOVE, TABLE_T
 # Thresholds: lengths in metres, durations in control steps, shares of the episode's steps.
 MISSED_HEIGHT = 0.12  # so high above the table, after it touched the cube and without it, the hand missed and moved on
 SEARCH_SHARE = 0.35  # from this share on, the same height without a touch counts as well
-HOVER_SHARE, HOVER_DISTANCE, HOVER_CHANGE = (
-    0.8,
-    0.05,
-    0.05,
-)  # late, open fingers near the cube that hardly change the action
-STILL_STEPS, STILL_DISTANCE = 24, 0.005  # the hand moved less than this in so many steps
+HOVER_SHARE = (
+    0.8  # from this share on, open fingers so near the cube that change the action so little do not know what to do
+)
+HOVER_DISTANCE, HOVER_CHANGE = 0.05, 0.05
 SHOVE_SHARE, PUSH_STEP = 0.3, 0.003  # the cube was shoved by this share of what ends the attempt, and is pushed on
-GRASP_REACH, GRASP_HEIGHT = (
-    0.012,
-    0.034,
-)  # the cube is between fingers whose middle is that near, and whose tips are so low
+GRASP_REACH, GRASP_HEIGHT = 0.012, 0.034  # the cube is between fingers whose middle is that near, and that are so low
 LANDED_STEPS = 8  # the hand touched the cube from above for so long
-LAND_X, LAND_HEIGHT, LAND_MARGIN = (
-    0.035,
-    0.044,
-    0.012,
-)  # about to land: that near to the cube's middle, and so far above it
+LAND_X, LAND_HEIGHT, LAND_MARGIN = 0.035, 0.044, 0.012  # about to land: so near to the cube's middle, so far above it
 EMPTY_OPENING = 0.03  # fingers that were closed, and are this near to each other, hold nothing
 RELEASE_REACH = 0.02  # fingers may open when the held cube is this near to the tray's middle
-CARRY_PAST, CARRY_SINK = (
-    0.03,
-    0.015,
-)  # a carried cube that is so far past the tray, or so far too low beside it, is misplaced
+CARRY_PAST, CARRY_SINK = 0.03, 0.015  # a carried cube so far past the tray, or so far too low beside it, is misplaced
 FAR = 0.1  # from where it was lifted; a cube that is this far is carried back, to show the way to the tray anew
 DROP_DISTANCE = 0.04  # a cube that was held and is this far from the hand was dropped
 STRAY_X, STRAY_Y = 0.03, 0.12  # how far a hand that searches may be beside the line of the sweep, and before its start
@@ -72,13 +58,13 @@ class InterventionGate(StagedGate):
     """The gate of the tasks with a cube; see `StagedGate`."""
 
     stages = _STAGES
+    still = (24, 0.005)
 
     def __init__(self, env, expert: GraspExpert):
         super().__init__(env, expert)
         self._on_top_for = 0  # steps
         self._was_held = self._was_up = False
         self._first_cube = self._lifted_at = env.position("cube")
-        self._positions: deque[np.ndarray] = deque(maxlen=STILL_STEPS + 1)
 
     def act(self) -> np.ndarray:
         """The expert's action (4,) for the present state."""
@@ -87,12 +73,6 @@ class InterventionGate(StagedGate):
         if self.expert.phase == "lower" and (self._hears() or not self._is_open()):
             self.expert.phase = "approach"  # a new search begins as the first did: in silence
         return super().act()
-
-    def label(self) -> np.ndarray:
-        """See `StagedGate`. An expert that does not lead the hand shows nothing anew: it brings no cube back."""
-        if self.expert.phase == "bring_back":
-            self.expert.begin_at(self._fitting_phase())
-        return super().label()
 
     # What there is to see
 
@@ -103,7 +83,6 @@ class InterventionGate(StagedGate):
         if self._holds() and self._cube_height() > 0.01 and not self._was_held:
             self._was_held, self._lifted_at = True, self.env.position("cube")
         self._was_up |= self._holds() and self._height() > self._carry_height() - 0.01
-        self._positions.append(self.env.eef_position)
 
     def _height(self) -> float:
         """Of the fingertips' middle above the table [m]."""
@@ -185,9 +164,8 @@ class InterventionGate(StagedGate):
         """Has carried the cube past the tray, or lowers it beside the tray."""
         if not self._was_up or not self._is_far():
             return False
-        way, left = (
-            place[1] - self.env.shown["bin_position"][1] for place in (self._lifted_at, self.env.position("cube"))
-        )
+        tray = self.env.shown["bin_position"]
+        way, left = (place[1] - tray[1] for place in (self._lifted_at, self.env.position("cube")))
         past = np.sign(way) * left < -CARRY_PAST
         lowers = self._height() < self._carry_height() - CARRY_SINK
         return bool(past or (lowers and not self._is_over_tray()))
@@ -249,11 +227,6 @@ class InterventionGate(StagedGate):
             return False
         return bool(np.abs(action - self._last_action).max() < HOVER_CHANGE)
 
-    def _is_still(self) -> bool:
-        first, last = self._positions[0], self._positions[-1]
-        full = len(self._positions) == self._positions.maxlen
-        return bool(full and np.linalg.norm(last - first) < STILL_DISTANCE)
-
     def _is_late(self) -> bool:
         """Has only as many steps left as the expert needs. What comes after a touch is judged by its result."""
         left = self.env._max_episode_steps - self._n_steps
@@ -281,7 +254,6 @@ class InterventionGate(StagedGate):
 
     def _take_over(self) -> None:
         """Starts the expert in the phase that fits what the hand is doing, until the stage that went wrong is done."""
-        self._positions.clear()
         brings_back, phase = self._brings_back(), self._fitting_phase()
         self._was_held, self._was_up = self._holds(), False
         self.expert.begin_at(phase)
@@ -291,14 +263,6 @@ class InterventionGate(StagedGate):
         self._hands_back_at = GRASP if is_searching else max(LIFT, _STAGES[phase] + 1)
         if self.reason in ("opens", "misplaces") or brings_back:
             self._hands_back_at = CARRY + 1  # never: whoever shows where not to let go also shows where to
-
-    def _follow(self) -> None:
-        phase, now = self._fitting_phase(), _STAGES[self.expert.phase]
-        found = phase in ("dwell", "grasp") and now == SEARCH and self.expert.phase != "sweep"
-        if found or _STAGES[phase] > max(now, GRASP):
-            self.expert.begin_at(phase)
-        elif _STAGES[phase] == now == SEARCH:
-            self.expert.phase = phase  # its speeds stay those of this search
 
     def _fitting_phase(self) -> str:
         if self._holds():

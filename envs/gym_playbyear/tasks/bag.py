@@ -118,17 +118,12 @@ _SOFT = 'priority="2" condim="4" friction="0.5 0.005 0.0002" solref="0.02 1" sol
 # What is round does not roll away: there are pills in the bottle, and the paper below gives way.
 _ROUND = 'priority="2" condim="6" friction="0.5 0.005 0.002" solref="0.005 1" solimp="0.95 0.99 0.0005"'
 _WHITE, _PENS = "0.95 0.95 0.95 1", ("0.15 0.25 0.75 1", "0.1 0.1 0.1 1", "0.7 0.15 0.15 1")
-_HANG = {
-    "lever": (1, 0, 0),
-    "opener": (-1, 0, 0),
-    "medallion": (0, 1, 0),
-    "whistle": (0, -1, 0),
-}  # where each sits on the ring
+# Where each sits on the ring.
+_HANG = {"lever": (1, 0, 0), "opener": (-1, 0, 0), "medallion": (0, 1, 0), "whistle": (0, -1, 0)}
 _DROOP = (0.0, 0.6)  # rad: how far they hang down when the ring falls; a right angle is straight down
 _RING_HEIGHT, _DROP_HEIGHT = 0.07, 0.045  # m
 # How far what is too long for the fingers may be turned from lying across them [rad]; the rest lies as it likes.
 _LARGEST_TURN = {"bottle": 0.5, "chips": 0.4, "pens": 0.4, "sponge": 0.2}
-_GRID = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)  # (P, 3)
 _RING_RADIUS, _WIRE = 0.008, 0.0013  # m
 
 
@@ -223,10 +218,7 @@ _MADE = {
 }
 CONTENTS_KINDS = tuple(_MADE)
 # What crackles when it bends: the packet, and sweets in their wrappers. Joints, and factors on their speed.
-_BENDS = {
-    "chips": (("fold", 1.0),),
-    "candies": tuple((f"sweet_{k}", 0.5) for k in range(4)),
-}
+_BENDS = {"chips": (("fold", 1.0),), "candies": tuple((f"sweet_{k}", 0.5) for k in range(4))}
 _LOUDNESS = {"cloth": 0.05, "sponge": 0.05}  # of 1: nearly mute
 
 
@@ -277,18 +269,3 @@ def middle_of(env: Any) -> np.ndarray:
     model = env.model
     parts = model.body_rootid == model.body(CONTENTS).id
     return np.asarray(np.average(env.data.xipos[parts], axis=0, weights=model.body_mass[parts]))
-
-
-def points_of(env: Any) -> np.ndarray:
-    """Points spread through what is in the bag (N, 3) [m, world]."""
-    model, data = env.model, env.data
-    of_it = np.flatnonzero(model.body_rootid[model.geom_bodyid] == model.body(CONTENTS).id)
-    size = model.geom_size[of_it].copy()  # (G, 3)
-    is_round = np.isin(model.geom_type[of_it], (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE))
-    size[is_round] = size[is_round][:, [0, 0, 1]]
-    size[model.geom_type[of_it] == mujoco.mjtGeom.mjGEOM_SPHERE] = size[:, [0, 0, 0]][
-        model.geom_type[of_it] == mujoco.mjtGeom.mjGEOM_SPHERE
-    ]
-    local = size[:, None] * _GRID  # (G, P, 3)
-    turned = np.einsum("gij,gpj->gpi", data.geom_xmat[of_it].reshape(-1, 3, 3), local)
-    return (data.geom_xpos[of_it][:, None] + turned).reshape(-1, 3)

@@ -1,6 +1,6 @@
 """Keys in a bag (paper, section "Real Robot Key Extraction Environment", table I and appendix A)."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -33,32 +33,26 @@ _OUT = RIM + 0.01  # m, world: what is in the middle of the bag and higher than 
 _HOLDS = 0.5  # N
 
 
-@dataclass(frozen=True)
-class BagNumbers:
-    """A bag task's numbers, which decide whether it can be solved without hearing.
+_MAX_PRESS, _MAX_TEAR = 30.0, 12.0  # N: with which the hand may come down on the things, and push the bag
+_CLOSINGS = 2  # the how-manieth closing on nothing ends the attempt
+_HOLD_SECONDS = 0.4  # for so long the things have to be held in sight
+_WORKSPACE = ((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))  # m, world
+_SENSORS = SensorNoise(wander=0.0006)
 
-    sides: of the bag's middle, along the line on which the fingers open, on which the things may be dropped, -1 or 1; sideways:
-    how far from it, least and most [m]; around: and around that place, at most [m]; bottom: height of the bag's bottom above
-    the table, least and most [m]; max_press: largest force with which the hand may come down on the things [N]; max_tear:
-    largest force on the bag [N]; closings: the how-manieth closing on nothing ends the attempt; hold_s: for how long the
-    things have to be held in sight [s]; horizon: steps of an episode; arm, sensors: their numbers.
+
+@dataclass(frozen=True)
+class Places:
+    """Where the things may lie, which decides whether a bag can be emptied without hearing.
+
+    sides: of the bag's middle, along the line on which the fingers open, on which they may be dropped, -1 or 1; sideways: how
+    far from it, least and most [m]; around: and around that place, at most [m]; bottom: height of the bag's bottom above the
+    table, least and most [m].
     """
 
     sides: tuple[int, ...]
     sideways: tuple[float, float] = (0.02, 0.03)
     around: float = 0.004
     bottom: tuple[float, float] = (0.025, 0.10)
-    max_press: float = 30.0
-    max_tear: float = 12.0
-    closings: int = 2
-    hold_s: float = 0.4
-    horizon: int = 75
-    arm: Panda = field(
-        default_factory=lambda: Panda(
-            max_opening=0.074, grip_force=20.0, workspace=((-0.06, -0.07, 0.803), (0.06, 0.07, 1.15))
-        )
-    )
-    sensors: SensorNoise = field(default_factory=lambda: SensorNoise(wander=0.0006))
 
     @property
     def middles(self) -> list[np.ndarray]:
@@ -72,8 +66,8 @@ class BagNumbers:
         return BAG_MIDDLE + np.array([radius * np.cos(angle), radius * np.sin(angle) + sideways])
 
 
-EASY = BagNumbers(sides=(1,))
-HARD = BagNumbers(sides=(-1, 1), sideways=(0.028, 0.038))
+EASY = Places(sides=(1,))
+HARD = Places(sides=(-1, 1), sideways=(0.028, 0.038))
 
 
 def key_bag_easy(*, contents: str = "keys") -> Task:
@@ -133,49 +127,43 @@ def key_bag_hard(*, contents: str = "keys") -> Task:
     return _task("KeyBag-Hard-v1", HARD, contents, microphones=FINGERS)
 
 
-def _task(name: str, numbers: BagNumbers, contents: str, **more: Any) -> Task:
+def _task(name: str, places: Places, contents: str, **more: Any) -> Task:
     return Task(
         name=name,
         description="Find the keys in the bag by touch and sound, grasp them and lift them out.",
-        arm=numbers.arm,
+        arm=Panda(max_opening=0.074, grip_force=20.0, workspace=_WORKSPACE),
         arena=TABLE,
         props=(bag(), contents_prop(contents)),
         initialize_episode=_initialize_episode,
-        success=Success(_is_out, CONTENTS, numbers.hold_s),
-        terminations=(
-            Pressed(CONTENTS, numbers.max_press, FRICTION),
-            Torn(numbers.max_tear),
-            Groped(numbers.closings),
-        ),
+        reset_options=("bottom", "contents_position"),
+        success=Success(_is_out, CONTENTS, _HOLD_SECONDS),
+        terminations=(Pressed(CONTENTS, _MAX_PRESS, FRICTION), Torn(_MAX_TEAR), Groped(_CLOSINGS)),
         early_action=ClosedUnheard(CONTENTS),
         expert=BagExpert if contents in ("keys", "candies") else TallThingsExpert,
         gate=BagGate,
         blind={strategy: partial(BlindBag, strategy=strategy) for strategy in BLIND_GROPES},
         deaf={
-            name: partial(
-                GropingScript, grope=grope, bottom=numbers.bottom, sensors=numbers.sensors, middles=numbers.middles
-            )
+            name: partial(GropingScript, grope=grope, bottom=places.bottom, sensors=_SENSORS, middles=places.middles)
             for name, grope in GROPES.items()
         },
         sees=walls_seen,
-        horizon=numbers.horizon,
+        horizon=75,
         control_hz=5,
         sample_rate=48000,
         cameras=(CAMERA,),
         start=(*BAG_MIDDLE, RIM + 0.07),
         start_spread=0.01,
-        sensors=numbers.sensors,
+        sensors=_SENSORS,
         force_proxy_of=CONTENTS,
-        numbers=numbers,
+        numbers=places,
         **more,
     )
 
 
 def _initialize_episode(env: Any, options: dict[str, Any]) -> dict[str, Any]:
     """Sets the bag's bottom and drops the things into the bag."""
-    numbers, rng = env.definition.numbers, env.np_random
-    bottom = rng.uniform(*numbers.bottom)
-    place = numbers.draw_place(rng)
+    places, rng = env.definition.numbers, env.np_random
+    bottom, place = rng.uniform(*places.bottom), places.draw_place(rng)
     bottom, place = options.get("bottom", bottom), np.array(options.get("contents_position", place), dtype=float)
     set_bottom(env, bottom)
     drop(env, place, rng.uniform(-np.pi, np.pi), TABLE_TOP + bottom + BOTTOM_THICKNESS, rng)

@@ -32,10 +32,7 @@ CUBE_MATERIALS = ("cube", "glass", "tin", "cardboard", "rubber")
 _CUBE_YAW = np.pi / 12  # rad, either way: a turned cube does not fit between the fingers
 _CUBE_FRICTION = 0.4  # sliding: a cube that blocked the arm would give the contact away
 _CARRIED_HEIGHT = TABLE_TOP + CUBE_HALF_SIZE + 0.015  # m: the cube's centre is this high only when it was picked up
-_HOLD_SECONDS, _STILL = (
-    0.5,
-    0.015,
-)  # s, m: for how long a cube stays where it is wanted, and how far it may move meanwhile
+_HOLD_SECONDS, _STILL = 0.5, 0.015  # s, m: so long a cube stays where it is wanted, and moves no further meanwhile
 _SQUEEZE = 20.0  # N from which on the cube counts as held, and not shoved
 _MAX_PRESS, _CLOSINGS = 5.0, 3  # N; the how-manieth closing on nothing ends the attempt
 _RAIL_GAP, _RAIL_HEIGHT, _RAIL_THICKNESS = 0.06, 0.02, 0.01  # m
@@ -103,6 +100,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
         description="Find the cube behind the wall by touch and sound, grasp it and lift it.",
         props=(wall, panel, _rails(-0.38, 0.38), _cube(2000, cube_material)),
         initialize_episode=_initialize_grasp,
+        reset_options=("cube_position", "cube_yaw"),
         expert=GraspExpert,
         blind={name: partial(BlindGrasp, strategy=name) for name in BLIND_GRASPS},
         horizon=250,
@@ -160,6 +158,7 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
         description="Find the cube behind the wall by touch and sound, grasp it and put it into the tray.",
         props=(wall, bin_, _rails(0.0, 0.38), _cube(3000, cube_material)),
         initialize_episode=_initialize_pick_place,
+        reset_options=("cube_position", "cube_yaw", "bin_position"),
         expert=PickPlaceExpert,
         blind={name: partial(BlindPickPlace, strategy=name) for name in BLIND_GRASPS},
         horizon=400,

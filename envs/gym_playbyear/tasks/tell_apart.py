@@ -147,6 +147,7 @@ def tell_apart(*, contents: str | None = None) -> Task:
         arena=TABLE,
         props=(pouch(), *pieces()),
         initialize_episode=partial(_initialize_episode, contents=contents),
+        reset_options=("contents", "pouch_position", "pouch_yaw"),
         success=ToldApart(course),
         terminations=(ToldWrong(course),),
         early_action=MovedUnheard(POUCH, is_lifted, has_landed),
