@@ -271,6 +271,7 @@ microphone | low_db: -10.0 | low_db=-10.0
 microphone | high_db: .inf | high_db=inf
 microphone | width: 90 | width=96
 microphone | width: 225 | both even
+microphone | height: 98, sample_rate: 48000 | at this width height=100
 """
 
 
