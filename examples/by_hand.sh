@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# The main job with LeRobot's own commands, small enough to watch: two demonstrations, eight updates, half an episode.
+# The main job with LeRobot's own commands, small enough to watch: two demonstrations, four updates, two seconds of acting.
 # Enough to see that everything works, far too little to learn; `make demo` is the real thing.
 set -euo pipefail
 export MUJOCO_GL=${MUJOCO_GL:-egl}
@@ -11,7 +11,7 @@ playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v1 \
 lerobot-train --policy.type=playbyear --policy.push_to_hub=false --policy.device=cpu \
   --policy.image_size=48 --policy.vision_width=8 \
   --dataset.repo_id=me/occluded --dataset.root="$folder/dataset" --dataset.video_backend=pyav \
-  --batch_size=4 --steps=8 --num_workers=0 --output_dir="$folder/train"
+  --batch_size=4 --steps=4 --num_workers=0 --output_dir="$folder/train"
 
 lerobot-eval --policy.path="$folder/train/checkpoints/last/pretrained_model" \
-  --env.type=playbyear --env.task=OccludedGrasp-v1 --env.episode_length=120 --eval.n_episodes=1 --eval.batch_size=1 --output_dir="$folder/eval"
+  --env.type=playbyear --env.task=OccludedGrasp-v1 --env.episode_length=40 --eval.n_episodes=1 --eval.batch_size=1 --output_dir="$folder/eval"

@@ -30,16 +30,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-SEEN_IN = {
-    "lerobot": "0.6.1",
-    "torch": "2.11.0",
-    "torchvision": "0.26.0",
-    "draccus": "0.11.6",
-    "huggingface_hub": "1.33.0",
-}
-"""The versions of the distributions in which all was as it is described here."""
-
-
 class CompatError(ImportError):
     """Something borrowed is gone; the message says what, from where, and what does not work without it."""
 
@@ -78,9 +68,8 @@ def load(where: str, breaks: str) -> Any:
     except (ImportError, AttributeError) as error:
         distribution = where.replace(":", ".").partition(".")[0]
         raise CompatError(
-            f"In {distribution} {metadata.version(distribution)} there is no {where} ({error}), as there was in {distribution} "
-            f"{SEEN_IN[distribution]}. Without it: {breaks}. Install the versions of constraints.txt, or adapt "
-            "lerobot_playbyear/compat.py."
+            f"In {distribution} {metadata.version(distribution)} there is no {where} ({error}). Without it: {breaks}. Install "
+            "the versions of constraints.txt, or adapt lerobot_playbyear/compat.py."
         ) from error
 
 

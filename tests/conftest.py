@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 from support import shared
-from support.commands import Commands, remember_docstrings
+from support.commands import Commands, speed_up_parsers
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _options_are_documented_once():
-    """draccus searches the sources for the help of all 2,000 options whenever a command starts: here several hundred times."""
+def _parsers_are_quick():
+    """A command builds its parser whenever it starts: here several hundred times."""
     logging.getLogger("draccus").setLevel(logging.INFO)  # else as many lines of what it decodes are kept for each test
-    remember_docstrings()
+    speed_up_parsers()
 
 
 @pytest.fixture(scope="module")

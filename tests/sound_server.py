@@ -16,7 +16,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -29,7 +28,6 @@ import numpy as np
 
 RATE = 48000
 _CHUNK_S = 0.002
-_COARSE_CHUNK_S = 0.01
 _ALSA = "/usr/share/alsa/alsa.conf"
 
 
@@ -107,13 +105,6 @@ class SoundServer:
             time.sleep(0.02)
         for name in self._sources:
             self.add(name)
-
-    def state(self) -> str:
-        """What a failure may come from: whether server and listeners run, and what the server said."""
-        ended = {"server": self._process, **self._listeners}
-        runs = {name: process is not None and process.poll() is None for name, process in ended.items()}
-        sources = self._pactl("list", "short", "sources", check=False) if runs["server"] else ""
-        return f"runs: {runs}; sources: {sources}; said: {(self._folder / 'server.log').read_text()[-1000:]}"
 
     def kill(self) -> None:
         """As if it had crashed."""
@@ -238,21 +229,3 @@ class Player(threading.Thread):
             with contextlib.suppress(BlockingIOError):
                 while os.read(self._file, 1 << 16):
                     pass
-
-
-@contextlib.contextmanager
-def playing_elsewhere(fifo: Path, channels: int, sample_rate: int = RATE) -> Iterator[None]:
-    """Quiet noise from a process of its own, a little at a time, so that to make it costs this one next to nothing."""
-    lines = [
-        "import sys",
-        f"sys.path.insert(0, {str(Path(__file__).parent)!r})",
-        "from pathlib import Path; from sound_server import Player",
-        f"with Player(Path({str(fifo)!r}), {channels}, {sample_rate}, chunk_s={_COARSE_CHUNK_S}): sys.stdin.read()",
-    ]
-    process = subprocess.Popen([sys.executable, "-c", "\n".join(lines)], stdin=subprocess.PIPE)
-    try:
-        yield
-    finally:
-        assert process.stdin is not None
-        process.stdin.close()
-        process.wait()

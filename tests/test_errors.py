@@ -55,8 +55,6 @@ train | --bach_size=3 | --bach_size is no option; did you mean --batch_size?
 train | --datset.root=x | did you mean --dataset.root?
 train | --policy.image_sise=3 | did you mean --policy.image_size?
 train | --steps=many | steps | 'many' into an int
-train | --dataset.eval_split=long | eval_split | 'long' into a float
-train | --resume=perhaps | resume | 'perhaps' into a bool
 train | --steps | --steps needs a value
 train | cpu | 'cpu' is no option
 train | -dataset.repo_id | --dataset.repo_id is needed
@@ -73,7 +71,6 @@ train | --output_dir={file}/run | --output_dir={file}/run cannot be written: Not
 train | --dataset.root={truncated} | file-000.parquet' is truncated | playbyear-repair --root={truncated}
 dagger | --output_dir={file} | --output_dir={file} cannot be written | wanted
 dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagger
-dagger | --output_dir={full} --resume=true | {full} holds files, but no run of playbyear-dagger
 dagger | --interventions.root={demos} | --demos and --interventions are the same dataset | of their own
 dagger | --interventions.root={out}/dagger | --output_dir={out}/dagger lies in the folder of --interventions
 attach-audio | --output.root={file}/heard | --output.root={file}/heard cannot be written: Not a directory | wanted
@@ -254,22 +251,15 @@ reset | TellApart-v1, {contents: gravel} | contents='gravel' is not known: choos
 reset | KeyBag-Easy-v1, {botom: 0.1} | botom=0.1 | bottom, contents_position
 # Features of a microphone that is recorded, of 80 samples at 1600 Hz and 20 frames per second
 feature | info: {} | does not say its sample rate
-feature | info: null | does not say its sample rate
 feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz
-feature | info: {sample_rate: '1600'} | sample_rate '1600' | whole number of Hz
-feature | info: {sample_rate: true} | sample_rate True | whole number of Hz
 feature | info: {sample_rate: -1600} | positive integer
 feature | info: {sample_rate: 1601} | a frame must hold a whole number of samples
 feature | info: {sample_rate: 3200} | has shape (80,) | must be (160,)
 feature | dtype: int32 | dtype 'int32'; wanted 'int16'
-feature | dtype: string | dtype 'string'; wanted 'int16'
 feature | shape: [80, 2] | every microphone is its own key
-feature | shape: [80, 1] | wanted (80,)
 feature | shape: [] | must be (80,)
 action | dtype: float33 | 'action' has dtype 'float33'
 action | shape: [0] | 'action' has shape (0,)
-action | shape: null | 'action' has shape None
-action | dtype: null | 'action' has dtype None
 # A microphone's options
 microphone | file: null | nothing: give one of device, file and tone_hz
 microphone | tone_hz: 440.0 | file and tone_hz: give one
@@ -280,6 +270,7 @@ microphone | low_db: -10.0 | low_db=-10.0
 microphone | high_db: .inf | high_db=inf
 microphone | width: 90 | width=96
 microphone | width: 225 | both even
+microphone | height: 98, sample_rate: 48000 | at this width height=100
 """
 
 

@@ -37,6 +37,7 @@ def load(root: Path) -> LeRobotDataset:
     return LeRobotDataset("me/example", root=root, video_backend="pyav")
 
 
+@pytest.mark.timeout(300)  # LeRobot is imported, records, trains and evaluates: a minute and a half on a busy machine
 def test_the_main_job_with_lerobots_own_commands(commands, tmp_path):
     """bash says which commands the script runs, and they are run."""
     programs, said = tmp_path / "programs", tmp_path / "said"

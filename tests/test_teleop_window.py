@@ -222,7 +222,7 @@ def demonstrate(screen):
         screen.press("p")
         wait_for(lambda: state_shown(screen) is Control.PERSON)
         screen.hold("Up")
-        threading.Event().wait(0.3)
+        threading.Event().wait(0.6)
         screen.let_go("Up")
         screen.press(ending)
         wait_for(lambda: state_shown(screen) is not Control.PERSON)
@@ -245,16 +245,7 @@ def test_playbyear_record_records_a_persons_demonstrations(screen, tmp_path):
     assert 2 <= moved.sum() < len(recorded)
 
 
-def test_the_window_tells_when_it_is_gone(screen):
-    window = Window(f"{_TITLE}: test")
-    number = screen.window(_TITLE)
-    assert window.is_open
-    screen.kill_window(number)
-    wait_for(lambda: not window.is_open)
-    window.close()
-
-
-def test_a_key_that_is_held_is_let_go_when_the_window_loses_the_keyboard(screen):
+def test_a_key_is_let_go_when_the_window_loses_the_keyboard_and_the_window_tells_when_it_is_gone(screen):
     windows = [Window(f"{_TITLE}: {name}") for name in ("first", "second")]
     screen.focus(screen.window("first"))
     screen.hold("space")
@@ -263,5 +254,8 @@ def test_a_key_that_is_held_is_let_go_when_the_window_loses_the_keyboard(screen)
     wait_for(lambda: "space" not in windows[0].keys._held)
     assert not windows[0].keys.has_focus
     screen.let_go("space")
+    screen.kill_window(screen.window("second"))
+    wait_for(lambda: not windows[1].is_open)
+    assert windows[0].is_open
     for window in windows:
         window.close()

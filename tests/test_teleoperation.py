@@ -3,6 +3,7 @@
 import copy
 import json
 from dataclasses import dataclass
+from functools import cache
 
 import draccus
 import numpy as np
@@ -42,7 +43,7 @@ from lerobot_playbyear.teleoperation.controls import (
 from lerobot_playbyear.teleoperation.expert import Pace, TeleopExpert
 from lerobot_playbyear.teleoperation.panel import Control, Status
 from lerobot_playbyear.teleoperation.speaker import FLOOR_DB, Speaker
-from lerobot_playbyear.teleoperation.window import Window, WindowKeys
+from lerobot_playbyear.teleoperation.window import WindowKeys
 
 ARM = Box(-1.0, 1.0, (4,), np.float32)
 HAND = {"dtype": "float32", "shape": (4,), "names": {**dict(zip(DELTAS, range(3), strict=True)), "gripper": 3}}
@@ -124,15 +125,17 @@ def test_a_teleoperator_with_as_many_numbers_as_the_action_passes_them_on():
     np.testing.assert_allclose(mapping.vector({"angular_velocity": -0.5, "linear_velocity": 0.8}), [0.8, -0.5])
 
 
-def test_a_teleoperator_that_does_not_fit_is_refused():
-    with pytest.raises(ExpertError, match=r"linear_velocity.*4 numbers.*keyboard_window"):
-        ActionMapping({"linear_velocity": float}, ARM, "x,y,z", 0.3)
-
-
-@pytest.mark.parametrize("directions", ["x,y,y", "--x,y,z", ""])
-def test_directions_that_are_none_are_refused(directions):
-    with pytest.raises(ExpertError, match="directions"):
-        ActionMapping(HAND, ARM, directions, 0.3)
+@pytest.mark.parametrize(
+    ("features", "directions", "said"),
+    [
+        ({"linear_velocity": float}, "x,y,z", r"linear_velocity.*4 numbers.*keyboard_window"),
+        (HAND, "x,y,y", r"--expert.directions='x,y,y': give x, y and z"),
+        (HAND, "--x,y,z", "--expert.directions='--x,y,z'"),
+    ],
+)
+def test_a_teleoperator_that_does_not_fit_and_directions_that_are_none_are_refused(features, directions, said):
+    with pytest.raises(ExpertError, match=said):
+        ActionMapping(features, ARM, directions, 0.3)
 
 
 def test_the_gripper_is_told_what_the_arm_carries_out():
@@ -165,26 +168,19 @@ class Clock:
         self.now += seconds
 
 
-def test_steps_come_at_their_pace_and_late_ones_are_not_made_up_for():
+def test_late_steps_are_not_made_up_for_and_a_pace_that_cannot_be_kept_is_told():
     clock = Clock()
     pace = Pace(20, clock, clock.sleep)
     times = []
-    for work in [0.01] * 5 + [0.2] + [0.01] * 3:
+    for work in [0.01] * 30 + [0.2] + [0.01] * 3 + [0.1] * 30:
+        is_slow = Status(fps=20, achieved_fps=pace.achieved_fps).is_slow
+        assert not is_slow or len(times) > 30
         pace.wait()
         times.append(clock.now)
         clock.now += work
-    np.testing.assert_allclose(np.diff(times), [0.05] * 5 + [0.2] + [0.05] * 2)
-
-
-def test_a_pace_that_cannot_be_kept_is_told():
-    clock = Clock()
-    pace = Pace(20, clock, clock.sleep)
-    for work in [0.01] * 40 + [0.1] * 40:
-        assert not Status(fps=20, achieved_fps=pace.achieved_fps).is_slow or work == 0.1
-        pace.wait()
-        clock.now += work
+    np.testing.assert_allclose(np.diff(times), [0.05] * 30 + [0.2] + [0.05] * 3 + [0.1] * 29)
+    assert is_slow
     assert pace.achieved_fps == pytest.approx(10)
-    assert Status(fps=20, achieved_fps=pace.achieved_fps).is_slow
 
 
 def test_sound_plays_on_without_gaps_until_nothing_is_left():
@@ -238,15 +234,10 @@ def test_a_teleoperators_events_count_when_they_begin():
     assert [wish.verdict for wish in wishes] == [None, None, None, Verdict.SUCCESS, None, None]
 
 
-@pytest.mark.parametrize(
-    ("events", "verdict"),
-    [
-        ({TeleopEvents.TERMINATE_EPISODE}, Verdict.FAILURE),
-        ({TeleopEvents.TERMINATE_EPISODE, TeleopEvents.SUCCESS}, Verdict.SUCCESS),
-    ],
-)
-def test_terminate_says_less_than_what_is_beside_it(events, verdict):
-    assert Controls(scripted(events=[events]), WindowKeys()).read().verdict is verdict
+def test_terminate_says_less_than_what_is_beside_it():
+    for beside, verdict in ((set(), Verdict.FAILURE), ({TeleopEvents.SUCCESS}, Verdict.SUCCESS)):
+        events = {TeleopEvents.TERMINATE_EPISODE, *beside}
+        assert Controls(scripted(events=[events]), WindowKeys()).read().verdict is verdict
 
 
 class Listening(ScriptedTeleop, KeyboardTeleop):
@@ -315,28 +306,28 @@ def make_person(env, window, teleop=None, demonstrates=False, begin_paused=False
     return person
 
 
-def play(script, teleop=None, horizon=30, beside=lambda person: person, **how):
+@cache
+def make_env(horizon=30, sound="none"):
+    sizes = {"image_size": 16, "visualization_width": 32, "visualization_height": 32}
+    return env_spec(PlaybyearEnvConfig(**sizes, episode_length=horizon, sound=sound)).make()
+
+
+def play(script, teleop=None, env=None, beside=lambda person: person, **how):
     """One attempt with a policy that does nothing. Returns the attempt and the window.
 
     Args:
         script: What is pressed, by step.
         teleop: Instead of the window's keyboard.
-        horizon: Most steps.
+        env: Another environment than that of 30 steps without sound.
         beside: Makes the expert of the person, as a method of HG-DAgger does.
         how: Further options of the person.
     """
-    env, window = make_env(horizon), Screenless(script)
+    env, window = env or make_env(), Screenless(script)
     person = make_person(env, window, teleop, **how)
     try:
         return play_episode(env, Nobody(), seed=3, expert=beside(person)), window
     finally:
         person.close()
-        env.close()
-
-
-def make_env(horizon):
-    sizes = {"image_size": 16, "visualization_width": 32, "visualization_height": 32}
-    return env_spec(PlaybyearEnvConfig(**sizes, episode_length=horizon)).make()
 
 
 def test_the_person_acts_on_exactly_the_steps_in_which_the_key_is_held():
@@ -390,20 +381,20 @@ def test_an_attempt_ends_when_the_person_says_so(name, verdict, outcome):
 
 
 def test_the_gripper_key_closes_and_opens_it_with_the_cool_down_between():
-    presses = {3: tapping("g"), 20: tapping("g"), 50: tapping("g"), 60: tapping("g")}
-    attempt, window = play({0: holding("space"), **presses}, horizon=80)
+    presses = {3: tapping("g"), 20: tapping("g"), 45: tapping("g"), 50: tapping("g")}
+    attempt, window = play({0: holding("space"), **presses}, env=make_env(52))
     commands = attempt.actions[:, 3]
-    assert (np.flatnonzero(np.diff(commands)) + 1).tolist() == [3, 50]
+    assert (np.flatnonzero(np.diff(commands)) + 1).tolist() == [3, 45]
     assert commands[:3].tolist() == [-1] * 3
     shown = {status.step: status for status, picture in window.shown if picture is not None}
     assert (shown[5].gripper, shown[5].cooldown_s) == ("closed", 1.95)
-    assert shown[49].cooldown_s == 0
+    assert shown[44].cooldown_s == 0
 
 
 def test_a_teleoperator_says_close_stay_and_open():
-    grips = [(0, 0, 0, grip) for grip in [STAY] * 3 + [CLOSE] + [STAY] * 50 + [OPEN] + [STAY]]
-    attempt, _ = play({}, scripted(grips), demonstrates=True, horizon=70)
-    assert (np.flatnonzero(np.diff(attempt.actions[:, 3])) + 1).tolist() == [2, 53]
+    grips = [(0, 0, 0, grip) for grip in [STAY] * 3 + [CLOSE] + [STAY] * 41 + [OPEN] + [STAY]]
+    attempt, _ = play({}, scripted(grips), make_env(52), demonstrates=True)
+    assert (np.flatnonzero(np.diff(attempt.actions[:, 3])) + 1).tolist() == [2, 44]
 
 
 def test_a_demonstration_is_the_persons_from_start_to_end():
@@ -413,15 +404,14 @@ def test_a_demonstration_is_the_persons_from_start_to_end():
 
 
 def test_what_was_pressed_before_an_attempt_is_not_meant_for_it():
-    env, window = make_env(8), Screenless()
+    env, window = make_env(), Screenless()
     expert = make_person(env, window)
     press(window.keys, "s", "g", "p", "right", "space")
     attempt = play_episode(env, Nobody(), seed=3, expert=expert)
-    assert (attempt.verdict, len(attempt), attempt.intervention_share) == (None, 8, 0)
+    assert (attempt.verdict, len(attempt), attempt.intervention_share) == (None, 30, 0)
     press(window.keys, "escape")
     with pytest.raises(PersonLeftError):
         play_episode(env, Nobody(), seed=3, expert=expert)
-    env.close()
 
 
 @pytest.mark.parametrize("leave", [tapping("escape"), lambda window: window.close()])
@@ -432,7 +422,7 @@ def test_leaving_ends_the_command_as_ctrl_c_does(leave):
 
 
 def test_the_microphones_level_is_shown():
-    _, window = play({})
+    _, window = play({}, env=make_env(sound="waveform"))
     levels = [status.levels_db["gripper"] for status, picture in window.shown if picture is not None]
     assert [len(heard) for heard in levels] == list(range(1, 31))
     assert levels[3] == levels[-1][:4]
@@ -456,25 +446,25 @@ class Asking:
 def test_the_robot_calls_and_does_not_take_over(monkeypatch):
     rings = []
     monkeypatch.setattr(Speaker, "ring", lambda speaker: rings.append(True))
-    attempt, window = play({}, horizon=20, beside=lambda person: Asked(person, Asking()))
+    attempt, window = play({}, beside=lambda person: Asked(person, Asking()))
     shown = [status.control for status, picture in window.shown if picture is not None]
     assert not attempt.interventions.any()
     assert len(rings) == 1
-    assert [n for n, control in enumerate(shown) if control is Control.CALLED] == list(range(5, 20))
+    assert [n for n, control in enumerate(shown) if control is Control.CALLED] == list(range(5, 30))
 
 
 def test_a_person_who_was_called_acts_as_long_as_they_like_and_is_called_no_more():
     held = {7: holding("space"), 13: letting_go("space")}
-    attempt, window = play(held, horizon=20, beside=lambda person: Asked(person, Asking()))
+    attempt, window = play(held, beside=lambda person: Asked(person, Asking()))
     shown = [status.control for status, picture in window.shown if picture is not None]
     assert np.flatnonzero(attempt.interventions).tolist() == list(range(7, 13))
     assert shown.count(Control.CALLED) == 3
 
 
 def test_without_a_hand_back_one_press_is_for_the_whole_attempt():
-    attempt, window = play({7: holding("space"), 9: letting_go("space")}, horizon=20, beside=Staying)
+    attempt, window = play({7: holding("space"), 9: letting_go("space")}, beside=Staying)
     shown = [status.control for status, picture in window.shown if picture is not None]
-    assert np.flatnonzero(attempt.interventions).tolist() == list(range(7, 20))
+    assert np.flatnonzero(attempt.interventions).tolist() == list(range(7, 30))
     assert shown[8:] == [Control.PERSON] * len(shown[8:])
 
 
@@ -488,26 +478,6 @@ def test_a_resumed_run_has_the_same_person(tmp_path):
     path = tmp_path / "dagger_config.json"
     path.write_text(json.dumps(DaggerConfig(source, source, env=PlaybyearEnvConfig(), expert=expert).options()))
     assert draccus.parse(DaggerConfig, config_path=path, args=[]).expert == expert
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"speed": 0.0}, "speed=0"),
-        ({"gripper_cooldown_s": -1.0}, "gripper_cooldown_s=-1"),
-        ({"steps_per_second": 0.0}, "steps_per_second=0"),
-        ({"takeover_key": "f1"}, "takeover_key='f1': give a letter, a digit, or one of space"),
-        ({"takeover_key": " "}, "takeover_key=' ': give"),
-        ({"takeover_key": "P"}, "takeover_key='P': it means something else"),
-        ({"takeover_key": "e"}, "takeover_key='e': it means something else"),
-        ({"takeover": "press"}, "takeover='press': give hold or toggle"),
-    ],
-)
-def test_bad_options_are_refused_before_a_window_opens(options, message):
-    env = make_env(10)
-    with pytest.raises(ExpertError, match=message):
-        TeleopExpertConfig(**options).make(env)
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -528,13 +498,6 @@ def test_teleoperators_of_other_packages_are_made_by_lerobot():
     teleop = connect_teleoperator(ScriptedTeleopConfig(), Screenless())
     assert isinstance(teleop, ScriptedTeleop)
     assert teleop.is_connected
-
-
-def test_without_a_screen_the_window_says_so(monkeypatch):
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(ExpertError, match=r"No window can be opened \(DISPLAY=''\)"):
-        Window("test")
 
 
 def test_only_a_script_or_a_person_demonstrates(tmp_path):

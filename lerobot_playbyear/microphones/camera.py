@@ -9,8 +9,9 @@ import secrets
 import threading
 import time
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,13 @@ from lerobot_playbyear.audio.microphone_pictures import (
 )
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.microphones.card import KEPT_S, CardRecording, OpenCard, join_card, leave_card
-from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError, find_source
+from lerobot_playbyear.microphones.microphone import (
+    Microphone,
+    MicrophoneError,
+    file_microphone,
+    find_source,
+    tone_microphone,
+)
 from lerobot_playbyear.microphones.session_file import SessionFile
 
 _NO_FILE = "none"
@@ -116,6 +123,12 @@ class MicrophoneCameraConfig(CameraConfig):
         """What tells cards apart: microphones with the same one share a stream and a clock."""
         return self.source, str(self.device), self.file, self.tone_hz
 
+    @property
+    def label(self) -> str:
+        """Which microphone it is, for messages."""
+        options = {name: getattr(self, name) for name in ("source", "device", "file", "tone_hz")}
+        return ", ".join(f"{name}={value!r}" for name, value in options.items() if value is not None)
+
     def make(self, channels: int) -> Microphone:
         """The card, not connected yet, with at least as many channels.
 
@@ -128,30 +141,20 @@ class MicrophoneCameraConfig(CameraConfig):
             from lerobot_playbyear.microphones.portaudio import PortAudioMicrophone
 
             return PortAudioMicrophone(self.device, self.sample_rate, channels)
-        from lerobot_playbyear.microphones.file import file_microphone, tone_microphone
-
         if self.tone_hz is not None:
             return tone_microphone(self.tone_hz, self.sample_rate, channels)
         return file_microphone(Path(str(self.file)).expanduser(), self.sample_rate, channels)
 
 
 _cameras: "weakref.WeakSet[MicrophoneCamera]" = weakref.WeakSet()
+"""All that were made: the first of a card that is connected opens the channels of all of them."""
 
 
-def _samples_of(recording: CardRecording, config: MicrophoneCameraConfig) -> Callable[[int, int], np.ndarray]:
-    """Gives a microphone's samples from one number to before another, (n,) int16, with its gain."""
-    channel, gain = config.channel, 10 ** (config.gain_db / 20)
-
-    def samples(start: int, stop: int) -> np.ndarray:
-        heard = recording.samples(start, stop)[:, channel]
-        return heard if gain == 1 else np.clip(np.rint(heard * gain), -32768, 32767).astype(np.int16)
-
-    return samples
-
-
-def _name(config: MicrophoneCameraConfig) -> str:
-    options = {name: getattr(config, name) for name in ("source", "device", "file", "tone_hz")}
-    return ", ".join(f"{name}={value!r}" for name, value in options.items() if value is not None)
+def _heard(config: MicrophoneCameraConfig, recording: CardRecording, start: int, stop: int) -> np.ndarray:
+    """A microphone's samples from one number to before another, (n,) int16, with its gain."""
+    samples = recording.samples(start, stop)[:, config.channel]
+    gain = 10 ** (config.gain_db / 20)
+    return samples if gain == 1 else np.clip(np.rint(samples * gain), -32768, 32767).astype(np.int16)
 
 
 class MicrophoneCamera(Camera):
@@ -168,8 +171,11 @@ class MicrophoneCamera(Camera):
         self._file: SessionFile | None = None
         self._session = 0
         self._reading = threading.Lock()
-        self._has_said_zeros = False
+        self._was_mute = False
         _cameras.add(self)
+
+    def __str__(self) -> str:
+        return f"The microphone ({self.config.label})"
 
     @property
     def is_connected(self) -> bool:
@@ -190,46 +196,53 @@ class MicrophoneCamera(Camera):
         from lerobot_playbyear.audio.sound_picture import RollingSpectrogram
 
         if self._card is not None:
-            raise DeviceAlreadyConnectedError(f"The microphone ({_name(self.config)}) is connected already.")
+            raise DeviceAlreadyConnectedError(f"{self} is connected already.")
         config, width, height = self.config, self.width or 0, self.height or 0
         rows = n_rows(config.sample_rate, width)
         self._spectrogram = RollingSpectrogram(config.sample_rate, height - rows, width, config.low_db, config.high_db)
         self._label = _drawn_label(f"{config.low_db:g} to {config.high_db:g} dB", width, height - rows)
         self._session = 1 + secrets.randbelow(2**32 - 1)
-        alike = [camera.config.channel for camera in _cameras if camera.config.card == config.card]
-        card = self._card = join_card(config, [config.channel, *alike], _name(config))
+        _cameras.add(self)
         try:
-            self._save(card)
-        except BaseException as error:
-            self.disconnect()
-            if isinstance(error, OSError | ValueError):
-                raise MicrophoneError(
-                    f"The session's sound cannot be written to {config.save_to or SESSIONS}: {error}. Give another save_to, or "
-                    "save_to=none."
-                ) from error
+            alike = [camera.config.channel for camera in _cameras if camera.config.card == config.card]
+            self._card = join_card(config, alike)
+        except BaseException:
+            _cameras.discard(self)  # others of the card need not have its channel
             raise
+        self._samples = partial(_heard, config, self._card.recording)
+        try:
+            self._file = self._session_file(self._card)
+        except (OSError, ValueError) as error:
+            self.disconnect()
+            raise MicrophoneError(
+                f"The session's sound cannot be written to {config.save_to or SESSIONS}: {error}. Give another save_to, or "
+                "save_to=none."
+            ) from error
 
-    def _save(self, card: OpenCard) -> None:
-        config, self._samples = self.config, _samples_of(card.recording, self.config)
+    def _session_file(self, card: OpenCard) -> SessionFile | None:
+        config = self.config
         if config.save_to == _NO_FILE:
             logging.warning(
-                "The microphone (%s) saves no sound (save_to=none): a dataset with videos loses it, one with "
-                "--dataset.video=false keeps it in its pictures.",
-                _name(config),
+                "%s saves no sound (save_to=none): a dataset with videos loses it, one with --dataset.video=false keeps "
+                "it in its pictures.",
+                self,
             )
-            return
+            return None
         folder = Path(config.save_to).expanduser() if config.save_to else SESSIONS
         path = session_path(folder, self._session, time.strftime("%Y-%m-%d_%H-%M-%S"))
-        recording = card.recording
-        n_kept = round(KEPT_S * config.sample_rate)
-        self._file = SessionFile(path, config.sample_rate, lambda: recording.written, self._samples, n_kept)
+        recording, n_kept = (
+            card.recording,
+            round(KEPT_S * config.sample_rate),
+        )  # without `self`: once forgotten, it ends
+        file = SessionFile(path, config.sample_rate, lambda: recording.written, self._samples, n_kept)
         logging.info(
-            "The microphone (%s) listens. All that it hears, voices too, is written to %s, %.1f MB a minute, and what stands "
-            "in its pictures is sound as well.",
-            _name(config),
+            "%s listens. All that it hears, voices too, is written to %s, %.1f MB a minute, and what stands in its "
+            "pictures is sound as well.",
+            self,
             path,
             120 * config.sample_rate / 1e6,
         )
+        return file
 
     def read(self) -> np.ndarray:
         """The picture of now, (height, width, 3) uint8. Raises as `read_latest`."""
@@ -248,19 +261,18 @@ class MicrophoneCamera(Camera):
         """
         card = self._card
         if card is None:
-            raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is not connected.")
+            raise DeviceNotConnectedError(f"{self} is not connected.")
         if card.microphone.problem:
-            raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is gone: {card.microphone.problem}.")
-        if card.microphone.silent_for_s > max(max_age_ms / 1000, _STALLED_S):
-            raise TimeoutError(
-                f"The microphone ({_name(self.config)}) has brought nothing for {card.microphone.silent_for_s:.1f} s. Is it "
-                "still plugged in?"
-            )
+            raise DeviceNotConnectedError(f"{self} is gone: {card.microphone.problem}.")
+        silent_s = card.microphone.silent_for_s
+        if silent_s > max(max_age_ms / 1000, _STALLED_S):
+            raise TimeoutError(f"{self} has brought nothing for {silent_s:.1f} s. Is it still plugged in?")
         if self._file is not None and self._file.error:
-            raise DeviceNotConnectedError(
-                f"The microphone ({_name(self.config)}): {self._file.error}. Make room, and begin again."
-            )
-        self._look_for_zeros(card)
+            raise DeviceNotConnectedError(f"{self}: {self._file.error}. Make room, and begin again.")
+        is_mute = card.recording.zeros_s(self.config.channel) > _ZEROS_S
+        if is_mute and not self._was_mute:
+            logging.warning("%s gives nothing but zeros: it is muted, or unplugged.", self)
+        self._was_mute = is_mute
         with self._reading:
             return self._picture(card.newest(self._session))
 
@@ -270,21 +282,12 @@ class MicrophoneCamera(Camera):
         picture = np.zeros((self.height or 0, self.width or 0, 3), np.uint8)
         picture[: len(grey)] = grey[:, :, None]
         if self._label is not None:
-            picture[: len(self._label), TIMECODE_WIDTH : TIMECODE_WIDTH + self._label.shape[1]] = self._label[
-                :, :, None
-            ]
+            label_height, label_width = self._label.shape
+            picture[:label_height, TIMECODE_WIDTH : TIMECODE_WIDTH + label_width] = self._label[:, :, None]
         kept = self._samples(counter - n_kept(config.sample_rate), counter)
         write_strip(picture, Strip(self._session, counter, config.sample_rate, kept, config.low_db, config.high_db))
         write_timecode(picture, self._session, counter)
         return picture
-
-    def _look_for_zeros(self, card: OpenCard) -> None:
-        is_silent = card.recording.zeros_s(self.config.channel) > _ZEROS_S
-        if is_silent and not self._has_said_zeros:
-            logging.warning(
-                "The microphone (%s) gives nothing but zeros: it is muted, or unplugged.", _name(self.config)
-            )
-        self._has_said_zeros = is_silent
 
     def disconnect(self) -> None:
         """Stops listening, and says where the session's sound is.
@@ -293,13 +296,13 @@ class MicrophoneCamera(Camera):
             DeviceNotConnectedError: It was not connected.
         """
         if self._card is None:
-            raise DeviceNotConnectedError(f"The microphone ({_name(self.config)}) is not connected.")
+            raise DeviceNotConnectedError(f"{self} is not connected.")
         file, self._file = self._file, None
         if file is not None:
             file.close()
             logging.info("The session's sound is in %s%s.", file.path, ", not to its end" if file.error else "")
         card, self._card = self._card, None
-        leave_card(self.config.card, card)
+        leave_card(self.config, card)
 
 
 def _drawn_label(text: str, width: int, height: int) -> np.ndarray | None:

@@ -12,16 +12,13 @@ import numpy as np
 
 from lerobot_playbyear.audio.microphone_pictures import n_kept
 from lerobot_playbyear.datasets.features import to_pcm_s16
-from lerobot_playbyear.microphones.microphone import MicrophoneError
+from lerobot_playbyear.microphones.microphone import CHUNK_S, MicrophoneError
 
 if TYPE_CHECKING:
     from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
 
 KEPT_S = 10.0
 """How much of a card's sound is kept [s]."""
-
-CHUNK_S = 0.003
-"""How often sound is fetched from a card [s]; shorter costs more processor time."""
 
 _USUAL = 0.9  # share of the bursts that come no later than it is reckoned with
 _LONGEST_WAIT_S = 0.15
@@ -256,13 +253,12 @@ _open_cards: dict[Hashable, OpenCard] = {}
 _lock = threading.Lock()
 
 
-def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int], name: str) -> OpenCard:
+def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int]) -> OpenCard:
     """The card of a microphone, which listens from now on if it did not yet.
 
     Args:
         config: The microphone's options.
         channels: Its channel, and those of all other microphones of the card that were made.
-        name: Of the microphone, for messages.
 
     Raises:
         MicrophoneError: The card cannot be opened, nothing comes from it, or it is open in another way.
@@ -270,45 +266,31 @@ def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int], name: s
     with _lock:
         card = _open_cards.get(config.card)
         if card is None:
-            card = _open_cards[config.card] = _opened(config, max(channels) + 1)
+            card = OpenCard(config, max(channels) + 1)
+            card.open()
+            _open_cards[config.card] = card
         if card.microphone.problem:
             raise MicrophoneError(
                 f"{card.microphone.name} is gone: {card.microphone.problem}. Disconnect its other microphones first."
             )
         if card.microphone.sample_rate != config.sample_rate:
             raise MicrophoneError(
-                f"Microphones of one card ({name}) have sample_rate {card.microphone.sample_rate} and {config.sample_rate}: "
-                "give them the same."
+                f"Microphones of one card ({config.label}) have sample_rate {card.microphone.sample_rate} and "
+                f"{config.sample_rate}: give them the same."
             )
         if config.channel >= card.microphone.channels:
             raise MicrophoneError(
-                f"channel={config.channel} of a microphone ({name}): the card is open with {card.microphone.channels} "
-                "channels. Make all of its microphones before one is connected."
+                f"channel={config.channel} of a microphone ({config.label}): the card is open with "
+                f"{card.microphone.channels} channels. Make all of its microphones before one is connected."
             )
         card.n_users += 1
         return card
 
 
-def leave_card(key: Hashable, card: OpenCard) -> None:
+def leave_card(config: "MicrophoneCameraConfig", card: OpenCard) -> None:
     """A microphone needs its card no longer; without any the card is closed."""
     with _lock:
         card.n_users -= 1
         if card.n_users == 0:
-            _open_cards.pop(key, None)
+            _open_cards.pop(config.card, None)
             card.microphone.disconnect()
-
-
-def _opened(config: "MicrophoneCameraConfig", channels: int) -> OpenCard:
-    """A card that listens; with the microphone's own channel alone, if one that is not used any more wants too many.
-
-    Raises:
-        MicrophoneError: It cannot be opened, or nothing comes from it.
-    """
-    try:
-        card = OpenCard(config, channels)
-        card.open()
-    except MicrophoneError:
-        if channels == config.channel + 1:
-            raise
-        return _opened(config, config.channel + 1)
-    return card

@@ -143,9 +143,8 @@ def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
     microphone = PortAudioMicrophone(card.number, rate, channels)
     samples = _heard(microphone, cfg.seconds)
     if len(samples) == 0 and not microphone.problem:
-        samples = _heard(
-            microphone, cfg.seconds
-        )  # through a sound server a stream that was opened now and then never begins
+        # Through a sound server a stream that was opened now and then never begins.
+        samples = _heard(microphone, cfg.seconds)
     if sys.stdout.isatty():
         print("\r\033[K", end="")
     if len(samples) == 0:
@@ -157,16 +156,16 @@ def _listen(card: SoundCard, rate: int, cfg: FindMicrophonesConfig) -> str:
 
 def _heard(microphone: PortAudioMicrophone, seconds: float) -> np.ndarray:
     """What it hears in so many seconds from its first sample on, (n, channels) int16; its level is shown meanwhile."""
-    with _without_stderr():
-        microphone.connect()
     parts, wanted = [np.zeros((0, microphone.channels), np.int16)], round(seconds * microphone.sample_rate)
+    with _without_stderr():
+        microphone.connect(lambda chunk, came_s: parts.append(chunk.copy()))
     end = time.perf_counter() + seconds + _PATIENCE_S
     try:
         while sum(map(len, parts)) < wanted and time.perf_counter() < end and not microphone.problem:
+            n_shown = len(parts)
             time.sleep(_LOOK_S)
-            parts.append(microphone.read())
-            if sys.stdout.isatty():
-                print(f"\r  {level_text(parts[-1])}", end="", flush=True)
+            if sys.stdout.isatty() and parts[n_shown:]:
+                print(f"\r  {level_text(np.concatenate(parts[n_shown:]))}", end="", flush=True)
     finally:
         microphone.disconnect()
     return np.concatenate(parts)[:wanted]

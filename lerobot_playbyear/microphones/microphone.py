@@ -1,4 +1,4 @@
-"""What every microphone is, whatever brings its sound, and those of other packages."""
+"""What every microphone is, whatever brings its sound; sound that is played as one; and those of other packages."""
 
 import abc
 import importlib
@@ -7,10 +7,12 @@ import threading
 import time
 from collections.abc import Callable
 from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lerobot_playbyear.audio.audio_files import AudioFileError, read_audio, resample
 from lerobot_playbyear.datasets.errors import PlaybyearError
 
 if TYPE_CHECKING:
@@ -22,7 +24,10 @@ PLUGIN_PREFIX = "lerobot_microphone_"
 Listener = Callable[[np.ndarray, float], None]
 """Takes a chunk (n, channels), int16 PCM or floats in [-1, 1], and when its last sample came [s of time.perf_counter]."""
 
-_MOST_KEPT_S = 60.0
+CHUNK_S = 0.003
+"""How often sound is fetched from a card [s]; shorter costs more processor time."""
+
+_TONE_S, _TONE_LEVEL = 1.0, 0.25
 
 
 class MicrophoneError(PlaybyearError, RuntimeError):
@@ -42,9 +47,6 @@ class Microphone(abc.ABC):
 
     def __init__(self, name: str, sample_rate: int, channels: int) -> None:
         self.name, self.sample_rate, self.channels = name, sample_rate, channels
-        self._lock = threading.Lock()
-        self._chunks: list[np.ndarray] = []
-        self._n_kept = 0
         self._listener: Listener | None = None
         self._is_connected = False
         self._last_heard = 0.0
@@ -65,18 +67,18 @@ class Microphone(abc.ABC):
         """Since when nothing has come [s]."""
         return time.perf_counter() - self._last_heard
 
-    def connect(self, listener: Listener | None = None) -> None:
+    def connect(self, listener: Listener) -> None:
         """Begins to listen.
 
         Args:
-            listener: Gets every chunk when it comes, in the device's thread. None: chunks are kept for `read`.
+            listener: Gets every chunk when it comes, in the device's thread, and copies what it keeps.
 
         Raises:
             MicrophoneError: It cannot be opened.
         """
         if self._is_connected:
             return
-        self._listener, self._ended, self._chunks, self._n_kept = listener, "", [], 0
+        self._listener, self._ended = listener, ""
         self._last_heard = time.perf_counter()
         self._is_connected = True  # before it may end by itself
         try:
@@ -84,12 +86,6 @@ class Microphone(abc.ABC):
         except BaseException:
             self._is_connected = False
             raise
-
-    def read(self) -> np.ndarray:
-        """All samples that have come since the last call, (n, channels), of the last minute at most."""
-        with self._lock:
-            chunks, self._chunks, self._n_kept = self._chunks, [], 0
-        return np.concatenate(chunks) if chunks else np.zeros((0, self.channels), np.int16)
 
     def disconnect(self) -> None:
         """Stops listening; it may be disconnected already."""
@@ -114,16 +110,72 @@ class Microphone(abc.ABC):
         self._last_heard = time.perf_counter()
         if self._listener is not None:
             self._listener(chunk, came_s)
-            return
-        with self._lock:
-            self._chunks.append(chunk.copy())
-            self._n_kept += len(chunk)
-            while self._n_kept - len(self._chunks[0]) > _MOST_KEPT_S * self.sample_rate:
-                self._n_kept -= len(self._chunks.pop(0))
 
     def _end(self, reason: str) -> None:
         """No more sound will come."""
         self._ended = self._ended or reason
+
+
+class PlayedMicrophone(Microphone):
+    """Gives samples again and again, at the speed of time.
+
+    Args:
+        name: For messages.
+        samples: (n, channels) int16.
+        sample_rate: [Hz].
+    """
+
+    def __init__(self, name: str, samples: np.ndarray, sample_rate: int) -> None:
+        super().__init__(name, sample_rate, samples.shape[1])
+        self._samples = samples
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def _open(self) -> None:
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._play, name="played sound", daemon=True)
+        self._thread.start()
+
+    def _close(self) -> None:
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _play(self) -> None:
+        size = max(round(CHUNK_S * self.sample_rate), 1)
+        n_played, start = 0, time.perf_counter()
+        while True:
+            due = start + (n_played + size) / self.sample_rate
+            if self._stop.wait(max(due - time.perf_counter(), 0)):
+                return
+            self._heard(self._samples[np.arange(n_played, n_played + size) % len(self._samples)], due)
+            n_played += size
+
+
+def file_microphone(path: Path, sample_rate: int, channels: int) -> Microphone:
+    """A sound file, resampled where it has another rate [Hz].
+
+    Raises:
+        MicrophoneError: It cannot be read, or has fewer channels.
+    """
+    try:
+        samples, rate = read_audio(path)
+    except (OSError, AudioFileError) as error:
+        raise MicrophoneError(f"file={path} of a microphone cannot be read: {error}") from error
+    if samples.shape[1] < channels or len(samples) == 0:
+        raise MicrophoneError(
+            f"file={path} of a microphone has {samples.shape[1]} channels and {len(samples)} samples; channel {channels - 1} "
+            "is asked for, counted from 0."
+        )
+    return PlayedMicrophone(f"the sound file {path}", resample(samples, rate, sample_rate), sample_rate)
+
+
+def tone_microphone(tone_hz: float, sample_rate: int, channels: int) -> Microphone:
+    """A sine of a quarter of full scale, the same on all channels; of whole periods in a second where `tone_hz` is whole."""
+    time_s = np.arange(round(_TONE_S * sample_rate)) / sample_rate
+    wave = np.rint(32767 * _TONE_LEVEL * np.sin(2 * np.pi * tone_hz * time_s)).astype(np.int16)
+    return PlayedMicrophone(f"a tone of {tone_hz:g} Hz", np.repeat(wave[:, None], channels, axis=1), sample_rate)
 
 
 Source = Callable[["MicrophoneCameraConfig", int], Microphone]

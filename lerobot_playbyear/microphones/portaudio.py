@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_playbyear.compat import look_for_cards_again
-from lerobot_playbyear.microphones.card import CHUNK_S
-from lerobot_playbyear.microphones.microphone import Microphone, MicrophoneError
+from lerobot_playbyear.microphones.microphone import CHUNK_S, Microphone, MicrophoneError
 
 _FIND = "`playbyear-find-microphones` lists what there is."
 _MOST_OPENED = 8  # channels of a card that are opened without being asked for; a sound server offers 32, and has fewer

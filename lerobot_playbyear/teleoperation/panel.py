@@ -1,6 +1,7 @@
 """What the window tells a person, and how it looks: a frame for the scene in the colour of who acts, and a panel beside it."""
 
 import math
+import textwrap
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache
@@ -87,6 +88,7 @@ FRAME = {control: frame for control, (frame, _, _) in _LOOKS.items()}
 _BACKGROUND, _TEXT, _DIM, _LINE, _WARNING = "#15181c", "#f2f3f4", "#9aa3ad", "#343a42", "#e69f00"
 _BAR, _LOUD = "#56b4e9", "#f0e442"
 _LEFT, _RIGHT = 728, 976  # of the panel's content
+_TASK_LETTERS, _SOUND_LETTERS = 28, 38  # that fit between them
 _LOUD_DB = -20.0
 
 
@@ -115,7 +117,7 @@ def _draw_frame(draw: ImageDraw.ImageDraw, status: Status) -> None:
 
 
 def _draw_progress(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
-    for line in _wrapped(status.task, _font(17), _RIGHT - _LEFT)[:3]:
+    for line in textwrap.wrap(status.task, _TASK_LETTERS)[:3]:
         draw.text((_LEFT, y), line, _TEXT, _font(17), "lm")
         y += 22
     if not status.n_steps:
@@ -136,7 +138,7 @@ def _draw_levels(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
     if not status.levels_db:
         return y
     sound = f"Not played: {status.sound}" if status.sound else "Played on the loudspeaker"
-    draw.text((_LEFT, y), _shortened(sound, _font(13)), _DIM, _font(13), "lm")
+    draw.text((_LEFT, y), textwrap.shorten(sound, _SOUND_LETTERS, placeholder="..."), _DIM, _font(13), "lm")
     return y + 8
 
 
@@ -188,22 +190,6 @@ def _bar(draw: ImageDraw.ImageDraw, y: int, height: int, share: float, colour: s
     width = math.floor((_RIGHT - _LEFT) * min(max(share, 0.0), 1.0))
     if width:
         draw.rectangle((_LEFT, y, _LEFT + width, y + height - 1), fill=colour)
-
-
-def _wrapped(text: str, font: ImageFont.FreeTypeFont, width: int) -> list[str]:
-    lines: list[str] = []
-    for word in text.split():
-        if lines and font.getlength(f"{lines[-1]} {word}") <= width:
-            lines[-1] += f" {word}"
-        else:
-            lines.append(word)
-    return lines
-
-
-def _shortened(text: str, font: ImageFont.FreeTypeFont) -> str:
-    while len(text) > 4 and font.getlength(text) > _RIGHT - _LEFT:
-        text = text[:-4].rstrip() + "..."
-    return text
 
 
 @cache

@@ -21,12 +21,8 @@ _MOST_BLOCKS = 6  # more than this is too late to be played
 def microphone_blocks(observation: Observation) -> dict[str, np.ndarray]:
     """The samples (S,) of each microphone in a raw observation, floats of full scale 1, by the microphone's name."""
     blocks = {key.removeprefix(_AUDIO): np.asarray(v) for key, v in observation.items() if key.startswith(_AUDIO)}
-    return {name: as_float(block) for name, block in blocks.items()}
-
-
-def as_float(block: np.ndarray) -> np.ndarray:
-    """Samples as float32: integers are PCM at full scale, floats are in [-1, 1] already."""
-    return block.astype(np.float32) / (_FULL_SCALE if np.issubdtype(block.dtype, np.integer) else 1.0)
+    is_pcm = {name: np.issubdtype(block.dtype, np.integer) for name, block in blocks.items()}
+    return {name: block.astype(np.float32) / (_FULL_SCALE if is_pcm[name] else 1) for name, block in blocks.items()}
 
 
 def level_db(block: np.ndarray) -> float:

@@ -7,6 +7,7 @@ Each command has its own arguments, environment, output and exit status. What is
 import contextlib
 import gc
 import importlib
+import inspect
 import json
 import os
 import pkgutil
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 _COMMANDS = {
@@ -166,24 +168,30 @@ def _check_cards_there() -> None:
 def _read_options() -> None:
     """What a command takes longest for: draccus searches the sources for the help of all 2,000 options."""
     from draccus.argparsing import ArgumentParser
-    from lerobot.utils.import_utils import register_third_party_plugins
+    from lerobot.utils import import_utils
 
     sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
     from list_options import CONFIGS  # type: ignore[import-not-found]
 
-    remember_docstrings()
-    register_third_party_plugins()
+    speed_up_parsers()
+    import_utils.register_third_party_plugins()
     for config in CONFIGS.values():
         ArgumentParser(config)
     gc.collect()
     gc.freeze()
 
 
-def remember_docstrings() -> None:
-    """Searches the sources for the help of an option once, and not whenever a command is run in this process."""
-    from draccus.wrappers import docstring
+def speed_up_parsers() -> None:
+    """What the parser of 2,000 options looks up in sources, and LeRobot in all distributions, is looked up once a process."""
+    from draccus.wrappers import docstring, field_wrapper
+    from lerobot.utils import import_utils
 
+    docstring._get_class_source = cache(docstring._get_class_source.__wrapped__)  # it has room for 100 classes
     docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
+    field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
+    register = import_utils.register_third_party_plugins
+    register_those_on = cache(lambda *path: register())
+    import_utils.register_third_party_plugins = lambda: register_those_on(*sys.path)
 
 
 def _run(job: dict[str, Any]) -> None:

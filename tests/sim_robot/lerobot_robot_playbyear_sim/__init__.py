@@ -4,8 +4,6 @@ Its folder on PYTHONPATH is all that LeRobot's discovery needs.
 """
 
 from lerobot_robot_playbyear_sim.devices import (
-    PlainMicrophone,
-    PlainMicrophoneConfig,
     PlaybyearSim,
     PlaybyearSimConfig,
     PlaybyearSimLeader,
@@ -18,8 +16,6 @@ __all__ = [
     "JointArmConfig",
     "JointLeader",
     "JointLeaderConfig",
-    "PlainMicrophone",
-    "PlainMicrophoneConfig",
     "PlaybyearSim",
     "PlaybyearSimConfig",
     "PlaybyearSimLeader",

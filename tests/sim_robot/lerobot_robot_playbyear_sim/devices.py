@@ -8,9 +8,8 @@ import numpy as np
 from lerobot.cameras import CameraConfig
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.robots import Robot, RobotConfig
-from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
+from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 
-from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_robot_playbyear_sim.link import Link
 
 # In the order of the environment's `action` and `agent_pos`; LeRobot hands on what ends in .pos or .vel.
@@ -70,10 +69,6 @@ class PlaybyearSim(Robot):
 
     def configure(self) -> None: ...
 
-    def reset_episode(self, seed: int | None) -> None:
-        """As a person would, who sets the scene up."""
-        self._ask("reset", seed=seed)
-
     def get_observation(self) -> dict[str, Any]:
         answer = self._ask("observe")
         pictures = {name: camera.read_latest() for name, camera in self.cameras.items()}
@@ -112,12 +107,10 @@ class PlaybyearSimLeaderConfig(TeleoperatorConfig):
 
     Args:
         socket: Of the simulation.
-        judges: Whether it also says when the task is solved, and takes over when the script would.
         demonstrates: Whether the script is that of demonstrations; otherwise that of corrections.
     """
 
     socket: str
-    judges: bool = True
     demonstrates: bool = False
 
 
@@ -152,36 +145,9 @@ class PlaybyearSimLeader(Teleoperator):
         answer = self._link.ask("script", demonstrates=self.config.demonstrates)
         return dict(zip(ACTIONS, answer["action"], strict=True))
 
-    def get_teleop_events(self) -> dict[TeleopEvents, bool]:
-        assert self._link is not None
-        if not self.config.judges:
-            return {}
-        status = self._link.ask("status")
-        return {
-            TeleopEvents.IS_INTERVENTION: status["wants_control"],
-            TeleopEvents.SUCCESS: status["success"],
-            TeleopEvents.FAILURE: status["failed"],
-        }
-
     def send_feedback(self, feedback: dict[str, Any]) -> None: ...
 
     def disconnect(self) -> None:
         link, self._link = self._link, None
         if link is not None:
             link.close()
-
-
-@CameraConfig.register_subclass("playbyear_sim_plain")
-@dataclass(kw_only=True)
-class PlainMicrophoneConfig(MicrophoneCameraConfig):
-    """A microphone whose picture is the spectrogram alone."""
-
-
-class PlainMicrophone(MicrophoneCamera):
-    """Shows what its picture would be without strip and timecode: to compare policies that look at it."""
-
-    def _picture(self, counter: int) -> np.ndarray:
-        grey = self._spectrogram.draw(counter, self._samples)
-        picture = np.zeros((self.height, self.width, 3), np.uint8)
-        picture[: len(grey)] = grey[:, :, None]
-        return picture

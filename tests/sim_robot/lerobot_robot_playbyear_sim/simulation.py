@@ -34,14 +34,13 @@ class Loudspeaker:
         self._player.start()
         self._rate, self._end = sample_rate, 0.0
 
-    def play(self, block: np.ndarray) -> float:
-        """Plays it now, as a contact is heard when it happens. Returns when it begins [s of time.perf_counter]."""
+    def play(self, block: np.ndarray) -> None:
+        """Plays it now, as a contact is heard when it happens."""
         begins = time.perf_counter() + LAG_S
         if abs(begins - self._end) < JITTER_S:  # joins the one before
             begins = self._end
         self._player.play(block, begins)
         self._end = begins + len(block) / self._rate
-        return begins
 
 
 class Simulation:
@@ -58,8 +57,6 @@ class Simulation:
         ).unwrapped
         self.speaker = Loudspeaker(fifo, sample_rate) if fifo else None
         self.requests: queue.Queue = queue.Queue()
-        self.is_blind = False
-        self.heard_at_s: list[float] = []
         self._seed = 0
         self.reset(0)
 
@@ -91,8 +88,6 @@ class Simulation:
         self.wants_control = bool(self.gate.wants_control(np.array(action, np.float32)))
 
     def observe(self) -> dict[str, Any]:
-        if self.is_blind:
-            return {"error": "the camera has stopped"}
         return {"state": self.observation["agent_pos"].tolist(), "picture": self.observation["pixels"]["front"]}
 
     def script(self, demonstrates: bool) -> dict[str, Any]:
@@ -109,22 +104,6 @@ class Simulation:
         now = {name: getattr(self, name) for name in names}
         seconds = round(self.last_step_s - self.first_step_s, 3)  # what n_steps - 1 steps took
         return {**now, "seed": self._seed, "most_steps": self.env._max_episode_steps, "seconds": seconds}
-
-    def tap(self) -> dict[str, Any]:
-        """A short loud sound, now."""
-        rate = self.env.observation_space["audio.gripper"].shape[0] * 20
-        wave = 20000 * np.exp(-np.arange(rate // 50) / (rate / 200)) * np.sin(np.arange(rate // 50) * 0.8)
-        assert self.speaker is not None
-        self.heard_at_s.append(self.speaker.play(wave.astype(np.int16)))
-        return {}
-
-    def taps(self) -> dict[str, Any]:
-        """When each was heard [s of time.perf_counter]."""
-        return {"heard_at_s": self.heard_at_s}
-
-    def blind(self, is_blind: bool) -> dict[str, Any]:
-        self.is_blind = is_blind
-        return {}
 
     def run(self) -> None:
         while True:
