@@ -169,10 +169,6 @@ def random_runs(config: PlaybyearConfig, n: int) -> dict[str, Tensor]:
 def random_observations(n: int) -> list[dict[str, Tensor]]:
     """Observations of n control steps, noise, as LeRobot hands them to `select_action`."""
     return [
-        {
-            CAMERA: torch.rand(1, 3, PIXELS, PIXELS),
-            MICROPHONE: 0.02 * torch.randn(1, SAMPLES),
-            STATE: torch.randn(1, 7),
-        }
+        {CAMERA: torch.rand(1, 3, PIXELS, PIXELS), MICROPHONE: 0.02 * torch.randn(1, SAMPLES), STATE: torch.randn(1, 7)}
         for _ in range(n)
     ]

@@ -71,9 +71,7 @@ def measure_reading(root: Path, turns: int) -> list[Row]:
     seconds = medians(in_turns(works, turns))
     rates = {name: n * _BATCH / seconds[name] for name, n in n_batches.items()}
     what, beside = f"dataset windows, {WINDOW} frames, ", ("windows/s", "stock LeRobotDataset", rates["stock"])
-    return [
-        Row(what + "as training uses them", rates["compact"], *beside, "copying as many bytes", rates["copy"]),
-    ]
+    return [Row(what + "as training uses them", rates["compact"], *beside, "copying as many bytes", rates["copy"])]
 
 
 if __name__ == "__main__":

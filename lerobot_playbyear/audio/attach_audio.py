@@ -19,7 +19,7 @@ from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, cu
 from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_layout
 from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature, audio_keys
 from lerobot_playbyear.datasets.files import (
     EPISODES_DIR,
     INFO_PATH,
@@ -197,11 +197,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
                 lengths = [int(length) for length in dataset.meta.episodes["length"]]
                 added = _read([source], lengths, dataset.fps, cfg, scratch)
         write_new_dataset(root, target, added, removed, notes)
-    heard = [
-        f"{key} at {own.feature['info']['sample_rate']} Hz"
-        for key, own in added.items()
-        if key.startswith(AUDIO_PREFIX)
-    ]
+    heard = [f"{key} at {added[key].feature['info']['sample_rate']} Hz" for key in audio_keys(added)]
     print(f"\nDataset: {target} ({n_episodes} episodes with {', '.join(heard)})")
     return target
 
@@ -290,14 +286,10 @@ def _is_in_dataset(cfg: AttachAudioConfig) -> bool:
 def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
     """Whether the options say where the sound is, and in one way."""
     if cfg.files is not None and cfg.session is not None:
-        raise AttachError(
-            "--files has the sound of each episode, --session that of all; both are given. Give one of them."
-        )
+        raise AttachError("--files has the sound of each episode, --session that of all; both are given. Give one.")
     if _is_in_dataset(cfg):
         own = ("the dataset's own files", "offset", "sample_rate", "pad")
-        source, *taken = (
-            own if has_own_files else ("microphones that were recorded as cameras", "session", "microphone")
-        )
+        source, *taken = own if has_own_files else ("microphones recorded as cameras", "session", "microphone")
         for option in fields(AttachAudioConfig):
             value = getattr(cfg, option.name)
             if option.name not in ("dataset", "output", *taken) and value != option.default:
@@ -402,7 +394,7 @@ def _files(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], _: P
             return str(Path(pattern.format(episode=episode)))
         except (KeyError, IndexError, ValueError) as error:
             raise AttachError(
-                f"--files={pattern} cannot be filled in: {error}. Only {{episode}} may stand in it."
+                f"--files={pattern} cannot be filled in: {error}. Only {{episode}} may be in it."
             ) from error
 
     def recording(episode: int) -> Recording:

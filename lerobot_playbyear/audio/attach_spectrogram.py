@@ -90,9 +90,7 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
             f"{how.feature}: the last {how.seconds:.2f} s of '{how.microphone}', {how.width} x {how.height}, "
             f"{how.low_db:g} to {how.high_db:g} dB"
         )
-    print(
-        f"\nDataset: {target} ({len(dataset.episodes)} episodes). To roll out what it taught: --env.spectrogram={target}"
-    )
+    print(f"\nDataset: {target} ({len(dataset.episodes)} episodes). To roll out with it: --env.spectrogram={target}")
     return target
 
 
@@ -111,9 +109,7 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPic
     names = [key.removeprefix(AUDIO_PREFIX) for key in rates]
     for name in cfg.microphones or []:
         if name not in names:
-            raise AttachSpectrogramError(
-                f"--microphones names '{name}'; the dataset in {dataset.root} has {', '.join(names)}."
-            )
+            raise AttachSpectrogramError(f"--microphones names '{name}'; {dataset.root} has {', '.join(names)}.")
     wanted = names if cfg.microphones is None else list(dict.fromkeys(cfg.microphones))
     if not wanted:
         raise AttachSpectrogramError("--microphones names none. Name at least one, or leave it out for all.")

@@ -107,11 +107,7 @@ def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
 
 
 def _write_frames(
-    source: Path,
-    target: Path,
-    schema: pa.Schema,
-    added: Mapping[str, AddedColumn],
-    removed: Collection[str],
+    source: Path, target: Path, schema: pa.Schema, added: Mapping[str, AddedColumn], removed: Collection[str]
 ) -> None:
     file = DataFile(source)
     metadata = file.schema.metadata or {}
@@ -143,9 +139,7 @@ def _values(frames: pa.Table, column: AddedColumn, kind: pa.DataType) -> pa.Arra
     first, last = int(numbers[0]), int(numbers[-1])
     values = column.values(episode) if 0 <= episode < len(column.stats) else []
     if not 0 <= first <= last < len(values) or (np.diff(numbers) != 1).any():
-        raise ValueError(
-            f"it holds frames {first} to {last} of episode {episode}, for which meta/episodes counts {len(values)}"
-        )
+        raise ValueError(f"it holds frames {first} to {last} of episode {episode}; meta/episodes counts {len(values)}")
     own = values[first : last + 1]
     return numpy_to_column(own, kind) if isinstance(own, np.ndarray) else pa.array(own, kind)
 

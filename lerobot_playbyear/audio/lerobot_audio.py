@@ -113,9 +113,7 @@ def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> 
         info = read_info(root)
         fps, features = info["fps"], info["features"]
         if fps % 1:
-            raise AudioLayoutError(
-                f"{root / INFO_PATH}: fps is {fps!r}; wanted a whole number of frames per second. Correct it."
-            )
+            raise AudioLayoutError(f"{root / INFO_PATH}: fps is {fps!r}; wanted a whole number. Correct it.")
         template = info.get("audio_path") or DEFAULT_AUDIO_PATH
         if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
             raise AudioLayoutError(
@@ -143,12 +141,10 @@ def _episodes(root: Path, n_frames: int) -> tuple[pa.Table, list[int]]:
         raise AudioLayoutError(f"{root / EPISODES_DIR} is damaged: {error}. {remedy}") from error
     if numbers != list(range(len(rows))) or not all(isinstance(length, int) and length > 0 for length in lengths):
         raise AudioLayoutError(
-            f"{root / EPISODES_DIR} does not name episodes 0 to {len(rows) - 1} and their lengths. {remedy}"
+            f"{root / EPISODES_DIR} lacks episodes of 0 to {len(rows) - 1}, or their lengths. {remedy}"
         )
     if sum(lengths) != n_frames:
-        raise AudioLayoutError(
-            f"{root / EPISODES_DIR} counts {sum(lengths)} frames; the data files hold {n_frames}. {remedy}"
-        )
+        raise AudioLayoutError(f"{root / EPISODES_DIR} counts {sum(lengths)} frames; data/ holds {n_frames}. {remedy}")
     return rows, lengths
 
 

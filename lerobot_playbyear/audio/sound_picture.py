@@ -288,9 +288,7 @@ def pictures_of(features: Mapping[str, Mapping[str, Any]]) -> list[SoundPicture]
         if said is None:
             continue
         if not isinstance(said, dict) or set(said) != names:
-            raise InputError(
-                f"'{key}': {INFO_KEY} in its info is {said!r}; wanted the fields {', '.join(sorted(names))}."
-            )
+            raise InputError(f"'{key}': {INFO_KEY} is {said!r}; wanted the fields {', '.join(sorted(names))}.")
         try:
             found.append(SoundPicture(**said))
         except TypeError as error:
@@ -319,9 +317,7 @@ def read_pictures(path: str | Path) -> list[SoundPicture]:
             f"{file} cannot be read ({error}); wanted a dataset's folder or its {INFO_PATH}, from playbyear-attach-spectrogram"
         ) from error
     if not pictures:
-        raise InputError(
-            f"{file} names no pictures of sound; make a dataset that has some: playbyear-attach-spectrogram"
-        )
+        raise InputError(f"{file} names no pictures of sound; make some: playbyear-attach-spectrogram")
     return pictures
 
 

@@ -127,9 +127,7 @@ class DaggerConfig:
             if isinstance(value, int) and value < _LEAST.get(name, 0):
                 raise InputError(f"--{name}={value}: give at least {_LEAST.get(name, 0)}.")
         if self.eval.n_episodes < (self.eval_every > 0):
-            raise InputError(
-                f"--eval.n_episodes={self.eval.n_episodes}: give at least 1, or --eval_every=0 for no evaluation."
-            )
+            raise InputError(f"--eval.n_episodes={self.eval.n_episodes}: give at least 1, or --eval_every=0 for none.")
         if self.batch_size < 2 or self.batch_size % 2:
             raise InputError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
         if self.is_online and self.updates:

@@ -50,9 +50,7 @@ def run_dagger(cfg: DaggerConfig) -> Path:
         PlaybyearError: If the run cannot go on. What was saved before is safe.
     """
     init_logging()
-    logging.getLogger("lerobot.configs.video").setLevel(
-        logging.WARNING
-    )  # it has a line for every attempt that is saved
+    logging.getLogger("lerobot.configs.video").setLevel(logging.WARNING)  # a line for every attempt that is saved
     with ExitStack() as stack:
         with errors_of_input(FileNotFoundError, MemoryError):
             cfg.check()
@@ -79,9 +77,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     overrides = [*parser.get_yaml_overrides("policy"), *(parser.get_cli_overrides("policy") or [])]  # the last one wins
     if state is None:
         if given is None:
-            raise InputError(
-                "HG-DAgger improves a trained policy: give its folder or its name on the Hub, --policy.path."
-            )
+            raise InputError("HG-DAgger improves a trained policy: give its folder or name on the Hub, --policy.path.")
         if (folder.path / CONFIG_NAME).is_file():
             logging.info(f"{folder.path}: the run was ended before its first attempt and begins anew.")
         state = RunState(policy_path=given, policy_overrides=overrides, first_episodes=None)
@@ -104,9 +100,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     if overrides:
         _check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
-        raise InputError(
-            "--policy.push_to_hub=true needs a name: give --policy.repo_id, or --policy.push_to_hub=false."
-        )
+        raise InputError("--policy.push_to_hub=true needs --policy.repo_id; or give --policy.push_to_hub=false.")
     if cfg.policy.push_to_hub:
         check_name("policy.repo_id", str(cfg.policy.repo_id))
         warn_without_login()
@@ -167,9 +161,8 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     report = stack.enter_context(Report(cfg, training, folder, state))
     scene = None
     if env is not None and cfg.env is not None and expert is not None:
-        actor = PolicyActor(
-            learner.unwrapped, cfg.env, learner.preprocessor, learner.postprocessor, learner.accelerator.autocast
-        )
+        processors = (learner.preprocessor, learner.postprocessor)
+        actor = PolicyActor(learner.unwrapped, cfg.env, *processors, learner.accelerator.autocast)
         scene = Scene(env, actor, expert)
     return Loop(
         cfg, training, folder, state, learner, windows, demonstrations, corrections, batches, report, scene, method
@@ -265,9 +258,7 @@ def _why_none(cfg: DaggerConfig, state: RunState) -> str:
     if state.kept == 0:
         return "no attempt was kept"
     if cfg.updates_per_episode == 0:
-        return (
-            "--updates_per_episode=0. To learn from all attempts give --episodes=0 --updates=N and another --output_dir"
-        )
+        return "--updates_per_episode=0. To learn from all give --episodes=0 --updates=N and another --output_dir"
     return f"--warmup_episodes={cfg.warmup_episodes} is more than the dataset holds"
 
 
@@ -286,11 +277,8 @@ def _check_places(cfg: DaggerConfig) -> None:
             f"--demos and --interventions are the same dataset, {demos}: attempts would be written among the demonstrations, "
             "with what the policy did wrong in them. Give --interventions.repo_id and --interventions.root of their own."
         )
-    if (
-        cfg.is_online
-        and cfg.output_dir.resolve().is_relative_to(interventions)
-        and not (interventions / "meta").exists()
-    ):
+    is_within = cfg.output_dir.resolve().is_relative_to(interventions)
+    if cfg.is_online and is_within and not (interventions / "meta").exists():
         raise InputError(
             f"--output_dir={cfg.output_dir} lies in the folder of --interventions, {interventions}, where a dataset is to be "
             "made: give another one."

@@ -41,18 +41,10 @@ LOCK = ".lock"
 """File in the output folder while a run is at work."""
 
 _SAME_RUN = (
-    "demos",
-    "interventions",
-    "env",
-    "expert",
-    "method",
-    "skip_s",
-    "new_weights",
-    "seed",
-    "episode_seed",
-    "warmup_episodes",
-    "rename_map",
-)  # options that stay as they are when a run goes on
+    *("demos", "interventions", "env", "expert", "method", "skip_s", "new_weights", "seed"),
+    *("episode_seed", "warmup_episodes", "rename_map"),
+)
+"""Options that stay as they are when a run goes on."""
 
 
 @dataclass
@@ -145,9 +137,7 @@ class RunFolder:
         """Removes what was made for a run that did not begin."""
         if (self.path / CONFIG_NAME).exists():
             return
-        with contextlib.suppress(
-            OSError
-        ):  # there was no lock, Windows removes no open file, or something else is there
+        with contextlib.suppress(OSError):  # no lock was there, or Windows removes no open file, or others are there
             (self.path / LOCK).unlink()
             if is_new:
                 self.path.rmdir()
@@ -299,7 +289,7 @@ def _errors_of_writing(folder: Path) -> Iterator[None]:
         yield
     except (OSError, SafetensorError) as error:
         raise InputError(
-            f"Cannot write to {folder}: {error}. What was saved before is complete; once there is room, go on with "
+            f"Cannot write to {folder}: {error}. What was saved is complete; once there is room, go on with "
             "--resume=true."
         ) from error
 

@@ -152,8 +152,7 @@ class DurableWriter:
         """
         if self._is_complete:
             raise DatasetWriteError(
-                f"Episode {self.num_episodes} is not saved yet: call save_episode again, or give it up with "
-                "discard_episode."
+                f"Episode {self.num_episodes} is not saved yet: call save_episode again, or discard_episode."
             )
         values = {key: _as_array(value) for key, value in frame.items()}
         check_frame(values, self._info.features)
@@ -188,9 +187,7 @@ class DurableWriter:
             DatasetWriteError: It is complete on disk already, and only has to be moved to its place.
         """
         if (self.root / JOURNAL).exists():
-            raise DatasetWriteError(
-                f"Episode {self.num_episodes} is complete on disk already: call save_episode again."
-            )
+            raise DatasetWriteError(f"Episode {self.num_episodes} is complete on disk already: call save_episode.")
         self._forget_episode()
 
     def close(self) -> None:
@@ -305,9 +302,7 @@ def check_root(root: Path, *, resume: bool) -> None:
         raise DatasetWriteError(f"Cannot write a dataset to {root}: it is a file.")
     if has_dataset(root) or (root / JOURNAL).is_file():
         if not resume:
-            raise FileExistsError(
-                f"{root} already holds a dataset. Append to it with --resume=true, or choose another root."
-            )
+            raise FileExistsError(f"{root} already holds a dataset. Append with --resume=true, or choose another root.")
     elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
         raise FileExistsError(f"{root} is not empty and holds no dataset. Choose another root.")
 

@@ -28,11 +28,10 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.journal import STAGING, remove_staged
 from lerobot_playbyear.datasets.parquet import (
+    DataFile,
     ParquetDamageError,
     fit_to_schema,
     numpy_to_column,
-    open_checked,
-    read_row_groups,
     read_table,
     with_values,
     write_rows,
@@ -184,14 +183,13 @@ def _row_groups(path: Path, schema: pa.Schema) -> list[pa.Table]:
     Raises:
         ParquetDamageError: One of them is damaged, or the file has other columns.
     """
-    with open_checked(path) as file:
-        if not file.schema_arrow.remove_metadata().equals(schema.remove_metadata()):
-            raise ParquetDamageError("its columns are of other types")
-        tables = []
-        for table in read_row_groups(file):
-            if isinstance(table, ParquetDamageError):
-                raise table
-            tables.append(table.replace_schema_metadata(schema.metadata))
+    file, tables = DataFile(path), []
+    if not file.schema.remove_metadata().equals(schema.remove_metadata()):
+        raise ParquetDamageError("its columns are of other types")
+    for _, table in file.row_groups():
+        if isinstance(table, ParquetDamageError):
+            raise table
+        tables.append(table.replace_schema_metadata(schema.metadata))
     return tables
 
 

@@ -245,9 +245,7 @@ def check_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> None:
     for key in audio_keys(features):
         rate = features[key]["info"]["sample_rate"]
         if not isinstance(rate, int):  # a reader takes any number that is whole; what is written is plain
-            raise InputError(
-                f"'{key}' has sample_rate {rate!r}; wanted a whole number of Hz, a Python int such as 16000."
-            )
+            raise InputError(f"'{key}' has sample_rate {rate!r}; wanted whole Hz, a Python int such as 16000.")
 
 
 def check_frame(frame: Mapping[str, Any], features: Mapping[str, Mapping[str, Any]]) -> None:
@@ -285,9 +283,7 @@ def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
     shape = feature["shape"]
     sizes = shape if isinstance(shape, tuple | list) else [None]
     if "/" in key:
-        raise InputError(
-            f"'{key}' has a '/' in it; LeRobot's features have names without, such as {key.replace('/', '.')!r}."
-        )
+        raise InputError(f"'{key}' has a '/' in it; LeRobot's names have none, such as {key.replace('/', '.')!r}.")
     if not all(isinstance(size, int | np.integer) and size > 0 for size in sizes):
         raise InputError(f"'{key}' has shape {shape!r}; wanted a tuple of positive whole numbers.")
     if key.startswith(AUDIO_PREFIX) and len(shape) > 1:

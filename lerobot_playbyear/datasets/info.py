@@ -173,9 +173,7 @@ def check_links(root: Path) -> None:
     for path in entries_below(root):
         name = path.relative_to(root)
         if path.is_symlink() and path.is_dir() and fits(name, *_FOLDERS):
-            raise OutsideError(
-                f"'{path}' is a link to a folder, whose files would be left out. Put the folder itself there."
-            )
+            raise OutsideError(f"'{path}' is a link to a folder, whose files would be left out. Put the folder there.")
 
 
 def check_links_out(root: Path) -> None:
@@ -260,11 +258,10 @@ def _values_held(footers: Iterable[pq.FileMetaData], keys: Sequence[str]) -> dic
     n_rows = 0
     for footer in footers:
         n_rows += footer.num_rows
-        for group in (footer.row_group(index) for index in range(footer.num_row_groups)):
-            for column in (group.column(index) for index in range(group.num_columns)):
-                key = max(
-                    (key for key in keys if f"{column.path_in_schema}.".startswith(f"{key}.")), key=len, default=None
-                )
+        for group in map(footer.row_group, range(footer.num_row_groups)):
+            for column in map(group.column, range(group.num_columns)):
+                path = f"{column.path_in_schema}."
+                key = max((key for key in keys if path.startswith(f"{key}.")), key=len, default=None)
                 if key is not None and column.physical_type != "BYTE_ARRAY":
                     n_values[key] = n_values.get(key, 0) + column.num_values
     return {key: count / n_rows for key, count in n_values.items()} if n_rows else {}

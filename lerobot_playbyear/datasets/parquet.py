@@ -116,7 +116,8 @@ class DataFile:
             MemoryError: There is no room for them.
         """
         with open_checked(self.path, self.footer) as file:
-            yield from zip(self._edges, read_row_groups(file, columns, self.path), strict=False)
+            for group, first in enumerate(self._edges[:-1]):
+                yield first, self._read_group(file, group, columns)
 
     def read(self, start: int, stop: int, columns: list[str] | None = None) -> pa.Table:
         """Some of the rows. Whoever reads on reads no row group twice.
@@ -136,63 +137,27 @@ class DataFile:
             for group, (first, end) in enumerate(zip(self._edges, self._edges[1:], strict=False))
             if first < stop and end > start
         ]
-        return pa.concat_tables(tables) if tables else self._empty(columns)
+        return pa.concat_tables(tables) if tables else self.schema.empty_table().select(columns or self.schema.names)
 
     def _group(self, group: int, columns: list[str] | None) -> pa.Table:
         last = self._last  # another thread may read something else meanwhile
         if last is None or last[:2] != (group, columns):
             with open_checked(self.path, self.footer) as file:
-                last = self._last = (group, columns, read_row_group(file, group, columns, self.path))
+                last = self._last = (group, columns, self._read_group(file, group, columns))
         table = last[2]
         if isinstance(table, ParquetDamageError):
             raise ParquetDamageError(f"{self.path} is damaged: {table}.")
         return table
 
-    def _empty(self, columns: list[str] | None) -> pa.Table:
-        table = self.schema.empty_table()
-        return table if columns is None else table.select(columns)
-
-
-def read_row_groups(
-    file: pq.ParquetFile, columns: list[str] | None = None, path: Path | None = None
-) -> Iterator[pa.Table | ParquetDamageError]:
-    """Every row group of an opened file; arguments and errors as for `read_row_group`."""
-    for group in range(file.num_row_groups):
-        yield read_row_group(file, group, columns, path)
-
-
-def read_row_group(
-    file: pq.ParquetFile, group: int, columns: list[str] | None = None, path: Path | None = None
-) -> pa.Table | ParquetDamageError:
-    """A row group as a table, or what is wrong with it.
-
-    Args:
-        file: An opened file.
-        group: Which.
-        columns: Which to read; None: all.
-        path: Its name, for errors.
-
-    Raises:
-        OSError: The file cannot be read now.
-        MemoryError: There is no room for it.
-    """
-    try:
-        with parsing(path):
-            table = file.read_row_group(group, columns=columns, use_threads=False)
-            table.validate(full=True)
-            return table
-    except ParquetDamageError as error:
-        return error
-
-
-def row_group_parts(file: pq.ParquetFile, index: int, columns: list[str] | None = None) -> Iterator[pa.Table]:
-    """A row group in parts of bounded size. Raises what pyarrow raises where it cannot be read."""
-    group = file.metadata.row_group(index)
-    rows = _rows_within(PIECE_BYTES, group.total_byte_size, group.num_rows)
-    for batch in file.iter_batches(rows, row_groups=[index], columns=columns, use_threads=False):
-        table = pa.Table.from_batches([batch])
-        table.validate(full=True)
-        yield table
+    def _read_group(self, file: pq.ParquetFile, group: int, columns: list[str] | None) -> pa.Table | ParquetDamageError:
+        """A row group of the opened file, or what is wrong with it. Raises as `row_groups`."""
+        try:
+            with parsing(self.path):
+                table = file.read_row_group(group, columns=columns, use_threads=False)
+                table.validate(full=True)
+                return table
+        except ParquetDamageError as error:
+            return error
 
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:

@@ -10,6 +10,7 @@ import av
 import numpy as np
 from PIL import Image
 
+from lerobot_playbyear.datasets.files import INFO_PATH
 from lerobot_playbyear.datasets.info import OutsideError, real_path
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
@@ -47,9 +48,7 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
     if not has_shape(image.height, image.width, feature["shape"]):
         size = f"{image.width} x {image.height}"
         image.close()
-        raise ValueError(
-            f"'{key}': a picture of {size} pixels; meta/info.json gives the shape {tuple(feature['shape'])}"
-        )
+        raise ValueError(f"'{key}': a picture of {size} pixels; {INFO_PATH} gives the shape {tuple(feature['shape'])}")
     return image
 
 

@@ -282,10 +282,8 @@ class SurveyedDataset(EpisodeReader):
 
     def __init__(self, repo_id: str, found: Survey, episodes: Sequence[int] | None = None) -> None:
         files = {each.frames.file.path: each.frames.file for each in found.whole if each.frames}
-        super().__init__(
-            repo_id, found.root, int(found.info["fps"]), found.info["features"], files.values(), found.tasks
-        )
         self.survey, self.info = found, found.info
+        super().__init__(repo_id, found.root, int(self.info["fps"]), self.info["features"], files.values(), found.tasks)
         self.chosen = None if episodes is None else set(episodes)
         self._places = {each.number: each.places for each in found.whole}
         first_of = dict(zip(files, self._firsts, strict=False))
@@ -295,11 +293,7 @@ class SurveyedDataset(EpisodeReader):
 
     @classmethod
     def open(
-        cls,
-        repo_id: str,
-        root: str | Path | None = None,
-        episodes: list[int] | None = None,
-        damaged: bool = False,
+        cls, repo_id: str, root: str | Path | None = None, episodes: list[int] | None = None, damaged: bool = False
     ) -> "SurveyedDataset":
         """Opens a dataset from its folder, or by its name from LeRobot's cache or the Hub.
 

@@ -110,9 +110,8 @@ def add_stats(total: Stats | None, episodes: Iterable[Stats]) -> Stats:
 
 def write_stats(stats: Stats, root: Path) -> None:
     """Writes `meta/stats.json` as LeRobot does, but each feature on one line: vectors of thousands take less room."""
-    lines = [
-        f"{json.dumps(key)}: {json.dumps(value, separators=(',', ':'))}" for key, value in serialize_dict(stats).items()
-    ]
+    narrow = json.JSONEncoder(separators=(",", ":"))
+    lines = [f"{json.dumps(key)}: {narrow.encode(value)}" for key, value in serialize_dict(stats).items()]
     path = root / STATS_PATH
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("{\n" + ",\n".join(lines) + "\n}\n")

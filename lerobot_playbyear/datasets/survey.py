@@ -201,9 +201,7 @@ def _schema(root: Path, info: Mapping[str, Any]) -> pa.Schema:
     try:
         return get_hf_features_from_features(features).arrow_schema
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DatasetDamagedError(
-            f"{root / INFO_PATH}: LeRobot does not know a feature: {error}. Correct it."
-        ) from error
+        raise DatasetDamagedError(f"{root / INFO_PATH}: LeRobot knows no such feature: {error}. Correct it.") from error
 
 
 # Frames
@@ -439,9 +437,7 @@ def _judge_episodes(
     if without := [number for number, _ in whole if number not in rows]:
         yield _wrong("rows", f"the rows of {name_episodes(without)} in {EPISODES_DIR} are lost", without)
     if mixed := [number for number, frames in whole if not frames.is_numbered]:
-        yield _wrong(
-            "rows", f"{name_episodes(mixed)}: the frames are not numbered one after the other in 'index'", mixed
-        )
+        yield _wrong("rows", f"{name_episodes(mixed)}: frames are not numbered one after the other in 'index'", mixed)
     if untimely := [number for number, frames in whole if not frames.is_timely]:
         said = f"{name_episodes(untimely)}: timestamps are not frame / fps at {info['fps']} frames per second"
         yield _wrong("times", said, untimely, f"If they are right, correct fps in {INFO_PATH}")
@@ -505,9 +501,7 @@ def _read_tasks(
     if nameless := sorted(set(wanted) - set(known)):
         remedy = "Put a table from a copy in its place, or correct the frames' task_index"
         said_of = ", ".join(map(str, nameless[:8]))
-        findings.append(
-            _wrong("tasks", f"{TASKS_PATH}: frames are of task {said_of}, which has no text", remedy=remedy)
-        )
+        findings.append(_wrong("tasks", f"{TASKS_PATH}: frames are of task {said_of}, without a text", remedy=remedy))
     for task, text, numbers in ((each, text, own) for each in wanted for text, own in said[each].items()):
         if text != known.get(task, text) and not problem:
             message = (

@@ -159,7 +159,7 @@ def _observation_boxes(space: gym.spaces.Dict) -> dict[str, gym.spaces.Box]:
             raise InputError(f"The observation {key!r} cannot be recorded: its space is {box}.")
         if key.startswith(AUDIO_PREFIX) and len(box.shape) != 1:
             raise InputError(
-                f"The observation {key!r} has shape {box.shape}; wanted (S,): every microphone is its own key."
+                f"Observation {key!r} has shape {box.shape}; wanted (S,): every microphone is its own key."
             )
     return boxes
 

@@ -49,9 +49,7 @@ class Script:
             return
         baselines = owner.blind_baselines() if hasattr(owner, "blind_baselines") else {}
         if self._baseline not in baselines:
-            raise RolloutError(
-                f"There is no blind baseline {self._baseline!r}; there are: {', '.join(baselines) or 'none'}."
-            )
+            raise RolloutError(f"There is no blind baseline {self._baseline!r}, only {', '.join(baselines) or 'none'}.")
         self._script = baselines[self._baseline]
 
     def act(self, observation: Observation) -> np.ndarray:

@@ -103,14 +103,9 @@ def pictures_for(
         if microphone not in sample_rates:
             heard = ", ".join(sample_rates) or "none"
             raise InputError(f"{path} has pictures of the microphone '{microphone}'; the environment has {heard}")
-        for name, seen, wanted in (
-            ("sample_rate", sample_rates[microphone], how.sample_rate),
-            ("fps", fps, how.fps),
-        ):
+        for name, seen, wanted in (("sample_rate", sample_rates[microphone], how.sample_rate), ("fps", fps, how.fps)):
             if seen != wanted:
-                raise InputError(
-                    f"{path} has pictures of '{microphone}' for {name}={wanted}; the environment has {seen}"
-                )
+                raise InputError(f"{path} has pictures of '{microphone}' for {name}={wanted}, the environment {seen}")
         if how.name in cameras:
             raise InputError(
                 f"{path} has pictures of '{microphone}' that are called '{how.name}', as a camera of the environment is; "

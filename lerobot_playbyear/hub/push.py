@@ -354,9 +354,7 @@ def find_checkpoint(path: Path) -> Path:
         found = path / inside
         if all((found / name).is_file() for name in wanted):
             if not found.resolve().is_relative_to(path.resolve()):
-                raise HubError(
-                    f"policy.path={path}: its last checkpoint is a link to {found.resolve()}. Give that folder."
-                )
+                raise HubError(f"policy.path={path}: its last checkpoint is a link to {found.resolve()}. Give that.")
             return found
     raise HubError(
         f"policy.path={path}: there is no checkpoint with {' and '.join(wanted)}. Give the folder "

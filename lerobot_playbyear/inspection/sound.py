@@ -170,9 +170,7 @@ def _check_microphone(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
         yield Finding("silence", "ok", span, key, figures=figures)
     yield cut.verdict("clipping", "cut peaks", "no peak is cut")
     if offset:
-        message = (
-            f"{name_episodes(offset)}: mean up to {worst_offset:.1%} of full scale; remove it with a high-pass filter"
-        )
+        message = f"{name_episodes(offset)}: mean up to {worst_offset:.1%} of full scale; a high-pass filter removes it"
         yield Finding("DC offset", "warning", message, key, offset, {"largest": worst_offset})
     else:
         message = f"mean at most {worst_offset:.2%} of full scale"

@@ -230,10 +230,7 @@ class MicrophoneCamera(Camera):
             return None
         folder = Path(config.save_to).expanduser() if config.save_to else SESSIONS
         path = session_path(folder, self._session, time.strftime("%Y-%m-%d_%H-%M-%S"))
-        recording, n_kept = (
-            card.recording,
-            round(KEPT_S * config.sample_rate),
-        )  # without `self`: once forgotten, it ends
+        recording, n_kept = card.recording, round(KEPT_S * config.sample_rate)  # no `self`: once forgotten, it ends
         file = SessionFile(path, config.sample_rate, lambda: recording.written, self._samples, n_kept)
         logging.info(
             "%s listens. All that it hears, voices too, is written to %s, %.1f MB a minute, and what stands in its "

@@ -50,9 +50,7 @@ def load_sounddevice() -> ModuleType:
     except ImportError as error:
         raise MicrophoneError("Microphones need the package sounddevice: pip install sounddevice.") from error
     except OSError as error:
-        raise MicrophoneError(
-            f"PortAudio is missing ({error}). Debian, Ubuntu: sudo apt install libportaudio2."
-        ) from error
+        raise MicrophoneError(f"PortAudio is missing ({error}). Debian: sudo apt install libportaudio2.") from error
     return sounddevice
 
 
@@ -116,7 +114,7 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
     (card,) = found
     if card.channels < channels:
         raise MicrophoneError(
-            f"device={text!r}: channel {channels - 1} is asked for, counted from 0, and {card.name} has "
+            f"device={text!r}: channel {channels - 1} is asked for, from 0 on, and {card.name} has "
             f"{card.channels}. {_FIND}"
         )
     return card

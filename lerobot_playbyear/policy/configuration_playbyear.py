@@ -256,9 +256,7 @@ class PlaybyearConfig(PreTrainedConfig):
 
     def get_optimizer_preset(self) -> AdamConfig:
         return AdamConfig(
-            lr=self.optimizer_lr,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
+            lr=self.optimizer_lr, weight_decay=self.optimizer_weight_decay, grad_clip_norm=self.optimizer_grad_clip_norm
         )
 
     def get_scheduler_preset(self) -> PlaybyearSchedulerConfig | None:

@@ -75,9 +75,7 @@ def make_encoder(option: str, config: PlaybyearConfig) -> nn.Module:
         )
     encoder = factories[name](config)
     if not isinstance(getattr(encoder, "embedding_size", None), int):
-        raise ValueError(
-            f"--policy.{option}={name}: {type(encoder).__name__} has no `embedding_size`: give it one, an int."
-        )
+        raise ValueError(f"--policy.{option}={name}: {type(encoder).__name__} has no int `embedding_size`: add it.")
     return encoder
 
 
@@ -114,7 +112,7 @@ def _register[Factory: EncoderFactory](option: str, name: str) -> Callable[[Fact
     def add(factory: Factory) -> Factory:
         if name in factories:
             raise ValueError(
-                f"An encoder '{name}' is registered already, by {factories[name].__module__}: take another name."
+                f"An encoder '{name}' is registered already, by {factories[name].__module__}: take another."
             )
         factories[name] = factory
         return factory

@@ -113,9 +113,8 @@ class PlaybyearNetwork(nn.Module):
         shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
         if colour is not None:
             colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
-        levels = spectrogram(
-            shared.stretches(wave), shared.stretches(begun), colour
-        )  # (B * n_stretches, bins, columns)
+        # (B * n_stretches, bins, columns)
+        levels = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
         n_columns = getattr(encoder, "window_columns", None)
         if isinstance(n_columns, int):  # convolutional along time: embeddings overlap, too
             embeddings = shared.windows(encoder(levels), n_columns)  # (B * n, channels, n_columns)
@@ -371,9 +370,7 @@ def newest(batch: dict[str, Tensor], key: str, n_frames: int, shape: tuple[int, 
         raise ValueError(f"The batch has no '{key}', which the policy was built for; it has {sorted(batch)}.")
     values = batch[key]
     if values.dim() < 2 or values.shape[1] < n_frames:
-        raise ValueError(
-            f"'{key}' has shape {tuple(values.shape)}, but {n_frames} frames are needed along its second dimension."
-        )
+        raise ValueError(f"'{key}' has shape {tuple(values.shape)}, but its second dimension needs {n_frames} frames.")
     values = values[:, -n_frames:]
     if shape == (1,) and values.dim() == 2:  # LeRobot reads a column of single numbers as scalars
         values = values.unsqueeze(-1)

@@ -26,16 +26,14 @@ from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 _FULL_SCALE = 32768  # int16: samples are in [-32768, 32767]
 _USUAL_RATES = (16000, 48000, 44100, 32000, 22050, 8000, 96000)  # Hz
-_PACE_STEPS = slice(
-    2, 22
-)  # of an episode, whose lengths are looked at; the first ones wait for the policy's first thoughts
+_PACE_STEPS = slice(2, 22)
+"""Steps of an episode whose lengths are looked at; the first ones wait for the policy's first thoughts."""
 
 
 def make_playbyear_pre_post_processors(
     config: PlaybyearConfig, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[
-    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
-    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]], PolicyProcessorPipeline[PolicyAction, PolicyAction]
 ]:
     """Builds both pipelines.
 

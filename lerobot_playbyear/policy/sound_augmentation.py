@@ -152,9 +152,7 @@ class RecordedNoise:
             raise InputError(f"{option}: there is no such folder; wanted one with WAV or FLAC files, or null.")
         files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _ENDINGS and path.is_file())
         if not files:
-            raise InputError(
-                f"{option}: the folder holds no {' or '.join(_ENDINGS)} file: put recordings of noise into it."
-            )
+            raise InputError(f"{option}: the folder holds no {' or '.join(_ENDINGS)} file: put some noise into it.")
         self._recordings: list[Tensor] = []
         seconds = 0.0
         for path in files:

@@ -123,9 +123,7 @@ def record(cfg: RecordConfig) -> Path:
                 _record_episodes(cfg, episodes, writer)
                 summary = f"{writer.num_episodes} episodes, {writer.num_frames} frames"
     except MemoryError as error:
-        raise PlaybyearError(
-            f"There is not enough memory to record to {root}. What was saved before is complete."
-        ) from error
+        raise PlaybyearError(f"There is not enough memory to record to {root}. What was saved is complete.") from error
     except OSError as error:
         raise PlaybyearError(f"Cannot write to {root}: {error}") from error
     fps = f" --policy.fps={facts.fps}" if facts.fps != _POLICY_FPS else ""
@@ -208,7 +206,7 @@ def _check_options(cfg: RecordConfig) -> None:
         raise InputError(f"--seed={cfg.seed}: give 0 or more.")
     if not isinstance(cfg.expert, ScriptedExpertConfig | TeleopExpertConfig):
         raise InputError(
-            f"--expert.type={cfg.expert.type} corrects a policy and does not demonstrate: give scripted or teleop."
+            f"--expert.type={cfg.expert.type} corrects a policy and demonstrates nothing: give scripted or teleop."
         )
     if getattr(cfg.expert, "person", False):
         raise InputError("--expert.person=true: it corrects a policy, and does not demonstrate; leave it out.")

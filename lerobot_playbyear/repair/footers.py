@@ -192,13 +192,7 @@ def _row_group(columns: list[Struct], n_rows: int, chunks: _Chunks) -> Struct:
             details[11] = (I64, chunk[0].start)
         described.append(Struct({2: (I64, 0), 3: (STRUCT, details)}))
     size = sum(page.inflated for chunk in chunks for page in chunk)
-    return Struct(
-        {
-            1: (LIST, Elements(STRUCT, described)),
-            2: (I64, size),
-            3: (I64, n_rows),
-        }
-    )
+    return Struct({1: (LIST, Elements(STRUCT, described)), 2: (I64, size), 3: (I64, n_rows)})
 
 
 def read_struct(data: bytes) -> tuple[Struct, int]:

@@ -77,11 +77,10 @@ class RepairReport:
             return lines[0]
         moved = [f"{old} is now {new}" for old, new in self.kept.items() if old != new]
         if moved:
-            lines.append(
-                f"Numbered anew: {', '.join(moved[:_MOST_MOVES])}{' ...' if len(moved) > _MOST_MOVES else ''}."
-            )
+            more = " ..." if len(moved) > _MOST_MOVES else ""
+            lines.append(f"Numbered anew: {', '.join(moved[:_MOST_MOVES])}{more}.")
         lines.append(
-            f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is as it was."
+            f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is unchanged."
         )
         if self.left:
             lines.append(f"What is left to be done in the copy: {'. '.join(each.remedy for each in self.left)}.")
@@ -109,9 +108,7 @@ def look(root: Path, like: Path | None = None) -> RepairReport:
     if not root.is_dir():
         raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
     if like is not None and not (like / INFO_PATH).is_file():
-        raise InputError(
-            f"--like={like} holds no LeRobotDataset: it has no {INFO_PATH}. Give a dataset with the same settings."
-        )
+        raise InputError(f"--like={like} holds no LeRobotDataset: no {INFO_PATH}. Give one with the same settings.")
     return RepairReport(survey(root, rescue=rescue, like=like))
 
 

@@ -40,11 +40,7 @@ _MOVING_KEYS = {
 
 _RATE_OVER_S = 1.0
 _BEGIN = "Press P to begin"
-_NOTES = {
-    Verdict.SUCCESS: "Ended as a success",
-    Verdict.FAILURE: "Ended as failed",
-    Verdict.DISCARD: "Thrown away",
-}
+_NOTES = {Verdict.SUCCESS: "Ended as a success", Verdict.FAILURE: "Ended as failed", Verdict.DISCARD: "Thrown away"}
 
 
 class Pace:
@@ -58,10 +54,7 @@ class Pace:
     """
 
     def __init__(
-        self,
-        fps: float,
-        clock: Callable[[], float] = time.perf_counter,
-        sleep: Callable[[float], None] = time.sleep,
+        self, fps: float, clock: Callable[[], float] = time.perf_counter, sleep: Callable[[float], None] = time.sleep
     ) -> None:
         self.fps = fps
         self._clock, self._sleep = clock, sleep

@@ -49,10 +49,8 @@ def make_batches(
         first: Number of the first batch; a run that goes on continues with that of its next update.
     """
     sampler = RunSampler(run_weights(store, windows.n_windows), seed)
-    n_items, share = (
-        batch_size * accelerator.num_processes,
-        slice(accelerator.process_index, None, accelerator.num_processes),
-    )
+    n_items = batch_size * accelerator.num_processes
+    share = slice(accelerator.process_index, None, accelerator.num_processes)
     batches = (windows.batch(store, sampler.draw(n_items, number)[share]) for number in itertools.count(first))
     if accelerator.device.type == "cuda" and store.device.type == "cpu":
         return prefetched(pinned(batch) for batch in batches)

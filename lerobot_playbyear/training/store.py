@@ -137,11 +137,7 @@ class EpisodeStore:
         with bar:
             pieces = partial(_pieces, reader, image_size, new_rates, bar)
             if place == "disk":
-                identity = {
-                    **dataset_identity(reader, features),
-                    "image_size": image_size,
-                    "sample_rates": new_rates,
-                }
+                identity = {**dataset_identity(reader, features), "image_size": image_size, "sample_rates": new_rates}
                 on_disk = cached_columns(identity, row_bytes, len(reader), pieces, cache)
                 columns = {key: values.to(device) for key, values in on_disk.items()}
             else:
@@ -264,9 +260,7 @@ class EpisodeStore:
         """One feature of new frames, (n, ...), in the store's shape and dtype."""
         missing = [i for i, frame in enumerate(frames) if key not in frame]
         if missing:
-            raise InputError(
-                f"'{key}' is missing in frame {missing[0]} of the new episode; the store holds {self.keys}."
-            )
+            raise InputError(f"'{key}' is missing in frame {missing[0]} of an episode; the store holds {self.keys}.")
         shape, dtype = self._columns[key].shape[1:], self._columns[key].dtype
         values = torch.from_numpy(np.stack([np.asarray(frame[key]) for frame in frames]))
         if _kind(values.dtype) != _kind(dtype):
@@ -279,9 +273,7 @@ class EpisodeStore:
         if not shape and values.shape[1:] == (1,):
             values = values.squeeze(1)
         if values.shape[1:] != shape:
-            raise InputError(
-                f"'{key}' has shape {tuple(values.shape[1:])} in the new episode, and {tuple(shape)} in the store."
-            )
+            raise InputError(f"'{key}' has shape {tuple(values.shape[1:])} in an episode, {tuple(shape)} in the store.")
         if values.dtype.is_floating_point and not values.isfinite().all():
             raise InputError(f"'{key}' holds NaN or infinite values in the new episode; wanted finite numbers.")
         return values.to(dtype)
@@ -327,10 +319,7 @@ def _with_rows(values: Tensor, position: int, new: Tensor) -> Tensor:
 
 
 def choose_place(
-    place: str,
-    reader: DatasetReader,
-    keys: Iterable[str] | None = None,
-    sample_rates: Mapping[str, int] | None = None,
+    place: str, reader: DatasetReader, keys: Iterable[str] | None = None, sample_rates: Mapping[str, int] | None = None
 ) -> str:
     """Where to keep a dataset: "memory" or "disk". "auto" is memory where its frames fill at most half of what is free.
 
