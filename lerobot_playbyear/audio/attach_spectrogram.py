@@ -109,7 +109,9 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPic
     names = [key.removeprefix(AUDIO_PREFIX) for key in rates]
     for name in cfg.microphones or []:
         if name not in names:
-            raise AttachSpectrogramError(f"--microphones names '{name}'; {dataset.root} has {', '.join(names)}.")
+            raise AttachSpectrogramError(
+                f"--microphones names '{name}'; the dataset in {dataset.root} has {', '.join(names)}."
+            )
     wanted = names if cfg.microphones is None else list(dict.fromkeys(cfg.microphones))
     if not wanted:
         raise AttachSpectrogramError("--microphones names none. Name at least one, or leave it out for all.")

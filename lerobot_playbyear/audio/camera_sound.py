@@ -25,13 +25,10 @@ from lerobot_playbyear.audio.microphone_pictures import (
     read_timecode,
 )
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
-from lerobot_playbyear.datasets.features import IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
+from lerobot_playbyear.datasets.features import INTERVENTION, IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import numeric_stats
-
-INTERVENTION = "intervention"
-"""LeRobot's column of the frames that a person corrected."""
 
 
 @dataclass

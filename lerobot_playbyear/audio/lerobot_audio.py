@@ -117,7 +117,7 @@ def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> 
         template = info.get("audio_path") or DEFAULT_AUDIO_PATH
         if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
             raise AudioLayoutError(
-                f"{root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
+                f"{root / INFO_PATH}: audio_path is {template!r}; wanted e.g. {DEFAULT_AUDIO_PATH!r}."
             )
         rows, lengths = _episodes(root, sum(footer.num_rows for footer in footers))
         tracks = [
@@ -140,9 +140,7 @@ def _episodes(root: Path, n_frames: int) -> tuple[pa.Table, list[int]]:
     except (ParquetDamageError, pa.ArrowException, KeyError) as error:
         raise AudioLayoutError(f"{root / EPISODES_DIR} is damaged: {error}. {remedy}") from error
     if numbers != list(range(len(rows))) or not all(isinstance(length, int) and length > 0 for length in lengths):
-        raise AudioLayoutError(
-            f"{root / EPISODES_DIR} lacks episodes of 0 to {len(rows) - 1}, or their lengths. {remedy}"
-        )
+        raise AudioLayoutError(f"{root / EPISODES_DIR} lacks episodes, or lengths, of 0 to {len(rows) - 1}. {remedy}")
     if sum(lengths) != n_frames:
         raise AudioLayoutError(f"{root / EPISODES_DIR} counts {sum(lengths)} frames; data/ holds {n_frames}. {remedy}")
     return rows, lengths
@@ -172,9 +170,7 @@ def _track(
     start_time_s: float | None,
 ) -> AudioTrack:
     if not key.startswith(AUDIO_PREFIX) or key == AUDIO_PREFIX or "/" in key or "\\" in key:
-        raise AudioLayoutError(
-            f"'{key}' has dtype 'audio'; wanted a key like '{AUDIO_PREFIX}<microphone>', without '/'. Rename it."
-        )
+        raise AudioLayoutError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>'. Rename it.")
     info = feature.get("info") or {}
     if not isinstance(info, Mapping):
         raise AudioLayoutError(f"'{key}': info is {info!r}; wanted fields such as sample_rate. Correct {INFO_PATH}.")
@@ -201,8 +197,7 @@ def _spans(root: Path, key: str, template: str, rows: pa.Table, latest_s: float)
     missing = [name for name in names.values() if name not in rows.column_names]
     if missing:
         raise AudioLayoutError(
-            f"'{key}': meta/episodes has no column {missing[0]!r}, so nothing says where the sound lies. "
-            "Record again, or add the column."
+            f"'{key}': meta/episodes has no column {missing[0]!r}, which says where its sound is. Add it."
         )
     columns = {name: rows.column(column).to_pylist() for name, column in names.items()}
     end_name = f"{AUDIO_FOLDER}/{key}/to_timestamp"

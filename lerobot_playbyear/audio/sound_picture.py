@@ -229,10 +229,8 @@ class RollingSpectrogram:
         wanted = width / _ROLLING_S
         per_second = min((n for n in range(1, 4 * width) if sample_rate % n == 0), key=lambda n: abs(n - wanted))
         self._hop = sample_rate // per_second
-        names = (AUDIO_PREFIX + "microphone", PICTURE_PREFIX + "microphone")
-        self._look = SoundPicture(
-            *names, sample_rate, per_second, height, width, 1, low_db, high_db, before_episode=(0,) * height
-        )
+        names, size = (AUDIO_PREFIX + "microphone", PICTURE_PREFIX + "microphone"), (height, width)
+        self._look = SoundPicture(*names, sample_rate, per_second, *size, 1, low_db, high_db, (0,) * height)
         self._grey = np.zeros((height, width), np.uint8)
         self._n_drawn = 0
 

@@ -81,10 +81,8 @@ class Corrections:
             ValueError: It is damaged.
         """
         self._read_as: tuple[Any, ...] = (keys, device, image_size)
-        if self.n_episodes:
-            self._read(*self._read_as)
-
-    def _read(self, keys: Sequence[str], device: torch.device, image_size: int | None) -> None:
+        if not self.n_episodes:
+            return
         reader = DatasetReader(self._source.repo_id, self._source.root)
         further = [key for key in (SEED, SUCCESS) if key in reader.features]
         wanted = [*keys, INTERVENTION, *further]
@@ -111,7 +109,7 @@ class Corrections:
         assert self._writer is not None
         frames = save_episode(episode, self._writer)
         if self.store is None:
-            self._read(*self._read_as)
+            self.read(*self._read_as)
         else:
             self.store.append_episode(frames)
 

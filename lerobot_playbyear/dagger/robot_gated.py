@@ -53,7 +53,7 @@ class RobotGated(Method):
 
     def check(self) -> None:
         if not 0 < self.intervention_share < 1:
-            raise InputError(f"--method.intervention_share={self.intervention_share}: give one above 0, below 1.")
+            raise InputError(f"--method.intervention_share={self.intervention_share}: give a share above 0, below 1.")
         if self.rollouts < 1:
             raise InputError(f"--method.rollouts={self.rollouts}: give at least 1.")
 

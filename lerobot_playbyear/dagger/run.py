@@ -31,7 +31,6 @@ from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.hub.push import METRICS_NAME, PushOptions, check_name, push_policy, warn_without_login
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import PolicyWindows, dataset_names
-from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.learner import Learner, check_dataset_suits, make_learner
 from lerobot_playbyear.training.train import read_store
 
@@ -100,7 +99,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     if overrides:
         _check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
-        raise InputError("--policy.push_to_hub=true needs --policy.repo_id; or give --policy.push_to_hub=false.")
+        raise InputError("--policy.push_to_hub=true needs a name: give --policy.repo_id, or push_to_hub=false.")
     if cfg.policy.push_to_hub:
         check_name("policy.repo_id", str(cfg.policy.repo_id))
         warn_without_login()
@@ -139,7 +138,8 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         features, fps, what = corrections.meta.features, corrections.meta.fps, "the corrections"
     _check_alike(dataset_names(cfg.policy, cfg.rename_map).values(), demos.meta, features, fps, what)
 
-    training = _training_options(cfg, folder, state)
+    training = cfg.training()
+    training.resume, training.checkpoint_path = state.checkpoint is not None, folder.checkpoint(state)
     learner = make_learner(training, demos.meta, keep_normalization=True)
     if cfg.new_weights and state.checkpoint is None:
         _forget_all(learner, cfg.seed)
@@ -180,12 +180,6 @@ def _forget_all(learner: Learner, seed: int) -> None:
     for name, values in fresh.items():
         if not any(name.startswith(prefix) for prefix in kept):
             weights[name].copy_(values)
-
-
-def _training_options(cfg: DaggerConfig, folder: RunFolder, state: RunState) -> PlaybyearTrainConfig:
-    training = cfg.training()
-    training.resume, training.checkpoint_path = state.checkpoint is not None, folder.checkpoint(state)
-    return training
 
 
 def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, corrections: Corrections) -> None:

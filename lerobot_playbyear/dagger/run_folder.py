@@ -118,10 +118,7 @@ class RunFolder:
             InputError: It cannot be written, or another process works in it.
         """
         check_can_be_made(self.path, f"--output_dir={self.path}")
-        in_use = (
-            f"--output_dir={self.path}: another playbyear-dagger is at work there. Wait until it has ended, or choose another "
-            "folder."
-        )
+        in_use = f"--output_dir={self.path}: another playbyear-dagger is at work there. Wait, or choose another."
         is_new = not self.path.exists()
         with contextlib.ExitStack() as stack:
             try:
@@ -165,7 +162,7 @@ class RunFolder:
             )
         if not resume:
             raise InputError(
-                f"--output_dir={self.path} holds a run already: go on with it with --resume=true, or choose another folder."
+                f"--output_dir={self.path} holds a run already: go on with it with --resume=true, or choose another."
             )
         state = self.path / STATE_NAME
         return RunState(**json.loads(state.read_text())) if state.is_file() else None
@@ -289,7 +286,7 @@ def _errors_of_writing(folder: Path) -> Iterator[None]:
         yield
     except (OSError, SafetensorError) as error:
         raise InputError(
-            f"Cannot write to {folder}: {error}. What was saved is complete; once there is room, go on with "
+            f"Cannot write to {folder}: {error}. What was saved before is complete; make room, and go on with "
             "--resume=true."
         ) from error
 

@@ -23,6 +23,9 @@ AUDIO_PREFIX = "observation.audio."
 AUDIO_DTYPE = "audio"
 """Of a feature whose sound lies in files beside the frames, which is not our layout: see `audio.lerobot_audio`."""
 
+INTERVENTION = "intervention"
+"""LeRobot's column of the frames that an expert corrected."""
+
 IS_FIRST = "is_first"
 """A column of datasets with pauses: the frames before which something was not recorded, each episode's first one included.
 Memory and sound do not reach back beyond such a frame."""

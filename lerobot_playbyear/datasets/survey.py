@@ -162,9 +162,9 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
 
 
 def _wrong(
-    check: str, message: str, episodes: Sequence[int] = (), remedy: str = "", feature: str | None = None
+    check: str, said: str, episodes: Sequence[int] = (), remedy: str = "", feature: str | None = None
 ) -> Finding:
-    return Finding(check, "error", message, feature, episodes, remedy=remedy)
+    return Finding(check, "error", said, feature, episodes, remedy=remedy)
 
 
 def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[str, Any]:
@@ -501,12 +501,13 @@ def _read_tasks(
     if nameless := sorted(set(wanted) - set(known)):
         remedy = "Put a table from a copy in its place, or correct the frames' task_index"
         said_of = ", ".join(map(str, nameless[:8]))
-        findings.append(_wrong("tasks", f"{TASKS_PATH}: frames are of task {said_of}, without a text", remedy=remedy))
+        findings.append(
+            _wrong("tasks", f"{TASKS_PATH}: frames are of task {said_of}, which has no text", remedy=remedy)
+        )
     for task, text, numbers in ((each, text, own) for each in wanted for text, own in said[each].items()):
         if text != known.get(task, text) and not problem:
-            message = (
-                f"{TASKS_PATH}: task {task} reads {known[task]!r}; the rows of {name_episodes(numbers)} say {text!r}"
-            )
+            others = name_episodes(numbers)
+            message = f"{TASKS_PATH}: task {task} reads {known[task]!r}; the rows of {others} say {text!r}"
             remedy = "If nobody renamed it, lerobot-edit-dataset with --operation.type=modify_tasks sets the right one"
             findings.append(Finding("tasks", "warning", message, episodes=numbers, remedy=remedy))
     return known

@@ -126,10 +126,8 @@ class _Films:
             times = self._times_of(path)
             wanted = place.start + np.arange(length) / self._info["fps"]
             after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
-            near = (
-                np.abs(times.take([after - 1, after], mode="clip") - wanted) if len(times) else np.full((2, 1), np.inf)
-            )
-            if near.min(axis=0).max() >= TOLERANCE_S + np.spacing(np.float32(place.end)):
+            near = times.take([after - 1, after], mode="clip") if len(times) else np.full((2, 1), np.inf)
+            if np.abs(near - wanted).min(axis=0).max() >= TOLERANCE_S + np.spacing(np.float32(place.end)):
                 return f"{name} {self._problem_of(path) or 'lacks some of the pictures'}"
         return None
 

@@ -207,9 +207,7 @@ class ScriptedPerson(ScriptedExpert):
 
     def __init__(self, config: ScriptedExpertConfig, fps: float) -> None:
         if not fps > 0:
-            raise ExpertError(
-                "--expert.person=true needs an environment with its steps per second, metadata['render_fps']."
-            )
+            raise ExpertError("--expert.person=true needs the environment's steps per second, metadata['render_fps'].")
         self._config, self.clock_fps = config, fps
         self._n_late = round(config.reaction_s * fps)
         self._n_wrong = round(config.wrong_s * fps)

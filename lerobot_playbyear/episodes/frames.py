@@ -23,11 +23,10 @@ from lerobot.utils.constants import (
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, INTERVENTION, audio_feature
 from lerobot_playbyear.episodes.environment import EnvFacts
 from lerobot_playbyear.episodes.play import Episode, Observation
 
-INTERVENTION = "intervention"
 SEED = "seed"
 
 _STATE_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
@@ -158,9 +157,7 @@ def _observation_boxes(space: gym.spaces.Dict) -> dict[str, gym.spaces.Box]:
         if not isinstance(box, gym.spaces.Box) or (key.startswith(AUDIO_PREFIX) and box.dtype != np.int16):
             raise InputError(f"The observation {key!r} cannot be recorded: its space is {box}.")
         if key.startswith(AUDIO_PREFIX) and len(box.shape) != 1:
-            raise InputError(
-                f"Observation {key!r} has shape {box.shape}; wanted (S,): every microphone is its own key."
-            )
+            raise InputError(f"Observation {key!r} has shape {box.shape}; wanted (S,), one microphone per key.")
     return boxes
 
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.info import OutsideError, check_links_out
-from lerobot_playbyear.datasets.reader import SurveyedDataset
+from lerobot_playbyear.datasets.reader import DatasetPlace, SurveyedDataset
 from lerobot_playbyear.inspection.motion import check_actions, check_alignment, check_interventions, check_success
 from lerobot_playbyear.inspection.pictures import PictureChecks
 from lerobot_playbyear.inspection.sound import check_sound
@@ -33,7 +33,7 @@ _COLOURS = {"ok": "32", "info": "36", "warning": "33", "error": "31;1"}
 
 
 @dataclass
-class InspectDatasetConfig:
+class InspectDatasetConfig(DatasetPlace):
     """The dataset.
 
     Args:
@@ -42,8 +42,6 @@ class InspectDatasetConfig:
         episodes: Only these. None: all.
     """
 
-    repo_id: str
-    root: str | None = None
     episodes: list[int] | None = None
 
 

@@ -21,12 +21,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from lerobot_playbyear.datasets.features import INTERVENTION
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 from lerobot_playbyear.inspection.sound import FULL_SCALE, heard, runs
 
 SUCCESS = "next.success"
-INTERVENTION = "intervention"
 
 _ACTION = "action"
 _NORMALISED_SHARE = 0.9  # of all values in [-1, 1]: then the actions are taken to be normalised

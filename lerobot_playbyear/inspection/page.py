@@ -234,9 +234,7 @@ class EpisodeData:
             tagged = dataset.values(INTERVENTION, episode).astype(bool)
             interventions = [(start, stop - 1) for start, stop in runs(tagged)]
         return {
-            "microphones": [
-                self._draw_sound(*pair) for pair in zip(self.microphones, self.sound(episode), strict=True)
-            ],
+            "microphones": list(map(self._draw_sound, self.microphones, self.sound(episode))),
             "curves": [_base64(self._curve(curve["key"], episode)) for curve in self.curves],
             "interventions": interventions,
         }

@@ -17,10 +17,8 @@ _STATS_TOLERANCE = 0.02  # of a value's range; LeRobot sums statistics in float3
 
 def check_survey(dataset: SurveyedDataset) -> Iterator[Finding]:
     """Files, rows, times and tasks: what is wrong with the episodes that are looked at."""
-    asked = dataset.chosen
-    found = [
-        each for each in dataset.survey.findings if not each.episodes or asked is None or asked & set(each.episodes)
-    ]
+    every, asked = dataset.survey.findings, dataset.chosen
+    found = [each for each in every if not each.episodes or asked is None or asked & set(each.episodes)]
     yield from found
     if not any(finding.check in ("files", "rows", "info") for finding in found):
         message = f"{len(dataset.episodes)} episodes, {len(dataset):,} frames, none missing"
@@ -79,12 +77,10 @@ def check_finite_numbers(dataset: SurveyedDataset) -> Iterator[Finding]:
         if _rows(dataset, key, dataset.episodes[0]).dtype.kind != "f":
             continue
         n_columns += 1
-        bad = {
-            each.index: int((~np.isfinite(_rows(dataset, key, each)).all(axis=1)).sum()) for each in dataset.episodes
-        }
-        if n_bad := sum(bad.values()):
+        bad = [int((~np.isfinite(_rows(dataset, key, each)).all(axis=1)).sum()) for each in dataset.episodes]
+        if n_bad := sum(bad):
             is_finite = False
-            episodes = [episode for episode, own in bad.items() if own]
+            episodes = [each.index for each, own in zip(dataset.episodes, bad, strict=True) if own]
             message = f"NaN or infinite in {n_bad} frames ({name_episodes(episodes)})"
             yield Finding("finite numbers", "error", message, key, episodes, {"frames": n_bad})
     if is_finite:

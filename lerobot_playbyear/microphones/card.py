@@ -269,7 +269,7 @@ def join_card(config: "MicrophoneCameraConfig", channels: Sequence[int]) -> Open
             _open_cards[config.card] = card
         if card.microphone.problem:
             raise MicrophoneError(
-                f"{card.microphone.name} is gone: {card.microphone.problem}. Disconnect its other microphones first."
+                f"{card.microphone.name} is gone: {card.microphone.problem}. Disconnect the others first."
             )
         if card.microphone.sample_rate != config.sample_rate:
             raise MicrophoneError(

@@ -114,7 +114,7 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
     (card,) = found
     if card.channels < channels:
         raise MicrophoneError(
-            f"device={text!r}: channel {channels - 1} is asked for, from 0 on, and {card.name} has "
+            f"device={text!r}: channel {channels - 1} is asked for, counted from 0, and {card.name} has "
             f"{card.channels}. {_FIND}"
         )
     return card

@@ -183,12 +183,8 @@ class PlaybyearConfig(PreTrainedConfig):
     def low_dimensional_keys(self) -> list[str]:
         """Everything else that is observed, the state first."""
         kinds = (FeatureType.STATE, FeatureType.ENV)
-        keys = [
-            key
-            for key, feature in (self.input_features or {}).items()
-            if feature.type in kinds and not key.startswith(AUDIO_PREFIX)
-        ]
-        return sorted(keys, key=lambda key: (key != OBS_STATE, key))
+        keys = {key for key, feature in (self.input_features or {}).items() if feature.type in kinds}
+        return sorted(keys - set(self.audio_keys), key=lambda key: (key != OBS_STATE, key))
 
     def feature_shape(self, key: str) -> tuple[int, ...]:
         """Shape of one frame of an observation."""
@@ -324,9 +320,7 @@ class PlaybyearConfig(PreTrainedConfig):
         if self.action_feature is None:
             raise ValueError("The dataset has no 'action': a policy cannot be trained without.")
         if self.use_vision and not self.camera_keys:
-            raise ValueError(
-                f"No camera among the observations {sorted(features)}: set --policy.use_vision=false to train without."
-            )
+            raise ValueError(f"No camera among the observations {sorted(features)}: give --policy.use_vision=false.")
         if not self.use_audio:
             return
         if not self.audio_keys:

@@ -111,9 +111,7 @@ def _register[Factory: EncoderFactory](option: str, name: str) -> Callable[[Fact
 
     def add(factory: Factory) -> Factory:
         if name in factories:
-            raise ValueError(
-                f"An encoder '{name}' is registered already, by {factories[name].__module__}: take another."
-            )
+            raise ValueError(f"An encoder '{name}' is registered already, by {factories[name].__module__}.")
         factories[name] = factory
         return factory
 

@@ -12,11 +12,11 @@ import gymnasium as gym
 import numpy as np
 from lerobot.configs.video import RGBEncoderConfig
 from lerobot.envs import EnvConfig
-from lerobot.utils.constants import HF_LEROBOT_HOME
 from tqdm import tqdm
 
 from lerobot_playbyear.datasets.durable import DurableWriter, check_root
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input
+from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
 from lerobot_playbyear.episodes.experts import ExpertConfig, ScriptedExpertConfig
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed, save_episode
@@ -30,7 +30,7 @@ _MIN_ATTEMPTS_PER_SUCCESS = 20  # attempts in a row without one success after wh
 
 
 @dataclass
-class RecordDatasetConfig:
+class RecordDatasetConfig(DatasetPlace):
     """The dataset that is written.
 
     Args:
@@ -45,18 +45,12 @@ class RecordDatasetConfig:
         tags: For its card on the Hub.
     """
 
-    repo_id: str
-    root: str | None = None
     num_episodes: int = 50
     video: bool = False
     rgb_encoder: RGBEncoderConfig = field(default_factory=RGBEncoderConfig)
     push_to_hub: bool = False
     private: bool | None = None
     tags: list[str] | None = None
-
-    @property
-    def folder(self) -> Path:
-        return Path(self.root) if self.root else HF_LEROBOT_HOME / self.repo_id
 
 
 @dataclass
@@ -205,9 +199,7 @@ def _check_options(cfg: RecordConfig) -> None:
     if cfg.seed < 0:
         raise InputError(f"--seed={cfg.seed}: give 0 or more.")
     if not isinstance(cfg.expert, ScriptedExpertConfig | TeleopExpertConfig):
-        raise InputError(
-            f"--expert.type={cfg.expert.type} corrects a policy and demonstrates nothing: give scripted or teleop."
-        )
+        raise InputError(f"--expert.type={cfg.expert.type} demonstrates nothing: give scripted or teleop.")
     if getattr(cfg.expert, "person", False):
         raise InputError("--expert.person=true: it corrects a policy, and does not demonstrate; leave it out.")
     if not cfg.dataset.video and cfg.dataset.rgb_encoder != RGBEncoderConfig():

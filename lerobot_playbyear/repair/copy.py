@@ -14,6 +14,7 @@ from lerobot.datasets.compute_stats import sample_indices
 from lerobot.datasets.io_utils import write_json, write_tasks
 
 from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
+from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     EPISODES_DIR,
@@ -57,9 +58,8 @@ def write_copy(survey: Survey, target: Path) -> None:
     columns = dict.fromkeys(column for row in rows for column in row)
     table = pa.table({column: [row.get(column) for row in rows] for column in columns})
     write_rows(table, target / EPISODES_DIR / "chunk-000/file-000.parquet")
-    if is_listed(survey.root, TASKS_PATH) and not any(
-        each.check == "tasks" and not each.remedy for each in survey.findings
-    ):
+    are_tasks_right = not any(each.check == "tasks" for each in survey.damage)
+    if is_listed(survey.root, TASKS_PATH) and are_tasks_right:
         shutil.copy2(survey.root / TASKS_PATH, target / TASKS_PATH)
     else:
         write_tasks(_tasks_table(survey), target)
@@ -173,12 +173,8 @@ def _episode_stats(survey: Survey, episode: Episode, frames: pa.Table) -> Stats:
     stats: Stats = {}
     root, sampled = survey.root, sample_indices(len(frames))
     for key, feature in survey.info["features"].items():
-        shape, details = tuple(feature["shape"]), feature.get("info") or {}
-        if (
-            details.get("is_depth_map")
-            or details.get("video.is_depth_map")
-            or feature["dtype"] in ("string", "language")
-        ):
+        shape = tuple(feature["shape"])
+        if is_depth(feature) or feature["dtype"] in ("string", "language"):
             continue
         if feature["dtype"] == "image":
             pictures = []
@@ -189,9 +185,8 @@ def _episode_stats(survey: Survey, episode: Episode, frames: pa.Table) -> Stats:
         elif feature["dtype"] == "video":
             place = episode.places[key]
             times = [place.start + index / survey.info["fps"] for index in sampled]
-            stats[key] = picture_stats(
-                video_pictures(film_path(root, survey.info, key, place), times, TOLERANCE_S, key, shape)
-            )
+            film = film_path(root, survey.info, key, place)
+            stats[key] = picture_stats(video_pictures(film, times, TOLERANCE_S, key, shape))
         else:
             values = column_to_numpy(frames.column(key))
             numbers[key] = values.reshape(len(frames), *(() if math.prod(shape) == 1 else shape))

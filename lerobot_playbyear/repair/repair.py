@@ -80,7 +80,7 @@ class RepairReport:
             more = " ..." if len(moved) > _MOST_MOVES else ""
             lines.append(f"Numbered anew: {', '.join(moved[:_MOST_MOVES])}{more}.")
         lines.append(
-            f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is unchanged."
+            f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is as it was."
         )
         if self.left:
             lines.append(f"What is left to be done in the copy: {'. '.join(each.remedy for each in self.left)}.")

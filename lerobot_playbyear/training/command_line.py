@@ -23,21 +23,9 @@ PRESETS = {
 """When to choose which. What each is, and what differs from the publication on purpose: docs/training.md."""
 
 _NETWORK = (
-    "type",
-    "device",
-    "image_size",
-    "vision_width",
-    "normalize_encodings",
-    "low_dimensional_gain",
-    "hop_s",
-    "n_memory_steps",
-    "action_range",
-    "audio_envelope_gain",
-    "memory_displacement_gain",
-    "memory_readers",
-    "auxiliary_onset",
-    "auxiliary_balance",
-    "auxiliary_way",
+    *("type", "device", "image_size", "vision_width", "normalize_encodings", "low_dimensional_gain", "hop_s"),
+    *("n_memory_steps", "action_range", "audio_envelope_gain", "memory_displacement_gain", "memory_readers"),
+    *("auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
 )
 """Options of the policy that fix what the network is and what its numbers mean: with `--policy.path` the checkpoint says it."""
 

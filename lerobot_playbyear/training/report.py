@@ -88,9 +88,8 @@ class Progress(abc.ABC):
 
     def _to_wandb(self, kind: str, figures: dict[str, Any]) -> None:
         if self._wandb:
-            self._wandb.log_dict(
-                figures, self._counter.step, mode="eval" if kind in ("eval", "validation") else "train"
-            )
+            mode = "eval" if kind in ("eval", "validation") else "train"
+            self._wandb.log_dict(figures, self._counter.step, mode=mode)
 
 
 class Report(Progress):
