@@ -7,10 +7,10 @@ LeRobot is imported when the dataset's files have been looked at.
 """
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
@@ -19,7 +19,7 @@ from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, cu
 from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_layout
 from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_feature, audio_keys
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
 from lerobot_playbyear.datasets.files import (
     EPISODES_DIR,
     INFO_PATH,
@@ -33,7 +33,7 @@ from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
 
 if TYPE_CHECKING:
-    from lerobot_playbyear.audio.dataset_copy import AddedColumn
+    from lerobot_playbyear.audio.dataset_copy import Columns
 
 _MOST_ERRORS = 10  # that are listed
 _SPARE_S = 1.0  # of a file's sound behind what the episodes need
@@ -142,7 +142,7 @@ class PutAside:
             np.save(self._file(key, len(self._stats[key])), blocks[..., channel])
             self._stats[key].append(sound_stats(blocks[..., channel]))
 
-    def columns(self, sample_rate: int, fps: int) -> "dict[str, AddedColumn]":
+    def columns(self, sample_rate: int, fps: int) -> "Columns":
         """All that was added, as columns of a copy."""
         from lerobot_playbyear.audio.dataset_copy import AddedColumn
 
@@ -176,7 +176,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
     _check_source(cfg, has_own_files)
     target = output_folder(cfg.output)
     removed: list[str] = []
-    notes: dict[str, dict[str, Any]] = {}
+    notes: Features = {}
     with scratch_folder() as folder:
         scratch = Path(folder)
         if has_own_files:
@@ -203,11 +203,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
 
 
 def write_new_dataset(
-    root: Path,
-    target: Path,
-    added: "Mapping[str, AddedColumn]",
-    removed: Collection[str] = (),
-    notes: Mapping[str, Mapping[str, Any]] | None = None,
+    root: Path, target: Path, added: "Columns", removed: Collection[str] = (), notes: Features | None = None
 ) -> None:
     """Writes a dataset made from another, which is there only when it is complete and on the disk itself.
 
@@ -338,9 +334,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
 # Where sound is
 
 
-def _read(
-    sources: Sequence[Source], lengths: Sequence[int], fps: int, cfg: AttachAudioConfig, scratch: Path
-) -> "dict[str, AddedColumn]":
+def _read(sources: list[Source], lengths: Sequence[int], fps: int, cfg: AttachAudioConfig, scratch: Path) -> "Columns":
     """Cuts the sound of all episodes, so that what is wrong with it is known before anything is written.
 
     Raises:

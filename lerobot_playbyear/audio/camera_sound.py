@@ -4,7 +4,6 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from huggingface_hub.constants import HF_HUB_CACHE
@@ -12,7 +11,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, PutAside, raise_all
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
-from lerobot_playbyear.audio.dataset_copy import AddedColumn
+from lerobot_playbyear.audio.dataset_copy import AddedColumn, Columns
 from lerobot_playbyear.audio.microphone_pictures import (
     SESSIONS,
     SessionSound,
@@ -25,7 +24,7 @@ from lerobot_playbyear.audio.microphone_pictures import (
     read_timecode,
 )
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
-from lerobot_playbyear.datasets.features import INTERVENTION, IS_FIRST, IS_FIRST_FEATURE, MICROPHONE
+from lerobot_playbyear.datasets.features import INTERVENTION, IS_FIRST, IS_FIRST_FEATURE, MICROPHONE, Features
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import numeric_stats
@@ -41,9 +40,7 @@ class _Frame:
     was_read: bool = True
 
 
-def read_camera_sound(
-    cfg: AttachAudioConfig, dataset: DatasetReader, scratch: Path
-) -> tuple[dict[str, AddedColumn], dict[str, dict[str, Any]]]:
+def read_camera_sound(cfg: AttachAudioConfig, dataset: DatasetReader, scratch: Path) -> tuple[Columns, Features]:
     """Reads the sound of all microphones, so that what is wrong is known before anything is written.
 
     Args:

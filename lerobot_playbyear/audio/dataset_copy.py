@@ -15,6 +15,7 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
+from lerobot_playbyear.datasets.features import Features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, take_over
 from lerobot_playbyear.datasets.info import read_info
 from lerobot_playbyear.datasets.parquet import (
@@ -49,12 +50,11 @@ class AddedColumn:
     values: Callable[[int], np.ndarray | list]
 
 
+Columns = Mapping[str, AddedColumn]
+
+
 def write_copy(
-    root: Path,
-    target: Path,
-    added: Mapping[str, AddedColumn],
-    removed: Collection[str] = (),
-    notes: Mapping[str, Mapping[str, Any]] | None = None,
+    root: Path, target: Path, added: Columns, removed: Collection[str] = (), notes: Features | None = None
 ) -> None:
     """Writes a dataset with more columns.
 
@@ -106,9 +106,7 @@ def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
         raise ParquetDamageError(f"{path} is damaged: {error}.") from error
 
 
-def _write_frames(
-    source: Path, target: Path, schema: pa.Schema, added: Mapping[str, AddedColumn], removed: Collection[str]
-) -> None:
+def _write_frames(source: Path, target: Path, schema: pa.Schema, added: Columns, removed: Collection[str]) -> None:
     file = DataFile(source)
     metadata = file.schema.metadata or {}
     if b"huggingface" in metadata:

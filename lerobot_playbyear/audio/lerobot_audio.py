@@ -161,13 +161,7 @@ def column_names(track: AudioTrack) -> list[str]:
 
 
 def _track(
-    root: Path,
-    key: str,
-    feature: Mapping[str, Any],
-    template: str,
-    rows: pa.Table,
-    seconds: float,
-    start_time_s: float | None,
+    root: Path, key: str, feature: dict, template: str, rows: pa.Table, seconds: float, start_time_s: float | None
 ) -> AudioTrack:
     if not key.startswith(AUDIO_PREFIX) or key == AUDIO_PREFIX or "/" in key or "\\" in key:
         raise AudioLayoutError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>'. Rename it.")

@@ -9,7 +9,7 @@ same samples give the same picture, whichever process makes it. Environments nee
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features
 from lerobot_playbyear.datasets.files import INFO_PATH
 
 PICTURE_PREFIX = "observation.images."
@@ -273,7 +273,7 @@ def mel_bank(n_bands: int, fft_size: int, sample_rate: int) -> list[tuple[int, n
     return bank
 
 
-def pictures_of(features: Mapping[str, Mapping[str, Any]]) -> list[SoundPicture]:
+def pictures_of(features: Features) -> list[SoundPicture]:
     """The pictures of sound among a dataset's features.
 
     Raises:

@@ -97,15 +97,11 @@ class Method(draccus.ChoiceRegistry):
         """No attempt follows."""
 
     def batches(
-        self,
-        cfg: "DaggerConfig",
-        windows: "PolicyWindows",
-        demonstrations: EpisodeStore,
-        corrections: EpisodeStore | None,
+        self, cfg: "DaggerConfig", windows: "PolicyWindows", demonstrations: EpisodeStore, attempts: EpisodeStore | None
     ) -> BalancedBatches:
         """What is learned from: half demonstrations, half of what the expert chose in corrections."""
         n_skipped = cfg.n_skipped(demonstrations.fps)
-        return BalancedBatches(windows, demonstrations, corrections, cfg.batch_size, cfg.seed, n_skipped)
+        return BalancedBatches(windows, demonstrations, attempts, cfg.batch_size, cfg.seed, n_skipped)
 
 
 @Method.register_subclass("hg_dagger")
@@ -144,13 +140,9 @@ class Redo(Method):
         self._expert.demonstrates = demonstrates
 
     def batches(
-        self,
-        cfg: "DaggerConfig",
-        windows: "PolicyWindows",
-        demonstrations: EpisodeStore,
-        corrections: EpisodeStore | None,
+        self, cfg: "DaggerConfig", windows: "PolicyWindows", demonstrations: EpisodeStore, attempts: EpisodeStore | None
     ) -> BalancedBatches:
-        return JoinedBatches(windows, demonstrations, corrections, cfg.batch_size, cfg.seed)
+        return JoinedBatches(windows, demonstrations, attempts, cfg.batch_size, cfg.seed)
 
 
 # Experts that speak for another

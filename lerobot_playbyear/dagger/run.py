@@ -6,7 +6,6 @@ import shlex
 from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig, parser
@@ -22,7 +21,7 @@ from lerobot_playbyear.dagger.loop import Loop, Scene
 from lerobot_playbyear.dagger.report import Report, Totals
 from lerobot_playbyear.dagger.run_folder import BEST_LINK, RunFolder, RunState
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
-from lerobot_playbyear.datasets.features import differences
+from lerobot_playbyear.datasets.features import Features, differences
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.experts import Expert, ExpertError
@@ -325,23 +324,21 @@ def _check_dataset(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename
             )
 
 
-def _check_alike(
-    keys: Iterable[str], demos: LeRobotDatasetMetadata, other: Mapping[str, Mapping[str, Any]], fps: int, what: str
-) -> None:
+def _check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, own: Features, fps: int, what: str) -> None:
     """Refuse what cannot share a batch with the demonstrations.
 
     Args:
         keys: The observations that matter; the action always does.
         demos: The demonstrations' metadata.
-        other: Features of a dataset, or of what the environment would write.
+        own: Features of a dataset, or of what the environment would write.
         fps: Their frames per second.
-        what: What `other` is, for the message.
+        what: What `own` is, for the message.
 
     Raises:
         InputError: With every difference.
     """
     found = [f"fps is {demos.fps} there and {fps} here"] if demos.fps != fps else []
-    found += differences(demos.features, other, [*keys, ACTION], pictures_as_stored=False)
+    found += differences(demos.features, own, [*keys, ACTION], pictures_as_stored=False)
     if found:
         raise InputError(
             f"The demonstrations '{demos.repo_id}' and {what} differ: {'; '.join(found)}. Record with the same "

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from lerobot_playbyear.datasets.episode_files import stage_episode
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
-from lerobot_playbyear.datasets.features import check_features, check_frame, differences, is_depth
+from lerobot_playbyear.datasets.features import Features, check_features, check_frame, differences, is_depth
 from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
@@ -339,14 +339,12 @@ def check_undamaged(root: Path) -> None:
         )
 
 
-def _check_compatible(
-    root: Path, info: DatasetInfo, fps: int, features: Mapping[str, Mapping[str, Any]], robot_type: str | None
-) -> None:
+def _check_compatible(root: Path, info: DatasetInfo, fps: int, features: Features, robot: str | None) -> None:
     """Whether frames of `features` at `fps`, of a robot of this type, can be appended to an existing dataset."""
     found = [f"fps is {info.fps} there and {fps} here"] if info.fps != fps else []
     found += differences(info.features, features)
-    if info.robot_type and robot_type and info.robot_type != robot_type:
-        found.append(f"the robot is {info.robot_type} there and {robot_type} here")
+    if info.robot_type and robot and info.robot_type != robot:
+        found.append(f"the robot is {info.robot_type} there and {robot} here")
     if found:
         raise InputError(
             f"The dataset in {root} does not fit what is to be appended: {'; '.join(found)}. "

@@ -25,7 +25,7 @@ from lerobot.datasets.utils import DEFAULT_EPISODES_PATH, DEFAULT_TASKS_PATH, Da
 from lerobot.datasets.video_utils import encode_video_frames, get_video_duration_in_s, get_video_info
 from lerobot.utils.constants import DEFAULT_FEATURES
 
-from lerobot_playbyear.datasets.features import is_depth
+from lerobot_playbyear.datasets.features import Features, is_depth
 from lerobot_playbyear.datasets.journal import STAGING, remove_staged
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -56,16 +56,14 @@ SMALL_TABLE_BYTES = 2 * 2**20
 """A table of episodes below this is continued."""
 
 
-def stage_episode(
-    root: Path, info: DatasetInfo, frames: Sequence[Mapping[str, Any]], encoder: RGBEncoderConfig
-) -> None:
+def stage_episode(root: Path, info: DatasetInfo, frames: Sequence[Mapping[str, Any]], rgb: RGBEncoderConfig) -> None:
     """Writes all files that a dataset shall have other than now with one more episode, into its staging folder.
 
     Args:
         root: The dataset's folder.
         info: What its `meta/info.json` holds; it is changed to what that holds afterwards.
         frames: The episode, pictures compressed.
-        encoder: Of films.
+        rgb: How films are encoded, but those of distances.
     """
     remove_staged(root)
     staging = root / STAGING
@@ -92,7 +90,7 @@ def stage_episode(
     row |= {"dataset_from_index": first, "dataset_to_index": first + n_frames}
     for key, feature in info.features.items():
         if feature["dtype"] == "video":
-            row |= _stage_film(root, info, key, columns[key], encoder, last)
+            row |= _stage_film(root, info, key, columns[key], rgb, last)
     stats = _stats(columns, info.features)
     _stage_row(root, row | stats_columns(stats), table, last, info.chunks_size)
 
@@ -111,7 +109,7 @@ def _column(values: list[Any], feature: Mapping[str, Any]) -> Any:
     return stacked.reshape(len(values)) if tuple(feature["shape"]) == (1,) else stacked
 
 
-def _stats(columns: Mapping[str, Any], features: Mapping[str, Mapping[str, Any]]) -> Stats:
+def _stats(columns: Mapping[str, Any], features: Features) -> Stats:
     stats = numeric_stats({key: values for key, values in columns.items() if isinstance(values, np.ndarray)}, features)
     for key, feature in features.items():
         if feature["dtype"] in ("image", "video"):
@@ -194,16 +192,11 @@ def _row_groups(path: Path, schema: pa.Schema) -> list[pa.Table]:
 
 
 def _stage_film(
-    root: Path,
-    info: DatasetInfo,
-    key: str,
-    pictures: Sequence[bytes],
-    rgb_encoder: RGBEncoderConfig,
-    last: Mapping[str, Any],
+    root: Path, info: DatasetInfo, key: str, pictures: Sequence[bytes], rgb: RGBEncoderConfig, last: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Encodes an episode's film of one camera, a file of its own. Returns what its row says of it."""
     feature = info.features[key]
-    encoder = depth_encoder_defaults() if is_depth(feature) else rgb_encoder
+    encoder = depth_encoder_defaults() if is_depth(feature) else rgb
     template = str(info.video_path).replace("{video_key}", key)
     name, place = _place(root, template, last, f"videos/{key}", info.chunks_size)
     path, folder = root / STAGING / name, root / STAGING / "pictures"

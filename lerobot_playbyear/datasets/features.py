@@ -17,6 +17,9 @@ from lerobot_playbyear.datasets.parquet import column_to_numpy
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset
 
+Features = Mapping[str, Mapping[str, Any]]
+"""LeRobot's features: what is said of each column, by its key."""
+
 AUDIO_PREFIX = "observation.audio."
 """What the key of every microphone starts with."""
 
@@ -91,7 +94,7 @@ def is_depth(feature: Mapping[str, Any]) -> bool:
     return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
 
 
-def check_audio_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> dict[str, int]:
+def check_audio_features(features: Features, fps: int) -> dict[str, int]:
     """Check every microphone of a dataset against the contract.
 
     Args:
@@ -182,10 +185,7 @@ def to_pcm_s16(waveform: np.ndarray) -> np.ndarray:
 
 
 def differences(
-    there: Mapping[str, Mapping[str, Any]],
-    here: Mapping[str, Mapping[str, Any]],
-    keys: Iterable[str] | None = None,
-    pictures_as_stored: bool = True,
+    there: Features, here: Features, keys: Iterable[str] | None = None, pictures_as_stored: bool = True
 ) -> list[str]:
     """In what the features of two datasets, or of a dataset and what would be written, differ.
 
@@ -228,7 +228,7 @@ def _number_names(feature: Mapping[str, Any] | None) -> list[str]:
     return [str(name) for name in names] if isinstance(names, list | tuple | dict) else []
 
 
-def check_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> None:
+def check_features(features: Features, fps: int) -> None:
     """Whether a dataset of these features can be written.
 
     Args:
@@ -251,7 +251,7 @@ def check_features(features: Mapping[str, Mapping[str, Any]], fps: int) -> None:
             raise InputError(f"'{key}' has sample_rate {rate!r}; wanted whole Hz, a Python int such as 16000.")
 
 
-def check_frame(frame: Mapping[str, Any], features: Mapping[str, Mapping[str, Any]]) -> None:
+def check_frame(frame: Mapping[str, Any], features: Features) -> None:
     """Whether a frame can become part of an episode.
 
     Args:

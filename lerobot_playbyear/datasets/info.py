@@ -26,6 +26,9 @@ from lerobot_playbyear.datasets.files import (
 )
 from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked
 
+Info = Mapping[str, Any]
+"""The fields of `meta/info.json`."""
+
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """That every dataset of LeRobot's has."""
 
@@ -185,8 +188,7 @@ def check_links_out(root: Path) -> None:
         real = real_path(path)
         if path.is_symlink() and not real.is_relative_to(home):
             raise OutsideError(
-                f"'{path}' is a link to '{real}', outside its folder. Put the file itself there if it belongs "
-                "there, or remove the link."
+                f"'{path}' is a link to '{real}', outside its folder. Put the file itself there, or remove the link."
             )
 
 
@@ -208,7 +210,7 @@ def _check_version(root: Path, version: Any) -> None:
         raise InfoError(f"{root} was written by a newer LeRobot (format {version}); wanted v3.0. Update lerobot.")
 
 
-def _check_fields(info: Mapping[str, Any]) -> None:
+def _check_fields(info: Info) -> None:
     """Raises a ValueError that names a field, what it is, and what is wanted."""
     for name in ("total_episodes", "total_frames", "chunks_size"):
         if not _is_count(info.get(name)):
@@ -240,7 +242,7 @@ def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and value >= 0
 
 
-def _check_templates(root: Path, info: Mapping[str, Any]) -> None:
+def _check_templates(root: Path, info: Info) -> None:
     keys = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
     for name, default in (("data_path", DEFAULT_DATA_PATH), ("video_path", DEFAULT_VIDEO_PATH)):
         template = info.get(name)

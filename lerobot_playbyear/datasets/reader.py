@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features, is_depth
+from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.info import (
     INDEX_COLUMNS,
@@ -98,17 +98,11 @@ class EpisodeReader:
     """
 
     def __init__(
-        self,
-        repo_id: str,
-        root: Path,
-        fps: int,
-        features: dict[str, dict[str, Any]],
-        files: Iterable[DataFile],
-        tasks: Mapping[int, str],
+        self, repo_id: str, root: Path, fps: int, features: Features, files: list[DataFile], tasks: Mapping[int, str]
     ) -> None:
         self.repo_id, self.root, self.fps, self.features, self.tasks = repo_id, root, fps, features, tasks
         self.episodes: list[EpisodeRows] = []
-        self._files = list(files)
+        self._files = files
         self._firsts: np.ndarray = np.cumsum([0, *(file.n_rows for file in self._files)])
         self._rows: np.ndarray = np.arange(self._firsts[-1])  # where each row here is in the files, in order
 
@@ -283,7 +277,9 @@ class SurveyedDataset(EpisodeReader):
     def __init__(self, repo_id: str, found: Survey, episodes: Sequence[int] | None = None) -> None:
         files = {each.frames.file.path: each.frames.file for each in found.whole if each.frames}
         self.survey, self.info = found, found.info
-        super().__init__(repo_id, found.root, int(self.info["fps"]), self.info["features"], files.values(), found.tasks)
+        super().__init__(
+            repo_id, found.root, int(self.info["fps"]), self.info["features"], list(files.values()), found.tasks
+        )
         self.chosen = None if episodes is None else set(episodes)
         self._places = {each.number: each.places for each in found.whole}
         first_of = dict(zip(files, self._firsts, strict=False))

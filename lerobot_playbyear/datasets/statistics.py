@@ -24,7 +24,7 @@ from lerobot.datasets.compute_stats import (
 )
 from lerobot.datasets.utils import STATS_PATH, serialize_dict
 
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX, audio_keys
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_keys
 
 Stats = dict[str, dict[str, np.ndarray]]
 """Per feature and statistic, as LeRobot keeps them."""
@@ -62,7 +62,7 @@ def picture_stats(pictures: Iterable[np.ndarray], is_depth: bool = False) -> dic
     return {name: value if name == "count" else np.squeeze(value / scale, axis=0) for name, value in stats.items()}
 
 
-def numeric_stats(columns: Mapping[str, np.ndarray], features: Mapping[str, Mapping[str, Any]]) -> Stats:
+def numeric_stats(columns: Mapping[str, np.ndarray], features: Features) -> Stats:
     """Statistics of one episode's numeric columns, as LeRobot computes them, and of its microphones.
 
     Args:

@@ -21,7 +21,7 @@ from PIL import Image, UnidentifiedImageError
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
-from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, OutsideError, read_info
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, Info, InfoError, OutsideError, read_info
 from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, parsing, read_table
 from lerobot_playbyear.datasets.pictures import PICTURE_FORMATS
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
@@ -30,6 +30,9 @@ TASKS_PATH, STATS_PATH = "meta/tasks.parquet", "meta/stats.json"
 
 Rescue = Callable[[Path, pa.Schema], pq.FileMetaData | None]
 """Makes the footer of a parquet file that has lost its own, from the file and the columns that it should have."""
+
+Rows = Mapping[int, Mapping[str, Any]]
+"""The rows of `meta/episodes`, by their episodes' numbers."""
 
 _TIME_TOLERANCE_S = 1e-3
 
@@ -161,10 +164,8 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
     return Survey(root, info, schema, episodes, tasks, findings)
 
 
-def _wrong(
-    check: str, said: str, episodes: Sequence[int] = (), remedy: str = "", feature: str | None = None
-) -> Finding:
-    return Finding(check, "error", said, feature, episodes, remedy=remedy)
+def _wrong(check: str, said: str, episodes: Sequence[int] = (), remedy: str = "", key: str | None = None) -> Finding:
+    return Finding(check, "error", said, key, episodes, remedy=remedy)
 
 
 def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[str, Any]:
@@ -190,11 +191,11 @@ def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[s
             check_audio_features({key: info["features"][key]}, info["fps"])
         except ValueError as error:
             said = str(error).removeprefix(f"'{key}' ")
-            findings.append(_wrong("sample rate", said, remedy=f"Correct it in {INFO_PATH}", feature=key))
+            findings.append(_wrong("sample rate", said, remedy=f"Correct it in {INFO_PATH}", key=key))
     return info
 
 
-def _schema(root: Path, info: Mapping[str, Any]) -> pa.Schema:
+def _schema(root: Path, info: Info) -> pa.Schema:
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}
@@ -241,9 +242,7 @@ def _difference(found: pa.Schema, wanted: pa.Schema) -> str | None:
     return None
 
 
-def _read_frames(
-    root: Path, file: DataFile, info: Mapping[str, Any], thorough: bool, findings: list[Finding]
-) -> Iterator[Frames]:
+def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, findings: list[Finding]) -> Iterator[Frames]:
     """A file's rows, cut where another episode begins or frames are missing."""
     name = file.path.relative_to(root)
     cameras = [key for key, feature in info["features"].items() if feature["dtype"] == "image"] if thorough else []
@@ -322,7 +321,7 @@ def _read_rows(root: Path, findings: list[Finding]) -> dict[int, dict[str, Any]]
     return rows
 
 
-def _match(found: Iterable[Frames], rows: Mapping[int, Mapping[str, Any]], info: Mapping[str, Any]) -> list[Episode]:
+def _match(found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
     """Finds each episode's frames, and where its row says that its pictures are."""
     frames_of: dict[int, list[Frames]] = defaultdict(list)
     for frames in found:
@@ -355,9 +354,7 @@ def _choose(number: int, found: Sequence[Frames], row: Mapping[str, Any]) -> Epi
     return Episode(number, reason=reason)
 
 
-def _find_films(
-    root: Path, info: Mapping[str, Any], episodes: list[Episode], rows: Mapping[int, Mapping[str, Any]], thorough: bool
-) -> list[Episode]:
+def _find_films(root: Path, info: Info, episodes: list[Episode], rows: Rows, thorough: bool) -> list[Episode]:
     """Finds each episode's pictures in films. An episode without them is lost."""
     for key, feature in info["features"].items():
         if feature["dtype"] == "video":
@@ -378,7 +375,7 @@ def _find_films(
     ]
 
 
-def _contradiction(root: Path, info: Mapping[str, Any], row: Mapping[str, Any], episode: Episode) -> str | None:
+def _contradiction(root: Path, info: Info, row: Mapping[str, Any], episode: Episode) -> str | None:
     """What an episode's row says that its frames and films do not."""
     frames = episode.frames
     assert frames is not None
@@ -406,7 +403,7 @@ def _contradiction(root: Path, info: Mapping[str, Any], row: Mapping[str, Any], 
     return None
 
 
-def data_path(info: Mapping[str, Any], row: Mapping[str, Any]) -> str | None:
+def data_path(info: Info, row: Mapping[str, Any]) -> str | None:
     """Where an episode's row says that its frames are; None where it does not."""
     try:
         return info["data_path"].format(chunk_index=row["data/chunk_index"], file_index=row["data/file_index"])
@@ -421,9 +418,7 @@ def _are_numbers(value: Any) -> bool:
         return False
 
 
-def _judge_episodes(
-    root: Path, info: Mapping[str, Any], episodes: Sequence[Episode], rows: Mapping[int, Mapping[str, Any]]
-) -> Iterator[Finding]:
+def _judge_episodes(root: Path, info: Info, episodes: Sequence[Episode], rows: Rows) -> Iterator[Finding]:
     lost: dict[str, list[int]] = defaultdict(list)
     for episode in episodes:
         if not episode.frames:
@@ -446,7 +441,7 @@ def _judge_episodes(
 # What is said of the whole dataset
 
 
-def _judge_counts(root: Path, info: Mapping[str, Any], episodes: Sequence[Episode], n_found: int) -> Iterator[Finding]:
+def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], n_found: int) -> Iterator[Finding]:
     n_frames = sum(episode.frames.length for episode in episodes if episode.frames)
     is_whole = all(episode.frames for episode in episodes)
     if info["total_episodes"] != len(episodes) or (is_whole and info["total_frames"] != n_frames):
@@ -481,9 +476,7 @@ def _judge_counts(root: Path, info: Mapping[str, Any], episodes: Sequence[Episod
             yield _wrong("statistics", f"{STATS_PATH}: the entries of {', '.join(bad)} are no numbers")
 
 
-def _read_tasks(
-    root: Path, episodes: Sequence[Episode], rows: Mapping[int, Mapping[str, Any]], findings: list[Finding]
-) -> dict[int, str]:
+def _read_tasks(root: Path, episodes: Sequence[Episode], rows: Rows, findings: list[Finding]) -> dict[int, str]:
     """The text of each task. Where the table lacks one, what all episodes of only this task say in their rows."""
     frames_of = {episode.number: episode.frames for episode in episodes if episode.frames}
     said: dict[int, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))

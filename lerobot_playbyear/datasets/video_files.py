@@ -15,7 +15,7 @@ import av
 import numpy as np
 
 from lerobot_playbyear.datasets.files import is_listed, naming
-from lerobot_playbyear.datasets.info import file_inside
+from lerobot_playbyear.datasets.info import Info, file_inside
 
 TOLERANCE_S = 1e-4
 """How far a picture's time may be from its frame's; LeRobot's own."""
@@ -46,7 +46,7 @@ def place_in_row(row: Mapping[str, Any], key: str) -> Place | None:
     return Place(int(chunk), int(file), float(start), float(end))
 
 
-def film_path(root: Path, info: Mapping[str, Any], key: str, place: Place) -> Path:
+def film_path(root: Path, info: Info, key: str, place: Place) -> Path:
     """The film of a place.
 
     Raises:
@@ -57,12 +57,7 @@ def film_path(root: Path, info: Mapping[str, Any], key: str, place: Place) -> Pa
 
 
 def find_places(
-    root: Path,
-    info: Mapping[str, Any],
-    key: str,
-    lengths: Sequence[int | None],
-    said: Sequence[Place | None],
-    thorough: bool,
+    root: Path, info: Info, key: str, lengths: Sequence[int | None], said: Sequence[Place | None], thorough: bool
 ) -> list[Place | str | None]:
     """Finds the pictures of each episode, and whether they are all there.
 
@@ -100,7 +95,7 @@ def find_places(
 class _Films:
     """The films of one camera. What was found out about one is kept, and not read again."""
 
-    def __init__(self, root: Path, info: Mapping[str, Any], key: str) -> None:
+    def __init__(self, root: Path, info: Info, key: str) -> None:
         self._root, self._info, self._key = root, info, key
         self._wrong: dict[Path, str | None] = {}
         self._times: dict[Path, np.ndarray] = {}

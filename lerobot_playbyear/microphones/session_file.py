@@ -21,7 +21,7 @@ class SessionFile:
 
     Args:
         path: A new file; its folder is made.
-        sample_rate: [Hz].
+        rate: Samples per second [Hz].
         written: Says how many samples there are.
         samples: Gives those from one number to before another, (n,) int16.
         n_kept: How many of the newest ones it gives.
@@ -34,16 +34,11 @@ class SessionFile:
     """
 
     def __init__(
-        self,
-        path: Path,
-        sample_rate: int,
-        written: Callable[[], int],
-        samples: Callable[[int, int], np.ndarray],
-        n_kept: int,
+        self, path: Path, rate: int, written: Callable[[], int], samples: Callable[[int, int], np.ndarray], n_kept: int
     ) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path, self.error = path, ""
-        self._rate, self._written, self._samples = sample_rate, written, samples
+        self._rate, self._written, self._samples = rate, written, samples
         new = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
         self._file = os.fdopen(os.open(path, new, 0o600), "wb", buffering=0)
         self._n = max(written() - n_kept, 0)  # what is older is a hole in the file, and silence

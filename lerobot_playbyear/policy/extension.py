@@ -79,7 +79,16 @@ def make_encoder(option: str, config: PlaybyearConfig) -> nn.Module:
     return encoder
 
 
-class MicrophoneStep(ObservationProcessorStep):
+class SoundStep(ObservationProcessorStep):
+    """A step that changes no feature's shape."""
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
+class MicrophoneStep(SoundStep):
     """A step between the microphones and the network, for `--policy.audio_steps=[<name>]`.
 
     Subclass it, implement `sound`, and decorate the class with LeRobot's `ProcessorStepRegistry.register(name=...)`. It is made
@@ -99,11 +108,6 @@ class MicrophoneStep(ObservationProcessorStep):
             if key.startswith(AUDIO_PREFIX) and not key.endswith("_is_pad")
         }
         return {**observation, **heard}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
 
 
 def _register[Factory: EncoderFactory](option: str, name: str) -> Callable[[Factory], Factory]:

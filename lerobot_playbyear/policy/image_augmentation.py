@@ -102,13 +102,8 @@ def resize(images: Tensor, size: int) -> Tensor:
     """(B, T, 3, H, W) -> (B, T, 3, size, size), bilinear, averaging where it shrinks."""
     if images.shape[-2:] == (size, size):
         return images
-    flat = functional.interpolate(
-        images.flatten(0, 1),
-        (size, size),
-        mode="bilinear",
-        align_corners=False,
-        antialias=max(images.shape[-2:]) > size,
-    )
+    flat, shrinks = images.flatten(0, 1), max(images.shape[-2:]) > size
+    flat = functional.interpolate(flat, (size, size), mode="bilinear", align_corners=False, antialias=shrinks)
     return flat.unflatten(0, images.shape[:2])
 
 

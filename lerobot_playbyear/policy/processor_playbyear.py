@@ -5,9 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import (
-    ObservationProcessorStep,
     PolicyAction,
     PolicyProcessorPipeline,
     ProcessorStep,
@@ -23,6 +21,7 @@ from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.policy.extension import SoundStep
 
 _FULL_SCALE = 32768  # int16: samples are in [-32768, 32767]
 _USUAL_RATES = (16000, 48000, 44100, 32000, 22050, 8000, 96000)  # Hz
@@ -70,7 +69,7 @@ def _microphone_step(name: str) -> ProcessorStep:
 
 @dataclass
 @ProcessorStepRegistry.register(name="playbyear_microphone_pictures_to_audio")
-class MicrophonePicturesToAudioStep(ObservationProcessorStep):
+class MicrophonePicturesToAudioStep(SoundStep):
     """Makes `observation.audio.<mic>` of `observation.images.<mic>`, where the sound is not there yet.
 
     In training and in simulation the sound is in the observation, and nothing is done. On a robot the microphone is a camera
@@ -167,15 +166,10 @@ class MicrophonePicturesToAudioStep(ObservationProcessorStep):
             f"--robot.cameras='{{{name}: {{type: microphone, device: ...}}}}' (playbyear-find-microphones prints it)."
         )
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
-
 
 @dataclass
 @ProcessorStepRegistry.register(name="playbyear_pcm16_to_float")
-class Pcm16ToFloatProcessorStep(ObservationProcessorStep):
+class Pcm16ToFloatProcessorStep(SoundStep):
     """Divides the int16 sound of an environment by 32,768: policies want floats in [-1, 1].
 
     An environment gives `audio.<microphone>` as int16; LeRobot's `preprocess_observation` makes floats of it without scaling
@@ -195,11 +189,6 @@ class Pcm16ToFloatProcessorStep(ObservationProcessorStep):
         """
         sound = {key: _scaled(value, key) for key, value in observation.items() if key.startswith(AUDIO_PREFIX)}
         return {**observation, **sound}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
 
 
 def _scaled(samples: Tensor, key: str) -> Tensor:

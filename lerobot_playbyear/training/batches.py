@@ -29,12 +29,7 @@ _AHEAD = 2
 
 
 def make_batches(
-    accelerator: "Accelerator",
-    windows: "PolicyWindows",
-    store: EpisodeStore,
-    batch_size: int,
-    seed: int,
-    first: int = 0,
+    accelerator: "Accelerator", windows: "PolicyWindows", store: EpisodeStore, n_items: int, seed: int, first: int = 0
 ) -> Iterator[dict[str, Any]]:
     """This process's share of every batch, without end.
 
@@ -44,14 +39,14 @@ def make_batches(
         accelerator: Of the processes.
         windows: Cut the items.
         store: The episodes.
-        batch_size: Items of a process per update.
+        n_items: Of a process per update.
         seed: Of the draws.
         first: Number of the first batch; a run that goes on continues with that of its next update.
     """
     sampler = RunSampler(run_weights(store, windows.n_windows), seed)
-    n_items = batch_size * accelerator.num_processes
+    n_all = n_items * accelerator.num_processes
     share = slice(accelerator.process_index, None, accelerator.num_processes)
-    batches = (windows.batch(store, sampler.draw(n_items, number)[share]) for number in itertools.count(first))
+    batches = (windows.batch(store, sampler.draw(n_all, number)[share]) for number in itertools.count(first))
     if accelerator.device.type == "cuda" and store.device.type == "cpu":
         return prefetched(pinned(batch) for batch in batches)
     return batches

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import torch
 from accelerate import Accelerator, PartialState
@@ -25,18 +25,12 @@ from lerobot_playbyear.training.store import EpisodeStore
 _MOST_WAITING = 1000  # updates
 
 
-class Counter(Protocol):
-    """What knows how many updates are done."""
-
-    step: int
-
-
 class Progress(abc.ABC):
     """A bar with the log above it, and W&B: what all that learns tells of itself in the same way.
 
     Args:
         cfg: Options, for W&B.
-        counter: Of updates; it is read, never changed.
+        counter: Its `step` says how many updates are done; it is read, never changed.
         total: What the bar counts to.
         done: Where it begins.
         unit: Of what it counts.
@@ -47,9 +41,7 @@ class Progress(abc.ABC):
         success: What the last evaluation gave [%]; None before.
     """
 
-    def __init__(
-        self, cfg: PlaybyearTrainConfig, counter: Counter, total: int, done: int, unit: str, name: str
-    ) -> None:
+    def __init__(self, cfg: PlaybyearTrainConfig, counter: Any, total: int, done: int, unit: str, name: str) -> None:
         self._counter = counter
         self._is_told = PartialState().is_main_process
         is_uploaded = self._is_told and cfg.wandb.enable and cfg.wandb.project
