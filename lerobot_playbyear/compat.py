@@ -131,12 +131,7 @@ def card_writer(policy: Any, config: "PreTrainedConfig") -> "Callable[..., Model
     generate = load("lerobot.common.train_utils:generate_model_card", "no policy gets a card")
 
     def write(
-        dataset_repo_id: str | None,
-        model_type: str,
-        license: str | None,
-        tags: list[str] | None,
-        cfg: Any = None,
-        dataset_meta: Any = None,
+        dataset_repo_id: str | None, model_type: str, license: Any, tags: Any, cfg: Any = None, dataset_meta: Any = None
     ) -> "ModelCard":
         described: Any = copy(config)
         described.license, described.tags = license, tags

@@ -20,14 +20,7 @@ from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_
 from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
-from lerobot_playbyear.datasets.files import (
-    EPISODES_DIR,
-    INFO_PATH,
-    check_can_be_made,
-    list_files,
-    new_folder,
-    scratch_folder,
-)
+from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder, scratch_folder
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
@@ -249,11 +242,10 @@ def open_for_copy(place: DatasetPlace) -> DatasetReader:
         raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
     try:
         dataset = DatasetReader(place.repo_id, place.root)
-        from lerobot_playbyear.audio.dataset_copy import read_named_table
+        from lerobot_playbyear.audio.dataset_copy import check_tables
 
         check_links(Path(dataset.root))  # the copy would hold what they lead to
-        for path in list_files(Path(dataset.root), f"{EPISODES_DIR}/*/*.parquet"):
-            read_named_table(path, ["length"])  # LeRobot looks at no checksum
+        check_tables(Path(dataset.root))  # LeRobot looks at no checksum
         return dataset
     except ParquetDamageError as error:
         raise AttachError(f"{error} Repair it first: playbyear-repair --root={dataset.root}") from error

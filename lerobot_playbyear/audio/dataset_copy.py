@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.features import Features
-from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, take_over
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, list_files, take_over
 from lerobot_playbyear.datasets.info import read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -98,8 +98,17 @@ def write_copy(
     (target / INFO_PATH).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def read_named_table(path: Path, columns: list[str] | None = None) -> pa.Table:
-    """As `read_table`; the error names the file."""
+def check_tables(root: Path) -> None:
+    """Whether the tables of episodes are whole.
+
+    Raises:
+        ParquetDamageError: One is not; it is named.
+    """
+    for path in list_files(root, _EPISODES):
+        _read_named(path, ["length"])
+
+
+def _read_named(path: Path, columns: list[str] | None = None) -> pa.Table:
     try:
         return read_table(path, columns)
     except ParquetDamageError as error:
@@ -143,7 +152,7 @@ def _values(frames: pa.Table, column: AddedColumn, kind: pa.DataType) -> pa.Arra
 
 
 def _write_rows(source: Path, target: Path, stats: Sequence[Mapping], removed: Collection[str]) -> None:
-    rows = read_named_table(source)
+    rows = _read_named(source)
     episodes = rows.column("episode_index").to_pylist()
     for episode in episodes:
         if not isinstance(episode, int) or not 0 <= episode < len(stats):

@@ -6,7 +6,6 @@ are learned from as there are actions that the expert chose, and all weigh the s
 """
 
 import logging
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,12 +14,10 @@ from torch import Tensor
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.episodes.frames import INTERVENTION
-from lerobot_playbyear.training.batches import PolicyWindows, RunSampler, run_weights
+from lerobot_playbyear.training.batches import Batch, PolicyWindows, RunSampler, run_weights
 from lerobot_playbyear.training.store import EpisodeStore
 
 _IS_PAD = f"{ACTION}_is_pad"
-
-Batch = dict[str, Any]
 
 
 class BalancedBatches:

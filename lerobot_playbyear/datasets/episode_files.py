@@ -38,14 +38,7 @@ from lerobot_playbyear.datasets.parquet import (
     write_tables,
 )
 from lerobot_playbyear.datasets.pictures import decode_picture
-from lerobot_playbyear.datasets.statistics import (
-    Stats,
-    add_stats,
-    numeric_stats,
-    picture_stats,
-    stats_columns,
-    write_stats,
-)
+from lerobot_playbyear.datasets.statistics import add_stats, numeric_stats, picture_stats, stats_columns, write_stats
 
 logger = logging.getLogger(__name__)
 
@@ -109,7 +102,7 @@ def _column(values: list[Any], feature: Mapping[str, Any]) -> Any:
     return stacked.reshape(len(values)) if tuple(feature["shape"]) == (1,) else stacked
 
 
-def _stats(columns: Mapping[str, Any], features: Features) -> Stats:
+def _stats(columns: Mapping[str, Any], features: Features) -> dict[str, Any]:
     stats = numeric_stats({key: values for key, values in columns.items() if isinstance(values, np.ndarray)}, features)
     for key, feature in features.items():
         if feature["dtype"] in ("image", "video"):

@@ -42,7 +42,7 @@ class InfoError(ValueError):
     """A dataset's `meta/info.json` says what cannot be right, or claims what its files do not hold."""
 
 
-class OutsideError(ValueError):
+class OutsideError(InfoError):
     """A dataset refers to something outside its folder."""
 
 

@@ -21,14 +21,7 @@ import pyarrow as pa
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
-from lerobot_playbyear.datasets.info import (
-    INDEX_COLUMNS,
-    InfoError,
-    OutsideError,
-    check_claims,
-    check_dataset_files,
-    file_inside,
-)
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, check_claims, check_dataset_files, file_inside
 from lerobot_playbyear.datasets.parquet import DataFile, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
@@ -310,7 +303,7 @@ class SurveyedDataset(EpisodeReader):
             found = survey(folder, thorough=False)
             dataset = cls(repo_id, found, episodes)
             check_claims(folder, [file.footer for file in dataset._files], len(found.episodes))
-        except (OutsideError, InfoError, DatasetDamagedError) as error:
+        except (InfoError, DatasetDamagedError) as error:
             raise InputError(str(error)) from error
         except (OSError, MemoryError) as error:
             said = f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"

@@ -21,7 +21,7 @@ from PIL import Image, UnidentifiedImageError
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
-from lerobot_playbyear.datasets.info import INDEX_COLUMNS, Info, InfoError, OutsideError, read_info
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, Info, InfoError, read_info
 from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, parsing, read_table
 from lerobot_playbyear.datasets.pictures import PICTURE_FORMATS
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
@@ -178,7 +178,7 @@ def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[s
         if not is_listed(root, INFO_PATH):
             raise InfoError(f"{root / INFO_PATH} is missing. {remedy}.")
         info = read_info(root)
-    except (InfoError, OutsideError) as error:
+    except InfoError as error:
         if known is None:
             raise DatasetDamagedError(str(error)) from error
         findings.append(_wrong("info", f"{INFO_PATH} cannot be read; it is made from that of {like}"))

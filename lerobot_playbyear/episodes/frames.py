@@ -9,17 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pyarrow.parquet as pq
-from lerobot.utils.constants import (
-    ACTION,
-    DONE,
-    OBS_ENV_STATE,
-    OBS_IMAGE,
-    OBS_IMAGES,
-    OBS_STATE,
-    OBS_STR,
-    REWARD,
-    SUCCESS,
-)
+from lerobot.utils.constants import ACTION, DONE, OBS_IMAGE, OBS_IMAGES, OBS_STATE, OBS_STR, REWARD, SUCCESS
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
@@ -29,7 +19,7 @@ from lerobot_playbyear.episodes.play import Episode, Observation
 
 SEED = "seed"
 
-_STATE_KEYS = {"agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
+_STATE_KEYS = {"agent_pos": OBS_STATE}  # the others have LeRobot's names
 
 
 def dataset_features(facts: EnvFacts, video: bool = False) -> dict[str, dict[str, Any]]:

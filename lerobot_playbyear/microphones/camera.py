@@ -33,13 +33,7 @@ from lerobot_playbyear.audio.microphone_pictures import (
 )
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.microphones.card import KEPT_S, CardRecording, OpenCard, join_card, leave_card
-from lerobot_playbyear.microphones.microphone import (
-    Microphone,
-    MicrophoneError,
-    file_microphone,
-    find_source,
-    tone_microphone,
-)
+from lerobot_playbyear.microphones.microphone import MicrophoneError
 from lerobot_playbyear.microphones.session_file import SessionFile
 
 _NO_FILE = "none"
@@ -128,22 +122,6 @@ class MicrophoneCameraConfig(CameraConfig):
         """Which microphone it is, for messages."""
         options = {name: getattr(self, name) for name in ("source", "device", "file", "tone_hz")}
         return ", ".join(f"{name}={value!r}" for name, value in options.items() if value is not None)
-
-    def make(self, channels: int) -> Microphone:
-        """The card, not connected yet, with at least as many channels.
-
-        Raises:
-            MicrophoneError: It is a file that cannot be read, or a source that nobody registers.
-        """
-        if self.source is not None:
-            return find_source(self.source)(self, channels)
-        if self.device is not None:
-            from lerobot_playbyear.microphones.portaudio import PortAudioMicrophone
-
-            return PortAudioMicrophone(self.device, self.sample_rate, channels)
-        if self.tone_hz is not None:
-            return tone_microphone(self.tone_hz, self.sample_rate, channels)
-        return file_microphone(Path(str(self.file)).expanduser(), self.sample_rate, channels)
 
 
 _cameras: "weakref.WeakSet[MicrophoneCamera]" = weakref.WeakSet()

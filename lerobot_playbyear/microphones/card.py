@@ -12,7 +12,7 @@ import numpy as np
 
 from lerobot_playbyear.audio.microphone_pictures import n_kept
 from lerobot_playbyear.datasets.features import to_pcm_s16
-from lerobot_playbyear.microphones.microphone import CHUNK_S, MicrophoneError
+from lerobot_playbyear.microphones.microphone import CHUNK_S, MicrophoneError, make_microphone
 
 if TYPE_CHECKING:
     from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
@@ -210,7 +210,7 @@ class OpenCard:
 
     def __init__(self, config: "MicrophoneCameraConfig", channels: int) -> None:
         self.n_users = 0
-        self.microphone = config.make(channels)
+        self.microphone = make_microphone(config, channels)
         if self.microphone.channels < channels:
             raise MicrophoneError(f"{self.microphone.name} has {self.microphone.channels} channels, wanted {channels}.")
         self.recording = CardRecording(self.microphone.name, config.sample_rate, self.microphone.channels)

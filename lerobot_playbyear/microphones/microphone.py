@@ -214,3 +214,20 @@ def find_source(name: str) -> Source:
             f"package, whose name begins with {PLUGIN_PREFIX}, or give `device`, `file` or `tone_hz` instead."
         )
     return SOURCES[name]
+
+
+def make_microphone(config: "MicrophoneCameraConfig", channels: int) -> Microphone:
+    """The card that a camera's options name, not connected yet, with at least as many channels.
+
+    Raises:
+        MicrophoneError: It is a file that cannot be read, or a source that nobody registers.
+    """
+    if config.source is not None:
+        return find_source(config.source)(config, channels)
+    if config.device is not None:
+        from lerobot_playbyear.microphones.portaudio import PortAudioMicrophone
+
+        return PortAudioMicrophone(config.device, config.sample_rate, channels)
+    if config.tone_hz is not None:
+        return tone_microphone(config.tone_hz, config.sample_rate, channels)
+    return file_microphone(Path(str(config.file)).expanduser(), config.sample_rate, channels)

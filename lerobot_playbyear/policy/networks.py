@@ -359,9 +359,8 @@ class Recollection(nn.Module):
 
 def mlp(n_in: int, hidden: int, n_out: int) -> nn.Sequential:
     """Two hidden layers: (N, n_in) -> (N, n_out)."""
-    return nn.Sequential(
-        nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, n_out)
-    )
+    layers = (nn.Linear(n_in, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, n_out))
+    return nn.Sequential(*layers)
 
 
 def newest(batch: dict[str, Tensor], key: str, n_frames: int, shape: tuple[int, ...] | None = None) -> Tensor:

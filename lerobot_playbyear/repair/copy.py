@@ -15,15 +15,7 @@ from lerobot.datasets.io_utils import write_json, write_tasks
 
 from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.features import is_depth
-from lerobot_playbyear.datasets.files import (
-    DEFAULT_DATA_PATH,
-    EPISODES_DIR,
-    INFO_PATH,
-    entries_below,
-    fits,
-    is_listed,
-    take_over,
-)
+from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits, take_over
 from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_rows, write_tables
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.statistics import (
@@ -58,8 +50,7 @@ def write_copy(survey: Survey, target: Path) -> None:
     columns = dict.fromkeys(column for row in rows for column in row)
     table = pa.table({column: [row.get(column) for row in rows] for column in columns})
     write_rows(table, target / EPISODES_DIR / "chunk-000/file-000.parquet")
-    are_tasks_right = not any(each.check == "tasks" for each in survey.damage)
-    if is_listed(survey.root, TASKS_PATH) and are_tasks_right:
+    if not any(each.check == "tasks" for each in survey.damage):
         shutil.copy2(survey.root / TASKS_PATH, target / TASKS_PATH)
     else:
         write_tasks(_tasks_table(survey), target)

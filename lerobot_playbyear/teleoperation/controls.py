@@ -221,6 +221,10 @@ class ActionMapping:
             values = [float(action[name]) for name in self._names]
         return np.asarray(values, np.float32).clip(self._low, self._high)
 
+    def closes(self, action: Mapping[str, Any]) -> bool | None:
+        """Whether a teleoperator's action closes the gripper, or opens it; None where it says neither."""
+        return {CLOSE: True, OPEN: False}.get(action.get(GRIPPER)) if self.moves_hand else None
+
 
 class Gripper:
     """What the gripper is told, whoever tells it: after a change the next one is blocked for a while.

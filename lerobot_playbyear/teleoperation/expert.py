@@ -12,16 +12,7 @@ from lerobot.teleoperators import Teleoperator
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.experts import Expert
 from lerobot_playbyear.episodes.play import Observation, Verdict
-from lerobot_playbyear.teleoperation.controls import (
-    CLOSE,
-    GRIPPER,
-    OPEN,
-    ActionMapping,
-    Controls,
-    Gripper,
-    PersonLeftError,
-    Wish,
-)
+from lerobot_playbyear.teleoperation.controls import ActionMapping, Controls, Gripper, PersonLeftError, Wish
 from lerobot_playbyear.teleoperation.panel import HISTORY_S, Control, Status
 from lerobot_playbyear.teleoperation.speaker import Speaker, level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.window import Window
@@ -231,12 +222,9 @@ class TeleopExpert(Expert):
 
     def _gripper_command(self) -> float:
         """1 closes, -1 opens: what the key or the teleoperator says, or else what it was."""
-        coded = self._wish.action.get(GRIPPER) if self.mapping.moves_hand else None
-        close = self.gripper.is_closed
-        if self._wish.toggles_gripper:
-            close = not close
-        elif coded is not None and coded in (CLOSE, OPEN):
-            close = coded == CLOSE
+        close = self.mapping.closes(self._wish.action)
+        if self._wish.toggles_gripper or close is None:
+            close = self.gripper.is_closed ^ self._wish.toggles_gripper
         return 1.0 if self.gripper.wish(close) else -1.0
 
     def _show(self, picture: np.ndarray | None = None) -> None:

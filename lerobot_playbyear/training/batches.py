@@ -25,12 +25,14 @@ from lerobot_playbyear.training.store import EpisodeStore, features_at, sample_r
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
+Batch = dict[str, Any]
+
 _AHEAD = 2
 
 
 def make_batches(
     accelerator: "Accelerator", windows: "PolicyWindows", store: EpisodeStore, n_items: int, seed: int, first: int = 0
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[Batch]:
     """This process's share of every batch, without end.
 
     All processes draw the same runs, so that together they have those of one process.
@@ -146,7 +148,7 @@ class PolicyWindows:
         rates = {key: sample_rate_in(self._meta.features[key]) for key in audio_keys(self._meta.features)}
         return {key: rate for key, rate in rates.items() if rate is not None}
 
-    def batch(self, store: EpisodeStore, last_frames: Tensor) -> dict[str, Any]:
+    def batch(self, store: EpisodeStore, last_frames: Tensor) -> Batch:
         """The training items whose last frames are `last_frames` (B,), on the store's device."""
         return store.windows(last_frames, self._deltas)
 
@@ -227,7 +229,7 @@ def runs_of_each_frame(store: EpisodeStore, n_windows: int, chosen: Tensor | Non
     return torch.cat(ends)
 
 
-def prefetched(batches: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+def prefetched(batches: Iterator[Batch]) -> Iterator[Batch]:
     """The same, made in a thread, two ahead of the one that is learned from.
 
     Raises:
@@ -243,6 +245,6 @@ def prefetched(batches: Iterator[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         pool.shutdown(cancel_futures=True)
 
 
-def pinned(batch: Mapping[str, Any]) -> dict[str, Any]:
+def pinned(batch: Mapping[str, Any]) -> Batch:
     """The batch in memory that a GPU reads by itself, so that copying it holds up nothing."""
     return {key: value.pin_memory() if isinstance(value, Tensor) else value for key, value in batch.items()}

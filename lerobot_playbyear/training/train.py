@@ -9,7 +9,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import torch
 from lerobot.datasets import make_train_eval_datasets
@@ -24,6 +23,7 @@ from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.hub.push import PushOptions, check_name, push_policy, warn_without_login
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import (
+    Batch,
     PolicyWindows,
     first_of_each_task,
     learned_meta,
@@ -34,6 +34,8 @@ from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.learner import Learner, make_accelerator, make_learner, noise_seed
 from lerobot_playbyear.training.report import Report, is_due, print_results
 from lerobot_playbyear.training.store import EpisodeStore, choose_place
+
+Loss = Callable[[], float]
 
 _OUTPUTS = "outputs/train"  # in which LeRobot makes folders for runs without a name
 
@@ -94,11 +96,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
 
 
 def _loop(
-    cfg: PlaybyearTrainConfig,
-    learner: Learner,
-    batches: Iterator[dict[str, Any]],
-    held_out_loss: Callable[[], float] | None,
-    report: Report,
+    cfg: PlaybyearTrainConfig, learner: Learner, batches: Iterator[Batch], held_out_loss: Loss | None, report: Report
 ) -> None:
     grad_clip_norm = cfg.optimizer.grad_clip_norm if cfg.optimizer is not None else 0.0
     is_first = learner.accelerator.is_main_process
@@ -140,7 +138,7 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
 
 def _loss_of(
     held_out: DatasetReader, learner: Learner, windows: PolicyWindows, cfg: PlaybyearTrainConfig, is_shared: bool
-) -> Callable[[], float]:
+) -> Loss:
     """What gives the mean loss over held-out episodes."""
     store = read_store(held_out, windows, cfg, is_shared)
     chosen = first_of_each_task(held_out, cfg.max_eval_samples)
