@@ -435,9 +435,7 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
     missing = [episode for episode in range(n_episodes) if episode not in known]
     if missing:
         named = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
-        raise AttachError(
-            f"{source} has no time for episode {named}; the dataset has {n_episodes} episodes. Add it, counted from 0."
-        )
+        raise AttachError(f"{source} has no time for episode {named}; the dataset has {n_episodes} episodes. Add it.")
     return [known[episode] for episode in range(n_episodes)]
 
 

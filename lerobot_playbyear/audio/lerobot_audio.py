@@ -75,13 +75,11 @@ class AudioLayout:
     """What a dataset says of its files of sound.
 
     Args:
-        root: Its folder.
         fps: Its frames per second [Hz].
         lengths: Frames of each episode.
         tracks: Its microphones.
     """
 
-    root: Path
     fps: int
     lengths: list[int]
     tracks: list[AudioTrack]
@@ -126,7 +124,7 @@ def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> 
             if feature["dtype"] == AUDIO_DTYPE
         ]
         _check_names(tracks, set(features))
-    return AudioLayout(root, int(fps), lengths, tracks)
+    return AudioLayout(int(fps), lengths, tracks)
 
 
 def _episodes(root: Path, n_frames: int) -> tuple[pa.Table, list[int]]:

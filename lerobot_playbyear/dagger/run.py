@@ -18,7 +18,7 @@ from lerobot_playbyear.dagger.batches import frames_by_expert
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
 from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.loop import Loop, Scene
-from lerobot_playbyear.dagger.report import Report, Totals
+from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.dagger.run_folder import BEST_LINK, RunFolder, RunState
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.features import Features, differences
@@ -202,7 +202,7 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
             f"Attempts:    {state.attempts}: {state.kept} kept in {cfg.interventions.folder}, {state.failed} failed, "
             f"{state.unneeded} needed no help, {state.discarded} thrown away"
         )
-        totals = Totals.of(folder.metrics())
+        totals = loop.report.totals
         print(
             f"Expert:      {totals.expert_steps} steps in {totals.takeovers} takeovers, {totals.switches} context switches, "
             f"autonomy {totals.autonomy:.0%}, {totals.person_seconds / 60:.1f} minutes of a person's time"

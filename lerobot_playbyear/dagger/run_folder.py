@@ -29,7 +29,7 @@ from lerobot_playbyear.datasets.files import (
     new_folder,
     write_atomically,
 )
-from lerobot_playbyear.hub.push import METRICS_NAME, figures_in
+from lerobot_playbyear.hub.push import METRICS_NAME, read_metrics
 
 STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""
@@ -122,7 +122,7 @@ class RunFolder:
         is_new = not self.path.exists()
         with contextlib.ExitStack() as stack:
             try:
-                stack.callback(FolderLock(self.path / LOCK, in_use).release)
+                stack.enter_context(FolderLock(self.path / LOCK, in_use))
             except FolderLockedError as error:
                 raise InputError(str(error)) from error
             except OSError as error:
@@ -261,9 +261,7 @@ class RunFolder:
 
     def metrics(self) -> list[dict[str, Any]]:
         """All lines of the figures; none before the first."""
-        path = self.path / METRICS_NAME
-        texts = path.read_text().splitlines() if path.is_file() else []
-        return [line for text in texts if (line := figures_in(text))]
+        return read_metrics(self.path)
 
     def _forget_metrics(self, state: RunState) -> None:
         """Drop lines of what was in progress when the run was killed; it is done again."""
@@ -271,11 +269,8 @@ class RunFolder:
         if not path.is_file():
             return
         done = {"attempt": state.attempts, "round": state.round, "eval": state.evaluated_round}
-        kept = []
-        for text in path.read_text().splitlines():
-            line = figures_in(text)
-            if line and line["attempt" if line["kind"] == "attempt" else "round"] <= done[line["kind"]]:
-                kept.append(text + "\n")
+        lines = ((line, line["attempt" if line["kind"] == "attempt" else "round"]) for line in self.metrics())
+        kept = [json.dumps(line) + "\n" for line, number in lines if number <= done[line["kind"]]]
         with _errors_of_writing(self.path):
             write_atomically(path, "".join(kept))
 

@@ -206,7 +206,7 @@ def differences(
     found = []
     for key in keys:
         old, new = (_describe(features.get(key), pictures_as_stored) for features in (there, here))
-        old_names, new_names = (_number_names(features.get(key)) for features in (there, here))
+        old_names, new_names = (number_names(features.get(key)) for features in (there, here))
         if old != new:
             found.append(f"{key} is {old} there and {new} here")
         elif old_names and new_names and old_names != new_names:
@@ -222,10 +222,13 @@ def _describe(feature: Mapping[str, Any] | None, pictures_as_stored: bool) -> st
     return f"{kind} {tuple(feature['shape'])}" + (f" at {rate} Hz" if rate else "")
 
 
-def _number_names(feature: Mapping[str, Any] | None) -> list[str]:
-    """What the numbers of a vector are called; those of a picture's axes tell nothing."""
+def number_names(feature: Mapping[str, Any] | None) -> list[str] | None:
+    """What the numbers of a vector are called, one name for each; None where they have none. Axes of pictures are none."""
     names = None if feature is None or len(feature["shape"]) != 1 else feature.get("names")
-    return [str(name) for name in names] if isinstance(names, list | tuple | dict) else []
+    while isinstance(names, Mapping) and len(names) == 1:  # LeRobot also writes {"motors": [...]}
+        names = next(iter(names.values()))
+    names = [str(name) for name in names] if isinstance(names, list | tuple | Mapping) else []
+    return names if feature is not None and len(names) == feature["shape"][0] else None
 
 
 def check_features(features: Features, fps: int) -> None:

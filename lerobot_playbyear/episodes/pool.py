@@ -43,7 +43,7 @@ class Script:
         if self._baseline is None:
             if not callable(getattr(owner, "scripted_expert", None)):
                 raise RolloutError(
-                    f"{type(owner).__name__} has no scripted expert: recording by script needs `scripted_expert()`."
+                    f"{type(owner).__name__} has no scripted expert: a script needs `scripted_expert()`."
                 )
             self._script = owner.scripted_expert()
             return

@@ -175,9 +175,8 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
             check_links(folder)
             files = _files(folder)
             before = _stamps(files)
-            card = write_dataset_card(
-                dataset, repo_id, Path(scratch), options.tags, options.license or "apache-2.0", options.preview
-            )
+            license = options.license or "apache-2.0"
+            card = write_dataset_card(dataset, repo_id, Path(scratch), options.tags, license, options.preview)
         except (InputError, OutsideError, OSError) as error:
             raise HubError(f"Not pushed. {error}") from error
 
@@ -369,17 +368,22 @@ def evaluation_of(checkpoint: Path) -> dict[str, float] | None:
         checkpoint: A folder `<run>/checkpoints/<step>/pretrained_model`.
     """
     folder = checkpoint.resolve()
-    state, metrics = folder.parent / "training_state" / "training_step.json", folder.parent.parent.parent / METRICS_NAME
-    if not (state.is_file() and metrics.is_file()):
+    state = folder.parent / "training_state" / "training_step.json"
+    if not state.is_file():
         return None
-    step = json.loads(state.read_text())["step"]
-    lines = [figures_in(line) for line in metrics.read_text().splitlines()]
+    step, lines = json.loads(state.read_text())["step"], read_metrics(folder.parent.parent.parent)
     found = [line for line in lines if line.get("kind") == "eval" and line.get("step") == step and "pc_success" in line]
     return found[-1] if found else None
 
 
-def figures_in(line: str) -> dict[str, Any]:
-    """What a line of `METRICS_NAME` says; nothing if a run that was killed, or a full disk, cut it off."""
+def read_metrics(run: Path) -> list[dict[str, Any]]:
+    """The lines of `METRICS_NAME` in a run's folder, without those that a kill or a full disk cut off."""
+    path = run / METRICS_NAME
+    lines = path.read_text().splitlines() if path.is_file() else []
+    return [figures for line in lines if (figures := _figures_in(line))]
+
+
+def _figures_in(line: str) -> dict[str, Any]:
     try:
         figures = json.loads(line)
     except ValueError:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from lerobot_playbyear.datasets.features import number_names
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 from lerobot_playbyear.film.dataset_film import encode, tile
@@ -210,10 +211,11 @@ class EpisodeData:
         for key in dict.fromkeys(key for key in wanted if key in self._dataset.numbers):
             values = self._dataset.values(key).reshape(len(self._dataset), -1)[:, :_MAX_CURVES].astype(np.float64)
             finite = np.where(np.isfinite(values), values, 0)
+            names = number_names(self._dataset.features[key]) or [f"[{i}]" for i in range(values.shape[1])]
             curves.append(
                 {
                     "key": key,
-                    "names": _dimension_names(self._dataset.features[key], values.shape[1]),
+                    "names": names[: values.shape[1]],
                     "unit": str((self._dataset.features[key].get("info") or {}).get("unit", "")),
                     "low": finite.min(axis=0).tolist(),
                     "high": finite.max(axis=0).tolist(),
@@ -305,17 +307,6 @@ def _envelope(samples: np.ndarray, peak: float) -> np.ndarray:
     edges = np.linspace(0, len(samples), min(_MAX_COLUMNS, len(samples)) + 1).astype(int)[:-1]
     extreme = np.stack([np.minimum.reduceat(samples, edges), np.maximum.reduceat(samples, edges)], axis=1) / peak
     return np.clip(np.round(127 * extreme), -127, 127).astype(np.int8).reshape(-1)
-
-
-def _dimension_names(feature: dict[str, Any], size: int) -> list[str]:
-    names = feature.get("names")
-    while isinstance(names, dict) and len(names) == 1:
-        names = next(iter(names.values()))
-    if isinstance(names, dict):
-        names = list(names)
-    if isinstance(names, Sequence) and not isinstance(names, str) and len(names) >= size:
-        return [str(name) for name in names[:size]]
-    return [f"[{i}]" for i in range(size)]
 
 
 def _png(grey: np.ndarray) -> str:

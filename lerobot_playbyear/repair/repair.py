@@ -169,8 +169,6 @@ def _held(root: Path) -> Iterator[None]:
     except OSError:
         yield
         return
-    try:
+    with lock:
         finish_journal(root)
         yield
-    finally:
-        lock.release()

@@ -271,7 +271,7 @@ def _parse(directions: str) -> tuple[np.ndarray, np.ndarray]:
     axes = [part.lstrip("+-") for part in parts]
     if sorted(axes) != ["x", "y", "z"] or any(len(part) > 2 for part in parts):
         raise ExpertError(
-            f"--expert.directions={directions!r}: give x, y and z in some order, each with - for the opposite direction, such "
+            f"--expert.directions={directions!r}: give x, y and z in some order, - for the opposite direction, such "
             "as -y,x,z."
         )
     return np.array(["xyz".index(axis) for axis in axes]), np.array([-1.0 if p[0] == "-" else 1.0 for p in parts])

@@ -35,6 +35,7 @@ from lerobot_playbyear.compat import (
     save_checkpoint,
     update_last_checkpoint,
 )
+from lerobot_playbyear.datasets.features import number_names
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
@@ -267,7 +268,7 @@ def make_learner(
     for module in policy.modules():
         if isinstance(module, SoundAugmentation):
             module.read_recordings()
-    names = action_names(meta.features[ACTION])
+    names = number_names(meta.features[ACTION])
     return Learner(accelerator, policy, optimizer, scheduler, preprocessor, postprocessor, names, step)
 
 
@@ -292,15 +293,6 @@ def noise_seed(seed: int, process_index: int, step: int) -> int:
     if step == 0:
         return seed + process_index
     return int(np.random.SeedSequence([seed, process_index, step]).generate_state(1)[0])
-
-
-def action_names(feature: Mapping[str, Any]) -> list[str] | None:
-    """The names of an action's dimensions, as a dataset's features hold them; None if there are none."""
-    names = feature.get("names")
-    if isinstance(names, Mapping):  # LeRobot also writes {"motors": [...]}
-        names = next(iter(names.values()), None)
-    size = math.prod(feature["shape"])
-    return [str(name) for name in names] if isinstance(names, Sequence) and len(names) == size else None
 
 
 def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: Any) -> int:
@@ -369,9 +361,8 @@ def _make_processors(
             "normalizer_processor": {"features": features, "norm_map": norm_map, **stats},
             "rename_observations_processor": {"rename_map": cfg.rename_map},
         }
-        kwargs["postprocessor_overrides"] = {
-            "unnormalizer_processor": {"features": config.output_features, "norm_map": norm_map, **stats}
-        }
+        unnormalizer = {"features": config.output_features, "norm_map": norm_map, **stats}
+        kwargs["postprocessor_overrides"] = {"unnormalizer_processor": unnormalizer}
     return make_pre_post_processors(
         policy_cfg=config,
         pretrained_path=config.pretrained_path,
