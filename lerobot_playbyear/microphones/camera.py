@@ -194,7 +194,7 @@ class MicrophoneCamera(Camera):
             self.disconnect()
             raise MicrophoneError(
                 f"The session's sound cannot be written to {config.save_to or SESSIONS}: {error}. Give another save_to, or "
-                "none."
+                "save_to=none."
             ) from error
 
     def _session_file(self, card: OpenCard) -> SessionFile | None:
