@@ -101,7 +101,7 @@ class _MicrophoneReader:
         self._rate = 0  # of the column [Hz]
         self._steps: ControlStepSound | None = None
 
-    def read(self) -> tuple[dict[str, AddedColumn], list[np.ndarray]]:
+    def read(self) -> tuple[Columns, list[np.ndarray]]:
         """The sound of all episodes, and which of their frames are the first ones, (n,) bool."""
         is_first = [
             self._read_episode(number, self._dataset.pictures(self._key, episode))

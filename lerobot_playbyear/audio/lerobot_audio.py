@@ -118,11 +118,8 @@ def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> 
                 f"{root / INFO_PATH}: audio_path is {template!r}; wanted e.g. {DEFAULT_AUDIO_PATH!r}."
             )
         rows, lengths = _episodes(root, sum(footer.num_rows for footer in footers))
-        tracks = [
-            _track(root, key, feature, template, rows, sum(lengths) / fps, start_time_s)
-            for key, feature in features.items()
-            if feature["dtype"] == AUDIO_DTYPE
-        ]
+        seconds, heard = sum(lengths) / fps, [key for key, own in features.items() if own["dtype"] == AUDIO_DTYPE]
+        tracks = [_track(root, key, features[key], template, rows, seconds, start_time_s) for key in heard]
         _check_names(tracks, set(features))
     return AudioLayout(int(fps), lengths, tracks)
 

@@ -40,15 +40,10 @@ HEADER_BYTES = 44
 _LOOKED_AT = 3  # pictures of a camera that may be a microphone
 _CELL = 8  # pixels of a bit, a side
 _HEADER = np.dtype(
-    [
-        ("magic", "S4"),
-        ("session", "<u4"),
-        ("counter", "<u8"),
-        ("sample_rate", "<u4"),
-        ("low_db", "<f4"),
-        ("high_db", "<f4"),
-        ("checksum", "<u4"),
-    ]
+    {
+        "names": ["magic", "session", "counter", "sample_rate", "low_db", "high_db", "checksum"],
+        "formats": ["S4", "<u4", "<u8", "<u4", "<f4", "<f4", "<u4"],
+    }
 )
 _MAGIC = b"PBYS"
 HIGHEST_RATE = 1_000_000  # Hz

@@ -243,11 +243,8 @@ class RunFolder:
         """What tells a run apart from the one in the folder: another task, other data, another expert or method."""
         saved = json.loads((self.path / CONFIG_NAME).read_text())
         options = json.loads(json.dumps(cfg.options()))
-        changed = [
-            f"--{name} was {_brief(saved.get(name))} and is {_brief(options[name])}"
-            for name in _SAME_RUN
-            if saved.get(name) != options[name]
-        ]
+        names = [name for name in _SAME_RUN if saved.get(name) != options[name]]
+        changed = [f"--{name} was {_brief(saved.get(name))} and is {_brief(options[name])}" for name in names]
         if (saved["episodes"] > 0) != cfg.is_online:  # one collects, and the other learns from what is there
             changed.append(f"--episodes was {saved['episodes']} and is {cfg.episodes}")
         return changed

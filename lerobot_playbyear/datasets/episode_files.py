@@ -63,7 +63,8 @@ def stage_episode(root: Path, info: DatasetInfo, frames: Sequence[Mapping[str, A
     (staging / "meta").mkdir(parents=True)
     table, last = _last_row(root)
     index, n_frames, first = info.total_episodes, len(frames), info.total_frames
-    tasks = _tasks(root, [frame["task"] for frame in frames])
+    texts = [frame["task"] for frame in frames]
+    tasks = _tasks(root, texts)
     columns: dict[str, Any] = {}
     for key, feature in info.features.items():
         if key not in DEFAULT_FEATURES:
@@ -72,13 +73,9 @@ def stage_episode(root: Path, info: DatasetInfo, frames: Sequence[Mapping[str, A
     columns["frame_index"] = np.arange(n_frames)
     columns["episode_index"] = np.full(n_frames, index)
     columns["index"] = np.arange(first, first + n_frames)
-    columns["task_index"] = tasks.loc[[frame["task"] for frame in frames]].task_index.to_numpy()
+    columns["task_index"] = tasks.loc[texts].task_index.to_numpy()
 
-    row: dict[str, Any] = {
-        "episode_index": index,
-        "tasks": list(dict.fromkeys(frame["task"] for frame in frames)),
-        "length": n_frames,
-    }
+    row: dict[str, Any] = {"episode_index": index, "tasks": list(dict.fromkeys(texts)), "length": n_frames}
     row |= _stage_data(root, info, columns, last)
     row |= {"dataset_from_index": first, "dataset_to_index": first + n_frames}
     for key, feature in info.features.items():

@@ -75,12 +75,8 @@ def audio_feature(sample_rate: int, fps: int) -> dict[str, Any]:
     Raises:
         ValueError: If the frame rate does not divide the sample rate.
     """
-    return {
-        "dtype": "int16",
-        "shape": (samples_per_frame(sample_rate, fps),),
-        "names": None,
-        "info": {"sample_rate": sample_rate, "encoding": PCM_S16},
-    }
+    shape, info = (samples_per_frame(sample_rate, fps),), {"sample_rate": sample_rate, "encoding": PCM_S16}
+    return {"dtype": "int16", "shape": shape, "names": None, "info": info}
 
 
 def audio_keys(features: Iterable[str]) -> list[str]:

@@ -355,11 +355,8 @@ class SurveyedDataset(EpisodeReader):
 
     def _columns_of_numbers(self) -> list[str]:
         others = ("image", "video", "string", "language")
-        return [
-            key
-            for key, feature in self.features.items()
-            if key not in INDEX_COLUMNS and feature["dtype"] not in others and len(feature["shape"]) <= 1
-        ]
+        vectors = [key for key, own in self.features.items() if own["dtype"] not in others and len(own["shape"]) <= 1]
+        return [key for key in vectors if key not in INDEX_COLUMNS]
 
     def _film(self, key: str, episode: EpisodeRows) -> tuple[Path, float]:
         place = self._places[episode.index][key]

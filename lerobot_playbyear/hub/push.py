@@ -323,16 +323,8 @@ def _policy_card(policy: Any, folder: Path) -> ModelCard:
         root = Path(dataset.root) if dataset.root else HF_LEROBOT_HOME / dataset.repo_id
         meta = LeRobotDatasetMetadata(dataset.repo_id, root=root) if (root / INFO_PATH).is_file() else None
     with _card_is_refused():
-        card = write_card(
-            card_writer(policy, config),
-            config,
-            dataset.repo_id if dataset is not None else None,
-            config.type,
-            config.license,
-            config.tags,
-            cfg=training,
-            dataset_meta=meta,
-        )
+        own = (dataset.repo_id if dataset is not None else None, config.type, config.license, config.tags)
+        card = write_card(card_writer(policy, config), config, *own, cfg=training, dataset_meta=meta)
     figures = evaluation_of(folder)
     if figures is not None:
         result = f"Success in simulation: **{figures['pc_success']:.0f} %**, at step {figures['step']} of its training."

@@ -184,11 +184,8 @@ def as_text(dataset: SurveyedDataset, findings: Sequence[Finding], colour: bool 
 
 def as_json(dataset: SurveyedDataset, findings: Sequence[Finding]) -> str:
     """The same for a program."""
-    report = {
-        "dataset": facts(dataset),
-        "worst": worst(findings),
-        "verdicts": [finding.to_dict() for finding in findings],
-    }
+    verdicts = [finding.to_dict() for finding in findings]
+    report = {"dataset": facts(dataset), "worst": worst(findings), "verdicts": verdicts}
     return json.dumps(finite(report), indent=2, allow_nan=False)
 
 

@@ -190,12 +190,8 @@ def check_alignment(dataset: SurveyedDataset) -> Iterator[Finding]:
         if best != 0 and shares[best] > shares[0]:
             moment = "after" if best > 0 else "before"
             message += f"; {shares[best]:.0%} come {abs(best) / dataset.fps:.3g} s {moment} one"
-        figures = {
-            "sudden_sounds": n_onsets,
-            "coincide": shares[0],
-            "by_chance": chance,
-            "best_lag_s": best / dataset.fps,
-        }
+        lag_s = best / dataset.fps
+        figures = {"sudden_sounds": n_onsets, "coincide": shares[0], "by_chance": chance, "best_lag_s": lag_s}
         yield Finding("sound and motion", "info", message, key, figures=figures)
 
 

@@ -200,11 +200,8 @@ class EpisodeData:
     @cached_property
     def curves(self) -> list[dict[str, Any]]:
         """The features that are drawn as curves, with the range of each dimension in the dataset."""
-        wanted = [
-            "observation.state",
-            *(key for key in self._dataset.numbers if key.startswith("observation")),
-            "action",
-        ]
+        observed = [key for key in self._dataset.numbers if key.startswith("observation")]
+        wanted = ["observation.state", *observed, "action"]
         if "next.reward" in self._dataset.numbers and len(np.unique(self._dataset.values("next.reward"))) > 2:
             wanted.append("next.reward")  # one of 0 and 1 says no more than the mark of success
         curves = []
@@ -235,11 +232,9 @@ class EpisodeData:
         if INTERVENTION in dataset.numbers:
             tagged = dataset.values(INTERVENTION, episode).astype(bool)
             interventions = [(start, stop - 1) for start, stop in runs(tagged)]
-        return {
-            "microphones": list(map(self._draw_sound, self.microphones, self.sound(episode))),
-            "curves": [_base64(self._curve(curve["key"], episode)) for curve in self.curves],
-            "interventions": interventions,
-        }
+        drawn = list(map(self._draw_sound, self.microphones, self.sound(episode)))
+        curves = [_base64(self._curve(curve["key"], episode)) for curve in self.curves]
+        return {"microphones": drawn, "curves": curves, "interventions": interventions}
 
     def preview(self, episode: EpisodeRows) -> list[int]:
         """The level of the first microphone over the episode, 0 to 99 of its loudest, for the list of episodes."""
@@ -260,14 +255,8 @@ class EpisodeData:
         peak = max(float(np.abs(heard(dataset, key, each)).max()) for each in dataset.episodes) / FULL_SCALE
         top = float(np.ceil(levels.max() / 5) * 5)
         bottom = float(np.floor(np.quantile(levels, _DARKEST_SHARE) / 5) * 5)
-        return Microphone(
-            key=key,
-            sample_rate=rate,
-            peak=peak,
-            top_db=top,
-            bottom_db=min(max(bottom, top - _LARGEST_RANGE_DB), top - 5),
-            top_hz=min(TOP_FREQUENCY, rate / 2),
-        )
+        bottom = min(max(bottom, top - _LARGEST_RANGE_DB), top - 5)
+        return Microphone(key, rate, peak, top, bottom, top_hz=min(TOP_FREQUENCY, rate / 2))
 
     def _draw_sound(self, microphone: Microphone, samples: np.ndarray) -> dict[str, Any]:
         levels, hop_s = _levels(samples, microphone.sample_rate)  # (columns, bins)

@@ -40,13 +40,9 @@ def check_lengths(dataset: SurveyedDataset) -> Iterator[Finding]:
     lengths = np.array([len(episode) for episode in dataset.episodes])
     seconds = lengths / dataset.fps
     median = float(np.median(lengths))
-    figures = {
-        "shortest_s": float(seconds.min()),
-        "median_s": median / dataset.fps,
-        "longest_s": float(seconds.max()),
-        "total_s": float(seconds.sum()),
-    }
-    text = f"{seconds.min():.4g} to {seconds.max():.4g} s, median {median / dataset.fps:.4g} s"
+    least, usual, most, total = float(seconds.min()), median / dataset.fps, float(seconds.max()), float(seconds.sum())
+    figures = {"shortest_s": least, "median_s": usual, "longest_s": most, "total_s": total}
+    text = f"{least:.4g} to {most:.4g} s, median {usual:.4g} s"
     single = [e.index for e in dataset.episodes if len(e) < 2]
     odd = [e.index for e in dataset.episodes if not median / _LENGTH_FACTOR <= len(e) <= median * _LENGTH_FACTOR]
     if single:

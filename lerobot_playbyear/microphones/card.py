@@ -135,11 +135,8 @@ class CardRecording:
                 self._bursts.clear()  # which seemed late
             self._changed.notify_all()
         if lost:
-            logging.warning(
-                "%s lost %.0f ms of sound: the machine or the USB port is too busy.",
-                self._name,
-                1e3 * lost / self._rate,
-            )
+            lost_ms = 1e3 * lost / self._rate
+            logging.warning("%s lost %.0f ms of sound: the machine or the USB port is too busy.", self._name, lost_ms)
 
     @property
     def written(self) -> int:

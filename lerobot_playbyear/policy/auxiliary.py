@@ -45,13 +45,10 @@ class AuxiliaryHeads(nn.Module):
         self.weights, self.memory_steps = weights_of(config), config.memory_steps
         n_felt = sum(math.prod(config.feature_shape(key)) for key in config.low_dimensional_keys)
         sizes = {"onset": 1, "balance": len(config.audio_keys), "way": n_felt}
-        self.heads = nn.ModuleDict(
-            {
-                kind: nn.Sequential(nn.Linear(config.embedding_size, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, size))
-                for kind, size in sizes.items()
-                if self.weights[kind]
-            }
-        )
+        self.heads = nn.ModuleDict()
+        for kind in (kind for kind in sizes if self.weights[kind]):
+            layers = (nn.Linear(config.embedding_size, _HIDDEN), nn.ReLU(), nn.Linear(_HIDDEN, sizes[kind]))
+            self.heads[kind] = nn.Sequential(*layers)
 
     def forward(
         self, waves: list[Tensor], felt: list[Tensor], encodings: Tensor, outputs: Tensor

@@ -59,11 +59,8 @@ def with_hearing(card: ModelCard, config: PlaybyearConfig) -> ModelCard:
 
 def _section(config: PlaybyearConfig) -> str:
     features = config.input_features or {}
-    heard = [
-        f"{code(key)}: {config.sample_rate:,} Hz, {features[key].shape[0]:,} samples a step"
-        for key in config.audio_keys
-        if config.use_audio
-    ]
+    ears = config.audio_keys if config.use_audio else []
+    heard = [f"{code(key)}: {config.sample_rate:,} Hz, {features[key].shape[0]:,} samples a step" for key in ears]
     seen = [code(key) for key in config.camera_keys] if config.use_vision else []
     rows = [
         ("Microphones", "<br>".join(heard) or "none: it is deaf"),

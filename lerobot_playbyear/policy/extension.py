@@ -10,7 +10,7 @@ from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import ObservationProcessorStep
 from torch import Tensor, nn
 
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX
+from lerobot_playbyear.datasets.features import audio_keys
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.spectrogram import to_float_wave
 
@@ -102,12 +102,8 @@ class MicrophoneStep(SoundStep):
 
     def observation(self, observation: dict) -> dict:
         """Every `observation.audio.<microphone>`, integers as PCM at full scale, and nothing else."""
-        heard = {
-            key: self.sound(to_float_wave(value, key))
-            for key, value in observation.items()
-            if key.startswith(AUDIO_PREFIX) and not key.endswith("_is_pad")
-        }
-        return {**observation, **heard}
+        keys = [key for key in audio_keys(observation) if not key.endswith("_is_pad")]
+        return {**observation, **{key: self.sound(to_float_wave(observation[key], key)) for key in keys}}
 
 
 def _register[Factory: EncoderFactory](option: str, name: str) -> Callable[[Factory], Factory]:

@@ -20,6 +20,8 @@ GRIPPER = "gripper"
 CLOSE, STAY, OPEN = 0, 1, 2
 """How LeRobot's teleoperators code the gripper."""
 
+_CLOSES: dict[Any, bool] = {CLOSE: True, OPEN: False}
+
 _X, _Y, _Z = DELTAS
 MOVES = {"right": (_X, 1), "left": (_X, -1), "up": (_Y, 1), "down": (_Y, -1), "e": (_Z, 1), "d": (_Z, -1)}
 """Which displacement a key makes, and its sign."""
@@ -223,7 +225,7 @@ class ActionMapping:
 
     def closes(self, action: Mapping[str, Any]) -> bool | None:
         """Whether a teleoperator's action closes the gripper, or opens it; None where it says neither."""
-        return {CLOSE: True, OPEN: False}.get(action.get(GRIPPER)) if self.moves_hand else None
+        return _CLOSES.get(action.get(GRIPPER)) if self.moves_hand else None
 
 
 class Gripper:

@@ -103,12 +103,8 @@ class Learner:
         if self.scheduler is not None:
             self.scheduler.step()
         self.step += 1
-        figures = {
-            **(figures or {}),
-            "loss": mean_over_processes(loss.detach()),
-            "grad_norm": norm,
-            "lr": self.optimizer.param_groups[0]["lr"],
-        }
+        rate, of_all = self.optimizer.param_groups[0]["lr"], mean_over_processes(loss.detach())
+        figures = {**(figures or {}), "loss": of_all, "grad_norm": norm, "lr": rate}
         if accelerator.device.type == "cuda":
             figures["gpu_mem_gb"] = torch.cuda.max_memory_allocated() / 2**30
         return {**figures, "update_s": time.perf_counter() - start}

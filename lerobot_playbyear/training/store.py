@@ -414,18 +414,15 @@ def _gathered(pieces: Iterator[np.ndarray], n_rows: int) -> Tensor:
 
 
 def _select_features(reader: DatasetReader, keys: Iterable[str] | None) -> dict[str, Any]:
-    features = reader.features
+    features, others = reader.features, {*LANGUAGE_COLUMNS, *reader.meta.depth_keys}
+    others |= {key for key, feature in features.items() if feature["dtype"] == "string"}
     if keys is None:
-        keys = [
-            key
-            for key, feature in features.items()
-            if key not in LANGUAGE_COLUMNS and key not in reader.meta.depth_keys and feature["dtype"] != "string"
-        ]
+        keys = [key for key in features if key not in others]
     keys = list(dict.fromkeys([*keys, *INDEX_KEYS, *([IS_FIRST] if _has_is_first(features) else [])]))
     for key in keys:
         if key not in features:
             raise ValueError(f"The dataset '{reader.repo_id}' has no '{key}'; it has {sorted(features)}.")
-        if key in reader.meta.depth_keys or features[key]["dtype"] == "string" or key in LANGUAGE_COLUMNS:
+        if key in others:
             raise ValueError(f"'{key}' ({features[key]['dtype']}) cannot be kept in memory: use lerobot-train for it.")
     return {key: features[key] for key in keys}
 
