@@ -10,10 +10,5 @@ if TYPE_CHECKING:
 
 __all__ = ["cut_into_frames", "note_episode_start", "read_audio", "resample", "write_audio"]
 
-__getattr__ = lazy_names(
-    __name__,
-    {
-        "audio_files": ("cut_into_frames", "read_audio", "resample", "write_audio"),
-        "recorder_clock": ("note_episode_start",),
-    },
-)
+_FILES = ("cut_into_frames", "read_audio", "resample", "write_audio")
+__getattr__ = lazy_names(__name__, {"audio_files": _FILES, "recorder_clock": ("note_episode_start",)})

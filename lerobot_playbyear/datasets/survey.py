@@ -367,12 +367,11 @@ def _find_films(root: Path, info: Info, episodes: list[Episode], rows: Rows, tho
                     episodes[i] = replace(episodes[i], frames=None, reason=reason)
                 elif place is not None:
                     episodes[i] = replace(episodes[i], places={**episodes[i].places, key: place})
-    return [
-        replace(episode, row=row)
-        if episode.frames and (row := rows.get(episode.number)) and not _contradiction(root, info, row, episode)
-        else episode
-        for episode in episodes
-    ]
+    for i, episode in enumerate(episodes):
+        row = rows.get(episode.number)
+        if episode.frames and row and not _contradiction(root, info, row, episode):
+            episodes[i] = replace(episode, row=row)
+    return episodes
 
 
 def _contradiction(root: Path, info: Info, row: Mapping[str, Any], episode: Episode) -> str | None:
@@ -445,11 +444,8 @@ def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], n_found: 
     n_frames = sum(episode.frames.length for episode in episodes if episode.frames)
     is_whole = all(episode.frames for episode in episodes)
     if info["total_episodes"] != len(episodes) or (is_whole and info["total_frames"] != n_frames):
-        yield _wrong(
-            "rows",
-            f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all; there are "
-            f"{len(episodes)} of {n_frames}",
-        )
+        counted = f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all"
+        yield _wrong("rows", f"{counted}; there are {len(episodes)} of {n_frames}")
     if is_whole and n_found > n_frames:
         yield _wrong("rows", f"the data files hold {n_found - n_frames} frames that belong to no episode")
     expected = 0

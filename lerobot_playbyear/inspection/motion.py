@@ -183,10 +183,8 @@ def check_alignment(dataset: SurveyedDataset) -> Iterator[Finding]:
         shares = {shift: _coincidence(onsets, motion, shift) for shift in range(-search, search + 1)}
         chance = float(np.mean([_near(changes).mean() for changes in motion]))
         best = max(shares, key=lambda shift: (shares[shift], -abs(shift)))
-        message = (
-            f"{n_onsets} sudden sounds; {shares[0]:.0%} come within a frame of a change of motion ({motion_key}), "
-            f"by chance {chance:.0%} would"
-        )
+        message = f"{n_onsets} sudden sounds; {shares[0]:.0%} come within a frame of a change of motion ({motion_key})"
+        message += f", by chance {chance:.0%} would"
         if best != 0 and shares[best] > shares[0]:
             moment = "after" if best > 0 else "before"
             message += f"; {shares[best]:.0%} come {abs(best) / dataset.fps:.3g} s {moment} one"

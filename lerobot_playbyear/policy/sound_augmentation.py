@@ -101,10 +101,8 @@ def mix_in_noise(wave: Tensor, max_db: float, sample_rate: int, highest_hz: floa
     """
     n_items, n_samples = wave.shape
     draws = torch.rand(4, n_items, 1, device=wave.device)
-    level, tilt, pitch, hum = (
-        low + (high - low) * draw
-        for (low, high), draw in zip(((_FAINTEST_DB, max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
-    )
+    ranges = zip(((_FAINTEST_DB, max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
+    level, tilt, pitch, hum = (low + (high - low) * draw for (low, high), draw in ranges)
     resolution = sample_rate / n_samples  # [Hz] of a bin
     n_bins = n_samples // 2  # without the constant part
     n_drawn = min(n_bins, math.ceil(min(highest_hz, sample_rate) / resolution))

@@ -270,12 +270,9 @@ def make_learner(
 
 def make_accelerator(policy: PlaybyearConfig) -> Accelerator:
     """The Accelerator that lerobot-train makes for a policy: its device, its precision, and the processes launched."""
-    return Accelerator(
-        step_scheduler_with_optimizer=False,
-        mixed_precision=_DTYPES.get(policy.dtype or ""),
-        cpu=policy.device == "cpu",
-        kwargs_handlers=[InitProcessGroupKwargs(timeout=_PATIENCE)],
-    )
+    kind, is_cpu = _DTYPES.get(policy.dtype or ""), policy.device == "cpu"
+    patient = InitProcessGroupKwargs(timeout=_PATIENCE)
+    return Accelerator(step_scheduler_with_optimizer=False, mixed_precision=kind, cpu=is_cpu, kwargs_handlers=[patient])
 
 
 def noise_seed(seed: int, process_index: int, step: int) -> int:
@@ -359,12 +356,8 @@ def _make_processors(
         }
         unnormalizer = {"features": config.output_features, "norm_map": norm_map, **stats}
         kwargs["postprocessor_overrides"] = {"unnormalizer_processor": unnormalizer}
-    return make_pre_post_processors(
-        policy_cfg=config,
-        pretrained_path=config.pretrained_path,
-        pretrained_revision=getattr(config, "pretrained_revision", None),
-        **kwargs,
-    )
+    path, revision = config.pretrained_path, getattr(config, "pretrained_revision", None)
+    return make_pre_post_processors(policy_cfg=config, pretrained_path=path, pretrained_revision=revision, **kwargs)
 
 
 # What makes updates faster and changes nothing that is learned (docs/scale.md)

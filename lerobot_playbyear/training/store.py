@@ -127,13 +127,9 @@ class EpisodeStore:
         n_bytes = sum(row_bytes.values()) * len(reader)
         device = _choose_device(device, n_bytes)
         n_cameras = sum(feature["dtype"] in _CAMERA_DTYPES for feature in features.values())
-        bar = tqdm(
-            desc="Reading frames",
-            total=n_cameras * len(reader),
-            unit="frame",
-            delay=1,  # what is there already takes less
-            disable=not (progress and n_cameras),
-        )
+        total, is_hidden = n_cameras * len(reader), not (progress and n_cameras)
+        # Delayed, for what is there already takes less.
+        bar = tqdm(desc="Reading frames", total=total, unit="frame", delay=1, disable=is_hidden)
         with bar:
             pieces = partial(_pieces, reader, image_size, new_rates, bar)
             if place == "disk":
