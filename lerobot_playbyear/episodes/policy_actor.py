@@ -77,9 +77,6 @@ def load_policy_actor(policy_cfg: PreTrainedConfig, env_cfg: EnvConfig) -> Polic
     return PolicyActor(policy, env_cfg, preprocessor, postprocessor, autocast)
 
 
-def _as_batch(observation: Observation) -> Observation:
+def _as_batch(raw: Observation) -> Observation:
     """A raw observation as a batch of one."""
-    return {
-        key: _as_batch(value) if isinstance(value, dict) else np.asarray(value)[None]
-        for key, value in observation.items()
-    }
+    return {key: _as_batch(own) if isinstance(own, dict) else np.asarray(own)[None] for key, own in raw.items()}
