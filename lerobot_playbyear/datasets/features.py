@@ -290,12 +290,12 @@ def _check_shape(key: str, feature: Mapping[str, Any]) -> None:
         raise InputError(f"'{key}' has shape {shape!r}; wanted a tuple of positive whole numbers.")
     if key.startswith(AUDIO_PREFIX) and len(shape) > 1:
         n_channels = min(shape)
+        keys = f"'{key}_left' and '{key}_right'"
         advice = (
-            f"wanted ({max(shape)},)"
-            if n_channels == 1
-            else f"every microphone is its own key: write {n_channels} features of shape ({max(shape)},), such as "
-            f"'{key}_left' and '{key}_right'"
+            f"every microphone is its own key: write {n_channels} features of shape ({max(shape)},), such as {keys}"
         )
+        if n_channels == 1:
+            advice = f"wanted ({max(shape)},)"
         raise InputError(f"'{key}' has shape {tuple(shape)}; {advice}.")
 
 
