@@ -1,10 +1,8 @@
 """Tasks put together from parts: what follows from the parts, rates of their own, two loose things, and what is refused."""
 
-import os
 import pickle
 from dataclasses import replace
 
-import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
@@ -133,20 +131,3 @@ def test_no_episode_depends_on_the_one_before():
         np.testing.assert_array_equal(worn.data.qpos, fresh.data.qpos)
         scenes.add(float(worn.model.body("wall").quat[0]))
     assert len(scenes) == 2
-
-
-@pytest.mark.parametrize("n_environments", [6, pytest.param(40, marks=pytest.mark.slow)])
-def test_environments_that_are_closed_leave_nothing_open(n_environments):
-    def n_open() -> int:
-        return len(os.listdir("/proc/self/fd"))
-
-    def use() -> None:
-        env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", image_size=8, render_size=8)
-        env.reset(seed=0)
-        env.close()
-
-    use()
-    before = n_open()
-    for _ in range(n_environments):
-        use()
-    assert n_open() == before

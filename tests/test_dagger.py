@@ -21,14 +21,10 @@ from dagger_factory import (
     seeds,
     state,
 )
-from lerobot.envs import make_env, make_env_pre_post_processors
-from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval, lerobot_train
-from lerobot.scripts.lerobot_eval import rollout
 from safetensors.torch import load_file
 from support.shared import ENV, trained
 
-from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.methods import Method
@@ -36,7 +32,6 @@ from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -47,21 +42,6 @@ def _finished():
 
 
 # Attempts
-
-
-def test_a_policy_acts_as_in_lerobots_rollout():
-    env, actor, expert = scene()
-    episode = play(env, actor, seed=5, expert=expert)
-    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=20)
-    policy = PlaybyearPolicy.from_pretrained(trained()).eval()
-    own = make_pre_post_processors(policy.config, str(trained()))
-    vec = make_env(env_cfg)["playbyear"][0]
-    result = rollout(vec, policy, *make_env_pre_post_processors(env_cfg, policy.config), *own, seeds=[5])
-    vec.close()
-    env.close()
-    expected = result["action"][0].clamp(-1, 1)
-    np.testing.assert_array_equal(episode.actions, expected)
-    assert not episode.interventions.any()
 
 
 def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the_policy_remembers_it_all():

@@ -68,19 +68,6 @@ def test_wherever_it_stops_it_ends_alike(finished_run, tmp_path, owner, name, af
     assert_a_power_cut_changes_nothing(tmp_path, finished_run, RUN, after, owner, name)
 
 
-@pytest.mark.slow
-def test_one_attempt_that_was_saved_and_not_counted_is_all_that_was_wanted(tmp_path, monkeypatch):
-    run = (*QUICK, "--episodes=1")
-    dagger(tmp_path / "calm", *run)
-    with monkeypatch.context() as patch:
-        cut_power(patch, folder_module.RunFolder, "commit", len(metrics(tmp_path / "calm", "attempt")))
-        with pytest.raises(PowerCut):
-            dagger(tmp_path / "cut", *run)
-    assert state(tmp_path / "cut")["kept"] == 0 < len(seeds(tmp_path / "cut"))
-    command("--resume=true", f"--output_dir={tmp_path / 'cut/out'}")
-    assert_ended_alike(tmp_path / "cut", tmp_path / "calm")
-
-
 def test_attempts_in_vain_count_on_after_a_resume(tmp_path, monkeypatch):
     monkeypatch.setattr(Quick, "verdict", lambda self: Verdict.FAILURE if self.n >= self.n_steps else None)
     run = (*QUICK, "--episodes=1", "--max_attempts=3")

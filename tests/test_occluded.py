@@ -112,29 +112,6 @@ def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
     assert ends.count("success") >= 0.75 * len(ends)  # the others shove the cube, which both searches move
 
 
-def test_the_twin_world_is_the_same_until_touch_and_sounds_otherwise_after_it():
-    """Every observation, byte for byte; `test_check.py` has the other tasks, whose sound it does not compare."""
-    env, twin = (make(CUBES[0], sound="waveform", hidden_object=there) for there in (True, False))
-    observation, other = (world.reset(seed=3)[0] for world in (env, twin))
-    expert = env.scripted_expert()
-
-    def step() -> list[dict]:
-        action = expert.act()
-        return [world.step(action)[0] for world in (env, twin)]
-
-    while env.contact_forces["gripper-cube"] == 0:
-        np.testing.assert_array_equal(observation["pixels"]["front"], other["pixels"]["front"])
-        for name in ("agent_pos", "audio.gripper"):
-            np.testing.assert_array_equal(observation[name], other[name])
-        observation, other = step()
-    n_heard = 0
-    while expert.phase != "hop":
-        n_heard += not np.array_equal(observation["audio.gripper"], other["audio.gripper"])
-        observation, other = step()
-    assert n_heard > 0
-    assert twin.contact_forces["gripper-cube"] == 0
-
-
 @pytest.mark.parametrize("task", CUBES)
 def test_it_comes_down_above_the_cube_while_the_touch_is_remembered(task):
     """Of the expert's first search in every episode: lengths [m], and steps from the touch to the descent."""

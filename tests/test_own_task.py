@@ -120,10 +120,3 @@ def test_a_broken_distribution_says_so_and_breaks_nothing_else():
 def test_a_task_whose_physics_does_not_divide_its_control_steps_says_so():
     with pytest.raises(ValueError, match=r"StopAtTheTin-v1: physics_dt=0.003 s .* for example to 0.002"):
         replace(make_definition("StopAtTheTin-v1", {}), physics_dt=0.003)
-
-
-def test_tasks_and_their_options_that_there_are_not_are_named():
-    with pytest.raises(DecodingError, match=r"OccludedGrasp-v1.*StopAtTheTin-v1"):
-        PlaybyearEnvConfig(task="Nope-v1")
-    with pytest.raises(DecodingError, match="StopAtTheTin-v1 has no such option"):
-        PlaybyearEnvConfig(task="StopAtTheTin-v1", task_options={"colour": "blue"})

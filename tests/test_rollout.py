@@ -1,10 +1,8 @@
 """`lerobot-rollout` with a microphone: policies hear in every strategy, and one without a microphone says so."""
 
-import runpy
 import sys
 from pathlib import Path
 
-import lerobot
 import lerobot_operator  # noqa: F401  (LeRobot finds the arm of joints then)
 import numpy as np
 import pytest
@@ -143,11 +141,3 @@ def test_a_policy_that_does_not_hear_acts(arm_dataset, told, monkeypatch, tmp_pa
     assert 5 <= len(told) <= 11
     assert all(sorted(action) == ["elbow.pos", "gripper.pos", "shoulder.pos"] for action in told)
     assert np.isfinite([list(action.values()) for action in told]).all()
-
-
-def test_lerobots_policy_server_refuses_the_policy_by_its_type():
-    """It takes what is in this list, and says the list to whoever asks for another. Read without grpc, which it needs."""
-    path = Path(lerobot.__file__).parent / "async_inference" / "constants.py"
-    constants = runpy.run_path(str(path))
-    assert "act" in constants["SUPPORTED_POLICIES"]
-    assert "playbyear" not in constants["SUPPORTED_POLICIES"]

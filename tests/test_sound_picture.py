@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import torchaudio
-from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
+from dataset_factory import CAMERA, MICROPHONE, make_dataset
 from draccus.utils import DecodingError
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.feature_utils import features_equal_for_merge
@@ -21,12 +21,9 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION, env_to_policy_features
 from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_edit_dataset, lerobot_eval, lerobot_train
 from test_lerobot_tools import needs
-from torchvision.ops import FrozenBatchNorm2d
 
-from experiments import act_start
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.audio import attach_spectrogram as attaching
-from lerobot_playbyear.audio.attach_audio import AttachError
 from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramConfig, attach_spectrogram
 from lerobot_playbyear.audio.sound_picture import SoundPicture, pictures_of, read_pictures
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -186,28 +183,11 @@ def test_every_frame_shows_the_last_seconds_and_all_else_stays(original, seen, t
     ] == []
 
 
-def test_a_copy_that_fails_is_not_there_and_one_that_is_there_is_not_touched(original, seen, tmp_path, monkeypatch):
-    with pytest.raises(AttachError, match="is there already"):
-        attach_spectrogram(config(original, seen))
+def test_a_copy_that_fails_is_not_there(original, tmp_path, monkeypatch):
     monkeypatch.setattr(attaching, "_png", lambda picture: (_ for _ in ()).throw(OSError("the disk is full")))
     with pytest.raises(OSError, match="disk is full"):
         attach_spectrogram(config(original, tmp_path / "new"))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_dataset_with_nothing_but_silence_is_refused(tmp_path):
-    dataset = LeRobotDataset.create(
-        "t/silent", 20, dataset_features(image_size=16), root=tmp_path / "silent", use_videos=False
-    )
-    for _ in range(3):
-        silence = {
-            k: np.zeros(f["shape"], f["dtype"]) for k, f in dataset_features(image_size=16).items() if k != CAMERA
-        }
-        dataset.add_frame({**silence, CAMERA: np.zeros((16, 16, 3), np.uint8), "task": "Wait."})
-    dataset.save_episode()
-    dataset.finalize()
-    with pytest.raises(InputError, match="nothing but silence"):
-        attach_spectrogram(config(tmp_path / "silent", tmp_path / "seen"))
 
 
 def test_lerobots_tools_keep_how_the_pictures_were_made_and_mix_no_levels(seen, tmp_path, monkeypatch):
@@ -303,9 +283,7 @@ def test_an_environment_that_hears_otherwise_is_refused(recorded, options, messa
         env_config(recorded, **options)
 
 
-def test_a_dataset_without_pictures_is_refused_and_so_is_recording_with_them(original, recorded, tmp_path):
-    with pytest.raises(DecodingError, match="names no pictures of sound"):
-        env_config(original)
+def test_recording_with_pictures_of_sound_is_refused(recorded, tmp_path):
     with pytest.raises(InputError, match="as a camera of the environment is; attach them with another --name"):
         pictures_for(recorded, {"gripper": 16000}, 20, ["gripper"])
     arguments = ["--env.type=playbyear", f"--env.spectrogram={recorded}", "--env.task=OccludedGrasp-v1"]
@@ -405,27 +383,3 @@ def test_lerobots_policies_train_and_roll_out_and_hear(name, recorded, tmp_path,
         batch = {key: value[None] for key, value in item.items() if key.startswith("observation.")}
         actions.append(policy.select_action({**batch, PICTURE: shown[None]}))
     assert not torch.equal(*actions), "what is heard has no part in what is done"
-
-
-@pytest.mark.slow
-def test_act_without_pretrained_weights_begins_with_norms_that_tell_pictures_apart(recorded, tmp_path):
-    options = ["pretrained_backbone_weights=null", *SMALL["act"].split()]
-    command = act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
-    assert command.startswith("python -m experiments.act_start")
-    assert "dim_model=32" in command
-    written = (tmp_path / "start/model.safetensors").stat().st_mtime_ns
-    act_start.saved_start(options, recorded, tmp_path / "start", seed=0)
-    assert (tmp_path / "start/model.safetensors").stat().st_mtime_ns == written
-    policy = get_policy_class("act").from_pretrained(tmp_path / "start")
-    dataset = load(recorded)
-    key = dataset.meta.camera_keys[0]
-    images = torch.stack([dataset[row][key] for row in range(0, len(dataset), 3)])
-    images = (images - images.mean(dim=(0, 2, 3), keepdim=True)) / images.std(dim=(0, 2, 3), keepdim=True)
-    calibrated = act_start.difference(policy.model.backbone, images)
-    for norm in policy.model.backbone.modules():
-        if isinstance(norm, FrozenBatchNorm2d):
-            norm.running_mean.zero_()
-            norm.running_var.fill_(1)
-    assert calibrated > 1.5 * act_start.difference(policy.model.backbone, images)
-    act_start.saved_start(options, recorded, tmp_path / "start", seed=1)
-    assert (tmp_path / "start/model.safetensors").stat().st_mtime_ns != written
