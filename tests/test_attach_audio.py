@@ -26,7 +26,7 @@ from lerobot_playbyear.repair import repair_dataset
 
 FPS, RATE = 20, 16000
 SIZE = RATE // FPS
-LENGTHS = (12, 17, 9)
+LENGTHS = (12, 17, 9)  # of the fixture `silent`
 KEY = "observation.audio.gripper"
 OFFSET = 0.25
 
@@ -40,13 +40,6 @@ def write_sounds(folder: Path, rate: int = RATE, ending: str = "wav", n_channels
         n_samples = round((OFFSET + length / FPS) * rate)
         write_audio(folder / f"{episode:03d}.{ending}", noise(episode, n_samples, n_channels), rate)
     return f"{folder}/{{episode:03d}}.{ending}"
-
-
-@pytest.fixture(scope="module")
-def silent(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("silent") / "dataset"
-    make_dataset(root, LENGTHS, repo_id="test/silent", image_size=16, microphones=())
-    return root
 
 
 def attach(root: Path, target: Path, **options) -> Path:

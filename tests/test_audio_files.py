@@ -57,18 +57,6 @@ def test_other_depths_are_rounded_to_16_bits(tmp_path, width, tolerance):
     assert np.abs(samples[:, 0].astype(int) - waveform).max() <= tolerance
 
 
-def test_flac_of_24_bits_is_rounded(tmp_path):
-    waveform = tone(440, RATE, 0.3)
-    with av.open(str(tmp_path / "deep.flac"), "w") as container:
-        stream = container.add_stream("flac", rate=RATE, layout="mono", format="s32")
-        frame = av.AudioFrame.from_ndarray((waveform.astype(np.int32) << 16).reshape(1, -1), "s32", "mono")
-        frame.sample_rate = RATE
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    samples, _ = read_audio(tmp_path / "deep.flac")
-    np.testing.assert_array_equal(samples[:, 0], waveform)
-
-
 def write_film(path, seconds: float, sound: np.ndarray | None, sound_from: float = 0.0) -> None:
     with av.open(str(path), "w") as film:
         video = film.add_stream("libx264", rate=FPS)

@@ -233,17 +233,12 @@ def actions_of(checkpoint: Path, device: str, n_frames: int = 4) -> torch.Tensor
 @both_trainers
 def test_a_training_saves_resumes_and_acts(device, script, dtype, noise, tmp_path):
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}", f"--policy.dtype={dtype}")
-    run_in_process(
-        script, *NOISY, *data, f"--policy.device={device}", "--steps=4", "--save_freq=2", f"--output_dir={tmp_path}/out"
-    )
+    saved = ("--steps=4", "--save_freq=2", f"--output_dir={tmp_path}/out")
+    run_in_process(script, *NOISY, *data, f"--policy.device={device}", *saved)
     checkpoints = tmp_path / "out/checkpoints"
     half = checkpoints / "000002"
-    run_in_process(
-        script,
-        "--resume=true",
-        f"--config_path={half / 'pretrained_model/train_config.json'}",
-        f"--output_dir={tmp_path}/on",
-    )
+    from_there = f"--config_path={half / 'pretrained_model/train_config.json'}"
+    run_in_process(script, "--resume=true", from_there, f"--output_dir={tmp_path}/on")
 
     last, resumed = weights_of(checkpoints / "last"), weights_of(tmp_path / "on/checkpoints/000004")
     assert all(value.isfinite().all() for value in (*last.values(), *resumed.values()))

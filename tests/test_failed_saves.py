@@ -325,7 +325,7 @@ READ_BY: dict[str, Callable[[Path], Any]] = {
     "resume": lambda root: writer(root).close(),
     "repair": lambda root: repair_dataset(root).dropped,
     "check": lambda root: [str(each) for each in check_numbers(SurveyedDataset.open(REPO_ID, root))],
-    "train": lambda root: EpisodeStore.load(REPO_ID, root, device="cpu").ends,
+    "train": lambda root: EpisodeStore.load(REPO_ID, root, device="cpu", keys=["action"]).ends,
 }
 
 

@@ -77,13 +77,8 @@ def test_lerobot_records_trains_and_evaluates_it_without_a_change_here(tmp_path)
     assert run_in_process(record, *ENV, *data, "--dataset.num_episodes=1", "--num_workers=0") is None
     assert run_in_process(train, *TINY, *data, "--steps=1", f"--output_dir={tmp_path / 't'}") is None
     checkpoint = tmp_path / "t/checkpoints/last/pretrained_model"
-    small = [
-        "--env.episode_length=5",
-        "--eval.n_episodes=1",
-        "--eval.batch_size=1",
-        f"--output_dir={tmp_path / 'eval'}",
-    ]
-    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *small)
+    once = ["--env.episode_length=5", "--eval.n_episodes=1", "--eval.batch_size=1"]
+    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *once, f"--output_dir={tmp_path / 'eval'}")
     assert '"n_episodes": 1' in (tmp_path / "eval/eval_info.json").read_text()
 
 
