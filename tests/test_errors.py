@@ -209,7 +209,6 @@ attach-spectrogram | --seconds=3 | 60 frames do not fit into 16 columns | at mos
 attach-spectrogram | --seconds=0 | --seconds=0 | above 0
 attach-spectrogram | --height=3 | --height=3 | 8 to 4096 pixels
 attach-spectrogram | --low_db=10 --high_db=-10 | --low_db=10 | the second above the first
-attach-spectrogram | --dataset.root={uncorrected} | nothing but silence
 attach-spectrogram | --dataset.root={deaf} | {deaf} has no sound in columns | playbyear-attach-audio
 # Films, inspection, microphones
 video | --seed=-1 | seed=-1: give 0 or more

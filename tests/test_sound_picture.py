@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import torchaudio
-from dataset_factory import CAMERA, MICROPHONE, make_dataset
+from dataset_factory import CAMERA, MICROPHONE, dataset_features, make_dataset
 from draccus.utils import DecodingError
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.feature_utils import features_equal_for_merge
@@ -183,6 +183,21 @@ def test_a_copy_that_fails_is_not_there(original, tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk is full"):
         attach_spectrogram(config(original, tmp_path / "new"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dataset_with_nothing_but_silence_is_refused(tmp_path):
+    dataset = LeRobotDataset.create(
+        "t/silent", 20, dataset_features(image_size=16), root=tmp_path / "silent", use_videos=False
+    )
+    for _ in range(3):
+        silence = {
+            k: np.zeros(f["shape"], f["dtype"]) for k, f in dataset_features(image_size=16).items() if k != CAMERA
+        }
+        dataset.add_frame({**silence, CAMERA: np.zeros((16, 16, 3), np.uint8), "task": "Wait."})
+    dataset.save_episode()
+    dataset.finalize()
+    with pytest.raises(InputError, match="nothing but silence"):
+        attach_spectrogram(config(tmp_path / "silent", tmp_path / "seen"))
 
 
 def test_lerobots_tools_keep_how_the_pictures_were_made_and_mix_no_levels(seen, tmp_path):
