@@ -45,6 +45,14 @@ def noise() -> Path:
 
 
 @pytest.fixture(scope="session")
+def silent() -> Path:
+    """The same without sound."""
+    from dataset_factory import make_dataset
+
+    return shared.once("silent", lambda root: make_dataset(root, repo_id="test/silent", image_size=16, microphones=()))
+
+
+@pytest.fixture(scope="session")
 def recorded() -> Path:
     return shared.recorded()
 

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from lerobot.policies import make_pre_post_processors
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.training import train as loop
-from lerobot_playbyear.training.learner import Learner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -131,41 +129,6 @@ def test_an_action_outside_the_demonstrations_is_learned_only_within_the_range(a
 
 
 # What is said
-
-
-def told(caplog, config, actions, stats=None, names=None):
-    """What a policy with these options says of actions; None if it says nothing."""
-    preprocessor = make_pre_post_processors(config, dataset_stats=stats)[0] if stats else processors(config)[0]
-    accelerator = SimpleNamespace(unwrap_model=lambda policy: policy)
-    caplog.clear()
-    Learner(accelerator, SimpleNamespace(config=config), None, None, preprocessor, None, names).warn_of_reach(
-        torch.tensor(actions), "the corrections"
-    )
-    return caplog.text or None
-
-
-def test_shares_are_told_by_dimension_and_what_would_reach_them(caplog):
-    actions = [[1.0, 0.0], [2.0, -1.0], [2.5, 0.0], [-1.0, 1.0]]  # normalised: 0, 1, 1.5, -2
-    text = told(caplog, small_config(), actions, names=["pan", "gripper"])
-    assert "the corrections" in text
-    assert "'pan' in 50.0 % of 4 frames" in text
-    assert "gripper" not in text
-    assert "--policy.action_range=2.2" in text
-    assert told(caplog, small_config(), actions[:2]) is None
-    assert told(caplog, small_config(action_range=2.2), actions) is None
-
-
-def test_what_never_moved_in_the_demonstrations_is_told_apart(caplog):
-    stats = {"action": {"min": torch.tensor([0.0, 0.0]), "max": torch.tensor([2.0, 0.0])}}
-    text = told(caplog, small_config(), [[1.0, 0.5], [2.5, 0.0]], stats)
-    assert "'action[0]' in 50.0 %, 'action[1]' in 50.0 % of 2 frames" in text
-    assert "--policy.action_range=1.7" in text
-    assert "'action[1]' hardly moves in the demonstrations" in text
-    degrees = small_config(normalization_mapping={"STATE": "MEAN_STD", "ACTION": "IDENTITY"})
-    text = told(caplog, degrees, [[-50.0, 0.5], [80.0, 0.0]])
-    assert "in 100.0 % of 2 frames" in text
-    assert "--policy.action_range=88" in text
-    assert "hardly moves" not in text
 
 
 def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wider_policy_takes_them(

@@ -16,10 +16,8 @@ from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace
 from lerobot_playbyear.audio.recorder_clock import (
     CLOCK_PATH,
     ClockError,
-    ClockLine,
     read_clock,
     read_episode_starts,
-    read_marks,
 )
 from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
@@ -28,7 +26,7 @@ from lerobot_playbyear.repair import repair_dataset
 
 FPS, RATE = 20, 16000
 SIZE = RATE // FPS
-LENGTHS = (12, 17, 9)
+LENGTHS = (12, 17, 9)  # of the fixture `silent`
 KEY = "observation.audio.gripper"
 OFFSET = 0.25
 
@@ -42,13 +40,6 @@ def write_sounds(folder: Path, rate: int = RATE, ending: str = "wav", n_channels
         n_samples = round((OFFSET + length / FPS) * rate)
         write_audio(folder / f"{episode:03d}.{ending}", noise(episode, n_samples, n_channels), rate)
     return f"{folder}/{{episode:03d}}.{ending}"
-
-
-@pytest.fixture(scope="module")
-def silent(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("silent") / "dataset"
-    make_dataset(root, LENGTHS, repo_id="test/silent", image_size=16, microphones=())
-    return root
 
 
 def attach(root: Path, target: Path, **options) -> Path:
@@ -244,15 +235,6 @@ def test_a_recording_without_its_drift_is_the_same_sound_at_the_right_times():
         steady = cut_into_frames(recording, RATE, FPS, 120, offset=0.1, speed=0.9997).reshape(-1)
         wanted = 10_000 * np.sin(2 * np.pi * frequency * (0.05 + np.arange(len(steady)) / RATE))
         assert np.abs(steady - wanted).max() < 10
-
-
-def test_marks_are_a_line():
-    assert read_marks(None) == ClockLine()
-    assert read_marks("2.5=100").sound_time(110) == 12.5
-    line = read_marks(" 1=101 , 1.5=101.4998, 1001 = 1101 ")
-    assert line.speed == pytest.approx(1, abs=1e-6)
-    assert 0 < line.error_s < 1e-3
-    assert read_marks("1.5=1754400000.5, 3605.1=1754403600.5").speed == pytest.approx(3603.6 / 3600)
 
 
 def test_an_episodes_start_is_noted_and_survives_being_killed(tmp_path):

@@ -10,7 +10,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from dataset_factory import make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, contents, load
 
@@ -88,13 +87,6 @@ def blocks_of(sound: np.ndarray, length: int) -> np.ndarray:
     """What is heard in (-1 / fps, (length - 1) / fps] around the first frame."""
     first = round(PRE_ROLL_S * RATE) - SIZE
     return sound[first : first + length * SIZE]
-
-
-@pytest.fixture(scope="module")
-def silent(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("silent") / "dataset"
-    make_dataset(root, LENGTHS, repo_id="test/silent", image_size=16, microphones=())
-    return root
 
 
 @pytest.fixture(scope="module")
@@ -258,17 +250,3 @@ def test_a_file_that_names_others_or_is_a_link_is_not_followed(with_files, tmp_p
 def test_options_that_do_not_fit_are_told(with_files, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
         attach(with_files, tmp_path / "x", **options)
-
-
-def test_files_may_lie_elsewhere_and_are_not_copied(with_files, tmp_path):
-    """`audio_path` with the chunk before the microphone."""
-    shutil.copytree(with_files, tmp_path / "files")
-    template = "audio/chunk-{chunk_index:03d}/{audio_key}/file-{file_index:03d}.m4a"
-    change_info(tmp_path / "files", lambda info: info.update(audio_path=template))
-    (tmp_path / "files/audio/chunk-000").mkdir()
-    for key in (TABLE, EARS):
-        (tmp_path / f"files/audio/{key}/chunk-000").rename(tmp_path / f"files/audio/chunk-000/{key}")
-    root = attach(tmp_path / "files", tmp_path / "columns")
-    once = attach(with_files, tmp_path / "once")
-    assert not (root / "audio").exists()
-    assert contents(root)["data/chunk-000/file-000.parquet"] == contents(once)["data/chunk-000/file-000.parquet"]

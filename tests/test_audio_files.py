@@ -7,13 +7,11 @@ from fractions import Fraction
 import av
 import numpy as np
 import pytest
-from dataset_factory import MICROPHONE, make_dataset
 
 from lerobot_playbyear.audio import cut_into_frames, read_audio, resample, write_audio
 from lerobot_playbyear.audio.attach_audio import _checked_pieces
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces
 from lerobot_playbyear.audio.lerobot_audio import AudioTrack
-from lerobot_playbyear.datasets import audio_feature, audio_keys, check_audio_features, episode_waveform
 
 RATE, FPS = 16000, 20
 SIZE = RATE // FPS
@@ -57,18 +55,6 @@ def test_other_depths_are_rounded_to_16_bits(tmp_path, width, tolerance):
         file.writeframes(data)
     samples, _ = read_audio(tmp_path / "sound.wav")
     assert np.abs(samples[:, 0].astype(int) - waveform).max() <= tolerance
-
-
-def test_flac_of_24_bits_is_rounded(tmp_path):
-    waveform = tone(440, RATE, 0.3)
-    with av.open(str(tmp_path / "deep.flac"), "w") as container:
-        stream = container.add_stream("flac", rate=RATE, layout="mono", format="s32")
-        frame = av.AudioFrame.from_ndarray((waveform.astype(np.int32) << 16).reshape(1, -1), "s32", "mono")
-        frame.sample_rate = RATE
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
-    samples, _ = read_audio(tmp_path / "deep.flac")
-    np.testing.assert_array_equal(samples[:, 0], waveform)
 
 
 def write_film(path, seconds: float, sound: np.ndarray | None, sound_from: float = 0.0) -> None:
@@ -176,16 +162,6 @@ def test_resampling_removes_what_the_new_rate_cannot_hold():
     assert np.abs(resample(tone(12000, 48000, 1), 48000, 16000)[1600:-1600]).max() < 30
 
 
-def test_resampling_treats_channels_alike_and_floats_as_floats():
-    both = np.stack([tone(500, 44100, 0.2), tone(700, 44100, 0.2)], axis=1)
-    result = resample(both, 44100, 48000)
-    assert result.shape == (9600, 2)
-    np.testing.assert_array_equal(result[:, 1], resample(both[:, 1], 44100, 48000))
-    floats = resample(both[:, 0].astype(np.float32) / 32768, 44100, 48000)
-    assert floats.dtype == np.float32
-    np.testing.assert_allclose(floats * 32768, result[:, 0], atol=0.6)
-
-
 # From a file to frames
 
 
@@ -217,49 +193,6 @@ def test_a_file_that_is_too_short_is_refused_or_filled():
 
 
 # The contract of columns
-
-
-@pytest.mark.parametrize(("sample_rate", "fps", "samples"), [(16000, 20, 800), (48000, 20, 2400), (48000, 30, 1600)])
-def test_feature_holds_a_whole_number_of_samples(sample_rate, fps, samples):
-    feature = audio_feature(sample_rate, fps)
-
-    assert feature["shape"] == (samples,)
-    assert feature["info"] == {"sample_rate": sample_rate, "encoding": "pcm_s16"}
-    assert check_audio_features({MICROPHONE: feature}, fps) == {MICROPHONE: sample_rate}
-
-
-def test_a_frame_rate_that_does_not_divide_the_sample_rate_is_refused():
-    with pytest.raises(ValueError, match=r"16000 / 30 .* 15990 Hz"):
-        audio_feature(16000, 30)
-
-
-@pytest.mark.parametrize(
-    ("change", "fps", "message"),
-    [
-        ({"shape": (801,)}, 20, r"'observation.audio.gripper' has shape \(801,\).*\(800,\)"),
-        ({"info": None}, 20, "does not say its sample rate"),
-        ({"dtype": "int32"}, 20, "dtype 'int32'; wanted 'int16'"),
-        ({}, 10, r"shape \(800,\); at 16000 Hz and 10 frames per second it must be \(1600,\)"),
-        ({}, 30, "not a positive integer"),
-    ],
-)
-def test_broken_features_are_named(change, fps, message):
-    with pytest.raises(ValueError, match=message):
-        check_audio_features({MICROPHONE: {**audio_feature(16000, 20), **change}}, fps)
-
-
-def test_an_episode_is_heard_as_it_was_recorded(tmp_path):
-    dataset = make_dataset(tmp_path / "noise", episode_lengths=(4, 6), image_size=8)
-
-    waveform, sample_rate = episode_waveform(dataset, 1, MICROPHONE)
-    path = write_audio(tmp_path / "episode.wav", waveform, sample_rate)
-
-    with wave.open(str(path)) as file:
-        assert (file.getframerate(), file.getnchannels(), file.getnframes()) == (16000, 1, 6 * 800)
-        written = np.frombuffer(file.readframes(6 * 800), dtype="<i2")
-    stock = np.concatenate([dataset[i][MICROPHONE].numpy() for i in range(4, 10)])
-    assert np.array_equal(written, stock)
-    assert audio_keys(dataset.meta.features) == [MICROPHONE]
 
 
 def test_float_sound_is_written_at_full_scale(tmp_path):

@@ -1,8 +1,5 @@
 """What the benchmarks compare with is what they say, and their figures are put together rightly."""
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -35,48 +32,8 @@ def test_the_published_scheme_gives_our_actions_for_the_same_weights():
         torch.testing.assert_close(reference(images, sound, state), policy.predict_run(batch)[:, 0], rtol=0, atol=1e-4)
 
 
-def test_work_is_timed_in_turns_and_a_row_says_how_many_times_better():
-    from common import Row, in_turns
-
-    calls: list[str] = []
-    seconds = in_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, n_turns=3, warm_up=2)
-    assert calls == ["a", "b"] * 5
-    assert [len(values) for values in seconds.values()] == [3, 3]
-    assert str(Row("steps", 500.0, "steps/s", "other", 20.0)) == "| steps | 500 steps/s | other: 20 | 25 |  |"
-    slow = Row("latency", 40.0, "ms", "other", 80.0, "alone", 30.0)
-    assert str(slow) == "| latency | 40 ms | other: 80 | 2 | alone: 30 |"
-
-
-def test_the_memory_of_a_command_is_limited_and_measured(tmp_path):
-    from memory import GIB, measure
-
-    work = "b = bytearray(200 << 20); b[::4096] = b'1' * len(b[::4096]); import time; time.sleep(1)"
-    row = measure("work", [sys.executable, "-c", work], GIB, {})
-    assert 190 < row.ours <= row.theirs < 400
-    for failing, said in (("b = bytearray(2000 << 20)", "MemoryError"), ("raise SystemExit('no file')", "no file")):
-        with pytest.raises(RuntimeError, match=rf"(?s)work: status 1: .*{said}"):
-            measure("work", [sys.executable, "-c", failing], GIB, {})
-
-
 @pytest.mark.slow
 def test_every_command_reads_an_episode_as_the_memory_benchmark_makes_it(tmp_path):
     from memory import COMMANDS, GIB, long_episode
 
     assert len(long_episode(tmp_path, 2, 4 * GIB, list(COMMANDS))) == len(COMMANDS)
-
-
-def test_the_benchmark_for_gpus_runs_without_one(noise, tmp_path):
-    """Every part of it, with a network that learns nothing."""
-    options = (
-        "--batch_size=2 --policy.image_size=16 --policy.vision_width=4 --policy.n_supervised_steps=4 "
-        "--policy.hidden_size=32 --compile=false"
-    )
-    output = tmp_path / "bench.json"
-    small = (f"--root={noise}", "--device=cpu", f"--options={options}", f"--output={output}")
-    result = subprocess.run(
-        [sys.executable, BENCHMARKS / "gpu.py", *small], capture_output=True, text=True, check=False
-    )
-    assert result.returncode == 0, result.stderr[-3000:]
-    rows = {row["what"]: row for row in json.loads(output.read_text())["rows"]}
-    operations = rows["operations of an update over its time"]
-    assert 0 < operations["ours"] < operations["limit"]

@@ -14,12 +14,10 @@ import torch
 from dataset_factory import CAMERA, make_dataset
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.compute_stats import get_feature_stats
-from lerobot.datasets.video_utils import decode_video_frames
 from PIL import Image
 
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.parquet import with_values
-from lerobot_playbyear.datasets.pictures import video_pictures
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import sound_stats
 from lerobot_playbyear.film.dataset_film import encode
@@ -68,18 +66,6 @@ def write_video(path: Path, n_frames: int, size: tuple[int, int], **options: str
             shifted = np.ascontiguousarray(np.roll(picture, 3 * i, axis=1))
             container.mux(stream.encode(av.VideoFrame.from_ndarray(shifted, "rgb24")))
         container.mux(stream.encode(None))
-
-
-@pytest.mark.parametrize("options", [{"g": "2"}, {"g": "1000", "bf": "3", "preset": "fast"}], ids=["g=2", "B-frames"])
-def test_pictures_that_are_decoded_one_by_one_are_those_of_lerobot(tmp_path, options):
-    write_video(tmp_path / "film.mp4", 90, (48, 64), **options)
-    times = [(20 + i) / FPS + 2e-5 for i in range(60)] + [79 / FPS]
-    expected = decode_video_frames(tmp_path / "film.mp4", times, 1e-4, "pyav", return_uint8=True)
-    pictures = np.stack(list(video_pictures(tmp_path / "film.mp4", times, 1e-4)))
-    np.testing.assert_array_equal(pictures, expected.permute(0, 2, 3, 1))
-    for wrong in ([1.01], [2.9, 3.1], [50.0]):
-        with pytest.raises(ValueError, match=r"film\.mp4"):
-            list(video_pictures(tmp_path / "film.mp4", wrong, 1e-4))
 
 
 @pytest.mark.parametrize("episodes", [None, [0, 2]])

@@ -1,7 +1,6 @@
 """HG-DAgger: attempts, what is recorded of them, rounds, checkpoints that LeRobot's commands take."""
 
 import shutil
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +20,10 @@ from dagger_factory import (
     seeds,
     state,
 )
-from lerobot.envs import make_env, make_env_pre_post_processors
-from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_eval, lerobot_train
-from lerobot.scripts.lerobot_eval import rollout
 from safetensors.torch import load_file
-from support.shared import ENV, trained
+from support.shared import ENV, run_in_process, trained
 
-from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.methods import Method
@@ -36,7 +31,6 @@ from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -47,21 +41,6 @@ def _finished():
 
 
 # Attempts
-
-
-def test_a_policy_acts_as_in_lerobots_rollout():
-    env, actor, expert = scene()
-    episode = play(env, actor, seed=5, expert=expert)
-    env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=20)
-    policy = PlaybyearPolicy.from_pretrained(trained()).eval()
-    own = make_pre_post_processors(policy.config, str(trained()))
-    vec = make_env(env_cfg)["playbyear"][0]
-    result = rollout(vec, policy, *make_env_pre_post_processors(env_cfg, policy.config), *own, seeds=[5])
-    vec.close()
-    env.close()
-    expected = result["action"][0].clamp(-1, 1)
-    np.testing.assert_array_equal(episode.actions, expected)
-    assert not episode.interventions.any()
 
 
 def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the_policy_remembers_it_all():
@@ -110,16 +89,8 @@ def test_a_run_collects_learns_saves_and_evaluates(finished):
     for line in rounds[1:]:
         assert line["loss_demonstrations"] > 0
         assert line["loss_interventions"] > 0
-        parts = (
-            "simulation_s",
-            "inference_s",
-            "update_s",
-            "batch_s",
-            "loss_s",
-            "episode_saving_s",
-            "checkpoint_saving_s",
-        )
-        assert line["total_s"] == pytest.approx(sum(line[part] for part in parts), rel=0.2)
+        parts = ["simulation", "inference", "update", "batch", "loss", "episode_saving", "checkpoint_saving"]
+        assert line["total_s"] == pytest.approx(sum(line[f"{part}_s"] for part in parts), rel=0.2)
     assert {path.name for path in (finished / "out/checkpoints").iterdir()} == {"000002", "000004", "last", "best"}
     assert {(finished / "out/checkpoints" / name).resolve().name for name in ("last", "best")} == {"000004"}
     check_normalisation_is_kept(finished / "out/checkpoints/last/pretrained_model")
@@ -166,24 +137,14 @@ def check_normalisation_is_kept(tuned):
     assert any(key.endswith("weight") for key in changed)
 
 
-def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_path, monkeypatch):
-    policy = finished / "out/checkpoints/last/pretrained_model"
-
-    def run(function, *args):
-        monkeypatch.setattr(sys, "argv", ["lerobot", *map(str, args)])
-        function()
-
-    evaluation = (
-        "--env.episode_length=5",
-        "--eval.n_episodes=1",
-        "--eval.batch_size=1",
-        f"--output_dir={tmp_path / 'eval'}",
-    )
-    run(lerobot_eval.eval_main, f"--policy.path={policy}", *ENV, *evaluation)
+def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_path):
+    policy = f"--policy.path={finished / 'out/checkpoints/last/pretrained_model'}"
+    once = ("--env.episode_length=5", "--eval.n_episodes=1", "--eval.batch_size=1")
+    run_in_process(lerobot_eval.eval_main, policy, *ENV, *once, f"--output_dir={tmp_path / 'eval'}")
     assert (tmp_path / "eval/eval_info.json").exists()
     data = ("--dataset.repo_id=tests/corrections", f"--dataset.root={finished / 'corrections'}", "--num_workers=0")
     small = ("--steps=1", "--batch_size=2", "--dataset.video_backend=pyav", "--env_eval_freq=0")
-    run(lerobot_train.train, f"--policy.path={policy}", *data, *small, f"--output_dir={tmp_path / 'tuned'}")
+    run_in_process(lerobot_train.train, policy, *data, *small, f"--output_dir={tmp_path / 'tuned'}")
     assert (tmp_path / "tuned/checkpoints/000001").is_dir()
 
 

@@ -121,16 +121,6 @@ def test_every_intervention_frame_is_learned_from_alike():
     assert relative.max() < 2
 
 
-def test_a_batch_is_given_by_its_number_alone():
-    first, again = (
-        BalancedBatches(windows(4), store([40]), store([len(ATTEMPTS)], ATTEMPTS), 8, seed=3) for _ in range(2)
-    )
-    expected = [first.batch(number) for number in range(5)]
-    for key in ("action", "action_is_pad"):
-        assert torch.equal(again.batch(4)[key], expected[4][key])
-        assert not torch.equal(expected[3][key], expected[4][key])
-
-
 def test_what_was_shown_joins_the_demonstrations_frame_by_frame():
     shown = store([30], "x" * 30, first=N_DEMONSTRATIONS)
     batches = JoinedBatches(windows(4), store([40, 20]), shown, batch_size=12)

@@ -76,17 +76,3 @@ def test_the_policy_that_a_run_began_with_may_be_the_best_and_other_episodes_are
         assert gives == []
         assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
     assert [line["pc_success"] for line in metrics(tmp_path, "eval")] == [30, 20, 40]
-
-
-@pytest.mark.slow
-def test_the_best_of_other_episodes_is_kept_when_a_run_that_has_ended_is_evaluated_again(tmp_path, gives):
-    gives += [10, 60]
-    dagger(tmp_path, *RUN, "--episodes=1")  # evaluated at its end, which is no milestone
-    best = tmp_path / "out/checkpoints" / state(tmp_path)["checkpoint"]
-    gives += [20]
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=2")
-    gives += [5]
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=2")
-    assert state(tmp_path)["best"]["success"] == 5
-    assert best.name != state(tmp_path)["checkpoint"]
-    assert (best / "pretrained_model/model.safetensors").is_file()

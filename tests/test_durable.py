@@ -15,8 +15,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot.datasets.aggregate import aggregate_datasets
-from lerobot.datasets.dataset_tools import delete_episodes
 from lerobot.datasets.io_utils import load_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from recording_factory import (
@@ -162,17 +160,6 @@ def test_lerobot_goes_on_with_our_dataset_and_we_with_lerobots(tmp_path):
     dataset.finalize()
     write(root, [3], RICH_FEATURES)
     assert_recorded(root, range(4), RICH_FEATURES)
-
-
-def test_lerobot_merges_and_deletes(tmp_path):
-    write(tmp_path / "one", range(3), RICH_FEATURES)
-    write(tmp_path / "two", range(3, 5), RICH_FEATURES)
-    roots = [tmp_path / "one", tmp_path / "two"]
-    aggregate_datasets(["a/one", "a/two"], REPO_ID, roots=roots, aggr_root=tmp_path / "merged")
-    assert_recorded(tmp_path / "merged", range(5), RICH_FEATURES)
-    delete_episodes(load(tmp_path / "merged"), [1, 3], output_dir=tmp_path / "left", repo_id=REPO_ID)
-    write(tmp_path / "left", [7], RICH_FEATURES)
-    assert_recorded(tmp_path / "left", [0, 2, 4, 7], RICH_FEATURES)
 
 
 # Crashes

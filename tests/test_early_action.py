@@ -4,7 +4,6 @@ import copy
 import json
 from dataclasses import replace
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
@@ -14,7 +13,6 @@ from gym_playbyear import TASKS
 from gym_playbyear.environment import TaskEnv
 from gym_playbyear.terminations import ClosedUnheard
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_env_playbyear.attempts import AttemptsFile
 
 OPEN, CLOSE = -1.0, 1.0
 
@@ -44,24 +42,6 @@ def test_a_hand_that_closes_in_the_air_was_early_and_one_that_stays_open_was_not
         env.reset_physics(seed=3)
         told = {"is_success": False, "end": "time", "acted_early": early, "n_closings": int(early)}
         assert after(env, *commands) == told
-
-
-def test_what_a_task_kept_secret_stands_in_the_file_as_numbers(tmp_path):
-    env = gym.make("gym_playbyear:gym_playbyear/OccludedGrasp-v1", disable_env_checker=True, horizon=1, sound="none")
-    keeps = AttemptsFile(env, str(tmp_path / "attempts.jsonl"))
-    keeps.reset(seed=0)
-    env.unwrapped.secrets |= {
-        "kind": np.int64(2),
-        "heavy": np.True_,
-        "where": (0.5, np.float32(0.25)),
-        "env": env,
-        "no": None,
-    }
-    keeps.step(np.zeros(4))
-    told = json.loads((tmp_path / "attempts.jsonl").read_text())
-    assert {key: told[key] for key in ("kind", "heavy", "where")} == {"kind": 2, "heavy": True, "where": [0.5, 0.25]}
-    assert not {"env", "no"} & told.keys()
-    env.close()
 
 
 def test_only_the_first_closing_counts():

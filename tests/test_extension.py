@@ -2,18 +2,17 @@
 
 import json
 import sys
-from pathlib import Path
 
 import draccus
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from dataset_factory import make_dataset
 from lerobot.scripts import lerobot_eval, lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 from support.distributions import install_example, longest_file
 from support.policy import MICROPHONE, make_config, make_episode, make_policy, run_ending_at, step_through
+from support.shared import ENV, TINY, run_in_process
 from torch import nn
 
 from lerobot_playbyear.audio.microphone_pictures import read_strip
@@ -42,61 +41,22 @@ def test_the_examples_are_short(example):
     assert longest_file(example) < 100
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory) -> Path:
-    root = tmp_path_factory.mktemp("data") / "noise"
-    make_dataset(root, (12, 17), image_size=16)
-    return root
-
-
-def call(command, *arguments: str | Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", [command.__name__, *map(str, arguments)])
-        command()
-
-
 @pytest.mark.parametrize(
     "command",
     [train, pytest.param(lerobot_train.main, marks=pytest.mark.slow)],
     ids=["playbyear-train", "lerobot-train"],
 )
-def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, dataset, tmp_path):
-    call(
-        command,
-        "--policy.type=playbyear",
-        "--policy.audio_encoder=spectrogram_gru",
-        "--policy.audio_steps=[remove_offset]",
-        "--policy.device=cpu",
-        "--policy.push_to_hub=false",
-        "--policy.image_size=16",
-        "--policy.vision_width=4",
-        "--policy.audio_window_s=0.9",
-        "--policy.n_memory_steps=2",
-        "--policy.hidden_size=32",
-        "--dataset.repo_id=tests/noise",
-        f"--dataset.root={dataset}",
-        "--num_workers=0",
-        "--batch_size=2",
-        "--steps=2",
-        "--seed=3",
-        f"--output_dir={tmp_path / 'train'}",
-    )
+def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, noise, tmp_path):
+    own = ("--policy.audio_encoder=spectrogram_gru", "--policy.audio_steps=[remove_offset]")
+    data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}")
+    run_in_process(command, *TINY, *own, *data, "--steps=2", f"--output_dir={tmp_path / 'train'}")
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
     saved = json.loads((checkpoint / "config.json").read_text())
     assert (saved["audio_encoder"], saved["vision_encoder"]) == ("spectrogram_gru", "resnet18")
     steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
     assert [step["registry_name"] for step in steps][-2:] == ["remove_offset", "normalizer_processor"]
-    call(
-        lerobot_eval.main,
-        f"--policy.path={checkpoint}",
-        "--env.type=playbyear",
-        "--env.task=OccludedGrasp-v1",
-        "--env.image_size=16",
-        "--env.episode_length=5",
-        "--eval.n_episodes=1",
-        "--eval.batch_size=1",
-        f"--output_dir={tmp_path / 'eval'}",
-    )
+    once = ("--env.episode_length=5", "--eval.n_episodes=1", "--eval.batch_size=1")
+    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *once, f"--output_dir={tmp_path / 'eval'}")
     assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
 
 

@@ -3,25 +3,29 @@ nothing is counted that is not on the disk. All else that is wrong is said, with
 
 import contextlib
 import errno
+import itertools
 import json
 import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-from recording_factory import FEATURES, FILM, RICH_FEATURES, differences, episode_frames, load
+from recording_factory import FEATURES, FILM, REPO_ID, RICH_FEATURES, differences, episode_frames, load
 from support.recording import add_episode, assert_recorded, everything, write, write_episode, writer
 
 from lerobot_playbyear.datasets import durable, episode_files, files
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, has_dataset
+from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.survey import DatasetDamagedError
 from lerobot_playbyear.episodes.frames import save_or_ask
+from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
 from lerobot_playbyear.repair import repair_dataset
+from lerobot_playbyear.training import EpisodeStore
 
 TWO_FILMS = {**RICH_FEATURES, FILM + "2": RICH_FEATURES[FILM]}
 
@@ -91,7 +95,6 @@ def test_a_save_on_a_full_disk_is_repeated_when_there_is_room(disk):
 
 
 FAULTS = {
-    "full disk": lambda: OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
     "broken disk": lambda: OSError(errno.EIO, os.strerror(errno.EIO)),
     "interrupt": KeyboardInterrupt,
 }
@@ -102,7 +105,6 @@ FAULTS = {
     [
         (os, "replace", 1, "interrupt"),
         (os, "fsync", 4, "broken disk"),
-        (episode_files, "encode_video_frames", 1, "full disk"),
         (episode_files, "encode_video_frames", 1, "interrupt"),
     ],
 )
@@ -319,32 +321,41 @@ def test_what_is_damaged_is_neither_dropped_nor_made_anew_in_passing(root, damag
     assert [path.name for path in (root / "images").iterdir()] == [".lock"]
 
 
-def test_the_command_that_is_named_makes_it_good(root):
-    cut(data_file(root, 1))
-    with pytest.raises(DatasetDamagedError, match=rf"(?s)othing was changed.*playbyear-repair --root={root}"):
-        writer(root)
-    repaired = repair_dataset(root).target
-    assert writer(repaired).num_episodes == N_EPISODES - 1
-    assert not differences(load(repaired), {0: 0, 1: 2, 2: 3}, FEATURES)
+READ_BY: dict[str, Callable[[Path], Any]] = {
+    "resume": lambda root: writer(root).close(),
+    "repair": lambda root: repair_dataset(root).dropped,
+    "check": lambda root: [str(each) for each in check_numbers(SurveyedDataset.open(REPO_ID, root))],
+    "train": lambda root: EpisodeStore.load(REPO_ID, root, device="cpu", keys=["action"]).ends,
+}
 
 
-@pytest.mark.parametrize(("code", "after"), [(errno.ESTALE, 0), (errno.EIO, 2), (errno.ENOMEM, 3)])
-def test_a_read_that_failed_once_costs_no_episode(root, monkeypatch, code, after):
-    """An error of the network or the disk while a data file is read; then it can be read again."""
-    real, calls = pq.ParquetFile.read_row_group, iter(range(1000))
+@pytest.mark.parametrize("what", READ_BY)
+def test_a_read_that_failed_once_costs_no_episode(root, monkeypatch, what):
+    """An error of the disk, the network or for lack of memory at each read of a table in turn: it is told as such, or what is
+    read is read again, and nothing is changed."""
+    before, expected, told = everything(root.parent), READ_BY[what](root), []
+    real, codes = pq.ParquetFile.read_row_group, itertools.cycle((errno.ESTALE, errno.EIO, errno.ENOMEM))
+    for fails_after in itertools.count():
+        calls = itertools.count()
 
-    def read_row_group(*args, **kwargs):
-        if next(calls) == after:
-            raise OSError(code, os.strerror(code))
-        return real(*args, **kwargs)
+        def read_row_group(*args, calls=calls, fails_after=fails_after, **kwargs):
+            if next(calls) == fails_after:
+                code = next(codes)
+                raise OSError(code, os.strerror(code))
+            return real(*args, **kwargs)
 
-    before = everything(root.parent)
-    with monkeypatch.context() as patch:
-        patch.setattr(pq.ParquetFile, "read_row_group", read_row_group)
-        with contextlib.suppress(DatasetWriteError, DatasetDamagedError):  # or it reads once more, and finds all well
-            writer(root).close()
-    assert everything(root.parent) == before
-    assert writer(root).num_episodes == N_EPISODES
+        with monkeypatch.context() as patch:
+            patch.setattr(pq.ParquetFile, "read_row_group", read_row_group)
+            try:
+                assert READ_BY[what](root) == expected
+            except (OSError, MemoryError, PlaybyearError) as error:
+                told.append(str(error))
+        assert everything(root.parent) == before
+        if next(calls) <= fails_after:
+            break
+    assert fails_after >= 3
+    assert not [error for error in told if "playbyear-repair" in error]
+    assert READ_BY[what](root) == expected
 
 
 @contextlib.contextmanager

@@ -14,12 +14,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from lerobot_playbyear.datasets.durable import DurableWriter
-from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import audio_feature
 from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.inspection import Finding
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
-from lerobot_playbyear.inspection.motion import sudden_sounds
 from lerobot_playbyear.inspection.sound import flat_tops, gaps, repeats
 from lerobot_playbyear.scripts.commands import inspect as main
 
@@ -242,17 +240,6 @@ def test_statistics_of_other_data_are_an_error(clean, tmp_path):
     assert "recompute_stats" in verdict.message
 
 
-def test_one_statistic_for_all_samples_of_a_microphone_is_understood(clean, tmp_path):
-    root = copy(clean, tmp_path)
-    samples = pq.read_table(root / "data")[MICROPHONE].combine_chunks().flatten().to_numpy().astype(float)
-    one = {"min": samples.min(), "max": samples.max(), "mean": samples.mean(), "std": samples.std()}
-    repeated = {name: [value] * BLOCK for name, value in one.items()}
-    edit(root, lambda stats: stats[MICROPHONE].update(repeated), "stats.json")
-    assert found(look(root)) == {}
-    edit(root, lambda stats: stats[MICROPHONE].update(max=[samples.max() * 2] * BLOCK), "stats.json")
-    assert list(found(look(root))) == ["statistics"]
-
-
 def change(root: Path, key: str, row: int, value: Any) -> None:
     """Another value in a column of the data; `value` may be a function of the one that is there."""
     (path,) = root.glob("data/*/*.parquet")
@@ -319,14 +306,6 @@ def test_interventions_and_success_are_counted(tmp_path):
     assert list(verdicts["success"].episodes) == [1]
 
 
-def test_actions_are_held_to_the_range_given(clean):
-    verdict = found(look(clean, action_range=[-0.5, 1.0]))["action range"]
-    assert verdict.level == "error"
-    assert verdict.figures["frames_outside"] > 10
-    with pytest.raises(InputError, match=r"action_range=\[1, -1\]"):
-        look(clean, action_range=[1, -1])
-
-
 def test_a_dataset_without_sound_or_cameras_says_so(tmp_path):
     keys = {key: feature for key, feature in features(sound=False).items() if key != CAMERA}
     verdicts = look(write(tmp_path / "dataset", clean_episodes(2), keys))
@@ -337,15 +316,6 @@ def test_a_dataset_without_sound_or_cameras_says_so(tmp_path):
 
 
 # Sound and motion
-
-
-def test_a_sudden_sound_is_placed_to_a_few_milliseconds():
-    rng = np.random.default_rng(1)
-    samples = rng.normal(0, 20, 2 * SAMPLE_RATE)
-    for second in (0.5, 1.25):
-        samples[int(second * SAMPLE_RATE) :][:2000] += rng.normal(0, 3000, 2000) * np.exp(-np.arange(2000) / 300)
-    assert sudden_sounds(samples, SAMPLE_RATE) == pytest.approx([0.5, 1.25], abs=0.005)
-    assert len(sudden_sounds(rng.normal(0, 3000, SAMPLE_RATE), SAMPLE_RATE)) == 0
 
 
 def test_sound_that_was_recorded_too_early_shows_as_a_lag(tmp_path):

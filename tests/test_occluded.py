@@ -112,49 +112,6 @@ def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
     assert ends.count("success") >= 0.75 * len(ends)  # the others shove the cube, which both searches move
 
 
-def test_the_twin_world_is_the_same_until_touch_and_sounds_otherwise_after_it():
-    """Every observation, byte for byte; `test_check.py` has the other tasks, whose sound it does not compare."""
-    env, twin = (make(CUBES[0], sound="waveform", hidden_object=there) for there in (True, False))
-    observation, other = (world.reset(seed=3)[0] for world in (env, twin))
-    expert = env.scripted_expert()
-
-    def step() -> list[dict]:
-        action = expert.act()
-        return [world.step(action)[0] for world in (env, twin)]
-
-    while env.contact_forces["gripper-cube"] == 0:
-        np.testing.assert_array_equal(observation["pixels"]["front"], other["pixels"]["front"])
-        for name in ("agent_pos", "audio.gripper"):
-            np.testing.assert_array_equal(observation[name], other[name])
-        observation, other = step()
-    n_heard = 0
-    while expert.phase != "hop":
-        n_heard += not np.array_equal(observation["audio.gripper"], other["audio.gripper"])
-        observation, other = step()
-    assert n_heard > 0
-    assert twin.contact_forces["gripper-cube"] == 0
-
-
-@pytest.mark.parametrize("task", CUBES)
-def test_it_comes_down_above_the_cube_while_the_touch_is_remembered(task):
-    """Of the expert's first search in every episode: lengths [m], and steps from the touch to the descent."""
-    env, beside, steps, heights = make(task), [], [], []
-    for seed in range(12):
-        env.reset_physics(seed=seed)
-        expert, of_sweep, n_steps = env.scripted_expert(), [], 0
-        while expert.phase != "descend":
-            if expert.phase == "sweep":
-                of_sweep.append(env.eef_position[2])
-            n_steps += expert.phase in ("dwell", "rise", "hover", "hop")
-            env.step_physics(expert.act())
-        beside.append(abs(env.position("cube")[1] - env.eef_position[1]))
-        steps.append(n_steps)
-        heights.append(np.median(of_sweep))
-    assert np.mean(beside) < 0.003
-    assert np.mean(np.array(steps) <= 18) > 0.8
-    assert np.ptp(heights) > 0.005
-
-
 def corrected(env, seed: int, policy: str) -> dict:
     """An episode of the expert or of a blind script, with the gate looking on; the last step's `info`."""
     env.reset_physics(seed=seed)
@@ -259,12 +216,12 @@ def test_a_cube_that_would_be_put_down_beside_the_tray_is_carried_back_and_then_
     assert min(ways[int(np.argmax(ways)) :]) > -0.02  # and not past the tray again
 
 
-def until_taken(env, gate, action, n_steps: int) -> int:
-    """The policy does the same at every step until the expert takes over; returns how often it did."""
+def until_taken(env, gate, action, n_steps: int, done=None) -> int:
+    """The policy wants the same at every step, and `done` happens, until the expert takes over; returns how often it did."""
     for step in range(n_steps):
         if gate.wants_control(action):
             return step
-        env.step_physics(action)
+        env.step_physics(action if done is None else done)
     raise AssertionError(f"nobody took over in {n_steps} steps")
 
 
@@ -290,14 +247,6 @@ def test_a_hand_that_is_about_to_land_on_the_cube_searches_anew():
     assert finish(env, Lifts(env), gate)["is_success"]
 
 
-def test_fingers_that_closed_on_nothing_bring_the_expert():
-    env, gate = at_phase("OccludedGrasp-v1", "sweep", horizon=350)
-    taken_after = until_taken(env, gate, np.array([0, 0, 0, 1.0]), 20)
-    assert gate.reason == "empty"
-    assert taken_after > 3
-    assert env.finger_positions.sum() < EMPTY_OPENING
-
-
 def test_a_hand_that_pushes_on_after_the_touch_is_stopped_in_time():
     env, gate = at_phase("OccludedGrasp-v1", "dwell")
     push = np.array([0.0, 0.2, 0.0, -1.0])
@@ -312,25 +261,23 @@ def test_a_hand_that_pushes_on_after_the_touch_is_stopped_in_time():
     assert not terminated
 
 
-def test_a_dropped_cube_brings_the_expert(patient):
-    env, gate = at_phase("OccludedPickPlace-v1", "carry")
-    close, open_ = np.array([0, 0, 0, 1.0]), np.array([0, 0, 0, -1.0])
-    for _ in range(60):  # the gate hears of a policy that holds on, and the hand lets go
-        if gate.wants_control(close):
-            break
-        env.step_physics(open_)
-    assert gate.reason == "dropped"
-
-
-def test_a_hand_that_rises_without_the_cube_brings_the_expert():
-    env, gate = at_phase("OccludedGrasp-v1", "hop")
-    up = np.array([0, 0, 0.4, -1.0])
-    for _ in range(10):
-        if gate.wants_control(up):
-            break
-        env.step_physics(up)
-    assert gate.reason == "missed"
-    assert env.eef_position[2] > 0.8 + MISSED_HEIGHT
+@pytest.mark.parametrize(
+    ("reason", "task", "phase", "told", "done"),
+    [
+        ("empty", "OccludedGrasp-v1", "sweep", (0, 0, 0, CLOSE), (0, 0, 0, CLOSE)),
+        ("missed", "OccludedGrasp-v1", "hop", (0, 0, 0.4, OPEN), (0, 0, 0.4, OPEN)),
+        ("dropped", "OccludedPickPlace-v1", "carry", (0, 0, 0, CLOSE), (0, 0, 0, OPEN)),  # of a policy that holds on
+    ],
+)
+def test_a_grasp_that_came_to_nothing_brings_the_expert(reason, task, phase, told, done, patient):
+    env, gate = at_phase(task, phase, horizon=350)
+    taken_after = until_taken(env, gate, np.array(told), 60, np.array(done))
+    assert gate.reason == reason
+    if reason == "empty":
+        assert taken_after > 3
+        assert env.finger_positions.sum() < EMPTY_OPENING
+    if reason == "missed":
+        assert env.eef_position[2] > 0.8 + MISSED_HEIGHT
 
 
 def test_an_expert_that_was_asked_stays_until_it_is_told():

@@ -77,13 +77,8 @@ def test_lerobot_records_trains_and_evaluates_it_without_a_change_here(tmp_path)
     assert run_in_process(record, *ENV, *data, "--dataset.num_episodes=1", "--num_workers=0") is None
     assert run_in_process(train, *TINY, *data, "--steps=1", f"--output_dir={tmp_path / 't'}") is None
     checkpoint = tmp_path / "t/checkpoints/last/pretrained_model"
-    small = [
-        "--env.episode_length=5",
-        "--eval.n_episodes=1",
-        "--eval.batch_size=1",
-        f"--output_dir={tmp_path / 'eval'}",
-    ]
-    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *small)
+    once = ["--env.episode_length=5", "--eval.n_episodes=1", "--eval.batch_size=1"]
+    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *once, f"--output_dir={tmp_path / 'eval'}")
     assert '"n_episodes": 1' in (tmp_path / "eval/eval_info.json").read_text()
 
 
@@ -120,10 +115,3 @@ def test_a_broken_distribution_says_so_and_breaks_nothing_else():
 def test_a_task_whose_physics_does_not_divide_its_control_steps_says_so():
     with pytest.raises(ValueError, match=r"StopAtTheTin-v1: physics_dt=0.003 s .* for example to 0.002"):
         replace(make_definition("StopAtTheTin-v1", {}), physics_dt=0.003)
-
-
-def test_tasks_and_their_options_that_there_are_not_are_named():
-    with pytest.raises(DecodingError, match=r"OccludedGrasp-v1.*StopAtTheTin-v1"):
-        PlaybyearEnvConfig(task="Nope-v1")
-    with pytest.raises(DecodingError, match="StopAtTheTin-v1 has no such option"):
-        PlaybyearEnvConfig(task="StopAtTheTin-v1", task_options={"colour": "blue"})

@@ -353,20 +353,6 @@ def test_no_episode_gets_the_pictures_of_another(copy):
     assert not differences(load(report.target), {0: 0}, RICH_FEATURES)
 
 
-def test_rows_without_a_number_cost_only_their_own_episode(copy):
-    root = copy("lerobot")
-    (path,) = files(root / "data")
-    table = pq.read_table(path)
-    with pq.ParquetWriter(path, table.schema) as writer:
-        for episode in range(N_EPISODES):
-            part = table.filter(pa.array(np.array(table.column("episode_index")) == episode))
-            if episode == 1:
-                place, kind = part.column_names.index("frame_index"), part.schema.field("frame_index").type
-                part = part.set_column(place, "frame_index", pa.array([None, *range(1, len(part))], kind))
-            writer.write_table(part)
-    assert list(repaired(root, RICH_FEATURES, lost=[1]).dropped) == [1]
-
-
 def test_pictures_in_files_are_read_in_the_folder_alone(copy):
     root = copy("one file")
     (path,) = files(root / "data")

@@ -1,13 +1,12 @@
 """`lerobot-rollout` with a microphone: policies hear in every strategy, and one without a microphone says so."""
 
-import runpy
 import sys
 from pathlib import Path
 
-import lerobot
 import lerobot_operator  # noqa: F401  (LeRobot finds the arm of joints then)
 import numpy as np
 import pytest
+from dataset_factory import make_dataset
 from lerobot.datasets import LeRobotDataset
 from lerobot.scripts import lerobot_rollout
 from support.shared import TINY, run_in_process
@@ -15,7 +14,6 @@ from support.shared import TINY, run_in_process
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets import audio_feature
-from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts.commands import train
@@ -24,29 +22,16 @@ from lerobot_playbyear.scripts.commands import train
 @pytest.fixture(scope="module")
 def arm_dataset(tmp_path_factory):
     """Two short episodes of the arm of joints, with a microphone."""
-    folder, rng = tmp_path_factory.mktemp("rollout"), np.random.default_rng(0)
     numbers = {"dtype": "float32", "shape": (3,), "names": ["shoulder.pos", "elbow.pos", "gripper.pos"]}
-    picture = {"dtype": "image", "shape": (48, 64, 3), "names": ["height", "width", "channel"]}
     features = {
-        "observation.images.front": picture,
+        "observation.images.front": {"dtype": "image", "shape": (48, 64, 3), "names": ["height", "width", "channel"]},
         "observation.state": numbers,
         "observation.audio.gripper": audio_feature(sample_rate=16000, fps=20),
         "action": numbers,
     }
-    with DurableWriter("tests/arm", folder / "arm", 20, features) as writer:
-        for _ in range(2):
-            for _ in range(12):
-                writer.add_frame(
-                    {
-                        "observation.images.front": rng.integers(0, 256, (48, 64, 3)).astype(np.uint8),
-                        "observation.state": rng.normal(size=3).astype(np.float32),
-                        "observation.audio.gripper": rng.normal(0, 3000, 800).astype(np.int16),
-                        "action": np.ones(3, np.float32),
-                        "task": "Reach out",
-                    }
-                )
-            writer.save_episode()
-    return folder / "arm"
+    root = tmp_path_factory.mktemp("rollout") / "arm"
+    make_dataset(root, (12, 12), features=features, repo_id="tests/arm")
+    return root
 
 
 def train_on(arm_dataset, folder, *options):
@@ -143,11 +128,3 @@ def test_a_policy_that_does_not_hear_acts(arm_dataset, told, monkeypatch, tmp_pa
     assert 5 <= len(told) <= 11
     assert all(sorted(action) == ["elbow.pos", "gripper.pos", "shoulder.pos"] for action in told)
     assert np.isfinite([list(action.values()) for action in told]).all()
-
-
-def test_lerobots_policy_server_refuses_the_policy_by_its_type():
-    """It takes what is in this list, and says the list to whoever asks for another. Read without grpc, which it needs."""
-    path = Path(lerobot.__file__).parent / "async_inference" / "constants.py"
-    constants = runpy.run_path(str(path))
-    assert "act" in constants["SUPPORTED_POLICIES"]
-    assert "playbyear" not in constants["SUPPORTED_POLICIES"]

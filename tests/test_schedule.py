@@ -1,17 +1,17 @@
 """The published recipe to the letter, and what becomes of the learning rate of a run that is to go on for longer."""
 
 import json
-import sys
 
 import pytest
 import torch
 from dataset_factory import dataset_features, make_dataset
 from lerobot.configs import parser
 from lerobot.scripts import lerobot_train
+from support.shared import run_in_process
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.scripts.commands import train as train_script
 from lerobot_playbyear.training import train as loop
-from lerobot_playbyear.training.command_line import apply_preset
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -19,17 +19,6 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 train = parser.wrap()(loop.train)
 
 TINY = ("--policy.device=cpu", "--policy.push_to_hub=false", "--policy.audio_window_s=0.9", "--num_workers=0")
-
-
-@pytest.fixture
-def command(monkeypatch):
-    """Runs a training script in this process, as the command line would."""
-
-    def run(function, *arguments):
-        monkeypatch.setattr(sys, "argv", ["train", *apply_preset(list(map(str, arguments)))])
-        return function()
-
-    return run
 
 
 # The published recipe
@@ -72,17 +61,17 @@ PUBLISHED = {
 }
 
 
-def test_the_preset_paper_is_the_published_recipe_to_the_letter(command, monkeypatch):
+def test_the_preset_paper_is_the_published_recipe_to_the_letter(monkeypatch):
     seen = []
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        command(train, "--preset=paper", "--dataset.repo_id=tests/noise")
+        run_in_process(train_script, "--preset=paper", "--dataset.repo_id=tests/noise")
     (cfg,) = seen
     assert {name: getattr(cfg.policy, name) for name in PUBLISHED} == PUBLISHED
     assert (cfg.batch_size, cfg.steps) == (16, 100_000)
 
 
-def test_the_preset_paper_keeps_adams_rate_constant_and_never_clips(command, tmp_path):
+def test_the_preset_paper_keeps_adams_rate_constant_and_never_clips(tmp_path):
     make_dataset(tmp_path / "data", (15, 12), image_size=16)
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={tmp_path / 'data'}")
     small = (
@@ -93,7 +82,7 @@ def test_the_preset_paper_keeps_adams_rate_constant_and_never_clips(command, tmp
         "--log_freq=1",
     )
 
-    command(train, "--preset=paper", *TINY, *data, *small, f"--output_dir={tmp_path / 'out'}")
+    run_in_process(train_script, "--preset=paper", *TINY, *data, *small, f"--output_dir={tmp_path / 'out'}")
 
     lines = [json.loads(line) for line in (tmp_path / "out/metrics.jsonl").read_text().splitlines()]
     saved = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/train_config.json").read_text())
@@ -120,9 +109,7 @@ def trained(tmp_path_factory):
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={folder / 'data'}")
     blind_and_deaf = ("--policy.type=playbyear", "--policy.use_vision=false", "--policy.use_audio=false")
     run = ("--policy.n_supervised_steps=2", "--steps=10", "--save_freq=5", "--batch_size=2", "--log_freq=1")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["train", *TINY, *data, *blind_and_deaf, *run, f"--output_dir={folder / 'out'}"])
-        train()
+    run_in_process(train, *TINY, *data, *blind_and_deaf, *run, f"--output_dir={folder / 'out'}")
     return folder / "out/checkpoints/last/pretrained_model/train_config.json"
 
 
@@ -136,17 +123,17 @@ def jumps(capfd):
     [train, pytest.param(lerobot_train.train, marks=pytest.mark.slow)],
     ids=["playbyear-train", "lerobot-train"],
 )
-def test_a_rate_that_rises_because_the_run_shall_be_longer_is_said(script, trained, command, tmp_path, capfd):
+def test_a_rate_that_rises_because_the_run_shall_be_longer_is_said(script, trained, tmp_path, capfd):
     resumed = ("--resume=true", f"--config_path={trained}", "--steps=20")
 
-    command(script, *resumed, f"--output_dir={tmp_path / 'out'}")
+    run_in_process(script, *resumed, f"--output_dir={tmp_path / 'out'}")
 
     (message,) = jumps(capfd)
     assert "planned for 10 updates" in message
     assert "from 1e-05 to 0.000505" in message
     advice = message.split("add ")[1].split()
     assert advice[:2] == ["--scheduler.num_warmup_steps=0", "--scheduler.num_decay_steps=10"]
-    command(script, *resumed, *advice[:2], f"--output_dir={tmp_path / 'low'}")
+    run_in_process(script, *resumed, *advice[:2], f"--output_dir={tmp_path / 'low'}")
     assert not jumps(capfd)
     state = json.loads((tmp_path / "low/checkpoints/last/training_state/scheduler_state.json").read_text())
     assert state["_last_lr"] == [pytest.approx(1e-5)]

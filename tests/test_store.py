@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import torch
-from dataset_factory import CAMERA, MICROPHONE, TASK, audio_feature, dataset_features, make_dataset, random_frame
+from dataset_factory import CAMERA, MICROPHONE, TASK, audio_feature, dataset_features, make_dataset
 from lerobot.datasets import LeRobotDataset
 from torch.utils.data import default_collate
 
@@ -61,29 +61,6 @@ def test_windows_are_those_of_lerobot_as_bytes_and_pcm(root, episodes):
     assert batch.pop("task") == expected["task"] == [TASK] * len(last)
     for key, values in batch.items():
         assert torch.equal(values, expected[key]), key
-
-
-def test_appended_episodes_are_as_good_as_read_ones(tmp_path):
-    features = dataset_features(image_size=16)
-    rng = np.random.default_rng(1)
-    episodes = [[{**random_frame(features, rng), "task": task} for _ in range(n)] for n, task in ((5, "a"), (8, "b"))]
-    writer = LeRobotDataset.create("tests/noise", FPS, features, root=tmp_path / "all", use_videos=False)
-    for frames in episodes:
-        for frame in frames:
-            writer.add_frame(dict(frame))
-        writer.save_episode()
-    writer.finalize()
-    whole = LeRobotDataset("tests/noise", tmp_path / "all")
-    expected = EpisodeStore.from_dataset(whole, device="cpu")
-    store = EpisodeStore.from_dataset(LeRobotDataset("tests/noise", tmp_path / "all", episodes=[0]), device="cpu")
-
-    store.append_episode(episodes[1])
-
-    assert (len(store), store.n_episodes, store.starts, store.ends) == (13, 2, [0, 5], [5, 13])
-    for i in range(13):
-        ours, theirs = (s.windows([i], DELTAS) for s in (store, expected))
-        assert ours.pop("task") == theirs.pop("task")
-        assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 
 # On the disk
@@ -185,15 +162,6 @@ def test_a_store_that_was_killed_at_random_times_is_whole(tmp_path, n_kills):
     assert answer["frames"] == 190
     assert answer["finished_early"] < n_kills, "no kill hit"
     assert not list((tmp_path / "cache").glob("*/*.part"))
-
-
-def test_a_column_that_was_cut_off_is_decoded_again_and_the_others_stay(root, tmp_path, decoded):
-    decoded[CAMERA] = KeyboardInterrupt()
-    with pytest.raises(KeyboardInterrupt):
-        load(root, tmp_path)
-    decoded.clear()
-    assert_same(load(root, tmp_path), in_memory(root))
-    assert CAMERA in decoded
 
 
 @pytest.fixture

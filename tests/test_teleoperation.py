@@ -17,7 +17,6 @@ from lerobot.teleoperators.keyboard import (
     KeyboardTeleopConfig,
 )
 
-from gym_playbyear.panda import CartesianController, Panda
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
 from lerobot_playbyear.dagger.methods import Method, Staying
@@ -35,7 +34,6 @@ from lerobot_playbyear.teleoperation.controls import (
     STAY,
     ActionMapping,
     Controls,
-    Gripper,
     KeyboardWindowTeleop,
     KeyboardWindowTeleopConfig,
     PersonLeftError,
@@ -136,23 +134,6 @@ def test_a_teleoperator_with_as_many_numbers_as_the_action_passes_them_on():
 def test_a_teleoperator_that_does_not_fit_and_directions_that_are_none_are_refused(features, directions, said):
     with pytest.raises(ExpertError, match=said):
         ActionMapping(features, ARM, directions, 0.3)
-
-
-def test_the_gripper_is_told_what_the_arm_carries_out():
-    """Whatever is wished, following the arm's own rule leaves both in the same state."""
-    controller = CartesianController(Panda(), control_hz=20)
-    controller.reset(np.array([-0.12, 0.0, 0.98]))
-    gripper, rng = Gripper(round(Panda().gripper_cooldown * 20)), np.random.default_rng(0)
-    n_changes = n_ignored = 0
-    for _ in range(400):
-        close, was_closed = bool(rng.random() < 0.5), gripper.is_closed
-        told = gripper.wish(close)
-        controller.command(np.array([0, 0, 0, 1.0 if told else -1.0]), controller.target)
-        gripper.follow(told)
-        assert controller._closed == gripper.is_closed == told
-        n_changes, n_ignored = n_changes + (told != was_closed), n_ignored + (told != close)
-    assert 5 <= n_changes <= 10
-    assert n_ignored > 50
 
 
 # Time and sound

@@ -1,7 +1,6 @@
 """playbyear-train learns what lerobot-train learns, and either continues the other's checkpoints."""
 
 import json
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.scripts.commands import train as train_script
 from lerobot_playbyear.training import EpisodeStore
 from lerobot_playbyear.training import train as loop
-from lerobot_playbyear.training.batches import PolicyWindows, first_of_each_task, runs_of_each_frame
+from lerobot_playbyear.training.batches import PolicyWindows, runs_of_each_frame
 from lerobot_playbyear.training.command_line import PRESETS, RECIPES, apply_preset, preset_options, with_long_store
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 from lerobot_playbyear.training.learner import noise_seed
@@ -136,13 +135,8 @@ def test_of_several_processes_a_resumed_one_draws_other_noise_than_at_the_begin(
 def test_lerobot_train_and_playbyear_train_continue_each_other(trained, command, tmp_path):
     ours = trained / "checkpoints" / "last"
 
-    command(
-        lerobot_train.train,
-        "--resume=true",
-        f"--config_path={config_of(ours)}",
-        "--steps=7",
-        f"--output_dir={tmp_path}",
-    )
+    options = ("--resume=true", f"--config_path={config_of(ours)}", "--steps=7", f"--output_dir={tmp_path}")
+    command(lerobot_train.train, *options)
     theirs = tmp_path / "checkpoints" / "last"
     assert step_of(theirs.resolve()) == 7
     command(train, "--resume=true", f"--config_path={config_of(theirs)}", "--steps=8")
@@ -152,15 +146,9 @@ def test_lerobot_train_and_playbyear_train_continue_each_other(trained, command,
 
 def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(trained, root, command, tmp_path):
     policy = trained / "checkpoints" / "last" / "pretrained_model"
-    options = (
-        "--preset=cpu",
-        "--steps=1",
-        "--batch_size=2",
-        "--policy.use_amp=false",
-        f"--output_dir={tmp_path / 'out'}",
-    )
+    options = ("--preset=cpu", "--steps=1", "--batch_size=2", "--policy.use_amp=false")
 
-    command(train_script, f"--policy.path={policy}", *data(root), *options)
+    command(train_script, f"--policy.path={policy}", *data(root), *options, f"--output_dir={tmp_path / 'out'}")
 
     tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (tuned["image_size"], tuned["vision_width"]) == (16, 4)
@@ -240,13 +228,6 @@ def test_the_cpu_preset_computes_in_bfloat16_where_that_is_faster(monkeypatch, c
     assert ("--policy.use_amp=true" in apply_preset(["--preset=cpu"])) == capable
     assert "--policy.use_amp=true" not in apply_preset(["--preset=cpu", "--policy.use_amp=false"])
     assert "--policy.use_amp=true" not in apply_preset(["--preset=paper"])
-
-
-def test_held_out_frames_are_shared_evenly_by_the_tasks(root):
-    reader = SimpleNamespace(values=lambda key: np.array([3] * 5 + [1] * 2 + [3] * 4))
-
-    assert first_of_each_task(reader, 9).nonzero().squeeze(1).tolist() == [0, 1, 2, 3, 5, 6]
-    assert first_of_each_task(reader, 0) is None
 
 
 @pytest.mark.parametrize("name", PRESETS)

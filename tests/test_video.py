@@ -2,7 +2,6 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -17,7 +16,7 @@ from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
-from lerobot_playbyear.film.rollout_film import VideoConfig, film, write_episode_film
+from lerobot_playbyear.film.rollout_film import VideoConfig, film
 from lerobot_playbyear.film.video import compose, episode_sound, write_film
 
 FPS, SAMPLE_RATE = 20, 16000
@@ -70,24 +69,6 @@ def test_two_microphones_are_left_and_right(tmp_path):
     left, right = np.abs(heard).mean(axis=1)
     assert right > 0.1
     assert left < 0.01
-
-
-def test_sound_of_a_rate_that_the_format_lacks_is_resampled(tmp_path):
-    rate = 30000
-    tone = (10000 * np.sin(2 * np.pi * 440 / rate * np.arange(40 * rate // FPS))).astype(np.int16)
-    pictures = [np.zeros((32, 32, 3), np.uint8)] * 40
-    observations = [{"audio.gripper": block} for block in tone.reshape(40, -1)]
-    episode = SimpleNamespace(observations=observations, watched=pictures)
-
-    write_episode_film(episode, tmp_path / "film.mp4", FPS)
-
-    shown, heard = decode(tmp_path / "film.mp4")
-    with av.open(str(tmp_path / "film.mp4")) as container:
-        played_rate = container.streams.audio[0].rate
-    assert len(shown) == 40
-    assert heard.shape[1] / played_rate == pytest.approx(40 / FPS, abs=0.1)
-    spectrum = np.abs(np.fft.rfft(heard[0]))
-    assert spectrum.argmax() * played_rate / heard.shape[1] == pytest.approx(440, abs=2)
 
 
 def test_a_film_without_microphones_is_silent(tmp_path):

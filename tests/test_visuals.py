@@ -3,7 +3,6 @@
 import copy
 
 import gymnasium as gym
-import mujoco
 import numpy as np
 import pytest
 
@@ -30,16 +29,6 @@ def test_everything_is_seen_where_it_is(task):
         stage.follow(env.model, env.data)
         np.testing.assert_array_equal(stage.data.xpos, env.data.xpos)
         np.testing.assert_array_equal(stage.data.xquat, env.data.xquat)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_the_simulation_and_the_policys_scene_hold_none_of_it(task):
-    env = make(task)
-    assert (env.model.nmesh, env.model.nmat, env.model.ntex) == (0, 0, 1)  # one texture: the sky
-    stage = PeopleView(env.definition, 64).model
-    assert stage.nmesh > 15
-    added = stage.geom_type == mujoco.mjtGeom.mjGEOM_MESH
-    assert not (stage.geom_contype[added] | stage.geom_conaffinity[added]).any()
 
 
 def test_who_watches_changes_nothing():
