@@ -132,7 +132,7 @@ class TaskEnv(gym.Env):
         self._peak_forces = np.zeros(len(self.pairs))
         self._cameras: dict[str, SceneRenderer] = {}  # those that have drawn
         self._people: PeopleView | None = None  # made when somebody looks
-        self._is_closed, self._n_steps = False, 0
+        self._is_closed, self.n_steps = False, 0
         self._expert_rng: np.random.Generator | None = None  # None before the first episode
         self._sensors = Proprioception(definition.sensors, definition.control_hz)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
@@ -228,7 +228,7 @@ class TaskEnv(gym.Env):
         seeds: Any = self.np_random.bit_generator.seed_seq
         sensors_rng = np.random.default_rng(seeds.spawn(1)[0])
         self._sensors = Proprioception(self.definition.sensors, self.control_hz, sensors_rng)
-        self._n_steps = 0
+        self.n_steps = 0
         mujoco.mj_forward(self.model, self.data)
         hold = np.repeat(self.data.ctrl[None].copy(), self._controller.n_substeps, axis=0)
         for _ in range(_SETTLE_STEPS):
@@ -256,10 +256,10 @@ class TaskEnv(gym.Env):
         if action.shape != (4,) or not np.isfinite(action).all():
             raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
         self._roll(self._controller.command(np.clip(action, -1, 1), self.eef_position))
-        self._n_steps += 1
+        self.n_steps += 1
         self._early_action.look(self)
         end = next((rule.name for rule in (self._success, *self._failures) if rule.applies(self)), None)
-        truncated = end is None and self._n_steps >= self._max_episode_steps
+        truncated = end is None and self.n_steps >= self._max_episode_steps
         info: dict[str, Any] = {"is_success": end == self._success.name}
         if end is not None or truncated:
             info |= {"end": end or "time", **self.secrets, **self._early_action.info()}

@@ -86,7 +86,7 @@ class EpisodeReader:
         tasks: The text of each task.
 
     Attributes:
-        repo_id, root, fps, features, tasks: As above.
+        repo_id, root, fps, features, files, tasks: As above.
         episodes: The episodes, in the order of their rows.
     """
 
@@ -95,8 +95,8 @@ class EpisodeReader:
     ) -> None:
         self.repo_id, self.root, self.fps, self.features, self.tasks = repo_id, root, fps, features, tasks
         self.episodes: list[EpisodeRows] = []
-        self._files = files
-        self._firsts: np.ndarray = np.cumsum([0, *(file.n_rows for file in self._files)])
+        self.files = files
+        self._firsts: np.ndarray = np.cumsum([0, *(file.n_rows for file in self.files)])
         self._rows: np.ndarray = np.arange(self._firsts[-1])  # where each row here is in the files, in order
 
     def __len__(self) -> int:
@@ -190,7 +190,7 @@ class EpisodeReader:
         """The rows from `start` to before `stop` of a column, file by file."""
         rows = self._rows[start:stop]
         begin, end = np.searchsorted(self._firsts, rows[[0, -1]], side="right") if len(rows) else (1, 0)
-        for file, first in zip(self._files[begin - 1 : end], self._firsts[begin - 1 :], strict=False):
+        for file, first in zip(self.files[begin - 1 : end], self._firsts[begin - 1 :], strict=False):
             own = rows[slice(*np.searchsorted(rows, [first, first + file.n_rows]))] - first
             if len(own):
                 column = file.read(int(own[0]), int(own[-1]) + 1, [key]).column(key)
@@ -302,7 +302,7 @@ class SurveyedDataset(EpisodeReader):
         try:
             found = survey(folder, thorough=False)
             dataset = cls(repo_id, found, episodes)
-            check_claims(folder, [file.footer for file in dataset._files], len(found.episodes))
+            check_claims(folder, [file.footer for file in dataset.files], len(found.episodes))
         except (InfoError, DatasetDamagedError) as error:
             raise InputError(str(error)) from error
         except (OSError, MemoryError) as error:

@@ -133,7 +133,7 @@ class DeafTask:
 
     def _view(self) -> DeafView:
         shown = {name: np.array(value, dtype=float) for name, value in self.env.camera_numbers().items()}
-        return DeafView(self._sensors.measure(self.env.true_proprioception(), self._rng), shown, self.env._n_steps)
+        return DeafView(self._sensors.measure(self.env.true_proprioception(), self._rng), shown, self.env.n_steps)
 
 
 Actions = Generator[np.ndarray, None, None]
