@@ -4,7 +4,8 @@
     python -m experiments.robot_loop train --name=deaf -- --policy.use_audio=false
     python -m experiments.robot_loop rollout --name=hearing --rollout=elsewhere \\
         --camera='{gripper: {type: microphone, file: outputs/other.wav, sample_rate: 16000}}'
-    python -m experiments.robot_loop correct dagger --name=hearing -- --method.type=weighted
+    python -m experiments.robot_loop correct dagger --name=hearing
+    python -m experiments.robot_loop dagger --name=hearing --heard=shuffled
 
 The arm runs in a process of its own; its sound is played into a PulseAudio server and comes back through PortAudio as from any
 sound card. Each step prints its command, keeps what the command says, and adds a line to results.jsonl. Recorded, attached and
@@ -26,6 +27,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lerobot_playbyear.datasets.parquet import with_values
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -153,11 +160,16 @@ class Loop:
         self._attach(
             "attach-corrections", "rollout_corrections", self.corrections, "corrections", self.attached_corrections
         )
-        output = self.fresh(self.own / "dagger")
+        kind = self.args.heard
+        heard = self.attached_corrections.with_name(f"attached_{kind}") if kind else self.attached_corrections
+        if kind:
+            shutil.copytree(self.attached_corrections, self.fresh(heard))
+            take_sound_away(heard, kind)
+        output = self.fresh(self.own / (f"dagger_{kind}" if kind else "dagger"))
         command = [
             *("playbyear-dagger", "--episodes=0", f"--updates={self.args.updates}"),
             *(f"--policy.path={self.checkpoint}", "--demos.repo_id=me/heard", f"--demos.root={self.attached}"),
-            *("--interventions.repo_id=me/corrections", f"--interventions.root={self.attached_corrections}"),
+            *("--interventions.repo_id=me/corrections", f"--interventions.root={heard}"),
             f"--output_dir={output}",
         ]
         self.run("dagger", command)
@@ -188,10 +200,10 @@ class Loop:
             server = SoundServer(folder, {"gripper": 1}, RATE)
             server.start()
             stack.callback(server.kill)
-            twin = ["--twin"] if self.args.twin else []
-            socket = stack.enter_context(simulation(folder, server.fifo("gripper"), f"--task={self.args.task}", *twin))
+            scene = [f"--task={self.args.task}", f"--image_size={self.args.pixels}", *["--twin"] * self.args.twin]
+            socket = stack.enter_context(simulation(folder, server.fifo("gripper"), *scene))
             options = (
-                *("--robot.type=playbyear_sim", f"--robot.socket={socket}"),
+                *("--robot.type=playbyear_sim", f"--robot.socket={socket}", f"--robot.image_size={self.args.pixels}"),
                 *(f"--robot.cameras={self.args.camera}", "--play_sounds=false"),
             )
             leader = ("--teleop.type=playbyear_sim_leader", f"--teleop.socket={socket}")
@@ -272,6 +284,26 @@ def figures(done: Done) -> dict[str, Any]:
     }
 
 
+def take_sound_away(root: Path, kind: str) -> None:
+    """Gives a dataset silence, or to every stretch between two marks the sound of another one ("shuffled")."""
+    files = sorted((root / "data").glob("*/*.parquet"))
+    tables = [pq.read_table(path) for path in files]
+    whole = pa.concat_tables(tables)
+    sound, begins = (np.stack(whole.column(key).to_numpy()) for key in ("observation.audio.gripper", "is_first"))
+    episodes = np.stack(whole.column("episode_index").to_numpy()).reshape(-1)
+    changes = np.flatnonzero(begins.reshape(-1).astype(bool) | np.diff(episodes, prepend=-1).astype(bool))
+    new, stretches = np.zeros_like(sound), np.split(sound, changes[1:])
+    if kind == "shuffled":
+        rng, order = np.random.default_rng(0), np.arange(len(stretches))
+        while (order == np.arange(len(stretches))).any():
+            order = rng.permutation(len(stretches))
+        for place, other in zip(np.split(new, changes[1:]), order, strict=True):
+            place[:] = stretches[other][np.arange(len(place)) % len(stretches[other])]
+    rows = iter(np.split(new, np.cumsum([len(table) for table in tables])[:-1]))
+    for path, table in zip(files, tables, strict=True):
+        pq.write_table(with_values(table, "observation.audio.gripper", next(rows).tolist()), path)
+
+
 def n_episodes(root: Path) -> int:
     """How many episodes a dataset has; 0 if it is not there."""
     info = root / "meta" / "info.json"
@@ -295,6 +327,7 @@ def main() -> None:
     parser.add_argument("--policy", type=Path, help="another policy's folder, instead of the one that was trained")
     parser.add_argument("--task", default="OccludedGrasp-v1")
     parser.add_argument("--camera", default=CAMERA, help="--robot.cameras, microphones among them")
+    parser.add_argument("--pixels", type=int, default=84, help="of the arm's own camera")
     parser.add_argument("--twin", action="store_true", help="the hand passes through the hidden object, unheard")
     parser.add_argument("--preset", default="cpu", help="of playbyear-train; empty: none")
     parser.add_argument("--demonstrations", type=int, default=50)
@@ -304,6 +337,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=70000, help="of their first scene; 70000 to 70099 are held out")
     parser.add_argument("--corrected", type=int, default=25, help="scenes in which the policy is corrected")
     parser.add_argument("--correction_seed", type=int, default=10000, help="of the first of them")
+    parser.add_argument("--heard", choices=("silent", "shuffled"), help="what corrections have in place of their sound")
     parser.add_argument("--updates", type=int, default=2000, help="of playbyear-dagger")
     parser.add_argument("--most_s", type=float, default=7200, help="after which a step on the robot is given up")
     at = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)

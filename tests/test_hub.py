@@ -188,6 +188,24 @@ def test_lerobot_trains_on_a_dataset_from_the_hub(pushed, hub, client, tmp_path)
     assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
 
 
+@pytest.mark.slow
+def test_our_commands_load_a_dataset_and_a_policy_from_the_hub_although_one_request_in_ten_fails(
+    pushed, hub, client, tmp_path
+):
+    hub.fault = one_in(10, seed=1)
+    assert_well(client.run("playbyear-inspect", f"--dataset.repo_id={DATASET}", "--json"))
+    assert content(client.snapshot(DATASET)) == content(pushed)
+    policy = ("--policy.push_to_hub=true", f"--policy.repo_id={POLICY}")
+    run = (*TINY, *policy, "--steps=2", f"--output_dir={tmp_path / 'out'}")
+    assert_well(client.run("playbyear-train", f"--dataset.repo_id={DATASET}", *run))
+    hub.fault = nothing_fails
+    evaluation = ("--eval.n_episodes=1", "--eval.batch_size=1", "--policy.device=cpu")
+    output = f"--output_dir={tmp_path / 'eval'}"
+    assert_well(client.run("lerobot-eval", f"--policy.path={POLICY}", *ENV, *evaluation, output))
+    assert (tmp_path / "eval" / "eval_info.json").is_file()
+    assert hub.faults()
+
+
 def test_a_policy_is_safe_without_the_hub_and_says_how_to_push_it_later(pushed, hub, client, tmp_path):
     hub.fault = lambda method, path: "cut" if method == "POST" else None
     policy = ("--policy.push_to_hub=true", "--policy.repo_id=tester/later", "--save_checkpoint=false")

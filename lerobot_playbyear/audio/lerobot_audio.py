@@ -159,7 +159,7 @@ def _track(
     root: Path, key: str, feature: dict, template: str, rows: pa.Table, seconds: float, start_time_s: float | None
 ) -> AudioTrack:
     if not key.startswith(AUDIO_PREFIX) or key == AUDIO_PREFIX or "/" in key or "\\" in key:
-        raise AudioLayoutError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>'. Rename it.")
+        raise AudioLayoutError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>', without '/'.")
     info = feature.get("info") or {}
     if not isinstance(info, Mapping):
         raise AudioLayoutError(f"'{key}': info is {info!r}; wanted fields such as sample_rate. Correct {INFO_PATH}.")
