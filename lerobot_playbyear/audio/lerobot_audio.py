@@ -115,7 +115,7 @@ def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> 
         template = info.get("audio_path") or DEFAULT_AUDIO_PATH
         if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
             raise AudioLayoutError(
-                f"{root / INFO_PATH}: audio_path is {template!r}; wanted e.g. {DEFAULT_AUDIO_PATH!r}."
+                f"{root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
             )
         rows, lengths = _episodes(root, sum(footer.num_rows for footer in footers))
         seconds, heard = sum(lengths) / fps, [key for key, own in features.items() if own["dtype"] == AUDIO_DTYPE]
