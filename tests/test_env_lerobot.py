@@ -96,7 +96,7 @@ def test_lerobots_rollout_sees_the_experts_succeed(policy_config):
     result = rollout(vec, policy, *env_processors, nothing, identity, seeds=[0, 1])
     assert result["success"].any(dim=1).tolist() == [True, True]
     lengths = (~result["done"]).sum(dim=1) + 1
-    steps = [env.unwrapped._n_steps for env in vec.envs]
+    steps = [env.unwrapped.n_steps for env in vec.envs]
     vec.close()
     assert lengths.max() == result["done"].shape[1]
     assert steps == lengths.tolist(), "an environment whose episode is over was simulated on"

@@ -213,7 +213,7 @@ attach-spectrogram | --dataset.root={deaf} | {deaf} has no sound in columns | pl
 # Films, inspection, microphones
 video | --seed=-1 | seed=-1: give 0 or more
 video | --attempts=0 | attempts=0: give at least 1
-video | --baseline=deaf | no blind baseline 'deaf'; there are: | search
+video | --baseline=deaf | no blind baseline 'deaf', only | search
 video | --policy.path={policy} --baseline=search | --baseline=search: it acts without a policy
 inspect | --action_range=[1,-1] | action_range=[1.0, -1.0]
 find-microphones | --seconds=0 | seconds=0

@@ -203,7 +203,7 @@ class MicrophoneCamera(Camera):
             logging.warning(
                 "%s saves no sound (save_to=none): a dataset with videos loses it, one with --dataset.video=false keeps "
                 "it in its pictures.",
-                self,
+                str(self),
             )
             return None
         folder = Path(config.save_to).expanduser() if config.save_to else SESSIONS
@@ -213,7 +213,7 @@ class MicrophoneCamera(Camera):
         logging.info(
             "%s listens. All that it hears, voices too, is written to %s, %.1f MB a minute, and what stands in its "
             "pictures is sound as well.",
-            self,
+            str(self),  # a record of the log may be kept
             path,
             120 * config.sample_rate / 1e6,
         )
@@ -246,7 +246,7 @@ class MicrophoneCamera(Camera):
             raise DeviceNotConnectedError(f"{self}: {self._file.error}. Make room, and begin again.")
         is_mute = card.recording.zeros_s(self.config.channel) > _ZEROS_S
         if is_mute and not self._was_mute:
-            logging.warning("%s gives nothing but zeros: it is muted, or unplugged.", self)
+            logging.warning("%s gives nothing but zeros: it is muted, or unplugged.", str(self))
         self._was_mute = is_mute
         with self._reading:
             return self._picture(card.newest(self._session))
