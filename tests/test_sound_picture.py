@@ -279,7 +279,7 @@ def test_a_rollout_shows_what_the_dataset_holds_bit_for_bit(recorded):
     ("options", "message"),
     [
         ({"spectrogram": "/nonexistent"}, "cannot be read"),
-        ({"sound": "none"}, "has no sound to show"),
+        ({"sound": "none"}, "--env.sound=none has no sound"),
         ({"microphones": ["table"]}, "the microphone 'gripper'; the environment has table"),
         ({"sample_rate": 48000}, "sample_rate=16000; the environment has 48000"),
         ({"task": "TellApart-v1"}, "sample_rate=16000|fps=20; the environment has"),

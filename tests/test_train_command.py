@@ -100,8 +100,8 @@ def test_its_options_are_kept_where_lerobot_does_not_stumble_over_them(trained):
 
 def test_measuring_held_out_episodes_changes_nothing_that_is_learned(trained, root, command, tmp_path):
     held_out = ("--dataset.eval_split=0.25", "--eval_steps=0", "--policy.n_supervised_steps=4")
-    command(train, *TINY, *data(root), "--steps=6", *held_out, f"--output_dir={tmp_path}")
-    ours, theirs = (weights_of(folder / "checkpoints" / "last") for folder in (tmp_path, trained))
+    command(train, *TINY, *data(root), "--steps=6", *held_out, f"--output_dir={tmp_path / 'out'}")
+    ours, theirs = (weights_of(folder / "checkpoints" / "last") for folder in (tmp_path / "out", trained))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 

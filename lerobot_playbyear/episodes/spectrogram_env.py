@@ -105,7 +105,7 @@ def pictures_for(
             raise InputError(f"{path} has pictures of the microphone '{microphone}'; the environment has {heard}")
         for name, seen, wanted in (("sample_rate", sample_rates[microphone], how.sample_rate), ("fps", fps, how.fps)):
             if seen != wanted:
-                raise InputError(f"{path} has pictures of '{microphone}' for {name}={wanted}, the environment {seen}")
+                raise InputError(f"{path} shows '{microphone}' with {name}={wanted}; the environment has {seen}")
         if how.name in cameras:
             raise InputError(
                 f"{path} has pictures of '{microphone}' that are called '{how.name}', as a camera of the environment is; "
