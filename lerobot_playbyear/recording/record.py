@@ -102,8 +102,15 @@ def record(cfg: RecordConfig) -> Path:
             with errors_of_input():
                 _check_facts(facts, cfg.env)
                 features = dataset_features(facts, cfg.dataset.video)
-                what, encoder = (cfg.dataset.repo_id, root, facts.fps, features), cfg.dataset.rgb_encoder
-                writer = DurableWriter(*what, resume=cfg.resume, robot_type=cfg.env.type, rgb_encoder=encoder)
+                writer = DurableWriter(
+                    cfg.dataset.repo_id,
+                    root,
+                    facts.fps,
+                    features,
+                    resume=cfg.resume,
+                    robot_type=cfg.env.type,
+                    rgb_encoder=cfg.dataset.rgb_encoder,
+                )
             with writer:
                 seconds = writer.longest_episode / facts.fps
                 print(f"With the memory that is free an episode can last about {seconds / 60:.0f} min.")
