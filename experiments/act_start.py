@@ -2,11 +2,15 @@
 
     python -m experiments.act_start outputs/seen outputs/start dim_model=128
     lerobot-train --policy.path=outputs/start --dataset.use_imagenet_stats=false --dataset.root=outputs/seen ...
+    python -m experiments.act_start outputs/demos outputs/start dim_model=128 --crop gripper=0,96,95,64 --size=48
 
 LeRobot's ACT sees with a ResNet whose batch norms are frozen: their statistics come with pretrained weights, which are
 downloaded. With random weights, statistics of 0 and 1 and pictures normalised as ImageNet's the encodings of different
 frames are much alike. Here the statistics are those of the dataset's own pictures under the random weights, as a batch norm
 that learns has them at first. The command prints by how much the encodings of 200 frames differ, relative to their size.
+
+With `--crop` and `--size` LeRobot's own step for it, `image_crop_resize_processor`, stands in the checkpoint's preprocessor:
+what a microphone's picture carries beside its spectrogram can be cut away.
 """
 
 import argparse
@@ -23,6 +27,7 @@ from lerobot.datasets.factory import IMAGENET_STATS
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.processor import ImageCropResizeProcessorStep
 from lerobot.utils.constants import OBS_IMAGES, OBS_STR
 from torch import Tensor, nn
 from torch.nn import functional
@@ -34,7 +39,9 @@ _N_FRAMES = 200
 _NOTE = "start.json"
 
 
-def saved_start(options: Sequence[str], dataset: Path, folder: Path, seed: int) -> str:
+def saved_start(
+    options: Sequence[str], dataset: Path, folder: Path, seed: int, crop: ImageCropResizeProcessorStep | None = None
+) -> str:
     """An ACT that has learned nothing, with its processors; made and saved unless it is there.
 
     Args:
@@ -42,14 +49,15 @@ def saved_start(options: Sequence[str], dataset: Path, folder: Path, seed: int) 
         dataset: Folder of the dataset whose pictures it shall tell apart.
         folder: Of the checkpoint; one that was made with other arguments is made anew.
         seed: Of the weights and of the pictures that are looked at.
+        crop: What the preprocessor does with pictures first.
 
     Returns:
         The command that makes it.
     """
-    note, made = folder / _NOTE, [*options, dataset.name, seed]
+    note, made = folder / _NOTE, [*options, dataset.name, seed, *([crop.get_config()] if crop else [])]
     if not note.exists() or json.loads(note.read_text()) != made:
         shutil.rmtree(folder, ignore_errors=True)
-        policy, processors, pictures = _prepared(options, dataset, seed)
+        policy, processors, pictures = _prepared(options, dataset, seed, crop)
         calibrate(policy.model.backbone, alike(pictures.values()))
         for part in (policy, *processors):
             part.save_pretrained(folder)
@@ -69,13 +77,17 @@ def difference(backbone: nn.Module, images: Tensor) -> float:
     return float(encoded.var(dim=0).mean().sqrt() / encoded.square().mean().sqrt())
 
 
-def _prepared(options: Sequence[str], dataset: Path, seed: int) -> tuple[Any, tuple[Any, Any], dict[str, Tensor]]:
+def _prepared(
+    options: Sequence[str], dataset: Path, seed: int, crop: ImageCropResizeProcessorStep | None = None
+) -> tuple[Any, tuple[Any, Any], dict[str, Tensor]]:
     """A new policy, its processors, and normalised pictures of every camera, (n, 3, H, W)."""
     config = draccus.parse(ACTConfig, args=["--device=cpu", *(f"--{option}" for option in options)])
     data = LeRobotDataset(f"experiments/{dataset.name}", root=dataset, video_backend="pyav")
     torch.manual_seed(seed)
     policy = make_policy(config, ds_meta=data.meta)
     processors = make_pre_post_processors(config, dataset_stats=data.meta.stats)
+    if crop:
+        processors[0].steps = [crop, *processors[0].steps]
     return policy, processors, _pictures(data, processors[0])
 
 
@@ -119,10 +131,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="of the checkpoint that is made")
     parser.add_argument("options", nargs="*", help="of ACT, NAME=VALUE; pretrained_backbone_weights=null is added")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--crop", nargs="*", default=[], help="CAMERA=TOP,LEFT,HEIGHT,WIDTH [pixels]")
+    parser.add_argument("--size", type=int, help="to which all pictures are resized [pixels]")
     given = parser.parse_args()
     options = list(dict.fromkeys(["pretrained_backbone_weights=null", *given.options]))
-    saved_start(options, given.dataset, given.folder, given.seed)
-    policy, _, pictures = _prepared(options, given.dataset, given.seed)
+    cuts = {
+        f"{OBS_IMAGES}.{name}": [int(x) for x in cut.split(",")] for name, cut in (c.split("=") for c in given.crop)
+    }
+    crop = ImageCropResizeProcessorStep(cuts, given.size and [given.size] * 2) if cuts or given.size else None
+    saved_start(options, given.dataset, given.folder, given.seed, crop)
+    policy, _, pictures = _prepared(options, given.dataset, given.seed, crop)
     backbone = policy.model.backbone
     mean, deviation = (torch.tensor(IMAGENET_STATS[name]) for name in ("mean", "std"))
     stats = LeRobotDataset(f"experiments/{given.dataset.name}", root=given.dataset, video_backend="pyav").meta.stats
