@@ -24,7 +24,7 @@ from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.survey import DatasetDamagedError
 from lerobot_playbyear.episodes.frames import save_or_ask
 from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
-from lerobot_playbyear.repair import repair_dataset
+from lerobot_playbyear.repair.repair import repair_dataset
 from lerobot_playbyear.training import EpisodeStore
 
 TWO_FILMS = {**RICH_FEATURES, FILM + "2": RICH_FEATURES[FILM]}

@@ -37,7 +37,7 @@ from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.journal import lock_dataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
-from lerobot_playbyear.repair import RepairReport, repair_dataset
+from lerobot_playbyear.repair.repair import RepairReport, repair_dataset
 from lerobot_playbyear.scripts.commands import repair as repair_command
 
 N_EPISODES = 6

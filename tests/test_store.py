@@ -186,7 +186,7 @@ def test_nan_is_refused_by_every_run_with_the_episode_that_holds_it(with_nan, tm
     options = {**options, "cache": tmp_path / "cache"} if options else {}
     for key in (MICROPHONE,) if "sample_rates" in options else (MICROPHONE, "observation.state"):
         for _ in range(2):
-            with pytest.raises(ValueError, match=rf"'{key}' holds NaN .* of 3 episodes \(0\)"):
+            with pytest.raises(ValueError, match=rf"'{key}' holds NaN .* in episode 0 of 3"):
                 in_memory(with_nan, keys=[key], **options)
 
 

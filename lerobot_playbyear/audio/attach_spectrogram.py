@@ -3,7 +3,6 @@
 LeRobot is imported when the dataset's files have been looked at.
 """
 
-import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ from lerobot_playbyear.audio.attach_audio import open_for_copy, output_folder, w
 from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture, picture_feature
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
+from lerobot_playbyear.datasets.pictures import encode_picture
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader, EpisodeRows
 
 if TYPE_CHECKING:
@@ -77,11 +77,6 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
     target = output_folder(cfg.output)
     dataset = open_for_copy(cfg.dataset)
     plans = _plan(cfg, dataset)
-    if [episode.index for episode in dataset.episodes] != list(range(dataset.meta.total_episodes)):
-        raise AttachSpectrogramError(
-            f"The data files do not hold episodes 0 to {dataset.meta.total_episodes - 1} in this order. Repair the dataset "
-            f"first: playbyear-repair --root={dataset.root}"
-        )
     with errors_of_input():
         fitted = [_with_levels(dataset, plan, cfg) for plan in plans]
         write_new_dataset(dataset.root, target, {how.feature: _column(dataset, how) for how in fitted})
@@ -149,22 +144,19 @@ def _size(cfg: AttachSpectrogramConfig, features: dict) -> tuple[int, int]:
 
 
 def _columns_per_frame(cfg: AttachSpectrogramConfig, width: int, fps: int) -> int:
-    if not cfg.seconds > 0:
-        raise AttachSpectrogramError(f"--seconds={cfg.seconds:g}: wanted a number above 0.")
-    columns = int(width / (cfg.seconds * fps) + 1e-9)
-    if columns < 1:
+    if not 0 < cfg.seconds * fps <= width + 1e-6:
         raise AttachSpectrogramError(
-            f"--seconds={cfg.seconds:g}: {cfg.seconds * fps:g} frames do not fit into {width} columns, one each at least. Give "
-            f"at most {width / fps:.2f}, or a larger --width."
+            f"--seconds={cfg.seconds:g}: wanted above 0 and at most {width / fps:.2f}, since each frame takes one of {width} "
+            "columns at least. Give that, or a larger --width."
         )
-    return columns
+    return int(width / (cfg.seconds * fps) + 1e-6)
 
 
 def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrogramConfig) -> SoundPicture:
     """How one microphone's pictures are made, once all of its sound has been heard.
 
     Raises:
-        AttachSpectrogramError: There is nothing but silence, or the levels do not go together.
+        InputError: There is nothing but silence, or the levels do not go together.
     """
     edges = np.arange(FLOOR_DB, _LOUDEST_DB + _STEP_DB / 2, _STEP_DB)
     counts = np.zeros((plan.height, len(edges) - 1), np.int64)
@@ -173,8 +165,7 @@ def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrog
     for sound, n_heard in tqdm(heard, "Hearing", len(dataset), unit="frame", delay=1):
         levels = plan.levels(sound)[plan.begun(n_heard)]
         bins = np.clip(((levels - FLOOR_DB) / _STEP_DB).astype(int), 0, counts.shape[1] - 1)
-        for column in bins:
-            counts[bands, column] += 1
+        np.add.at(counts, (bands, bins), 1)
     counts[:, 0] = 0  # digital silence, which no microphone has: something is missing there
     total = counts.sum(axis=0)
     low, high = cfg.low_db, cfg.high_db
@@ -187,10 +178,6 @@ def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrog
     if high is None:
         high = max(float(edges[np.flatnonzero(total)[-1] + 1]), low + _LEAST_RANGE_DB)
     low, high = round(low, 1), round(high, 1)
-    if not FLOOR_DB <= low < high:
-        raise AttachSpectrogramError(
-            f"--low_db={low:g} and --high_db={high:g}: wanted {FLOOR_DB:g} or more, and the second above the first."
-        )
     halves = counts.sum(axis=1, keepdims=True) / 2
     median = edges[(np.cumsum(counts, axis=1) < halves).sum(axis=1)]  # (height,)
     usual = np.rint(255 * np.clip((median - low) / (high - low), 0, 1)).astype(int)
@@ -208,7 +195,8 @@ def _column(dataset: DatasetReader, how: SoundPicture) -> "AddedColumn":
     stats = [picture_stats(_pictures(dataset, how, episode)) for episode in episodes]
 
     def values(episode: int) -> list[dict[str, bytes | None]]:
-        return [{"bytes": _png(one), "path": None} for one in _pictures(dataset, how, dataset.episodes[episode])]
+        pictures = map(Image.fromarray, _pictures(dataset, how, dataset.episodes[episode]))
+        return [{"bytes": encode_picture(one, False, _COMPRESS_LEVEL), "path": None} for one in pictures]
 
     return AddedColumn(feature, stats, values)
 
@@ -227,9 +215,3 @@ def _contexts(dataset: DatasetReader, how: SoundPicture, episode: EpisodeRows) -
     sound = np.concatenate([np.zeros(how.context, sound.dtype), sound])
     for n_heard in range(how.samples_per_frame, (len(episode) + 1) * how.samples_per_frame, how.samples_per_frame):
         yield sound[n_heard : n_heard + how.context], min(n_heard, how.context)
-
-
-def _png(picture: np.ndarray) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, "PNG", compress_level=_COMPRESS_LEVEL)
-    return file.getvalue()

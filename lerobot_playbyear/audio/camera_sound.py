@@ -26,6 +26,7 @@ from lerobot_playbyear.audio.microphone_pictures import (
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.features import INTERVENTION, IS_FIRST, IS_FIRST_FEATURE, MICROPHONE, Features
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
+from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import numeric_stats
 
@@ -107,7 +108,7 @@ class _MicrophoneReader:
             self._read_episode(number, self._dataset.pictures(self._key, episode))
             for number, episode in enumerate(tqdm(self._dataset.episodes, desc=f"Reading {self._key}", unit="episode"))
         ]
-        raise_all([f"{self._key}, {_listed(episodes)}: {error}" for error, episodes in self._errors.items()])
+        raise_all([f"{self._key}, {name_episodes(episodes)}: {error}" for error, episodes in self._errors.items()])
         self._check_pace()
         for session, (start, stop) in self._taken.items():
             file = self._files[session]
@@ -253,8 +254,3 @@ def _came_from_the_hub(root: Path) -> bool:
     caches = [Path(HF_HUB_CACHE).resolve(), (HF_LEROBOT_HOME / "hub").resolve()]
     is_in_cache = any(root.resolve().is_relative_to(cache) for cache in caches)
     return is_in_cache or (root / ".cache" / "huggingface").exists()
-
-
-def _listed(episodes: list[int]) -> str:
-    named = ", ".join(map(str, episodes[:5])) + (", ..." if len(episodes) > 5 else "")
-    return f"episode{'s' if len(episodes) > 1 else ''} {named}"

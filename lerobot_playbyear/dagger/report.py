@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_playbyear.dagger.batches import stretches
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.run_folder import RunFolder, RunState
+from lerobot_playbyear.datasets.parquet import stretches
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.report import Progress
 

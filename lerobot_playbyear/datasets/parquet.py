@@ -222,6 +222,11 @@ def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
     return starts, [*starts[1:], len(episode_index)]
 
 
+def stretches(flags: np.ndarray) -> np.ndarray:
+    """Where flags (T,) are true without a gap, (n, 2): the first row of each stretch, and the one after its last."""
+    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
+
+
 def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
     """Writes a file with one row group per table, or several where a table is large: readers hold a whole one.
 

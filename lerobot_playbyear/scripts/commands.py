@@ -91,22 +91,20 @@ def repair() -> None:
 
 @command()
 def attach_audio() -> None:
-    from lerobot_playbyear.audio.attach_audio import AttachError, attach_audio
+    from lerobot_playbyear.audio.attach_audio import attach_audio
+    from lerobot_playbyear.datasets.errors import errors_of_input
 
-    try:
+    with errors_of_input(OSError):
         run_alone(attach_audio)
-    except OSError as error:
-        raise AttachError(f"The copy cannot be written: {error}") from error
 
 
 @command()
 def attach_spectrogram() -> None:
-    from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramError, attach_spectrogram
+    from lerobot_playbyear.audio.attach_spectrogram import attach_spectrogram
+    from lerobot_playbyear.datasets.errors import errors_of_input
 
-    try:
+    with errors_of_input(OSError):
         run_alone(attach_spectrogram)
-    except OSError as error:
-        raise AttachSpectrogramError(f"The copy cannot be written: {error}") from error
 
 
 @command()
