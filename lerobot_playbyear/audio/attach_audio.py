@@ -9,6 +9,7 @@ LeRobot is imported when the dataset's files have been looked at.
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -133,22 +134,18 @@ class PutAside:
         from lerobot_playbyear.datasets.statistics import sound_stats
 
         for channel, key in enumerate(self._keys):
-            np.save(self._file(key, len(self._stats[key])), blocks[..., channel])
+            np.save(self._folder / f"{key}-{len(self._stats[key])}.npy", blocks[..., channel])
             self._stats[key].append(sound_stats(blocks[..., channel]))
 
     def columns(self, sample_rate: int, fps: int) -> "Columns":
         """All that was added, as columns of a copy."""
         from lerobot_playbyear.audio.dataset_copy import AddedColumn
 
-        def column(key: str) -> AddedColumn:
-            return AddedColumn(
-                audio_feature(sample_rate, fps), self._stats[key], lambda episode: np.load(self._file(key, episode))
-            )
+        feature = audio_feature(sample_rate, fps)
+        return {key: AddedColumn(feature, self._stats[key], partial(self._blocks, key)) for key in self._keys}
 
-        return {key: column(key) for key in self._keys}
-
-    def _file(self, key: str, episode: int) -> Path:
-        return self._folder / f"{key}-{episode}.npy"
+    def _blocks(self, key: str, episode: int) -> np.ndarray:
+        return np.load(self._folder / f"{key}-{episode}.npy")
 
 
 def attach_audio(cfg: AttachAudioConfig) -> Path:

@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from lerobot_playbyear.audio.attach_audio import open_for_copy, output_folder, write_new_dataset
+from lerobot_playbyear.audio.attach_audio import AttachError, open_for_copy, output_folder, write_new_dataset
 from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture, picture_feature
-from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.errors import errors_of_input
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
 from lerobot_playbyear.datasets.pictures import encode_picture
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader, EpisodeRows
@@ -29,10 +29,6 @@ _STEP_DB = 0.1  # of the histogram of levels
 _LOUDEST_DB = 20.0  # a square wave at full scale has 2
 _QUIET_SHARE = 0.01
 _LEAST_RANGE_DB = 20.0  # so that the noise of a dataset in which nothing happens stays grey
-
-
-class AttachSpectrogramError(InputError):
-    """The pictures cannot be made; nothing was written."""
 
 
 @dataclass
@@ -95,21 +91,19 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPic
     try:
         rates = check_audio_features(features, fps)
     except ValueError as error:
-        raise AttachSpectrogramError(str(error)) from error
+        raise AttachError(str(error)) from error
     if not rates:
-        raise AttachSpectrogramError(
+        raise AttachError(
             f"The dataset in {dataset.root} has no sound in columns '{AUDIO_PREFIX}<microphone>'. Choose another, or add "
             "sound first: playbyear-attach-audio."
         )
     names = [key.removeprefix(AUDIO_PREFIX) for key in rates]
     for name in cfg.microphones or []:
         if name not in names:
-            raise AttachSpectrogramError(
-                f"--microphones names '{name}'; the dataset in {dataset.root} has {', '.join(names)}."
-            )
+            raise AttachError(f"--microphones names '{name}'; the dataset in {dataset.root} has {', '.join(names)}.")
     wanted = names if cfg.microphones is None else list(dict.fromkeys(cfg.microphones))
     if not wanted:
-        raise AttachSpectrogramError("--microphones names none. Name at least one, or leave it out for all.")
+        raise AttachError("--microphones names none. Name at least one, or leave it out for all.")
     height, width = _size(cfg, features)
     columns = _columns_per_frame(cfg, width, fps)
     plans: list[SoundPicture] = []
@@ -117,12 +111,12 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPic
         key = AUDIO_PREFIX + name
         feature = picture_feature(key, cfg.name)
         if feature in features or feature in [plan.feature for plan in plans] or "/" in feature:
-            raise AttachSpectrogramError(
+            raise AttachError(
                 f"--name={cfg.name}: '{feature}' is in the dataset in {dataset.root} already, or is no name. Give "
                 "another, such as --name='heard_{microphone}'."
             )
         if columns > rates[key] // fps:
-            raise AttachSpectrogramError(
+            raise AttachError(
                 f"--seconds={cfg.seconds:g}: a frame of '{key}' has {rates[key] // fps} samples and would have {columns} "
                 "columns. Give more seconds, or a smaller --width."
             )
@@ -139,13 +133,13 @@ def _size(cfg: AttachSpectrogramConfig, features: dict) -> tuple[int, int]:
     height, width = (own or given for own, given in zip((cfg.height, cfg.width), usual, strict=True))
     for name, size in (("height", height), ("width", width)):
         if not 8 <= size <= 4096:
-            raise AttachSpectrogramError(f"--{name}={size}: wanted 8 to 4096 pixels.")
+            raise AttachError(f"--{name}={size}: wanted 8 to 4096 pixels.")
     return height, width
 
 
 def _columns_per_frame(cfg: AttachSpectrogramConfig, width: int, fps: int) -> int:
     if not 0 < cfg.seconds * fps <= width + 1e-6:
-        raise AttachSpectrogramError(
+        raise AttachError(
             f"--seconds={cfg.seconds:g}: wanted above 0 and at most {width / fps:.2f}, since each frame takes one of {width} "
             "columns at least. Give that, or a larger --width."
         )
@@ -170,7 +164,7 @@ def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrog
     total = counts.sum(axis=0)
     low, high = cfg.low_db, cfg.high_db
     if not total.any() and (low is None or high is None):
-        raise AttachSpectrogramError(
+        raise AttachError(
             f"'{plan.microphone}' holds nothing but silence. Choose others with --microphones, or give --low_db and --high_db."
         )
     if low is None:

@@ -29,10 +29,6 @@ _MOST_CHANNELS, _MOST_START_S, _MOST_INDEX = 64, 60.0, 10**6
 _TOLERANCE, _SPARE_S = 4, 60.0  # times as long as the episodes, and so much more, may the files claim to last
 
 
-class AudioLayoutError(InputError):
-    """What a dataset says of its files of sound cannot be so."""
-
-
 @dataclass(frozen=True)
 class AudioSpan:
     """Where an episode's sound lies.
@@ -90,10 +86,10 @@ def read_tracks(dataset: DatasetReader, start_time_s: float | None = None) -> li
         info = read_info(dataset.root)
         fps, features = info["fps"], info["features"]
         if fps % 1:
-            raise AudioLayoutError(f"{dataset.root / INFO_PATH}: fps is {fps!r}; wanted a whole number. Correct it.")
+            raise InputError(f"{dataset.root / INFO_PATH}: fps is {fps!r}; wanted a whole number. Correct it.")
         template = info.get("audio_path") or DEFAULT_AUDIO_PATH
         if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
-            raise AudioLayoutError(
+            raise InputError(
                 f"{dataset.root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
             )
         heard = [key for key, own in features.items() if own["dtype"] == AUDIO_DTYPE]
@@ -107,7 +103,7 @@ def _check_names(tracks: list[AudioTrack], features: set[str]) -> None:
     for track in tracks:
         for name in column_names(track):
             if name in taken:
-                raise AudioLayoutError(f"'{track.key}' becomes '{name}', which is there already. Rename one of them.")
+                raise InputError(f"'{track.key}' becomes '{name}', which is there already. Rename one of them.")
             taken.add(name)
 
 
@@ -118,7 +114,7 @@ def column_names(track: AudioTrack) -> list[str]:
 
 def _track(dataset: DatasetReader, key: str, feature: dict, template: str, start_time_s: float | None) -> AudioTrack:
     if not key.startswith(AUDIO_PREFIX) or key == AUDIO_PREFIX or "/" in key or "\\" in key:
-        raise AudioLayoutError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>', without '/'.")
+        raise InputError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>', without '/'.")
     info, shape = feature.get("info") or {}, feature["shape"]
     n_channels = shape[0] if len(shape) == 1 else None
     n_channels = _number(key, "shape", shape, n_channels, 1, _MOST_CHANNELS, "(channels,)")
@@ -127,7 +123,7 @@ def _track(dataset: DatasetReader, key: str, feature: dict, template: str, start
         rate = _number(key, "info.sample_rate", rate, rate, 1, 1_000_000, "a whole number of Hz")
     start = info.get("start_time_s") if start_time_s is None else start_time_s
     if not isinstance(start, int | float) or not 0 <= start <= _MOST_START_S:
-        raise AudioLayoutError(
+        raise InputError(
             f"'{key}': info.start_time_s is {start!r}; wanted how long before an episode's first frame its sound begins, "
             f"0 to {_MOST_START_S:g} s. Say it with --offset=1."
         )
@@ -140,9 +136,7 @@ def _spans(dataset: DatasetReader, key: str, template: str, latest_s: float) -> 
     names = {name: f"{AUDIO_FOLDER}/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")}
     missing = [name for name in names.values() if name not in rows.column_names]
     if missing:
-        raise AudioLayoutError(
-            f"'{key}': meta/episodes has no column {missing[0]!r}, which says where its sound is. Add it."
-        )
+        raise InputError(f"'{key}': meta/episodes has no column {missing[0]!r}, which says where its sound is. Add it.")
     end_name = f"{AUDIO_FOLDER}/{key}/to_timestamp"
     ends = rows[end_name] if end_name in rows.column_names else [None] * len(rows)
     spans: list[AudioSpan] = []
@@ -169,7 +163,7 @@ def _end(span: AudioSpan, starts: list[float]) -> float | None:
 
 def _number(of: str, name: str, seen: Any, value: Any, least: int, most: int, wanted: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int | float) or value % 1 or not least <= value <= most:
-        raise AudioLayoutError(
+        raise InputError(
             f"'{of}': {name} is {seen!r}; wanted {wanted}, {least} to {most:,}. Correct it, or ask who made the dataset."
         )
     return int(value)
@@ -177,7 +171,7 @@ def _number(of: str, name: str, seen: Any, value: Any, least: int, most: int, wa
 
 def _time(of: str, name: str, value: Any, least: float, most: float) -> None:
     if not isinstance(value, int | float) or not math.isfinite(value) or not least <= value <= most:
-        raise AudioLayoutError(
+        raise InputError(
             f"'{of}': {name} is {value!r}; wanted seconds, {least:g} to {most:g}, which is {_TOLERANCE} times what the "
             "episodes last. Correct it, or ask who made the dataset."
         )

@@ -203,11 +203,11 @@ def read_marks(text: str | None) -> ClockLine:
             sound_s, clock_s = map(float, part.split("="))
             if not math.isfinite(sound_s + clock_s):
                 raise ValueError
-        except ValueError as error:
+        except ValueError as wrong:
             raise ClockError(
                 f"--marks: {part.strip()!r} is no mark; wanted seconds in the sound file = seconds on the clock, such as "
                 "2.31=1754400000.12, and a comma between two of them."
-            ) from error
+            ) from wrong
         pairs.append((sound_s, clock_s))
     sound, clock = np.array(pairs).T
     origin_clock, origin_sound = float(clock.mean()), float(sound.mean())

@@ -306,8 +306,6 @@ def _check_dataset(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename
     names = dataset_names(policy, rename_map)
     for key, feature in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
         name = names.get(key, key)
-        if name not in meta.features:
-            raise InputError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
         seen_rate = (meta.features[name].get("info") or {}).get("sample_rate")
         rate = policy.sample_rate
         if rate is not None and seen_rate is not None and seen_rate != rate:

@@ -20,7 +20,7 @@ from pathlib import Path, PurePath
 from filelock import FileLock, Timeout
 from huggingface_hub.constants import HF_HOME
 
-from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
+from lerobot_playbyear.datasets.errors import InputError
 
 HF_LEROBOT_HOME = Path(os.getenv("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser()
 """LeRobot's own cache, where datasets without a root are."""
@@ -34,7 +34,7 @@ PARTIAL = ".partial"
 """What the name of a file or a folder ends in while it is written."""
 
 
-class FolderLockedError(PlaybyearError, RuntimeError):
+class FolderLockedError(InputError):
     """Another process works in the folder."""
 
 

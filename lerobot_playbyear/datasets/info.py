@@ -14,6 +14,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     DEFAULT_VIDEO_PATH,
@@ -38,7 +39,7 @@ _MOST_FPS = 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
 
 
-class InfoError(ValueError):
+class InfoError(InputError):
     """A dataset's `meta/info.json` says what cannot be right, or claims what its files do not hold."""
 
 

@@ -238,7 +238,7 @@ def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> N
     path.parent.mkdir(parents=True, exist_ok=True)
     with pq.ParquetWriter(path, schema, **writer_options(schema)) as writer:
         for table in tables:
-            writer.write_table(table, row_group_size=_rows_within(PIECE_BYTES, table.nbytes, len(table)))
+            writer.write_table(table, row_group_size=max(PIECE_BYTES * len(table) // max(table.nbytes, 1), 1))
 
 
 def write_rows(rows: pa.Table, path: Path) -> None:
@@ -286,11 +286,6 @@ def leaf_columns(path: str, kind: pa.DataType) -> list[Leaf]:
     if pa.types.is_struct(kind):
         return [column for field in kind for column in leaf_columns(f"{path}.{field.name}", field.type)]
     return [Leaf(path, kind, False, 1)]
-
-
-def _rows_within(limit: int, n_bytes: int, n_rows: int) -> int:
-    """How many rows take so many bytes, where `n_rows` take `n_bytes`; at least one."""
-    return max(min(n_rows, limit * n_rows // max(n_bytes, 1)), 1)
 
 
 def _is_list(kind: pa.DataType) -> bool:

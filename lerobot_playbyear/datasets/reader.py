@@ -22,10 +22,10 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.findings import name_episodes
-from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, check_claims, check_dataset_files, file_inside
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, check_claims, check_dataset_files, file_inside
 from lerobot_playbyear.datasets.parquet import DataFile, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
-from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
+from lerobot_playbyear.datasets.survey import Survey, survey
 from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
 
 if TYPE_CHECKING:
@@ -309,8 +309,6 @@ class SurveyedDataset(EpisodeReader):
             found = survey(folder, thorough=False)
             dataset = cls(repo_id, found, episodes)
             check_claims(folder, [file.footer for file in dataset.files], len(found.episodes))
-        except (InfoError, DatasetDamagedError) as error:
-            raise InputError(str(error)) from error
         except (OSError, MemoryError) as error:
             said = f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
             raise InputError(f"The dataset in '{folder}' cannot be opened: {said}.") from error

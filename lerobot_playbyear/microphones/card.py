@@ -209,7 +209,9 @@ class OpenCard:
         self.n_users = 0
         self.microphone = make_microphone(config, channels)
         if self.microphone.channels < channels:
-            raise MicrophoneError(f"{self.microphone.name} has {self.microphone.channels} channels, wanted {channels}.")
+            raise MicrophoneError(
+                f"{self.microphone.name} has {self.microphone.channels} channels, and {channels} are wanted."
+            )
         self.recording = CardRecording(self.microphone.name, config.sample_rate, self.microphone.channels)
         self._step_s, self._step_counter = -math.inf, 0
         self._readers: set[int] = set()  # in this control step

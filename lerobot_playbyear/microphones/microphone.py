@@ -153,21 +153,16 @@ class PlayedMicrophone(Microphone):
             n_played += size
 
 
-def file_microphone(path: Path, sample_rate: int, channels: int) -> Microphone:
+def file_microphone(path: Path, sample_rate: int) -> Microphone:
     """A sound file, resampled where it has another rate [Hz].
 
     Raises:
-        MicrophoneError: It cannot be read, or has fewer channels.
+        MicrophoneError: It cannot be read.
     """
     try:
         samples, rate = read_audio(path)
     except (OSError, AudioFileError) as error:
         raise MicrophoneError(f"file={path} of a microphone cannot be read: {error}") from error
-    if samples.shape[1] < channels or len(samples) == 0:
-        raise MicrophoneError(
-            f"file={path} of a microphone has {samples.shape[1]} channels and {len(samples)} samples; channel {channels - 1} "
-            "is asked for, counted from 0."
-        )
     return PlayedMicrophone(f"the sound file {path}", resample(samples, rate, sample_rate), sample_rate)
 
 
@@ -230,4 +225,4 @@ def make_microphone(config: "MicrophoneCameraConfig", channels: int) -> Micropho
         return PortAudioMicrophone(config.device, config.sample_rate, channels)
     if config.tone_hz is not None:
         return tone_microphone(config.tone_hz, config.sample_rate, channels)
-    return file_microphone(Path(str(config.file)).expanduser(), config.sample_rate, channels)
+    return file_microphone(Path(str(config.file)).expanduser(), config.sample_rate)

@@ -322,11 +322,7 @@ def check_dataset_suits(
     Raises:
         ValueError: Naming what was seen, what is wanted, and what to do.
     """
-    if policy.fps != meta.fps:
-        raise ValueError(
-            f"The dataset '{meta.repo_id}' has {meta.fps} frames per second, and the policy is configured for {policy.fps}: "
-            f"give --policy.fps={meta.fps}, or a dataset recorded at {policy.fps}."
-        )
+    policy.check_frame_rate(meta)
     missing = [key for key in dataset_names(policy, rename_map).values() if key not in meta.features]
     if missing:
         seen = [key for key in meta.features if key.startswith(OBS_STR)]
