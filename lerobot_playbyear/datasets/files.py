@@ -170,7 +170,7 @@ def new_folder(target: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-class FolderLock:
+class FolderLock(contextlib.ExitStack):
     """At most one process works in a folder: held until `release` or the end of the process, however it ends.
 
     The lock's file stays where it is: two processes that found different files under its name could both hold one.
@@ -185,22 +185,15 @@ class FolderLock:
     """
 
     def __init__(self, path: Path, in_use: str) -> None:
+        super().__init__()
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(path, timeout=0, thread_local=False)
         try:
-            self._lock.acquire()
+            self.enter_context(FileLock(path, timeout=0, thread_local=False))
         except Timeout as error:
             raise FolderLockedError(in_use) from error
 
-    def release(self) -> None:
-        """Lets another process in. Safe to call twice."""
-        self._lock.release()
-
-    def __enter__(self) -> "FolderLock":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
+    release = contextlib.ExitStack.close
+    """Lets another process in. Safe to call twice."""
 
 
 def scratch_folder() -> tempfile.TemporaryDirectory[str]:

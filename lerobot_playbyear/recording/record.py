@@ -140,7 +140,7 @@ Demonstrations = Callable[[Iterable[int]], Iterator[Episode]]
 def _demonstrations(cfg: RecordConfig) -> Iterator[tuple[EnvFacts, Demonstrations]]:
     """What the environment looks like, and where episodes come from: a script in several processes, or a person."""
     if not isinstance(cfg.expert, TeleopExpertConfig):
-        with RolloutPool(env_spec(cfg.env), cfg.num_workers or 0) as pool:
+        with closing(RolloutPool(env_spec(cfg.env), cfg.num_workers or 0)) as pool:
             with errors_of_input():
                 facts = pool.facts()
             yield facts, pool.episodes
