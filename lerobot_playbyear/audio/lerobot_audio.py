@@ -6,11 +6,10 @@ A feature `observation.audio.<microphone>` of dtype "audio" and shape (channels,
 be a stranger's, and is checked here.
 """
 
-import bisect
+import itertools
 import json
 import math
 import re
-from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -149,16 +148,10 @@ def _spans(dataset: DatasetReader, key: str, template: str, latest_s: float) -> 
             _time(of, "to_timestamp", end, start, latest_s)
         path = file_inside(dataset.root, template.format(audio_key=key, chunk_index=int(chunk), file_index=int(file)))
         spans.append(AudioSpan(path, float(start), None if end is None else float(end)))
-    starts: dict[Path, list[float]] = defaultdict(list)
-    for span in sorted(spans, key=lambda span: span.start_s):
-        starts[span.path].append(span.start_s)
-    return [replace(span, end_s=_end(span, starts[span.path])) for span in spans]
-
-
-def _end(span: AudioSpan, starts: list[float]) -> float | None:
-    """Where a sound ends [s]: if that is not said, where the next one in its file begins, if there is one."""
-    later = bisect.bisect_right(starts, span.start_s)
-    return span.end_s if span.end_s is not None else starts[later] if later < len(starts) else None
+    starts = sorted({(span.path, span.start_s) for span in spans})
+    # Where no end is said, a sound ends where the next one in its file begins, if there is one.
+    ends_of = {here: later[1] for here, later in itertools.pairwise(starts) if here[0] == later[0]}
+    return [replace(s, end_s=ends_of.get((s.path, s.start_s)) if s.end_s is None else s.end_s) for s in spans]
 
 
 def _number(of: str, name: str, seen: Any, value: Any, least: int, most: int, wanted: str) -> int:

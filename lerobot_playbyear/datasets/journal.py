@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, write_atomically
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, flush_all, write_atomically
 
 SCRATCH = Path("images")
 STAGING = SCRATCH / ".staging"
@@ -38,13 +38,9 @@ def publish(root: Path) -> None:
     Raises:
         JournalError: A file's place is not inside the dataset.
     """
-    names = _staged_files(root)
-    staging = root / STAGING
-    for name in names:
-        flush(staging / name)
-    for folder in sorted({staging / parent for name in names for parent in name.parents}):
-        flush(folder)
-    flush(staging.parent)
+    _staged_files(root)  # raises where one of them leads elsewhere
+    flush_all(root / STAGING)
+    flush(root / SCRATCH)
     write_atomically(root / JOURNAL, "")
     flush(root)
     finish_journal(root)

@@ -330,15 +330,8 @@ class SurveyedDataset(EpisodeReader):
     @cached_property
     def timed_microphones(self) -> list[str]:
         """The microphones whose rows are what their sample rate says; of the others no moment in time is known."""
-        fitting = []
-        for key in self.microphones:
-            try:
-                check_audio_features({key: self.features[key]}, self.fps)
-            except ValueError:
-                continue
-            if key not in self.unreadable:
-                fitting.append(key)
-        return fitting
+        wrong = {finding.feature for finding in self.survey.findings if finding.check == "sample rate"}
+        return [key for key in self.microphones if key not in {*wrong, *self.unreadable}]
 
     @cached_property
     def unreadable(self) -> dict[str, str]:

@@ -55,11 +55,6 @@ class RepairReport:
         return {episode.number: number for number, episode in enumerate(self.survey.whole)}
 
     @property
-    def dropped(self) -> dict[int, str]:
-        """The number of every other episode, and what is wrong with it."""
-        return {episode.number: episode.reason for episode in self.survey.episodes if not episode.frames}
-
-    @property
     def left(self) -> list[Finding]:
         """What only a person can put right."""
         return [finding for finding in self.survey.findings if finding.level == "error" and finding.remedy]
