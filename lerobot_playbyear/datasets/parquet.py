@@ -173,17 +173,6 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     return table
 
 
-def fit_to_schema(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """A table's columns in the order and types of a schema; what the table lacks is null, what it has more is left.
-
-    Raises:
-        pyarrow.ArrowInvalid: A column's type cannot become the schema's.
-    """
-    there = set(table.column_names)
-    columns = [table[f.name].cast(f.type) if f.name in there else pa.nulls(len(table), f.type) for f in schema]
-    return pa.Table.from_arrays(columns, schema=schema)
-
-
 def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
     """A column of numbers or of fixed-length lists of numbers, as an array (N,) or (N, values per row).
 

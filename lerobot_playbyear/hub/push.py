@@ -377,8 +377,9 @@ def check_name(option: str, repo_id: str, needs_user: bool = False) -> None:
         raise HubError(f"{option}={repo_id!r} cannot be pushed: {_first_line(error)}.") from error
 
 
-def warn_without_login() -> None:
-    """Says before long work that its upload will fail, so that there is time to log in."""
+def check_upload(option: str, repo_id: str, needs_user: bool = False) -> None:
+    """As `check_name`, before long work; says if nobody is logged in, so that there is time to do that."""
+    check_name(option, repo_id, needs_user)
     if not get_token():
         logger.warning("Nobody is logged in to the Hub: log in with `hf auth login` before the upload at the end.")
 
