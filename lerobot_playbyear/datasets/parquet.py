@@ -16,6 +16,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_playbyear.datasets.errors import first_line
+
 
 class ParquetDamageError(ValueError):
     """A parquet file, or a part of it, does not hold what was written."""
@@ -50,7 +52,7 @@ def parsing(path: Path | None = None) -> Iterator[None]:
             raise OSError(error.errno, os.strerror(error.errno), error.filename or (path and str(path))) from error
         if isinstance(error, MemoryError) and not _asks_for_the_impossible(error):
             raise
-        raise ParquetDamageError(_first_line(error)) from error
+        raise ParquetDamageError(first_line(error)) from error
 
 
 def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.ParquetFile:
@@ -99,11 +101,8 @@ class DataFile:
         self.is_rescued = footer is not None
         sizes = [self.footer.row_group(group).num_rows for group in range(self.footer.num_row_groups)]
         self._edges = [0, *np.cumsum(sizes, dtype=int).tolist()]
+        self.n_rows = self._edges[-1]
         self._last: tuple[int, list[str] | None, pa.Table | ParquetDamageError] | None = None  # what was read last
-
-    @property
-    def n_rows(self) -> int:
-        return self._edges[-1]
 
     def row_groups(self, columns: list[str] | None = None) -> Iterator[tuple[int, pa.Table | ParquetDamageError]]:
         """The first row of every row group, and its rows, or what is wrong with them.
@@ -293,7 +292,3 @@ def _asks_for_the_impossible(error: MemoryError) -> bool:
     """Whether more memory was asked for than there can be: a size in the file was misread."""
     asked = re.search(r"alloc of size (\d+) failed", str(error))
     return asked is not None and int(asked[1]) > _IMPOSSIBLE_BYTES
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

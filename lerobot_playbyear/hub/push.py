@@ -22,7 +22,7 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineMod
 from huggingface_hub.utils import validate_repo_id
 
 from lerobot_playbyear.compat import card_writer
-from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, first_line
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below
 from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out
 from lerobot_playbyear.datasets.journal import held
@@ -374,7 +374,7 @@ def check_name(option: str, repo_id: str, needs_user: bool = False) -> None:
     try:
         validate_repo_id(repo_id)
     except HFValidationError as error:
-        raise HubError(f"{option}={repo_id!r} cannot be pushed: {_first_line(error)}.") from error
+        raise HubError(f"{option}={repo_id!r} cannot be pushed: {first_line(error)}.") from error
 
 
 def check_upload(option: str, repo_id: str, needs_user: bool = False) -> None:
@@ -508,16 +508,16 @@ def reason(error: BaseException) -> str:
     if isinstance(cause, OfflineModeIsEnabled):
         return "the environment variable HF_HUB_OFFLINE forbids it"
     if isinstance(cause, httpx.TransportError):
-        return f"{constants.ENDPOINT} cannot be reached ({type(cause).__name__}: {_first_line(cause)})"
+        return f"{constants.ENDPOINT} cannot be reached ({type(cause).__name__}: {first_line(cause)})"
     if not isinstance(cause, HfHubHTTPError):
-        return f"{type(error).__name__}: {_first_line(error)}"
+        return f"{type(error).__name__}: {first_line(error)}"
     if cause.response.status_code in (401, 403):  # 403 may be a quota
         said = (cause.server_message or "it does not say why").partition("\n")[0].rstrip(".")
         return (
             f"{constants.ENDPOINT} refused (status {cause.response.status_code}): {said}. If that is about the token, "
             "log in with `hf auth login`, with one that may write there"
         )
-    return f"{constants.ENDPOINT} answered: {_first_line(cause)}"
+    return f"{constants.ENDPOINT} answered: {first_line(cause)}"
 
 
 def _is_passing(error: BaseException) -> bool:
@@ -534,7 +534,3 @@ def _cause(error: BaseException) -> BaseException:
     while not isinstance(cause, kinds) and cause.__cause__ is not None:
         cause = cause.__cause__
     return cause if isinstance(cause, kinds) else error
-
-
-def _first_line(error: BaseException) -> str:
-    return next((line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()), type(error).__name__)

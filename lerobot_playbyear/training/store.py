@@ -223,12 +223,11 @@ class EpisodeStore:
         """Add an episode at the end.
 
         Args:
-            frames: The episode's frames, as `LeRobotDataset.add_frame` takes them: a value for every feature of the
-                store, images (H, W, C) or (C, H, W) uint8, and optionally `task`. Index columns are filled in.
+            frames: The episode's frames, as a `DurableWriter` of the store's features has taken them: a value for every
+                feature, images (H, W, C) or (C, H, W) uint8, and optionally `task`. Index columns are filled in.
 
         Raises:
-            InputError: If there are no frames, a feature is missing or has another shape or dtype, or a value is NaN
-                or infinite. The store is then unchanged.
+            InputError: If there are no frames, or a value is NaN or infinite. The store is then unchanged.
         """
         if len(frames) == 0:
             raise InputError("An episode without frames cannot be appended.")
@@ -254,13 +253,8 @@ class EpisodeStore:
 
     def _stacked(self, key: str, frames: Sequence[Mapping[str, Any]]) -> Tensor:
         """One feature of new frames, (n, ...), in the store's shape and dtype."""
-        missing = [i for i, frame in enumerate(frames) if key not in frame]
-        if missing:
-            raise InputError(f"'{key}' is missing in frame {missing[0]} of an episode; the store holds {self.keys}.")
         shape, dtype = self._columns[key].shape[1:], self._columns[key].dtype
         values = torch.from_numpy(np.stack([np.asarray(frame[key]) for frame in frames]))
-        if _kind(values.dtype) != _kind(dtype):
-            raise InputError(f"'{key}' has dtype {values.dtype} in the new episode, and {dtype} in the store.")
         if len(shape) == 3 and values.dim() == 4:  # pictures
             if values.shape[1] != shape[0]:
                 values = values.movedim(-1, 1)  # (n, H, W, C) -> (n, C, H, W)
@@ -268,8 +262,6 @@ class EpisodeStore:
                 values = torch.from_numpy(shrink(values.numpy(), self.image_size))
         if not shape and values.shape[1:] == (1,):
             values = values.squeeze(1)
-        if values.shape[1:] != shape:
-            raise InputError(f"'{key}' has shape {tuple(values.shape[1:])} in an episode, {tuple(shape)} in the store.")
         if values.dtype.is_floating_point and not values.isfinite().all():
             raise InputError(f"'{key}' holds NaN or infinite values in the new episode; wanted finite numbers.")
         return values.to(dtype)
@@ -287,10 +279,6 @@ class EpisodeStore:
             "timestamp": frame_index.to(torch.float32) / self.fps,
         }
         return {key: values for key, values in columns.items() if key in self._columns}
-
-
-def _kind(dtype: torch.dtype) -> str:
-    return "bool" if dtype == torch.bool else "float" if dtype.is_floating_point else "int"
 
 
 def _sent_to(device: torch.device, values: Tensor) -> Tensor:
