@@ -21,13 +21,11 @@ from lerobot_playbyear.audio.audio_files import resample
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import IS_FIRST, check_audio_features, samples_per_frame, to_pcm_s16
 from lerobot_playbyear.datasets.free_memory import available_memory
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS
 from lerobot_playbyear.datasets.parquet import episode_bounds
 from lerobot_playbyear.datasets.pictures import kept_shape, shrink
 from lerobot_playbyear.datasets.reader import DatasetReader, check_finite
 from lerobot_playbyear.training.frame_cache import cached_columns, dataset_identity
-
-INDEX_KEYS = ("index", "episode_index", "frame_index", "task_index", "timestamp")
-"""The columns that every LeRobotDataset has."""
 
 PLACES = ("memory", "disk", "auto")
 """Where a dataset's frames are kept."""
@@ -233,7 +231,7 @@ class EpisodeStore:
             raise InputError("An episode without frames cannot be appended.")
         start, end = len(self), len(self) + len(frames)
         tasks = list(self.tasks)
-        columns = {key: self._stacked(key, frames) for key in self._columns if key not in INDEX_KEYS}
+        columns = {key: self._stacked(key, frames) for key in self._columns if key not in INDEX_COLUMNS}
         columns.update(self._index_columns(frames, start, tasks))
         for key, values in columns.items():
             self._columns[key] = _with_rows(self._columns[key], start, values.to(self.device))
@@ -402,7 +400,7 @@ def _select_features(reader: DatasetReader, keys: Iterable[str] | None) -> dict[
     others |= {key for key, feature in features.items() if feature["dtype"] == "string"}
     if keys is None:
         keys = [key for key in features if key not in others]
-    keys = list(dict.fromkeys([*keys, *INDEX_KEYS, *([IS_FIRST] if _has_is_first(features) else [])]))
+    keys = list(dict.fromkeys([*keys, *INDEX_COLUMNS, *([IS_FIRST] if _has_is_first(features) else [])]))
     for key in keys:
         if key not in features:
             raise ValueError(f"The dataset '{reader.repo_id}' has no '{key}'; it has {sorted(features)}.")
