@@ -67,11 +67,13 @@ def test_windows_are_those_of_lerobot_as_bytes_and_pcm(root, episodes):
 
 
 def load(root, cache, **options):
-    return EpisodeStore.load("tests/noise", root, device="cpu", place="disk", cache=cache, **options)
+    return EpisodeStore.from_dataset(
+        DatasetReader("tests/noise", root), device="cpu", place="disk", cache=cache, **options
+    )
 
 
 def in_memory(root, **options):
-    return EpisodeStore.load("tests/noise", root, device="cpu", **options)
+    return EpisodeStore.from_dataset(DatasetReader("tests/noise", root), device="cpu", **options)
 
 
 def assert_same(store, other):

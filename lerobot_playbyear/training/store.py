@@ -143,17 +143,6 @@ class EpisodeStore:
             columns, starts, ends, reader.fps, list(reader.meta.tasks.index), columns["index"].device, image_size
         )
 
-    @classmethod
-    def load(
-        cls, repo_id: str, root: str | None = None, episodes: list[int] | None = None, **kwargs: Any
-    ) -> "EpisodeStore":
-        """Open a dataset and read it; `kwargs` as for `from_dataset`.
-
-        Raises:
-            ValueError: Also if a file of the dataset is truncated.
-        """
-        return cls.from_dataset(DatasetReader(repo_id, root, episodes), **kwargs)
-
     def __len__(self) -> int:
         """The number of frames, N."""
         return self.ends[-1] if self.ends else 0
