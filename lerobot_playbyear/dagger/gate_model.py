@@ -92,7 +92,7 @@ class GateModel:
     def _scaled(self, memories: Tensor) -> Tensor:
         return (memories.float() - self._mean) / self._std
 
-    def _learn_heads(self, played: list[Played]) -> list[nn.Module]:
+    def _learn_heads(self, played: list[Played]) -> list[nn.Sequential]:
         masks = [torch.from_numpy(each.by_expert) for each in played]
         memories = self._scaled(torch.cat([p.memories[mask] for p, mask in zip(played, masks, strict=True)]))
         actions = torch.cat([p.actions[mask] for p, mask in zip(played, masks, strict=True)]).float()
@@ -104,7 +104,7 @@ class GateModel:
             heads.append(head)
         return heads
 
-    def _learn_values(self, played: list[Played]) -> list[nn.Module]:
+    def _learn_values(self, played: list[Played]) -> list[nn.Sequential]:
         kinds = [[each.seed for each in played if each.is_visited and each.success is kind] for kind in (True, False)]
         self._half = {seed: number % 2 for seeds in kinds for number, seed in enumerate(seeds)}  # both see both kinds
         values = []

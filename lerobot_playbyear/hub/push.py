@@ -165,7 +165,7 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
             before = _stamps(files)
             license = options.license or "apache-2.0"
             card = write_dataset_card(dataset, repo_id, Path(scratch), options.tags, license, options.preview)
-        except (InputError, OutsideError, OSError) as error:
+        except (InputError, OSError) as error:
             raise HubError(f"Not pushed. {error}") from error
 
         def upload() -> str:

@@ -181,10 +181,8 @@ def check_local_dataset(repo_id: str, root: str | None) -> None:
     Raises:
         InputError: A file is damaged, or leads out of the folder.
     """
-    from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
     from lerobot_playbyear.datasets.info import check_dataset_files
 
     if (Path(root or HF_LEROBOT_HOME / repo_id) / INFO_PATH).is_file():
-        with errors_of_input():
-            check_dataset_files(repo_id, root)
+        check_dataset_files(repo_id, root)
