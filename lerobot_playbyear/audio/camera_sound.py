@@ -79,7 +79,8 @@ def read_camera_sound(cfg: AttachAudioConfig, dataset: DatasetReader, scratch: P
 def _by_person(dataset: DatasetReader) -> list[np.ndarray]:
     """Which frames of each episode are corrections, (n,) bool: LeRobot's rollout resets the policy at every hand-back, however
     short the pause."""
-    if tuple(dataset.meta.features.get(INTERVENTION, {"shape": ()})["shape"]) != (1,):
+    feature = dataset.meta.features.get(INTERVENTION)
+    if feature is None or feature["dtype"] != "bool" or tuple(feature["shape"]) != (1,):
         return [np.zeros(len(episode), bool) for episode in dataset.episodes]
     return [dataset.values(INTERVENTION, episode).astype(bool) for episode in dataset.episodes]
 
