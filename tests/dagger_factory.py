@@ -16,10 +16,12 @@ from safetensors.torch import load_file
 from support.shared import ENV, once, recorded, trained
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict, run_dagger
 from lerobot_playbyear.dagger.config import with_saved_options
+from lerobot_playbyear.dagger.run import run_dagger
 from lerobot_playbyear.dagger.run_folder import RunFolder
 from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.experts import Expert, ExpertConfig
+from lerobot_playbyear.episodes.play import Verdict
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)

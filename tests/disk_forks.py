@@ -13,6 +13,7 @@ from pathlib import Path
 
 import torch
 
+from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.training import EpisodeStore
 
 IMAGE_SIZE = 24
@@ -21,7 +22,7 @@ IMAGE_SIZE = 24
 def build(root: str, cache: str, **options: object) -> EpisodeStore:
     """The dataset's store."""
     place = {"place": "disk", "cache": Path(cache), "image_size": IMAGE_SIZE, **options}
-    return EpisodeStore.load("tests/noise", root, device="cpu", **place)
+    return EpisodeStore.from_dataset(DatasetReader("tests/noise", root), device="cpu", **place)
 
 
 def forked(task) -> tuple[int, float]:

@@ -22,7 +22,7 @@ from lerobot_playbyear.audio.recorder_clock import (
 from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey
-from lerobot_playbyear.repair import repair_dataset
+from lerobot_playbyear.repair.repair import repair_dataset
 
 FPS, RATE = 20, 16000
 SIZE = RATE // FPS
@@ -305,7 +305,7 @@ def test_no_start_is_noted_through_a_link_or_without_a_meaning(tmp_path):
         ("0,a\n", "the time of episode 0 is 'a'; wanted seconds"),
         ("0,1\n0,2\n", "names episode 0 twice"),
         ("0 1\n", "a line is '0 1'; wanted episode and seconds, such as 0,12.5"),
-        ("1,2\n", "has no time for episode 0, 2; the dataset has 3 episodes"),
+        ("1,2\n", "has no time for episodes 0, 2; the dataset has 3 episodes"),
         ("0,1\n1,2\n2,500\n", r"episode 2, which began at 500.000 s of the clock: .*at its end more"),
     ],
 )

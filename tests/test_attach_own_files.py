@@ -13,8 +13,9 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, contents, load
 
-from lerobot_playbyear.datasets import AUDIO_PREFIX, episode_waveform
+from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX
 from lerobot_playbyear.datasets.survey import survey
 
 PRE_ROLL_S = 1.0

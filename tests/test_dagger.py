@@ -24,12 +24,12 @@ from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 from support.shared import ENV, run_in_process, trained
 
-from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.methods import Method
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
-from lerobot_playbyear.episodes.play import play
+from lerobot_playbyear.episodes.experts import Expert, ExpertConfig
+from lerobot_playbyear.episodes.play import Verdict, play
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")

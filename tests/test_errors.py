@@ -205,10 +205,10 @@ session | --microphone=left,right | 1 channels, and --microphone names 2
 attach-spectrogram | --microphones=[nose] | --microphones names 'nose'; the dataset in {noise} has gripper
 attach-spectrogram | --microphones=[] | --microphones names none
 attach-spectrogram | --name=front | 'observation.images.front' is in the dataset in {noise} already
-attach-spectrogram | --seconds=3 | 60 frames do not fit into 16 columns | at most 0.80
+attach-spectrogram | --seconds=3 | --seconds=3 | at most 0.80 | one of 16 columns | a larger --width
 attach-spectrogram | --seconds=0 | --seconds=0 | above 0
-attach-spectrogram | --height=3 | --height=3 | 8 to 4096 pixels
-attach-spectrogram | --low_db=10 --high_db=-10 | --low_db=10 | the second above the first
+attach-spectrogram | --height=5000 | height=5000; wanted at most 4096 pixels
+attach-spectrogram | --low_db=10 --high_db=-10 | low_db=10.0; wanted at least -100, and below high_db=-10.0
 attach-spectrogram | --dataset.root={deaf} | {deaf} has no sound in columns | playbyear-attach-audio
 # Films, inspection, microphones
 video | --seed=-1 | seed=-1: give 0 or more

@@ -21,10 +21,11 @@ from support.recording import add_episode, assert_recorded, everything, write, w
 from lerobot_playbyear.datasets import durable, episode_files, files
 from lerobot_playbyear.datasets.durable import DatasetWriteError, DurableWriter, has_dataset
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.survey import DatasetDamagedError
 from lerobot_playbyear.episodes.frames import save_or_ask
 from lerobot_playbyear.inspection import SurveyedDataset, check_numbers
-from lerobot_playbyear.repair import repair_dataset
+from lerobot_playbyear.repair.repair import repair_dataset
 from lerobot_playbyear.training import EpisodeStore
 
 TWO_FILMS = {**RICH_FEATURES, FILM + "2": RICH_FEATURES[FILM]}
@@ -325,7 +326,7 @@ READ_BY: dict[str, Callable[[Path], Any]] = {
     "resume": lambda root: writer(root).close(),
     "repair": lambda root: repair_dataset(root).dropped,
     "check": lambda root: [str(each) for each in check_numbers(SurveyedDataset.open(REPO_ID, root))],
-    "train": lambda root: EpisodeStore.load(REPO_ID, root, device="cpu", keys=["action"]).ends,
+    "train": lambda root: EpisodeStore.from_dataset(DatasetReader(REPO_ID, root), device="cpu", keys=["action"]).ends,
 }
 
 

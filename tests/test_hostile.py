@@ -30,7 +30,7 @@ from support.hub import HubServer, come_here
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
 from lerobot_playbyear.datasets.findings import worst
-from lerobot_playbyear.datasets.reader import SurveyedDataset
+from lerobot_playbyear.datasets.reader import DatasetReader, SurveyedDataset
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.film.video import film_sound
 from lerobot_playbyear.hub.dataset_card import describe_dataset
@@ -144,7 +144,7 @@ def attached(root: Path) -> None:
 
 
 READERS: dict[str, Callable[[Path], Any]] = {
-    "train": lambda root: EpisodeStore.load("a/b", str(root), device="cpu"),
+    "train": lambda root: EpisodeStore.from_dataset(DatasetReader("a/b", str(root)), device="cpu"),
     "inspect": looked,
     "page": lambda root: looked(root, html=root.parent / "page.html"),
     "check": checked,

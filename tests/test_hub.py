@@ -29,6 +29,7 @@ from support.hub import (
 )
 from support.shared import ENV, TINY
 
+from lerobot_playbyear.datasets.files import FolderLockedError
 from lerobot_playbyear.datasets.journal import lock_dataset
 from lerobot_playbyear.hub.client import be_patient
 from lerobot_playbyear.hub.push import HubError, PushOptions, evaluation_of, push_dataset, push_policy, reason
@@ -337,7 +338,7 @@ def film(tmp_path):
 
 def test_a_dataset_that_is_being_recorded_to_is_not_uploaded(dataset, here, film):
     lock = lock_dataset(dataset)
-    with pytest.raises(HubError, match=f"Not pushed. {dataset} is being recorded to"):
+    with pytest.raises(FolderLockedError, match="Another process is writing to"):
         push_dataset("tester/set", dataset, PushOptions(preview=film))
     lock.release()
     assert not here.requests

@@ -1,6 +1,7 @@
 """`playbyear-record`: what is on disk, and what is said when it cannot be."""
 
 import multiprocessing
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +129,7 @@ def test_without_an_opengl_library_it_says_what_to_install(tmp_path, monkeypatch
 
 def test_a_dead_worker_is_reported():
     others = set(multiprocessing.active_children())
-    with RolloutPool(env_spec(PlaybyearEnvConfig()), num_workers=1) as pool:
+    with closing(RolloutPool(env_spec(PlaybyearEnvConfig()), num_workers=1)) as pool:
         pool.facts()
         (worker,) = set(multiprocessing.active_children()) - others
         worker.kill()

@@ -37,13 +37,18 @@ from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.journal import lock_dataset
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
-from lerobot_playbyear.repair import RepairReport, repair_dataset
+from lerobot_playbyear.repair.repair import RepairReport, repair_dataset
 from lerobot_playbyear.scripts.commands import repair as repair_command
 
 N_EPISODES = 6
 EPISODES, TASKS_TABLE = "meta/episodes/chunk-000/file-000.parquet", "meta/tasks.parquet"
 INFO, STATS = "meta/info.json", "meta/stats.json"
 ENCODER = {"vcodec": "h264", "preset": "ultrafast"}
+
+
+def dropped(report: RepairReport) -> set[int]:
+    """The numbers of the episodes that are not in the copy."""
+    return {episode.number for episode in report.survey.episodes} - set(report.kept)
 
 
 def write_ours(root: Path, features: dict[str, Any], numbers: Iterable[int] = range(N_EPISODES)) -> None:
@@ -158,8 +163,8 @@ def repaired(root: Path, features: dict[str, Any], lost: Collection[int] = (), *
     assert everything(root) == before
     assert report.target is not None, str(report)
     assert report.is_done, str(report)
-    assert bool(report.dropped) == bool(lost), str(report)
-    assert all(number in lost for number in report.dropped), str(report)
+    assert bool(dropped(report)) == bool(lost), str(report)
+    assert all(number in lost for number in dropped(report)), str(report)
     assert survey(report.target).is_sound
     dataset = load(report.target)
     assert dataset.num_episodes == len(report.kept)
@@ -537,8 +542,8 @@ def damage_and_repair(original: Path, features: dict[str, Any], root: Path, seed
     if report.left:  # two of the places that say a thing were hit, or one that only a person can put right
         return
     if "film" not in names or "episodes" not in names:  # both say where pictures are
-        assert set(report.dropped) <= hit, story
-    assert all(report.dropped.values()), story
+        assert dropped(report) <= hit, story
+    assert all(each.reason for each in report.survey.episodes if not each.frames), story
     target = report.target or root
     assert survey(target).is_sound, story
     dataset = load(target)

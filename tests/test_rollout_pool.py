@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import ClassVar
 
@@ -51,7 +52,7 @@ import sys, time
 sys.path.insert(0, {tests!r})
 from test_rollout_pool import EnvSpec, RolloutPool
 if __name__ == "__main__":
-    with RolloutPool(EnvSpec("test_rollout_pool:Big-v0"), num_workers=1) as pool:
+    with closing(RolloutPool(EnvSpec("test_rollout_pool:Big-v0"), num_workers=1)) as pool:
         next(pool.episodes(range(100)))
         time.sleep({wait})
     print("closed")
@@ -67,7 +68,7 @@ def test_a_worker_that_is_sending_an_episode_does_not_keep_the_program_from_endi
 
 
 def test_an_episode_that_nobody_wants_ends_at_its_next_step():
-    with RolloutPool(EnvSpec("test_rollout_pool:Big-v0", {"step_seconds": 0.2}), num_workers=1) as pool:
+    with closing(RolloutPool(EnvSpec("test_rollout_pool:Big-v0", {"step_seconds": 0.2}), num_workers=1)) as pool:
         next(pool.episodes(range(100)))  # 4 s each; the worker has begun the second one
         workers, began = multiprocessing.active_children(), time.monotonic()
     assert time.monotonic() - began < 3.0

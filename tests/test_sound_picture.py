@@ -179,7 +179,7 @@ def test_every_frame_shows_the_last_seconds_and_all_else_stays(original, seen, t
 
 
 def test_a_copy_that_fails_is_not_there(original, tmp_path, monkeypatch):
-    monkeypatch.setattr(attaching, "_png", lambda picture: (_ for _ in ()).throw(OSError("the disk is full")))
+    monkeypatch.setattr(attaching, "encode_picture", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
     with pytest.raises(OSError, match="disk is full"):
         attach_spectrogram(config(original, tmp_path / "new"))
     assert list(tmp_path.iterdir()) == []

@@ -67,11 +67,13 @@ def test_windows_are_those_of_lerobot_as_bytes_and_pcm(root, episodes):
 
 
 def load(root, cache, **options):
-    return EpisodeStore.load("tests/noise", root, device="cpu", place="disk", cache=cache, **options)
+    return EpisodeStore.from_dataset(
+        DatasetReader("tests/noise", root), device="cpu", place="disk", cache=cache, **options
+    )
 
 
 def in_memory(root, **options):
-    return EpisodeStore.load("tests/noise", root, device="cpu", **options)
+    return EpisodeStore.from_dataset(DatasetReader("tests/noise", root), device="cpu", **options)
 
 
 def assert_same(store, other):
@@ -186,7 +188,7 @@ def test_nan_is_refused_by_every_run_with_the_episode_that_holds_it(with_nan, tm
     options = {**options, "cache": tmp_path / "cache"} if options else {}
     for key in (MICROPHONE,) if "sample_rates" in options else (MICROPHONE, "observation.state"):
         for _ in range(2):
-            with pytest.raises(ValueError, match=rf"'{key}' holds NaN .* of 3 episodes \(0\)"):
+            with pytest.raises(ValueError, match=rf"'{key}' holds NaN .* in episode 0 of 3"):
                 in_memory(with_nan, keys=[key], **options)
 
 

@@ -18,12 +18,14 @@ from lerobot.teleoperators.keyboard import (
 )
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.dagger import DaggerConfig, ExpertConfig, ExpertError, Verdict
+from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.methods import Method, Staying
 from lerobot_playbyear.dagger.robot_gated import Asked
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.environment import env_spec
+from lerobot_playbyear.episodes.experts import ExpertConfig, ExpertError
+from lerobot_playbyear.episodes.play import Verdict
 from lerobot_playbyear.episodes.play import play as play_episode
 from lerobot_playbyear.recording.record import Nobody, RecordConfig, RecordDatasetConfig, record
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_teleoperator

@@ -1,12 +1,6 @@
 """Sound into datasets: from files, and from the pictures of microphones that were recorded as cameras; and as pictures."""
 
-from typing import TYPE_CHECKING
-
 from lerobot_playbyear import lazy_names
-
-if TYPE_CHECKING:
-    from lerobot_playbyear.audio.audio_files import cut_into_frames, read_audio, resample, write_audio
-    from lerobot_playbyear.audio.recorder_clock import note_episode_start
 
 __all__ = ["cut_into_frames", "note_episode_start", "read_audio", "resample", "write_audio"]
 

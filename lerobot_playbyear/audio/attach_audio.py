@@ -9,6 +9,7 @@ LeRobot is imported when the dataset's files have been looked at.
 import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,11 +17,12 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, cut_into_frames, read_audio
-from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_layout
+from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_tracks
 from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder, scratch_folder
+from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.info import check_links
 from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
@@ -132,22 +134,18 @@ class PutAside:
         from lerobot_playbyear.datasets.statistics import sound_stats
 
         for channel, key in enumerate(self._keys):
-            np.save(self._file(key, len(self._stats[key])), blocks[..., channel])
+            np.save(self._folder / f"{key}-{len(self._stats[key])}.npy", blocks[..., channel])
             self._stats[key].append(sound_stats(blocks[..., channel]))
 
     def columns(self, sample_rate: int, fps: int) -> "Columns":
         """All that was added, as columns of a copy."""
         from lerobot_playbyear.audio.dataset_copy import AddedColumn
 
-        def column(key: str) -> AddedColumn:
-            return AddedColumn(
-                audio_feature(sample_rate, fps), self._stats[key], lambda episode: np.load(self._file(key, episode))
-            )
+        feature = audio_feature(sample_rate, fps)
+        return {key: AddedColumn(feature, self._stats[key], partial(self._blocks, key)) for key in self._keys}
 
-        return {key: column(key) for key in self._keys}
-
-    def _file(self, key: str, episode: int) -> Path:
-        return self._folder / f"{key}-{episode}.npy"
+    def _blocks(self, key: str, episode: int) -> np.ndarray:
+        return np.load(self._folder / f"{key}-{episode}.npy")
 
 
 def attach_audio(cfg: AttachAudioConfig) -> Path:
@@ -164,34 +162,28 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         InputError: The copy's folder cannot be made, before any sound is read.
         OSError: The copy cannot be written.
     """
-    root = cfg.dataset.folder
-    has_own_files = cfg.files is None and cfg.session is None and has_audio_files(root)
+    has_own_files = cfg.files is None and cfg.session is None and has_audio_files(cfg.dataset.folder)
     _check_source(cfg, has_own_files)
     target = output_folder(cfg.output)
+    dataset = open_for_copy(cfg.dataset, has_own_files)
     removed: list[str] = []
     notes: Features = {}
     with scratch_folder() as folder:
         scratch = Path(folder)
         if has_own_files:
-            layout = read_layout(cfg.dataset.repo_id, root, cfg.offset)
-            sources = [_own_files(track, layout.lengths, layout.fps, scratch) for track in layout.tracks]
-            removed = [track.key for track in layout.tracks]
-            added = _read(sources, layout.lengths, layout.fps, cfg, scratch)
-            n_episodes = len(layout.lengths)
-        else:
-            dataset = open_for_copy(cfg.dataset)
-            root, n_episodes = Path(dataset.root), dataset.meta.total_episodes
-            if _is_in_dataset(cfg):
-                from lerobot_playbyear.audio.camera_sound import read_camera_sound
+            tracks = read_tracks(dataset, cfg.offset)
+            removed = [track.key for track in tracks]
+            added = _read([_own_files(track, dataset, scratch) for track in tracks], cfg, dataset, scratch)
+        elif _is_in_dataset(cfg):
+            from lerobot_playbyear.audio.camera_sound import read_camera_sound
 
-                added, notes = read_camera_sound(cfg, dataset, scratch)
-            else:
-                source = (_session if cfg.files is None else _files)(cfg, dataset, _keys(cfg, dataset), scratch)
-                lengths = [int(length) for length in dataset.meta.episodes["length"]]
-                added = _read([source], lengths, dataset.fps, cfg, scratch)
-        write_new_dataset(root, target, added, removed, notes)
+            added, notes = read_camera_sound(cfg, dataset, scratch)
+        else:
+            source = (_session if cfg.files is None else _files)(cfg, dataset, _keys(cfg, dataset), scratch)
+            added = _read([source], cfg, dataset, scratch)
+        write_new_dataset(dataset.root, target, added, removed, notes)
     heard = [f"{key} at {added[key].feature['info']['sample_rate']} Hz" for key in audio_keys(added)]
-    print(f"\nDataset: {target} ({n_episodes} episodes with {', '.join(heard)})")
+    print(f"\nDataset: {target} ({len(dataset.episodes)} episodes with {', '.join(heard)})")
     return target
 
 
@@ -232,8 +224,12 @@ def output_folder(place: DatasetPlace) -> Path:
     return target
 
 
-def open_for_copy(place: DatasetPlace) -> DatasetReader:
+def open_for_copy(place: DatasetPlace, may_have_audio_files: bool = False) -> DatasetReader:
     """Opens a dataset of which a copy is to be made: no link leads out of it, and its tables of episodes are whole.
+
+    Args:
+        place: The dataset.
+        may_have_audio_files: See `DatasetReader`.
 
     Raises:
         AttachError: There is none, or it is not so.
@@ -241,16 +237,23 @@ def open_for_copy(place: DatasetPlace) -> DatasetReader:
     if place.root is not None and not (Path(place.root) / INFO_PATH).is_file():
         raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
     try:
-        dataset = DatasetReader(place.repo_id, place.root)
+        dataset = DatasetReader(place.repo_id, place.root, may_have_audio_files=may_have_audio_files)
         from lerobot_playbyear.audio.dataset_copy import check_tables
 
-        check_links(Path(dataset.root))  # the copy would hold what they lead to
-        check_tables(Path(dataset.root))  # LeRobot looks at no checksum
-        return dataset
+        check_links(dataset.root)  # the copy would hold what they lead to
+        check_tables(dataset.root)  # LeRobot looks at no checksum
     except ParquetDamageError as error:
         raise AttachError(f"{error} Repair it first: playbyear-repair --root={dataset.root}") from error
     except Exception as error:  # also what the Hub's client raises
         raise AttachError(f"The dataset '{place.repo_id}' in {place.folder} cannot be opened: {error}") from error
+    rows, held = dataset.meta.episodes, [(episode.index, len(episode)) for episode in dataset.episodes]
+    said = list(zip(rows["episode_index"], rows["length"], strict=True))
+    if held != said or [number for number, _ in said] != list(range(len(said))):
+        raise AttachError(
+            f"The data files do not hold episodes 0 to {len(said) - 1} in this order, as long as meta/episodes says. Repair "
+            f"the dataset first: playbyear-repair --root={dataset.root}"
+        )
+    return dataset
 
 
 def raise_all(errors: list[str]) -> None:
@@ -326,24 +329,25 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
 # Where sound is
 
 
-def _read(sources: list[Source], lengths: Sequence[int], fps: int, cfg: AttachAudioConfig, scratch: Path) -> "Columns":
+def _read(sources: list[Source], cfg: AttachAudioConfig, dataset: DatasetReader, scratch: Path) -> "Columns":
     """Cuts the sound of all episodes, so that what is wrong with it is known before anything is written.
 
     Raises:
         AttachError: Naming every episode whose sound is missing, too short or of another kind.
     """
+    fps = dataset.fps
     if cfg.sample_rate is not None and (cfg.sample_rate <= 0 or cfg.sample_rate % fps):
         raise AttachError(f"--sample_rate={cfg.sample_rate}: wanted a multiple of {fps} frames per second.")
     errors: list[str] = []
     found: list[tuple[PutAside, dict[int, int]]] = []  # and the episode in which each rate comes first
     for source in sources:
         sound, first_with = PutAside(source.keys, scratch), dict[int, int]()
-        for episode, length in enumerate(tqdm(lengths, desc="Reading sound", unit="episode")):
+        for episode, rows in enumerate(tqdm(dataset.episodes, desc="Reading sound", unit="episode")):
             try:
                 heard = source.recording(episode)
                 rate = _new_rate(cfg, heard.sample_rate, fps, source.is_own)
                 first_with.setdefault(rate, episode)
-                own = (heard.samples, heard.sample_rate, fps, length, heard.start_s)
+                own = (heard.samples, heard.sample_rate, fps, len(rows), heard.start_s)
                 sound.append(cut_into_frames(*own, cfg.pad, rate, heard.speed))
             except (AudioFileError, ValueError) as error:
                 errors.append(f"{source.named(episode)}{error}")
@@ -394,7 +398,7 @@ def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], sc
     """One recording of a whole session, and the times when the episodes began."""
     line = read_marks(cfg.marks)
     n_episodes = dataset.meta.total_episodes
-    starts, offsets = _starts(cfg, Path(dataset.root), n_episodes), _offsets(cfg, n_episodes)
+    starts, offsets = _starts(cfg, dataset.root, n_episodes), _offsets(cfg, n_episodes)
     path = Path(str(cfg.session))
     try:
         pieces = ((_choose_channels(cfg, samples, len(keys)), rate) for samples, rate in audio_pieces(path))
@@ -434,17 +438,18 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
         )
     missing = [episode for episode in range(n_episodes) if episode not in known]
     if missing:
-        named = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
-        raise AttachError(f"{source} has no time for episode {named}; the dataset has {n_episodes} episodes. Add it.")
+        raise AttachError(
+            f"{source} has no time for {name_episodes(missing)}; the dataset has {n_episodes} episodes. Add it."
+        )
     return [known[episode] for episode in range(n_episodes)]
 
 
-def _own_files(track: AudioTrack, lengths: Sequence[int], fps: int, scratch: Path) -> Source:
+def _own_files(track: AudioTrack, dataset: DatasetReader, scratch: Path) -> Source:
     """A microphone's files beside the frames, of several episodes each."""
     decoded: dict[Path, tuple[np.ndarray, int] | AudioFileError] = {}
     needed_s: dict[Path, float] = {}  # to where in each file; one may decode to more than a disk holds
-    for span, length in zip(track.spans, lengths, strict=True):
-        end_s = span.start_s + track.start_time_s + length / fps + _SPARE_S
+    for span, rows in zip(track.spans, dataset.episodes, strict=True):
+        end_s = span.start_s + track.start_time_s + len(rows) / dataset.fps + _SPARE_S
         needed_s[span.path] = max(end_s, needed_s.get(span.path, 0.0))
 
     def recording(episode: int) -> Recording:

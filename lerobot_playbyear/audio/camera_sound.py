@@ -26,6 +26,7 @@ from lerobot_playbyear.audio.microphone_pictures import (
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.features import INTERVENTION, IS_FIRST, IS_FIRST_FEATURE, MICROPHONE, Features
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
+from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import numeric_stats
 
@@ -94,7 +95,7 @@ class _MicrophoneReader:
         self._is_foreign = _came_from_the_hub(Path(dataset.root))
         own = [] if self._is_foreign else [SESSIONS]
         self._folders = own if cfg.session is None else [cfg.session, *own]
-        self._files: dict[int, SessionSound | None] = {}
+        self._files: dict[int, SessionSound] = {}
         self._taken: dict[int, tuple[int, int]] = {}  # of each session's file, from which sample to which
         self._spacing: list[list[int]] = []  # of each episode, samples from frame to frame
         self._errors: dict[str, list[int]] = {}  # what is wrong, and in which episodes
@@ -107,11 +108,10 @@ class _MicrophoneReader:
             self._read_episode(number, self._dataset.pictures(self._key, episode))
             for number, episode in enumerate(tqdm(self._dataset.episodes, desc=f"Reading {self._key}", unit="episode"))
         ]
-        raise_all([f"{self._key}, {_listed(episodes)}: {error}" for error, episodes in self._errors.items()])
+        raise_all([f"{self._key}, {name_episodes(episodes)}: {error}" for error, episodes in self._errors.items()])
         self._check_pace()
         for session, (start, stop) in self._taken.items():
             file = self._files[session]
-            assert file is not None
             print(f"{self._key}: {start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s of {file.path}")
         return self._sound.columns(self._rate, self._dataset.fps), is_first
 
@@ -179,17 +179,18 @@ class _MicrophoneReader:
         """
         if session not in self._files:
             path = next(filter(None, (find_session(folder, session) for folder in self._folders)), None)
-            self._files[session] = None if path is None else SessionSound(path)
-        file = self._files[session]
-        if file is None:
-            where = f"is not in {' or '.join(map(str, self._folders))}" if self._folders else "has to be named"
-            if self._is_foreign:
-                where += f", for this dataset came from the Hub and may be a stranger's (your own are in {SESSIONS})"
-            raise ValueError(
-                f"its pictures were compressed, and the session's file *_{session:08x}.wav {where}. Copy it from the machine "
-                "that recorded, and give --session=FOLDER"
-            )
-        return file
+            if path is None:
+                where = f"is not in {' or '.join(map(str, self._folders))}" if self._folders else "has to be named"
+                if self._is_foreign:
+                    where += (
+                        f", for this dataset came from the Hub and may be a stranger's (your own are in {SESSIONS})"
+                    )
+                raise ValueError(
+                    f"its pictures were compressed, and the session's file *_{session:08x}.wav {where}. Copy it from the "
+                    "machine that recorded, and give --session=FOLDER"
+                )
+            self._files[session] = SessionSound(path)
+        return self._files[session]
 
     def _samples_per_frame(self, frame: _Frame) -> int:
         """From one frame to the next, as it should be."""
@@ -253,8 +254,3 @@ def _came_from_the_hub(root: Path) -> bool:
     caches = [Path(HF_HUB_CACHE).resolve(), (HF_LEROBOT_HOME / "hub").resolve()]
     is_in_cache = any(root.resolve().is_relative_to(cache) for cache in caches)
     return is_in_cache or (root / ".cache" / "huggingface").exists()
-
-
-def _listed(episodes: list[int]) -> str:
-    named = ", ".join(map(str, episodes[:5])) + (", ..." if len(episodes) > 5 else "")
-    return f"episode{'s' if len(episodes) > 1 else ''} {named}"

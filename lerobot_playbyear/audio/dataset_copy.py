@@ -59,14 +59,14 @@ def write_copy(
     """Writes a dataset with more columns.
 
     Args:
-        root: The dataset.
+        root: The dataset, as `open_for_copy` opens it.
         target: An empty folder.
         added: The columns, by their keys; all of the same episodes.
         removed: Features with files of sound in whose place they come.
         notes: What the `info` of other features says more.
 
     Raises:
-        ParquetDamageError: A table is damaged, or names other frames than there are values for.
+        ParquetDamageError: A table is damaged.
         OSError: Something cannot be read or written.
     """
     info = read_info(root)
@@ -144,20 +144,15 @@ def _values(frames: pa.Table, column: AddedColumn, kind: pa.DataType) -> pa.Arra
     episode = frames.column("episode_index")[0].as_py()
     numbers = column_to_numpy(frames.column("frame_index"))
     first, last = int(numbers[0]), int(numbers[-1])
-    values = column.values(episode) if 0 <= episode < len(column.stats) else []
-    if not 0 <= first <= last < len(values) or (np.diff(numbers) != 1).any():
-        raise ValueError(f"it holds frames {first} to {last} of episode {episode}; meta/episodes counts {len(values)}")
-    own = values[first : last + 1]
+    own = column.values(episode)[first : last + 1]
+    if len(own) != len(frames) or (np.diff(numbers) != 1).any():
+        raise ValueError(f"frames {first} to {last} of episode {episode} are not numbered one after the other")
     return numpy_to_column(own, kind) if isinstance(own, np.ndarray) else pa.array(own, kind)
 
 
 def _write_rows(source: Path, target: Path, stats: Sequence[Mapping], removed: Collection[str]) -> None:
     rows = _read_named(source)
-    episodes = rows.column("episode_index").to_pylist()
-    for episode in episodes:
-        if not isinstance(episode, int) or not 0 <= episode < len(stats):
-            raise ParquetDamageError(f"{source} is damaged: it names episode {episode} of {len(stats)}.")
     prefixes = tuple(f"{folder}/{key}/" for key in removed for folder in ("stats", AUDIO_FOLDER))
     rows = rows.select([name for name in rows.column_names if not name.startswith(prefixes)])
-    rows = with_stats(rows, [dict(stats[episode]) for episode in episodes])
+    rows = with_stats(rows, [dict(stats[episode]) for episode in rows.column("episode_index").to_pylist()])
     write_rows(rows.replace_schema_metadata(None), target)

@@ -6,23 +6,19 @@ A feature `observation.audio.<microphone>` of dtype "audio" and shape (channels,
 be a stranger's, and is checked here.
 """
 
-import bisect
+import itertools
 import json
 import math
 import re
-from collections import defaultdict
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, AUDIO_PREFIX
-from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, list_files
-from lerobot_playbyear.datasets.info import check_dataset_files, check_links, file_inside, read_info
-from lerobot_playbyear.datasets.parquet import ParquetDamageError, read_table
+from lerobot_playbyear.datasets.files import INFO_PATH
+from lerobot_playbyear.datasets.info import file_inside, read_info
+from lerobot_playbyear.datasets.reader import DatasetReader
 
 AUDIO_FOLDER = "audio"
 DEFAULT_AUDIO_PATH = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
@@ -30,10 +26,6 @@ DEFAULT_AUDIO_PATH = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:audio_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _MOST_CHANNELS, _MOST_START_S, _MOST_INDEX = 64, 60.0, 10**6
 _TOLERANCE, _SPARE_S = 4, 60.0  # times as long as the episodes, and so much more, may the files claim to last
-
-
-class AudioLayoutError(InputError):
-    """What a dataset says of its files of sound cannot be so."""
 
 
 @dataclass(frozen=True)
@@ -70,21 +62,6 @@ class AudioTrack:
     spans: list[AudioSpan]
 
 
-@dataclass(frozen=True)
-class AudioLayout:
-    """What a dataset says of its files of sound.
-
-    Args:
-        fps: Its frames per second [Hz].
-        lengths: Frames of each episode.
-        tracks: Its microphones.
-    """
-
-    fps: int
-    lengths: list[int]
-    tracks: list[AudioTrack]
-
-
 def has_audio_files(root: Path) -> bool:
     """Whether a dataset has sound in files beside the frames; also False where its features cannot be read."""
     try:
@@ -94,51 +71,30 @@ def has_audio_files(root: Path) -> bool:
         return False
 
 
-def read_layout(repo_id: str, root: Path, start_time_s: float | None = None) -> AudioLayout:
+def read_tracks(dataset: DatasetReader, start_time_s: float | None = None) -> list[AudioTrack]:
     """Where the sound of a dataset lies that has it in files.
 
     Args:
-        repo_id: Its name.
-        root: Its folder.
+        dataset: The dataset.
         start_time_s: What is taken for `info.start_time_s` [s]; None: what the dataset says.
 
     Raises:
-        InputError: A file is damaged or lies outside the folder; or a name, a number or a time is missing or cannot be right.
+        InputError: A file lies outside the folder; or a name, a number or a time is missing or cannot be right.
     """
     with errors_of_input():
-        footers = check_dataset_files(repo_id, root)
-        check_links(root)
-        info = read_info(root)
+        info = read_info(dataset.root)
         fps, features = info["fps"], info["features"]
         if fps % 1:
-            raise AudioLayoutError(f"{root / INFO_PATH}: fps is {fps!r}; wanted a whole number. Correct it.")
+            raise InputError(f"{dataset.root / INFO_PATH}: fps is {fps!r}; wanted a whole number. Correct it.")
         template = info.get("audio_path") or DEFAULT_AUDIO_PATH
         if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
-            raise AudioLayoutError(
-                f"{root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
+            raise InputError(
+                f"{dataset.root / INFO_PATH}: audio_path is {template!r}; wanted something like {DEFAULT_AUDIO_PATH!r}."
             )
-        rows, lengths = _episodes(root, sum(footer.num_rows for footer in footers))
-        seconds, heard = sum(lengths) / fps, [key for key, own in features.items() if own["dtype"] == AUDIO_DTYPE]
-        tracks = [_track(root, key, features[key], template, rows, seconds, start_time_s) for key in heard]
+        heard = [key for key, own in features.items() if own["dtype"] == AUDIO_DTYPE]
+        tracks = [_track(dataset, key, features[key], template, start_time_s) for key in heard]
         _check_names(tracks, set(features))
-    return AudioLayout(int(fps), lengths, tracks)
-
-
-def _episodes(root: Path, n_frames: int) -> tuple[pa.Table, list[int]]:
-    """The rows of `meta/episodes` in the order of the episodes, and the frames of each."""
-    remedy = f"Repair it first: playbyear-repair --root={root}"
-    try:
-        tables = [read_table(path) for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet")]
-        rows = pa.concat_tables(tables, promote_options="default").sort_by("episode_index")
-        lengths = rows.column("length").to_pylist()
-        numbers = rows.column("episode_index").to_pylist()
-    except (ParquetDamageError, pa.ArrowException, KeyError) as error:
-        raise AudioLayoutError(f"{root / EPISODES_DIR} is damaged: {error}. {remedy}") from error
-    if numbers != list(range(len(rows))) or not all(isinstance(length, int) and length > 0 for length in lengths):
-        raise AudioLayoutError(f"{root / EPISODES_DIR} lacks episodes, or lengths, of 0 to {len(rows) - 1}. {remedy}")
-    if sum(lengths) != n_frames:
-        raise AudioLayoutError(f"{root / EPISODES_DIR} counts {sum(lengths)} frames; data/ holds {n_frames}. {remedy}")
-    return rows, lengths
+    return tracks
 
 
 def _check_names(tracks: list[AudioTrack], features: set[str]) -> None:
@@ -146,7 +102,7 @@ def _check_names(tracks: list[AudioTrack], features: set[str]) -> None:
     for track in tracks:
         for name in column_names(track):
             if name in taken:
-                raise AudioLayoutError(f"'{track.key}' becomes '{name}', which is there already. Rename one of them.")
+                raise InputError(f"'{track.key}' becomes '{name}', which is there already. Rename one of them.")
             taken.add(name)
 
 
@@ -155,67 +111,52 @@ def column_names(track: AudioTrack) -> list[str]:
     return [track.key] if track.n_channels == 1 else [f"{track.key}_{channel}" for channel in range(track.n_channels)]
 
 
-def _track(
-    root: Path, key: str, feature: dict, template: str, rows: pa.Table, seconds: float, start_time_s: float | None
-) -> AudioTrack:
+def _track(dataset: DatasetReader, key: str, feature: dict, template: str, start_time_s: float | None) -> AudioTrack:
     if not key.startswith(AUDIO_PREFIX) or key == AUDIO_PREFIX or "/" in key or "\\" in key:
-        raise AudioLayoutError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>', without '/'.")
-    info = feature.get("info") or {}
-    if not isinstance(info, Mapping):
-        raise AudioLayoutError(f"'{key}': info is {info!r}; wanted fields such as sample_rate. Correct {INFO_PATH}.")
-    shape = feature.get("shape")
-    n_channels = shape[0] if isinstance(shape, list) and len(shape) == 1 else None
+        raise InputError(f"'{key}' has dtype 'audio'; wanted '{AUDIO_PREFIX}<microphone>', without '/'.")
+    info, shape = feature.get("info") or {}, feature["shape"]
+    n_channels = shape[0] if len(shape) == 1 else None
     n_channels = _number(key, "shape", shape, n_channels, 1, _MOST_CHANNELS, "(channels,)")
     rate = info.get("sample_rate", info.get("audio.sample_rate"))
     if rate is not None:
         rate = _number(key, "info.sample_rate", rate, rate, 1, 1_000_000, "a whole number of Hz")
     start = info.get("start_time_s") if start_time_s is None else start_time_s
-    is_time = isinstance(start, int | float) and not isinstance(start, bool) and 0 <= start <= _MOST_START_S
-    if start is None or not is_time:
-        raise AudioLayoutError(
+    if not isinstance(start, int | float) or not 0 <= start <= _MOST_START_S:
+        raise InputError(
             f"'{key}': info.start_time_s is {start!r}; wanted how long before an episode's first frame its sound begins, "
             f"0 to {_MOST_START_S:g} s. Say it with --offset=1."
         )
-    latest_s = _TOLERANCE * (seconds + len(rows) * start) + _SPARE_S
-    spans = _spans(root, key, template, rows, latest_s)
-    return AudioTrack(key, int(n_channels), None if rate is None else int(rate), float(start), spans)
+    latest_s = _TOLERANCE * (len(dataset) / dataset.fps + len(dataset.episodes) * start) + _SPARE_S
+    return AudioTrack(key, n_channels, rate, float(start), _spans(dataset, key, template, latest_s))
 
 
-def _spans(root: Path, key: str, template: str, rows: pa.Table, latest_s: float) -> list[AudioSpan]:
+def _spans(dataset: DatasetReader, key: str, template: str, latest_s: float) -> list[AudioSpan]:
+    rows = dataset.meta.episodes
     names = {name: f"{AUDIO_FOLDER}/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")}
     missing = [name for name in names.values() if name not in rows.column_names]
     if missing:
-        raise AudioLayoutError(
-            f"'{key}': meta/episodes has no column {missing[0]!r}, which says where its sound is. Add it."
-        )
-    columns = {name: rows.column(column).to_pylist() for name, column in names.items()}
+        raise InputError(f"'{key}': meta/episodes has no column {missing[0]!r}, which says where its sound is. Add it.")
     end_name = f"{AUDIO_FOLDER}/{key}/to_timestamp"
-    ends = rows.column(end_name).to_pylist() if end_name in rows.column_names else [None] * len(rows)
+    ends = rows[end_name] if end_name in rows.column_names else [None] * len(rows)
     spans: list[AudioSpan] = []
-    for episode, (chunk, file, start, end) in enumerate(zip(*columns.values(), ends, strict=True)):
+    for episode, (chunk, file, start, end) in enumerate(zip(*map(rows.__getitem__, names.values()), ends, strict=True)):
         of = f"{key}', episode {episode}, '{AUDIO_FOLDER}"
         for name, value in (("chunk_index", chunk), ("file_index", file)):
             _number(of, name, value, value, 0, _MOST_INDEX, "a whole number")
         _time(of, "from_timestamp", start, 0, latest_s)
         if end is not None:
             _time(of, "to_timestamp", end, start, latest_s)
-        path = file_inside(root, template.format(audio_key=key, chunk_index=int(chunk), file_index=int(file)))
+        path = file_inside(dataset.root, template.format(audio_key=key, chunk_index=int(chunk), file_index=int(file)))
         spans.append(AudioSpan(path, float(start), None if end is None else float(end)))
-    starts: dict[Path, list[float]] = defaultdict(list)
-    for span in sorted(spans, key=lambda span: span.start_s):
-        starts[span.path].append(span.start_s)
-    return [replace(span, end_s=_end(span, starts[span.path])) for span in spans]
-
-
-def _end(span: AudioSpan, starts: list[float]) -> float | None:
-    """Where a sound ends [s]: if that is not said, where the next one in its file begins, if there is one."""
-    later = bisect.bisect_right(starts, span.start_s)
-    return span.end_s if span.end_s is not None else starts[later] if later < len(starts) else None
+    starts = sorted({(span.path, span.start_s) for span in spans})
+    # Where no end is said, a sound ends where the next one in its file begins, if there is one.
+    ends_of = {here: later[1] for here, later in itertools.pairwise(starts) if here[0] == later[0]}
+    return [replace(s, end_s=ends_of.get((s.path, s.start_s)) if s.end_s is None else s.end_s) for s in spans]
 
 
 def _number(of: str, name: str, seen: Any, value: Any, least: int, most: int, wanted: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int | float) or value % 1 or not least <= value <= most:
-        raise AudioLayoutError(
+        raise InputError(
             f"'{of}': {name} is {seen!r}; wanted {wanted}, {least} to {most:,}. Correct it, or ask who made the dataset."
         )
     return int(value)
@@ -223,7 +164,7 @@ def _number(of: str, name: str, seen: Any, value: Any, least: int, most: int, wa
 
 def _time(of: str, name: str, value: Any, least: float, most: float) -> None:
     if not isinstance(value, int | float) or not math.isfinite(value) or not least <= value <= most:
-        raise AudioLayoutError(
+        raise InputError(
             f"'{of}': {name} is {value!r}; wanted seconds, {least:g} to {most:g}, which is {_TOLERANCE} times what the "
             "episodes last. Correct it, or ask who made the dataset."
         )

@@ -12,7 +12,6 @@ import contextlib
 import csv
 import json
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +26,6 @@ CLOCK_PATH = "meta/playbyear_clock.json"
 """Where in a dataset's folder its episodes' times stand."""
 
 _MOST_DRIFT = 0.01  # beyond it a mark is wrong, not a clock
-_MARK = re.compile(r"\s*([-+.\deE]+)\s*=\s*([-+.\deE]+)\s*")
 _EPISODES = "episodes"
 _WANTED = f'wanted {{"{_EPISODES}": {{"0": <seconds>, "1": <seconds>}}}}'
 
@@ -201,16 +199,16 @@ def read_marks(text: str | None) -> ClockLine:
         return ClockLine()
     pairs = []
     for part in text.split(","):
-        match = _MARK.fullmatch(part)
         try:
-            pairs.append((float(match[1]), float(match[2])) if match else (math.nan, math.nan))
-        except ValueError:
-            pairs.append((math.nan, math.nan))
-        if not all(map(math.isfinite, pairs[-1])):
+            sound_s, clock_s = map(float, part.split("="))
+            if not math.isfinite(sound_s + clock_s):
+                raise ValueError
+        except ValueError as wrong:
             raise ClockError(
                 f"--marks: {part.strip()!r} is no mark; wanted seconds in the sound file = seconds on the clock, such as "
                 "2.31=1754400000.12, and a comma between two of them."
-            )
+            ) from wrong
+        pairs.append((sound_s, clock_s))
     sound, clock = np.array(pairs).T
     origin_clock, origin_sound = float(clock.mean()), float(sound.mean())
     if len(pairs) == 1:

@@ -85,7 +85,7 @@ class SoundPicture:
             if getattr(self, name) > _LARGEST:
                 raise self._error(name, f"at most {_LARGEST} pixels")
         if self.sample_rate % self.fps or self.columns_per_frame > self.samples_per_frame:
-            raise self._error("columns_per_frame", "at most as many as a frame has samples, which is sample_rate / fps")
+            raise self._error("columns_per_frame", "at most sample_rate / fps: more seconds, or a smaller width")
         if not FLOOR_DB <= self.low_db < self.high_db:
             raise self._error("low_db", f"at least {FLOOR_DB:g}, and below high_db={self.high_db}")
         object.__setattr__(self, "before_episode", tuple(self.before_episode))

@@ -13,6 +13,7 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.parquet import stretches
 from lerobot_playbyear.episodes.frames import INTERVENTION
 from lerobot_playbyear.training.batches import Batch, PolicyWindows, RunSampler, run_weights
 from lerobot_playbyear.training.store import EpisodeStore
@@ -170,11 +171,6 @@ def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
         )
         return by_expert
     return later
-
-
-def stretches(flags: np.ndarray) -> np.ndarray:
-    """Where flags (T,) are true without a gap, (n, 2): the first frame of each stretch, and the one after its last."""
-    return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]))).reshape(-1, 2)
 
 
 def frames_by_expert(store: EpisodeStore) -> Tensor:

@@ -9,12 +9,13 @@ memory changes with the policy.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+
+from lerobot_playbyear.policy.networks import mlp
 
 _N_HEADS = 5  # whose disagreement is novelty; ThriftyDAgger: five policies
 _DISCOUNT = 0.9999  # of a success, per step (ThriftyDAgger)
@@ -91,19 +92,19 @@ class GateModel:
     def _scaled(self, memories: Tensor) -> Tensor:
         return (memories.float() - self._mean) / self._std
 
-    def _learn_heads(self, played: list[Played]) -> list[nn.Module]:
+    def _learn_heads(self, played: list[Played]) -> list[nn.Sequential]:
         masks = [torch.from_numpy(each.by_expert) for each in played]
         memories = self._scaled(torch.cat([p.memories[mask] for p, mask in zip(played, masks, strict=True)]))
         actions = torch.cat([p.actions[mask] for p, mask in zip(played, masks, strict=True)]).float()
         heads = []
         for _ in range(_N_HEADS):
-            head = _network(memories.shape[1], actions.shape[1])
+            head = mlp(memories.shape[1], _HIDDEN, actions.shape[1])
             own = torch.randint(len(memories), (len(memories),))  # with replacement, as ThriftyDAgger's policies draw
             _fit(head, memories[own], actions[own], nn.functional.mse_loss)
             heads.append(head)
         return heads
 
-    def _learn_values(self, played: list[Played]) -> list[nn.Module]:
+    def _learn_values(self, played: list[Played]) -> list[nn.Sequential]:
         kinds = [[each.seed for each in played if each.is_visited and each.success is kind] for kind in (True, False)]
         self._half = {seed: number % 2 for seeds in kinds for number, seed in enumerate(seeds)}  # both see both kinds
         values = []
@@ -117,7 +118,7 @@ class GateModel:
                 ahead = torch.arange(len(each.memories) - 1, -1, -1)[own]
                 outcomes.append(each.success * _DISCOUNT ** ahead.float())
             inputs, targets = torch.cat(seen), torch.cat(outcomes).unsqueeze(-1)
-            values.append(_network(inputs.shape[1], 1))
+            values.append(mlp(inputs.shape[1], _HIDDEN, 1))
             _fit(values[-1], inputs, targets, nn.functional.binary_cross_entropy_with_logits)
         return values
 
@@ -180,12 +181,6 @@ def _last_takeover(by_expert: np.ndarray) -> int:
     """From which step on the outcome of an attempt tells of it: before the last takeover the expert made it what it was."""
     begins = np.flatnonzero(by_expert[1:] & ~by_expert[:-1]) + 1
     return int(begins[-1]) if len(begins) else 0
-
-
-def _network(n_in: int, n_out: int) -> nn.Module:
-    sizes = (n_in, _HIDDEN, _HIDDEN)
-    layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), nn.ReLU())]
-    return nn.Sequential(*layers, nn.Linear(_HIDDEN, n_out))
 
 
 def _fit(network: nn.Module, inputs: Tensor, targets: Tensor, loss_of: Callable[..., Tensor]) -> None:

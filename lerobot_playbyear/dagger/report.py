@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_playbyear.dagger.batches import stretches
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.dagger.run_folder import RunFolder, RunState
+from lerobot_playbyear.datasets.parquet import stretches
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.report import Progress
 
@@ -29,11 +29,9 @@ class Report(Progress):
 
     def __init__(self, cfg: DaggerConfig, training: PlaybyearTrainConfig, folder: RunFolder, state: RunState) -> None:
         training.resume, training.wandb.run_id = state.wandb_run_id is not None, state.wandb_run_id
-        if cfg.is_online:
-            done = (state.first_episodes or 0) + state.kept
-            super().__init__(training, state, cfg.episodes, done, "episode", "HG-DAgger")
-        else:
-            super().__init__(training, state, cfg.updates, state.step, "update", "HG-DAgger")
+        episodes = (cfg.episodes, (state.first_episodes or 0) + state.kept, "episode")
+        counted = episodes if cfg.is_online else (cfg.updates, state.step, "update")
+        super().__init__(training, state, *counted, "HG-DAgger")
         training.resume = False  # checkpoints of a resumed run are those of one that was not
         state.wandb_run_id = training.wandb.run_id = self._wandb.cfg.run_id if self._wandb else None
         self._cfg, self._folder, self._state = cfg, folder, state
@@ -142,11 +140,6 @@ def round_figures(lines: Sequence[Mapping[str, Any]], number: int) -> dict[str, 
     """
     totals = Totals.of(lines)
     own = Totals.of(line for line in lines if line.get("round") == number - 1)
-    return {
-        "expert_steps": totals.expert_steps,
-        "takeovers": totals.takeovers,
-        "switches": totals.switches,
-        "person_seconds": totals.person_seconds,
-        "autonomy": round(own.autonomy, 4),
-        "mean_takeover_steps": round(own.mean_takeover_steps, 2),
-    }
+    spent = {name: getattr(totals, name) for name in ("expert_steps", "takeovers", "switches", "person_seconds")}
+    means = {"autonomy": round(own.autonomy, 4), "mean_takeover_steps": round(own.mean_takeover_steps, 2)}
+    return {**spent, **means}

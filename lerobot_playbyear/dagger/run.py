@@ -27,7 +27,7 @@ from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.experts import Expert, ExpertError
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
 from lerobot_playbyear.episodes.policy_actor import PolicyActor
-from lerobot_playbyear.hub.push import METRICS_NAME, PushOptions, check_name, push_policy, warn_without_login
+from lerobot_playbyear.hub.push import METRICS_NAME, PushOptions, check_upload, push_policy
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import PolicyWindows, dataset_names
 from lerobot_playbyear.training.learner import Learner, check_dataset_suits, make_learner
@@ -100,8 +100,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise InputError("--policy.push_to_hub=true needs a name: give --policy.repo_id, or push_to_hub=false.")
     if cfg.policy.push_to_hub:
-        check_name("policy.repo_id", str(cfg.policy.repo_id))
-        warn_without_login()
+        check_upload("policy.repo_id", str(cfg.policy.repo_id))
     return state
 
 
@@ -306,8 +305,6 @@ def _check_dataset(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename
     names = dataset_names(policy, rename_map)
     for key, feature in {**(policy.input_features or {}), **(policy.output_features or {})}.items():
         name = names.get(key, key)
-        if name not in meta.features:
-            raise InputError(f"The dataset '{meta.repo_id}' lacks '{name}', which the policy needs.")
         seen_rate = (meta.features[name].get("info") or {}).get("sample_rate")
         rate = policy.sample_rate
         if rate is not None and seen_rate is not None and seen_rate != rate:

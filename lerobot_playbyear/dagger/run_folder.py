@@ -23,7 +23,6 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import (
     PARTIAL,
     FolderLock,
-    FolderLockedError,
     check_can_be_made,
     is_trial,
     new_folder,
@@ -115,7 +114,8 @@ class RunFolder:
         """Makes this process the only one that works in the folder. Of a run that never began nothing remains.
 
         Raises:
-            InputError: It cannot be written, or another process works in it.
+            InputError: It cannot be written.
+            FolderLockedError: Another process works in it.
         """
         check_can_be_made(self.path, f"--output_dir={self.path}")
         in_use = f"--output_dir={self.path}: another playbyear-dagger is at work there. Wait, or choose another."
@@ -123,8 +123,6 @@ class RunFolder:
         with contextlib.ExitStack() as stack:
             try:
                 stack.enter_context(FolderLock(self.path / LOCK, in_use))
-            except FolderLockedError as error:
-                raise InputError(str(error)) from error
             except OSError as error:
                 logging.warning(f"{self.path} cannot be locked ({error}): let no other playbyear-dagger work there.")
             stack.callback(self._leave_nothing, is_new)

@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 
 _LOW_DISK_BYTES = 64 * 2**20
 _UNCOMPRESSED = 32  # frames whose pictures may wait to be compressed
+_THREADS = 4  # that compress pictures
 _SAVING = 2  # saving takes so many times the memory of the episode besides
 _SPARE_BYTES = 256 * 2**20
 
@@ -68,7 +69,6 @@ class DurableWriter:
         features: LeRobot features of what `add_frame` gets, without the ones LeRobot adds itself.
         resume: Append to the dataset in `root` if there is one. Otherwise an existing one is an error.
         robot_type: Noted in a new dataset's metadata; one that notes another is refused.
-        image_writer_threads: Threads that compress pictures. 0: `add_frame` does it.
         rgb_encoder: Codec and quality of video. None: LeRobot's default.
 
     Raises:
@@ -90,7 +90,6 @@ class DurableWriter:
         *,
         resume: bool = False,
         robot_type: str | None = None,
-        image_writer_threads: int = 4,
         rgb_encoder: RGBEncoderConfig | None = None,
     ):
         check_features(features, fps)
@@ -99,7 +98,7 @@ class DurableWriter:
         self.features = features
         self._encoder = rgb_encoder or rgb_encoder_defaults()
         self._lock: FolderLock | None = None
-        self._pool = ThreadPoolExecutor(image_writer_threads) if image_writer_threads else None
+        self._pool = ThreadPoolExecutor(_THREADS)
         self._forget_episode()
         try:
             check_root(self.root, resume=resume)
@@ -199,8 +198,7 @@ class DurableWriter:
                 finish_journal(self.root)
                 remove_staged(self.root)
         self._forget_episode()
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        self._pool.shutdown(cancel_futures=True)
         self._lock.release()
         self._lock = None
 
@@ -222,9 +220,7 @@ class DurableWriter:
         if is_depth(feature):
             feature["info"].setdefault("depth_unit", infer_depth_unit(value.dtype))
         encode = partial(encode_picture, picture, is_depth(feature), 1 if feature["dtype"] == "video" else 6)
-        if self._pool is not None:
-            return self._pool.submit(encode)
-        return encode()
+        return self._pool.submit(encode)
 
     def _finish_frame(self, frame: dict[str, Any]) -> None:
         """Waits until the pictures of a frame are compressed."""

@@ -30,10 +30,8 @@ from lerobot_playbyear.datasets.journal import STAGING, remove_staged
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
     ParquetDamageError,
-    fit_to_schema,
     numpy_to_column,
     read_table,
-    with_values,
     write_rows,
     write_tables,
 )
@@ -211,18 +209,16 @@ def _stage_film(
 def _stage_row(root: Path, row: dict[str, Any], table: Path | None, last: Mapping[str, Any], chunks_size: int) -> None:
     """Puts the episode's row behind those of the last small table of episodes."""
     name, place = _place(root, DEFAULT_EPISODES_PATH, last, "meta/episodes", chunks_size)
-    rows = pa.Table.from_pydict({key: [value] for key, value in (row | place).items()})
-    if table is not None:
-        rows = fit_to_schema(rows, pq.read_schema(table).remove_metadata())
-        if _is_small(table, SMALL_TABLE_BYTES):
-            try:
-                before = read_table(table).replace_schema_metadata(None)
-                for key in place:
-                    rows = with_values(rows, key, [last[key]])
-                rows, name = pa.concat_tables([before, rows]).combine_chunks(), table.relative_to(root)
-            except ParquetDamageError as error:
-                logger.warning("%s is not continued: %s.", table, error)
-    write_rows(rows, root / STAGING / name)
+    schema = None if table is None else pq.read_schema(table).remove_metadata()
+    before = []
+    if table is not None and _is_small(table, SMALL_TABLE_BYTES):
+        try:
+            before = [read_table(table).replace_schema_metadata(None)]
+            name, place = table.relative_to(root), {key: last[key] for key in place}
+        except ParquetDamageError as error:
+            logger.warning("%s is not continued: %s.", table, error)
+    rows = pa.Table.from_pylist([row | place], schema)  # what the schema lacks is left out
+    write_rows(pa.concat_tables([*before, rows]).combine_chunks(), root / STAGING / name)
 
 
 def _is_small(path: Path, limit: int) -> bool:

@@ -19,6 +19,11 @@ class DatasetWriteError(PlaybyearError, RuntimeError):
     """An episode could not be written; the episodes saved before it are complete on disk."""
 
 
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says, without a full stop; its type where it says nothing."""
+    return next((line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()), type(error).__name__)
+
+
 @contextmanager
 def errors_of_input(*more: type[Exception]) -> Iterator[None]:
     """For the time in which options and data are read: what is raised of some kinds says what is wrong with them.

@@ -8,7 +8,6 @@ with them take seconds to import; a test compares them.
 """
 
 import contextlib
-import errno
 import fnmatch
 import glob
 import os
@@ -20,7 +19,7 @@ from pathlib import Path, PurePath
 from filelock import FileLock, Timeout
 from huggingface_hub.constants import HF_HOME
 
-from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
+from lerobot_playbyear.datasets.errors import InputError
 
 HF_LEROBOT_HOME = Path(os.getenv("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser()
 """LeRobot's own cache, where datasets without a root are."""
@@ -34,7 +33,7 @@ PARTIAL = ".partial"
 """What the name of a file or a folder ends in while it is written."""
 
 
-class FolderLockedError(PlaybyearError, RuntimeError):
+class FolderLockedError(InputError):
     """Another process works in the folder."""
 
 
@@ -70,8 +69,6 @@ def take_over(source: str | Path, target: str | Path) -> None:
         os.link(source, target)
     except OSError:
         shutil.copy2(source, target)
-        if source.stat().st_size != target.stat().st_size:
-            raise OSError(errno.EIO, "it could not be copied as a whole", str(source)) from None
 
 
 def fits(name: PurePath, *patterns: str) -> bool:
@@ -170,7 +167,7 @@ def new_folder(target: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-class FolderLock:
+class FolderLock(contextlib.ExitStack):
     """At most one process works in a folder: held until `release` or the end of the process, however it ends.
 
     The lock's file stays where it is: two processes that found different files under its name could both hold one.
@@ -185,22 +182,15 @@ class FolderLock:
     """
 
     def __init__(self, path: Path, in_use: str) -> None:
+        super().__init__()
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(path, timeout=0, thread_local=False)
         try:
-            self._lock.acquire()
+            self.enter_context(FileLock(path, timeout=0, thread_local=False))
         except Timeout as error:
             raise FolderLockedError(in_use) from error
 
-    def release(self) -> None:
-        """Lets another process in. Safe to call twice."""
-        self._lock.release()
-
-    def __enter__(self) -> "FolderLock":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
+    release = contextlib.ExitStack.close
+    """Lets another process in. Safe to call twice."""
 
 
 def scratch_folder() -> tempfile.TemporaryDirectory[str]:

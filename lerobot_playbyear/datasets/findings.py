@@ -53,12 +53,9 @@ def worst(findings: Iterable[Finding]) -> Level:
 def summary(findings: Sequence[Finding]) -> str:
     """ "19 checks: 17 ok, 1 info, 1 warning"."""
     counts = Counter(finding.level for finding in findings)
-    parts = [f"{counts[level]} {level}{_plural(level, counts[level])}" for level in LEVELS if counts[level]]
+    plural = {level: "s" if level in ("warning", "error") and counts[level] > 1 else "" for level in LEVELS}
+    parts = [f"{counts[level]} {level}{plural[level]}" for level in LEVELS if counts[level]]
     return f"{len(findings)} checks: {', '.join(parts)}"
-
-
-def _plural(level: str, count: int) -> str:
-    return "s" if count != 1 and level in ("warning", "error") else ""
 
 
 def name_episodes(episodes: Sequence[int]) -> str:

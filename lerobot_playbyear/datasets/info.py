@@ -14,6 +14,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     DEFAULT_VIDEO_PATH,
@@ -38,7 +39,7 @@ _MOST_FPS = 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
 
 
-class InfoError(ValueError):
+class InfoError(InputError):
     """A dataset's `meta/info.json` says what cannot be right, or claims what its files do not hold."""
 
 
@@ -107,7 +108,7 @@ def check_dataset_files(
         What its data files say of themselves; nothing where no local dataset is.
 
     Raises:
-        ValueError: Naming the file that is damaged, the folder without data, or what leads out of the folder or claims
+        InputError: Naming the file that is damaged, the folder without data, or what leads out of the folder or claims
             more than is there.
         OSError: A file cannot be read now, which says nothing about what it holds.
     """
@@ -124,12 +125,12 @@ def check_dataset_files(
             with open_checked(path) as file:
                 footers[path.relative_to(folder).parts[0]].append(file.metadata)
         except ParquetDamageError as error:
-            raise ValueError(
+            raise InputError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
                 f"killed, its episodes can be saved: playbyear-repair --root={folder}"
             ) from error
     if not footers["data"]:
-        raise ValueError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
+        raise InputError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
     check_claims(folder, footers["data"], sum(footer.num_rows for footer in footers["meta"]))
     return footers["data"]
 

@@ -5,11 +5,14 @@ dataset that a stranger made, so that nothing in it is believed: a journal says 
 moved stays inside the dataset, and no folder is followed that is a link.
 """
 
+import contextlib
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, write_atomically
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, flush_all, write_atomically
 
 SCRATCH = Path("images")
 STAGING = SCRATCH / ".staging"
@@ -19,7 +22,7 @@ JOURNAL = SCRATCH / ".journal.json"
 _PARTS = ("data", "meta", "videos")  # where an episode's files lie
 
 
-class JournalError(ValueError):
+class JournalError(InputError):
     """A journal, or the folder it is in, is none that was written here; nothing was changed."""
 
 
@@ -35,13 +38,9 @@ def publish(root: Path) -> None:
     Raises:
         JournalError: A file's place is not inside the dataset.
     """
-    names = _staged_files(root)
-    staging = root / STAGING
-    for name in names:
-        flush(staging / name)
-    for folder in sorted({staging / parent for name in names for parent in name.parents}):
-        flush(folder)
-    flush(staging.parent)
+    _staged_files(root)  # raises where one of them leads elsewhere
+    flush_all(root / STAGING)
+    flush(root / SCRATCH)
     write_atomically(root / JOURNAL, "")
     flush(root)
     finish_journal(root)
@@ -90,6 +89,25 @@ def lock_dataset(root: Path) -> FolderLock:
     """
     check_scratch(root)
     return FolderLock(root / LOCK, f"Another process is writing to {root}, or uploading it: wait until it has ended.")
+
+
+@contextlib.contextmanager
+def held(root: Path) -> Iterator[bool]:
+    """Keeps others from writing to a dataset that is read; where no lock can be made, nobody can write to it.
+
+    Yields:
+        Whether there is a lock.
+
+    Raises:
+        FolderLockedError, JournalError: As `lock_dataset`.
+    """
+    try:
+        lock = lock_dataset(root)
+    except OSError:
+        yield False
+        return
+    with lock:
+        yield True
 
 
 def check_scratch(root: Path) -> None:

@@ -16,6 +16,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lerobot_playbyear.datasets.errors import first_line
+
 
 class ParquetDamageError(ValueError):
     """A parquet file, or a part of it, does not hold what was written."""
@@ -50,7 +52,7 @@ def parsing(path: Path | None = None) -> Iterator[None]:
             raise OSError(error.errno, os.strerror(error.errno), error.filename or (path and str(path))) from error
         if isinstance(error, MemoryError) and not _asks_for_the_impossible(error):
             raise
-        raise ParquetDamageError(_first_line(error)) from error
+        raise ParquetDamageError(first_line(error)) from error
 
 
 def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.ParquetFile:
@@ -99,11 +101,8 @@ class DataFile:
         self.is_rescued = footer is not None
         sizes = [self.footer.row_group(group).num_rows for group in range(self.footer.num_row_groups)]
         self._edges = [0, *np.cumsum(sizes, dtype=int).tolist()]
+        self.n_rows = self._edges[-1]
         self._last: tuple[int, list[str] | None, pa.Table | ParquetDamageError] | None = None  # what was read last
-
-    @property
-    def n_rows(self) -> int:
-        return self._edges[-1]
 
     def row_groups(self, columns: list[str] | None = None) -> Iterator[tuple[int, pa.Table | ParquetDamageError]]:
         """The first row of every row group, and its rows, or what is wrong with them.
@@ -173,17 +172,6 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     return table
 
 
-def fit_to_schema(table: pa.Table, schema: pa.Schema) -> pa.Table:
-    """A table's columns in the order and types of a schema; what the table lacks is null, what it has more is left.
-
-    Raises:
-        pyarrow.ArrowInvalid: A column's type cannot become the schema's.
-    """
-    there = set(table.column_names)
-    columns = [table[f.name].cast(f.type) if f.name in there else pa.nulls(len(table), f.type) for f in schema]
-    return pa.Table.from_arrays(columns, schema=schema)
-
-
 def column_to_numpy(column: pa.ChunkedArray) -> np.ndarray:
     """A column of numbers or of fixed-length lists of numbers, as an array (N,) or (N, values per row).
 
@@ -222,6 +210,11 @@ def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:
     return starts, [*starts[1:], len(episode_index)]
 
 
+def stretches(flags: np.ndarray) -> np.ndarray:
+    """Where flags (T,) are true without a gap, (n, 2): the first row of each stretch, and the one after its last."""
+    return np.flatnonzero(np.diff(flags, prepend=False, append=False)).reshape(-1, 2)
+
+
 def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
     """Writes a file with one row group per table, or several where a table is large: readers hold a whole one.
 
@@ -233,7 +226,7 @@ def write_tables(path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> N
     path.parent.mkdir(parents=True, exist_ok=True)
     with pq.ParquetWriter(path, schema, **writer_options(schema)) as writer:
         for table in tables:
-            writer.write_table(table, row_group_size=_rows_within(PIECE_BYTES, table.nbytes, len(table)))
+            writer.write_table(table, row_group_size=max(PIECE_BYTES * len(table) // max(table.nbytes, 1), 1))
 
 
 def write_rows(rows: pa.Table, path: Path) -> None:
@@ -283,11 +276,6 @@ def leaf_columns(path: str, kind: pa.DataType) -> list[Leaf]:
     return [Leaf(path, kind, False, 1)]
 
 
-def _rows_within(limit: int, n_bytes: int, n_rows: int) -> int:
-    """How many rows take so many bytes, where `n_rows` take `n_bytes`; at least one."""
-    return max(min(n_rows, limit * n_rows // max(n_bytes, 1)), 1)
-
-
 def _is_list(kind: pa.DataType) -> bool:
     return isinstance(kind, pa.BaseExtensionType) or pa.types.is_nested(kind)
 
@@ -304,7 +292,3 @@ def _asks_for_the_impossible(error: MemoryError) -> bool:
     """Whether more memory was asked for than there can be: a size in the file was misread."""
     asked = re.search(r"alloc of size (\d+) failed", str(error))
     return asked is not None and int(asked[1]) > _IMPOSSIBLE_BYTES
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

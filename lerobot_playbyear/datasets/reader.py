@@ -21,10 +21,11 @@ import pyarrow as pa
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
-from lerobot_playbyear.datasets.info import INDEX_COLUMNS, InfoError, check_claims, check_dataset_files, file_inside
+from lerobot_playbyear.datasets.findings import name_episodes
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, check_claims, check_dataset_files, file_inside
 from lerobot_playbyear.datasets.parquet import DataFile, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
-from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
+from lerobot_playbyear.datasets.survey import Survey, survey
 from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
 
 if TYPE_CHECKING:
@@ -205,6 +206,7 @@ class DatasetReader(EpisodeReader):
         root: Its folder; None: LeRobot's own place for `repo_id`, or else the Hub.
         episodes: Only these; None: all.
         meta: What LeRobot has read of it already.
+        may_have_audio_files: Whether its sound may lie in files beside the frames, which this class does not read.
 
     Attributes:
         meta: What LeRobot knows of it.
@@ -222,6 +224,7 @@ class DatasetReader(EpisodeReader):
         episodes: Sequence[int] | None = None,
         *,
         meta: "LeRobotDatasetMetadata | None" = None,
+        may_have_audio_files: bool = False,
     ) -> None:
         if meta is None:
             is_local = bool(check_dataset_files(repo_id, root))
@@ -236,7 +239,10 @@ class DatasetReader(EpisodeReader):
         files = [DataFile(path) for path in list_files(folder, "data/*/*.parquet")]
         tasks = {} if meta.tasks is None else dict(enumerate(meta.tasks.index.astype(str)))
         super().__init__(meta.repo_id, folder, int(meta.fps), meta.features, files, tasks)
-        check_audio_features({key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps)
+        if not may_have_audio_files:
+            check_audio_features(
+                {key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps
+            )
         numbers = self.values("episode_index")
         bounds = zip(*episode_bounds(numbers), strict=True) if len(numbers) else ()
         found = [(int(numbers[start]), start, stop - start) for start, stop in bounds]
@@ -303,8 +309,6 @@ class SurveyedDataset(EpisodeReader):
             found = survey(folder, thorough=False)
             dataset = cls(repo_id, found, episodes)
             check_claims(folder, [file.footer for file in dataset.files], len(found.episodes))
-        except (InfoError, DatasetDamagedError) as error:
-            raise InputError(str(error)) from error
         except (OSError, MemoryError) as error:
             said = f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
             raise InputError(f"The dataset in '{folder}' cannot be opened: {said}.") from error
@@ -326,15 +330,8 @@ class SurveyedDataset(EpisodeReader):
     @cached_property
     def timed_microphones(self) -> list[str]:
         """The microphones whose rows are what their sample rate says; of the others no moment in time is known."""
-        fitting = []
-        for key in self.microphones:
-            try:
-                check_audio_features({key: self.features[key]}, self.fps)
-            except ValueError:
-                continue
-            if key not in self.unreadable:
-                fitting.append(key)
-        return fitting
+        wrong = {finding.feature for finding in self.survey.findings if finding.check == "sample rate"}
+        return [key for key in self.microphones if key not in {*wrong, *self.unreadable}]
 
     @cached_property
     def unreadable(self) -> dict[str, str]:
@@ -382,10 +379,9 @@ def check_finite(reader: DatasetReader, key: str) -> None:
     Raises:
         ValueError: Naming the episodes that hold them.
     """
-    wrong = [episode for episode in reader.episodes if not np.isfinite(reader.values(key, episode)).all()]
+    wrong = [each.index for each in reader.episodes if not np.isfinite(reader.values(key, each)).all()]
     if wrong:
-        names = ", ".join(str(episode.index) for episode in wrong[:10]) + (" ..." if len(wrong) > 10 else "")
         raise ValueError(
-            f"'{key}' holds NaN or infinite values in {len(wrong)} of {len(reader.episodes)} episodes ({names}); wanted "
+            f"'{key}' holds NaN or infinite values in {name_episodes(wrong)} of {len(reader.episodes)}; wanted "
             "finite numbers. Record these episodes again, or leave them out with --dataset.episodes."
         )

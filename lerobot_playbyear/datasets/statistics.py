@@ -30,7 +30,6 @@ Stats = dict[str, dict[str, np.ndarray]]
 """Per feature and statistic, as LeRobot keeps them."""
 
 _DIGITS = 5  # significant ones
-_FRAMES_AT_ONCE = 4096
 
 
 def sound_stats(sound: np.ndarray) -> dict[str, np.ndarray]:
@@ -40,11 +39,14 @@ def sound_stats(sound: np.ndarray) -> dict[str, np.ndarray]:
         sound: (N, S), the samples of N frames.
     """
     n_frames, n_samples = sound.shape
-    if sound.dtype == np.int16:
-        pooled = _pcm_stats(sound)
-    else:
-        column = sound.astype(np.float64).reshape(-1, 1)
-        pooled = {name: float(value[0]) for name, value in get_feature_stats(column, 0, False).items()}
+    values, counts = np.unique(sound, return_counts=True)  # in little memory where they are PCM
+    values = values.astype(np.float64)
+    mean = float(values @ counts / sound.size)
+    pooled = {"min": values[0], "max": values[-1], "mean": mean}
+    pooled["std"] = math.sqrt(np.square(values - mean) @ counts / sound.size)
+    below = np.cumsum(counts)
+    for share in DEFAULT_QUANTILES:
+        pooled[f"q{int(share * 100):02d}"] = values[np.searchsorted(below, share * sound.size)]
     stats = {name: np.full(n_samples, _rounded(value)) for name, value in pooled.items()}
     return {**stats, "count": np.array([n_frames])}
 
@@ -115,24 +117,6 @@ def write_stats(stats: Stats, root: Path) -> None:
     path = root / STATS_PATH
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
-
-
-def _pcm_stats(sound: np.ndarray) -> dict[str, float]:
-    """From how often each of the 65536 values occurs, which says all that there is to know in little memory."""
-    counts = np.zeros(2**16, np.int64)
-    for first in range(0, len(sound), _FRAMES_AT_ONCE):
-        block = sound[first : first + _FRAMES_AT_ONCE].reshape(-1).astype(np.int32)
-        counts += np.bincount(block + 2**15, minlength=2**16)
-    values = np.arange(-(2.0**15), 2.0**15)
-    n_samples = counts.sum()
-    mean = float(values @ counts / n_samples)
-    heard = values[counts > 0]
-    stats = {"min": heard[0], "max": heard[-1], "mean": mean}
-    stats["std"] = math.sqrt(np.square(values - mean) @ counts / n_samples)
-    below = np.cumsum(counts)
-    for share in DEFAULT_QUANTILES:
-        stats[f"q{int(share * 100):02d}"] = values[np.searchsorted(below, share * n_samples)]
-    return stats
 
 
 def _rounded(value: float) -> float:

@@ -18,12 +18,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
 from lerobot_playbyear.datasets.info import INDEX_COLUMNS, Info, InfoError, read_info
 from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, parsing, read_table
-from lerobot_playbyear.datasets.pictures import PICTURE_FORMATS
+from lerobot_playbyear.datasets.pictures import open_picture
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
 
 TASKS_PATH, STATS_PATH = "meta/tasks.parquet", "meta/stats.json"
@@ -37,7 +38,7 @@ Rows = Mapping[int, Mapping[str, Any]]
 _TIME_TOLERANCE_S = 1e-3
 
 
-class DatasetDamagedError(ValueError):
+class DatasetDamagedError(InputError):
     """A dataset is damaged, or too damaged to say what it holds; the message says how, and what to do."""
 
 
@@ -258,7 +259,7 @@ def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, finding
             continue
         parts.append({**part, "row": first + np.arange(len(table))})
         for key in cameras:
-            for row, problem in _damaged_pictures(table.column(key), info["features"][key]["shape"]):
+            for row, problem in _damaged_pictures(root, table.column(key), key, info["features"][key]):
                 spoilt[first + row] = f"a picture of '{key}' {problem}"
     if not parts:
         return
@@ -282,16 +283,15 @@ def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, finding
         )
 
 
-def _damaged_pictures(column: pa.ChunkedArray, shape: Sequence[int]) -> Iterator[tuple[int, str]]:
+def _damaged_pictures(
+    root: Path, column: pa.ChunkedArray, key: str, feature: Mapping[str, Any]
+) -> Iterator[tuple[int, str]]:
     """Of every damaged picture in a column its row, and what is wrong with it. Those in files of their own stay there."""
     for row, picture in enumerate(value.as_py() for value in column):
         try:
             if picture["bytes"] is not None:
-                with Image.open(io.BytesIO(picture["bytes"]), formats=PICTURE_FORMATS) as image:
+                with open_picture(picture, root, key, feature) as image:
                     image.verify()
-                    if (image.height, image.width) not in itertools.pairwise(shape):
-                        size = f"{image.width} x {image.height}"
-                        yield row, f"has {size} pixels; {INFO_PATH} gives the shape {tuple(shape)}"
         except UnidentifiedImageError:
             yield row, "is damaged (it is none)"
         except (OSError, SyntaxError, ValueError, TypeError, Image.DecompressionBombError) as error:

@@ -115,12 +115,6 @@ class RolloutPool:
             self._env.close()
             self._env = None
 
-    def __enter__(self) -> "RolloutPool":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def own_env(self) -> gym.Env:
         """The environment of this process."""
         if self._env is None:

@@ -1,7 +1,7 @@
 """Films with sound: pictures of an episode above the spectrogram of what was heard, and the sound itself."""
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,8 +11,6 @@ from PIL import Image, ImageDraw
 
 from lerobot_playbyear.audio.audio_files import resample
 
-_VIDEO_CODECS = ("libx264", "libopenh264", "mpeg4")  # the first that this build of FFmpeg has
-_AUDIO_CODECS = ("aac", "libmp3lame")
 _AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 _STRIP_HEIGHT = 120  # pixels
 _INSET_SHARE = 0.28  # of the picture's height
@@ -166,7 +164,7 @@ def write_film(
     sample_rate: int,
     x264_options: Mapping[str, str] | None = None,
 ) -> Path:
-    """Writes an mp4 that browsers and video players take (H.264 and AAC where FFmpeg has them).
+    """Writes an mp4 that browsers and video players take (H.264 and AAC).
 
     Args:
         path: Of the file; its folder is made.
@@ -210,17 +208,14 @@ def write_film(
 
 
 def _add_video_stream(film, fps: int, height: int, width: int, x264_options: Mapping[str, str]):
-    stream = film.add_stream(_first_codec(_VIDEO_CODECS), rate=fps)
+    stream = film.add_stream("libx264", rate=fps)
     stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
-    if stream.codec_context.name == "libx264":
-        stream.options = {"crf": "20", "preset": "veryfast", **x264_options}
-    else:
-        stream.bit_rate = 4_000_000
+    stream.options = {"crf": "20", "preset": "veryfast", **x264_options}
     return stream
 
 
 def _add_audio_stream(film, sample_rate: int, n_channels: int):
-    stream = film.add_stream(_first_codec(_AUDIO_CODECS), rate=sample_rate)
+    stream = film.add_stream("aac", rate=sample_rate)
     stream.layout = "stereo" if n_channels == 2 else "mono"
     stream.bit_rate = 96_000 * n_channels
     return stream
@@ -232,16 +227,6 @@ def _audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av
     frame = av.AudioFrame.from_ndarray(samples.astype(np.int16).reshape(1, -1), format="s16", layout=layout)
     frame.sample_rate, frame.pts, frame.time_base = sample_rate, first_sample, Fraction(1, sample_rate)
     return frame
-
-
-def _first_codec(names: Sequence[str]) -> str:
-    for name in names:
-        try:
-            av.codec.Codec(name, "w")
-        except av.FFmpegError:
-            continue
-        return name
-    raise RuntimeError(f"FFmpeg, as PyAV brings it, has none of the encoders {', '.join(names)}.")
 
 
 def _label(strip: np.ndarray, text: str) -> np.ndarray:

@@ -22,12 +22,12 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, OfflineMod
 from huggingface_hub.utils import validate_repo_id
 
 from lerobot_playbyear.compat import card_writer
-from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, FolderLockedError, entries_below
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, first_line
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below
 from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out
-from lerobot_playbyear.datasets.journal import JournalError, lock_dataset
+from lerobot_playbyear.datasets.journal import held
 from lerobot_playbyear.datasets.markdown import word
-from lerobot_playbyear.datasets.reader import SurveyedDataset
+from lerobot_playbyear.datasets.reader import DatasetPlace, SurveyedDataset
 from lerobot_playbyear.hub.dataset_card import CARD, FILM, write_dataset_card
 
 METRICS_NAME = "metrics.jsonl"
@@ -74,19 +74,6 @@ class PushOptions:
 
 
 @dataclass
-class PushDatasetConfig:
-    """The dataset.
-
-    Args:
-        repo_id: Its name on the Hub, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
-    """
-
-    repo_id: str | None = None
-    root: str | None = None
-
-
-@dataclass
 class PushPolicyConfig:
     """The policy.
 
@@ -113,7 +100,7 @@ class PushConfig(PushOptions):
         preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
     """
 
-    dataset: PushDatasetConfig = field(default_factory=PushDatasetConfig)
+    dataset: DatasetPlace = field(default_factory=lambda: DatasetPlace(""))
     policy: PushPolicyConfig = field(default_factory=PushPolicyConfig)
 
 
@@ -127,9 +114,9 @@ def push(cfg: PushConfig) -> str:
         HubError: An option is missing, there is nothing to upload, or it could not be uploaded.
     """
     dataset, policy = cfg.dataset, cfg.policy
-    if (dataset == PushDatasetConfig()) == (policy == PushPolicyConfig()):
+    if (dataset == DatasetPlace("")) == (policy == PushPolicyConfig()):
         raise HubError("Give either --dataset.repo_id (and --dataset.root), or --policy.path and --policy.repo_id.")
-    if dataset.repo_id is not None:
+    if dataset.repo_id:
         url = push_dataset(dataset.repo_id, dataset.root, cfg)
         print(f"Dataset: {url}\nLoad it anywhere: playbyear-inspect --dataset.repo_id={dataset.repo_id}")
         return url
@@ -164,12 +151,13 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
         Its address on the Hub.
 
     Raises:
-        HubError: There is no whole dataset in the folder, somebody writes to it, or it could not be uploaded.
+        HubError: There is no whole dataset in the folder, or it could not be uploaded.
+        FolderLockedError: Somebody writes to it.
     """
     folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
     check_name("dataset.repo_id", repo_id, needs_user=True)
     options.check()
-    with _lock(folder), TemporaryDirectory() as scratch:
+    with held(folder) if folder.is_dir() else contextlib.nullcontext(), TemporaryDirectory() as scratch:
         try:
             dataset = SurveyedDataset.open(repo_id, folder)
             check_links(folder)
@@ -177,7 +165,7 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
             before = _stamps(files)
             license = options.license or "apache-2.0"
             card = write_dataset_card(dataset, repo_id, Path(scratch), options.tags, license, options.preview)
-        except (InputError, OutsideError, OSError) as error:
+        except (InputError, OSError) as error:
             raise HubError(f"Not pushed. {error}") from error
 
         def upload() -> str:
@@ -193,18 +181,6 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
 
         later = [f"--dataset.repo_id={repo_id}", *([f"--dataset.root={root}"] if root is not None else [])]
         return _upload(upload, f"The dataset is complete in {folder}", later, options)
-
-
-def _lock(folder: Path) -> contextlib.AbstractContextManager[object]:
-    """Keeps recordings away from a dataset; where no lock can be made, only `_check_unchanged` notices them."""
-    try:
-        return lock_dataset(folder) if folder.is_dir() else contextlib.nullcontext()
-    except FolderLockedError as error:
-        raise HubError(
-            f"Not pushed. {folder} is being recorded to, repaired or uploaded by another process: push when it has ended."
-        ) from error
-    except (OSError, JournalError):
-        return contextlib.nullcontext()
 
 
 def _files(folder: Path) -> dict[str, Path]:
@@ -372,15 +348,11 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     """The lines of `METRICS_NAME` in a run's folder, without those that a kill or a full disk cut off."""
     path = run / METRICS_NAME
     lines = path.read_text().splitlines() if path.is_file() else []
-    return [figures for line in lines if (figures := _figures_in(line))]
-
-
-def _figures_in(line: str) -> dict[str, Any]:
-    try:
-        figures = json.loads(line)
-    except ValueError:
-        return {}
-    return figures if isinstance(figures, dict) else {}
+    figures: list[dict[str, Any]] = []
+    for line in lines:
+        with contextlib.suppress(ValueError):
+            figures.append(dict(json.loads(line)))
+    return figures
 
 
 # Before long work whose end is an upload
@@ -402,11 +374,12 @@ def check_name(option: str, repo_id: str, needs_user: bool = False) -> None:
     try:
         validate_repo_id(repo_id)
     except HFValidationError as error:
-        raise HubError(f"{option}={repo_id!r} cannot be pushed: {_first_line(error)}.") from error
+        raise HubError(f"{option}={repo_id!r} cannot be pushed: {first_line(error)}.") from error
 
 
-def warn_without_login() -> None:
-    """Says before long work that its upload will fail, so that there is time to log in."""
+def check_upload(option: str, repo_id: str, needs_user: bool = False) -> None:
+    """As `check_name`, before long work; says if nobody is logged in, so that there is time to do that."""
+    check_name(option, repo_id, needs_user)
     if not get_token():
         logger.warning("Nobody is logged in to the Hub: log in with `hf auth login` before the upload at the end.")
 
@@ -535,16 +508,16 @@ def reason(error: BaseException) -> str:
     if isinstance(cause, OfflineModeIsEnabled):
         return "the environment variable HF_HUB_OFFLINE forbids it"
     if isinstance(cause, httpx.TransportError):
-        return f"{constants.ENDPOINT} cannot be reached ({type(cause).__name__}: {_first_line(cause)})"
+        return f"{constants.ENDPOINT} cannot be reached ({type(cause).__name__}: {first_line(cause)})"
     if not isinstance(cause, HfHubHTTPError):
-        return f"{type(error).__name__}: {_first_line(error)}"
+        return f"{type(error).__name__}: {first_line(error)}"
     if cause.response.status_code in (401, 403):  # 403 may be a quota
         said = (cause.server_message or "it does not say why").partition("\n")[0].rstrip(".")
         return (
             f"{constants.ENDPOINT} refused (status {cause.response.status_code}): {said}. If that is about the token, "
             "log in with `hf auth login`, with one that may write there"
         )
-    return f"{constants.ENDPOINT} answered: {_first_line(cause)}"
+    return f"{constants.ENDPOINT} answered: {first_line(cause)}"
 
 
 def _is_passing(error: BaseException) -> bool:
@@ -561,7 +534,3 @@ def _cause(error: BaseException) -> BaseException:
     while not isinstance(cause, kinds) and cause.__cause__ is not None:
         cause = cause.__cause__
     return cause if isinstance(cause, kinds) else error
-
-
-def _first_line(error: BaseException) -> str:
-    return next((line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()), type(error).__name__)

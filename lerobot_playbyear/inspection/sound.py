@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
+from lerobot_playbyear.datasets.parquet import stretches
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 
 FULL_SCALE = 32768.0
@@ -83,8 +84,7 @@ def dbfs(rms_steps: float) -> float:
 
 def runs(mask: np.ndarray, shortest: int = 1) -> list[tuple[int, int]]:
     """First index, and index after the last, of every span of at least `shortest` True in a mask (n,)."""
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
-    return [(start, stop) for start, stop in edges.tolist() if stop - start >= shortest]
+    return [(start, stop) for start, stop in stretches(mask).tolist() if stop - start >= shortest]
 
 
 def flat_tops(samples: np.ndarray) -> list[tuple[int, int]]:

@@ -179,22 +179,20 @@ def _of_all_elements(each: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def facts(dataset: SurveyedDataset) -> dict[str, Any]:
-    """What the dataset is, for the head of a report; in JSON's numbers."""
+    """What the dataset is, for the head of a report."""
     rates = {key: (dataset.features[key].get("info") or {}).get("sample_rate") for key in dataset.microphones}
-    return finite(
-        {
-            "repo_id": dataset.repo_id,
-            "root": str(dataset.root),
-            "robot_type": dataset.info.get("robot_type"),
-            "fps": dataset.fps,
-            "episodes": len(dataset.episodes),
-            "frames": len(dataset),
-            "seconds": len(dataset) / dataset.fps,
-            "cameras": {key: list(dataset.features[key]["shape"]) for key in dataset.cameras},
-            "microphones": rates,
-            "tasks": sorted({dataset.task(episode) for episode in dataset.episodes}),
-        }
-    )
+    return {
+        "repo_id": dataset.repo_id,
+        "root": str(dataset.root),
+        "robot_type": dataset.info.get("robot_type"),
+        "fps": dataset.fps,
+        "episodes": len(dataset.episodes),
+        "frames": len(dataset),
+        "seconds": len(dataset) / dataset.fps,
+        "cameras": {key: list(dataset.features[key]["shape"]) for key in dataset.cameras},
+        "microphones": rates,
+        "tasks": sorted({dataset.task(episode) for episode in dataset.episodes}),
+    }
 
 
 def finite(value: Any) -> Any:

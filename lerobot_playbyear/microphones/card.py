@@ -108,6 +108,9 @@ class CardRecording:
         name: Of the card, for warnings.
         sample_rate: [Hz].
         channels: How many.
+
+    Attributes:
+        written: How many samples there are.
     """
 
     def __init__(self, name: str, sample_rate: int, channels: int) -> None:
@@ -115,7 +118,7 @@ class CardRecording:
         self._clock = CardClock(sample_rate, tolerance_s=_LATE_S)
         self._changed = threading.Condition()
         self._kept = np.zeros((round(KEPT_S * sample_rate), channels), np.int16)  # a ring, by number of sample
-        self._written = 0
+        self.written = 0
         # Of the last second: when a burst of chunks came, and how long its first sample had waited [s].
         self._bursts: deque[tuple[float, float]] = deque()
         self._came_s = -math.inf
@@ -129,7 +132,7 @@ class CardRecording:
             self._put(samples, len(samples))
             is_sound = samples[::-1] != 0
             self._zeros = np.where(is_sound.any(axis=0), is_sound.argmax(axis=0), self._zeros + len(samples))
-            lost = self._clock.note(self._written, came_s)
+            lost = self._clock.note(self.written, came_s)
             if lost:  # known a quarter of a second later: then silence stands where sound goes on
                 self._put(np.zeros((0, samples.shape[1]), np.int16), lost)
                 self._bursts.clear()  # which seemed late
@@ -137,11 +140,6 @@ class CardRecording:
         if lost:
             lost_ms = 1e3 * lost / self._rate
             logging.warning("%s lost %.0f ms of sound: the machine or the USB port is too busy.", self._name, lost_ms)
-
-    @property
-    def written(self) -> int:
-        """How many samples there are."""
-        return self._written
 
     def heard_at(self, now_s: float) -> int:
         """How many samples had come at a time [s of time.perf_counter], by the card's clock and not by its chunks.
@@ -155,13 +153,13 @@ class CardRecording:
             waits = sorted(wait for _, wait in self._bursts)
             usual = waits[int(_USUAL * len(waits))] if waits else 0.0
             behind = min(max(usual, CHUNK_S), _LONGEST_WAIT_S)
-            return max(min(round(self._clock.written_at(now_s - behind)), self._written), 0)
+            return max(min(round(self._clock.written_at(now_s - behind)), self.written), 0)
 
     def _note_burst(self, came_s: float) -> None:
         """A chunk came; the first one of a burst tells how long samples wait."""
         is_first, self._came_s = came_s - self._came_s > CHUNK_S / 2, came_s
         if is_first and self._clock.is_set:
-            self._bursts.append((came_s, (self._clock.written_at(came_s) - self._written) / self._rate))
+            self._bursts.append((came_s, (self._clock.written_at(came_s) - self.written) / self._rate))
         while self._bursts and self._bursts[0][0] < came_s - 1:
             self._bursts.popleft()
 
@@ -170,14 +168,14 @@ class CardRecording:
         numbers = np.arange(start, stop)
         with self._changed:
             found = self._kept[numbers % len(self._kept)]
-            is_kept = (numbers >= max(self._written - len(self._kept), 0)) & (numbers < self._written)
+            is_kept = (numbers >= max(self.written - len(self._kept), 0)) & (numbers < self.written)
         found[~is_kept] = 0
         return found
 
     def wait_for(self, n_samples: int, timeout_s: float) -> bool:
         """Waits until there are so many samples: whether they came in time [s]."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._written >= n_samples, timeout_s)
+            return self._changed.wait_for(lambda: self.written >= n_samples, timeout_s)
 
     def zeros_s(self, channel: int) -> float:
         """For how long a channel has given nothing but zeros [s]; no microphone in a room does."""
@@ -185,13 +183,13 @@ class CardRecording:
 
     def _put(self, samples: np.ndarray, n: int) -> None:
         """Writes the last `n` samples: those given, after silence."""
-        last = self._written + n
+        last = self.written + n
         n_kept = min(n, len(self._kept))
         block = np.zeros((n_kept, self._kept.shape[1]), np.int16)
         if len(samples):
             block[-len(samples) :] = samples[-n_kept:]
         self._kept[np.arange(last - n_kept, last) % len(self._kept)] = block
-        self._written = last
+        self.written = last
 
 
 class OpenCard:
@@ -209,7 +207,9 @@ class OpenCard:
         self.n_users = 0
         self.microphone = make_microphone(config, channels)
         if self.microphone.channels < channels:
-            raise MicrophoneError(f"{self.microphone.name} has {self.microphone.channels} channels, wanted {channels}.")
+            raise MicrophoneError(
+                f"{self.microphone.name} has {self.microphone.channels} channels, and {channels} are wanted."
+            )
         self.recording = CardRecording(self.microphone.name, config.sample_rate, self.microphone.channels)
         self._step_s, self._step_counter = -math.inf, 0
         self._readers: set[int] = set()  # in this control step

@@ -47,22 +47,16 @@ class FindMicrophonesConfig:
     seconds: float = 3.0
     output_dir: Path = Path("outputs/microphones")
 
-    def check(self) -> None:
-        """
-        Raises:
-            InputError: An option is out of range.
-        """
-        if not 0.1 <= self.seconds <= 60:
-            raise InputError(f"seconds={self.seconds}: give seconds from 0.1 to 60.")
-
 
 def find_microphones(cfg: FindMicrophonesConfig) -> None:
     """Prints what there is, and unless told otherwise listens to each card in turn.
 
     Raises:
+        InputError: An option is out of range.
         MicrophoneError: There is no card, or nothing can be heard with any.
     """
-    cfg.check()
+    if not 0.1 <= cfg.seconds <= 60:
+        raise InputError(f"seconds={cfg.seconds}: give seconds from 0.1 to 60.")
     cards = sound_cards(fresh=True)
     if not cards:
         raise MicrophoneError(_NO_CARD)

@@ -43,24 +43,17 @@ class Microphone(abc.ABC):
         name: For messages.
         sample_rate: Samples per second [Hz].
         channels: How many.
+
+    Attributes:
+        is_connected: Whether it was connected and not disconnected since.
+        problem: Why no more sound comes, if that is certain; empty while all is well.
     """
 
     def __init__(self, name: str, sample_rate: int, channels: int) -> None:
         self.name, self.sample_rate, self.channels = name, sample_rate, channels
         self._listener: Listener | None = None
-        self._is_connected = False
         self._last_heard = 0.0
-        self._ended = ""
-
-    @property
-    def is_connected(self) -> bool:
-        """Whether it was connected and not disconnected since."""
-        return self._is_connected
-
-    @property
-    def problem(self) -> str:
-        """Why no more sound comes, if that is certain; empty while all is well."""
-        return self._ended
+        self.is_connected, self.problem = False, ""
 
     @property
     def silent_for_s(self) -> float:
@@ -76,21 +69,21 @@ class Microphone(abc.ABC):
         Raises:
             MicrophoneError: It cannot be opened.
         """
-        if self._is_connected:
+        if self.is_connected:
             return
-        self._listener, self._ended = listener, ""
+        self._listener, self.problem = listener, ""
         self._last_heard = time.perf_counter()
-        self._is_connected = True  # before it may end by itself
+        self.is_connected = True  # before it may end by itself
         try:
             self._open()
         except BaseException:
-            self._is_connected = False
+            self.is_connected = False
             raise
 
     def disconnect(self) -> None:
         """Stops listening; it may be disconnected already."""
-        if self._is_connected:
-            self._is_connected = False
+        if self.is_connected:
+            self.is_connected = False
             self._close()
 
     @abc.abstractmethod
@@ -113,7 +106,7 @@ class Microphone(abc.ABC):
 
     def _end(self, reason: str) -> None:
         """No more sound will come."""
-        self._ended = self._ended or reason
+        self.problem = self.problem or reason
 
 
 class PlayedMicrophone(Microphone):
@@ -153,21 +146,16 @@ class PlayedMicrophone(Microphone):
             n_played += size
 
 
-def file_microphone(path: Path, sample_rate: int, channels: int) -> Microphone:
+def file_microphone(path: Path, sample_rate: int) -> Microphone:
     """A sound file, resampled where it has another rate [Hz].
 
     Raises:
-        MicrophoneError: It cannot be read, or has fewer channels.
+        MicrophoneError: It cannot be read.
     """
     try:
         samples, rate = read_audio(path)
     except (OSError, AudioFileError) as error:
         raise MicrophoneError(f"file={path} of a microphone cannot be read: {error}") from error
-    if samples.shape[1] < channels or len(samples) == 0:
-        raise MicrophoneError(
-            f"file={path} of a microphone has {samples.shape[1]} channels and {len(samples)} samples; channel {channels - 1} "
-            "is asked for, counted from 0."
-        )
     return PlayedMicrophone(f"the sound file {path}", resample(samples, rate, sample_rate), sample_rate)
 
 
@@ -230,4 +218,4 @@ def make_microphone(config: "MicrophoneCameraConfig", channels: int) -> Micropho
         return PortAudioMicrophone(config.device, config.sample_rate, channels)
     if config.tone_hz is not None:
         return tone_microphone(config.tone_hz, config.sample_rate, channels)
-    return file_microphone(Path(str(config.file)).expanduser(), config.sample_rate, channels)
+    return file_microphone(Path(str(config.file)).expanduser(), config.sample_rate)

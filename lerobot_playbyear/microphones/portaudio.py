@@ -204,5 +204,5 @@ class PortAudioMicrophone(Microphone):
         self._heard(chunk[:, : self.channels], now)
 
     def _finished(self) -> None:
-        if self._is_connected:
+        if self.is_connected:
             self._end("the sound card, or its sound server, has ended the recording")

@@ -50,10 +50,7 @@ def with_hearing(card: ModelCard, config: PlaybyearConfig) -> ModelCard:
     tags = {"audio", "multimodal"} if config.use_audio and config.audio_keys else set()
     card.data["tags"] = sorted({*card.data.get("tags", []), *tags})
     section = _section(config)
-    if _BEFORE in card.text:
-        card.text = card.text.replace(_BEFORE, f"{section}\n\n{_BEFORE}", 1)
-    else:
-        card.text = f"{card.text.rstrip()}\n\n{section}\n"
+    card.text = card.text.replace(_BEFORE, f"{section}\n\n{_BEFORE}", 1)
     return card
 
 

@@ -361,6 +361,14 @@ class PlaybyearConfig(PreTrainedConfig):
             self.sample_rate = int(seen)
             _check_samples(key, int(feature["shape"][0]), self.sample_rate, self.fps)
 
+    def check_frame_rate(self, meta: "LeRobotDatasetMetadata") -> None:
+        """Raises a ValueError if a dataset has another one than the policy."""
+        if meta.fps != self.fps:
+            raise ValueError(
+                f"The dataset '{meta.repo_id}' has {meta.fps} frames per second, and the policy is configured for {self.fps}: "
+                f"give --policy.fps={meta.fps}, or a dataset recorded at {self.fps}."
+            )
+
     def check_dataset(self, meta: "LeRobotDatasetMetadata") -> None:
         """Checks a dataset's frame rate, and leaves its microphones' pictures out of the observations.
 
@@ -368,11 +376,7 @@ class PlaybyearConfig(PreTrainedConfig):
             ValueError: The frame rate is not the configured one, or the sound of a microphone is not attached: a policy would
                 see it instead of hearing it.
         """
-        if meta.fps != self.fps:
-            raise ValueError(
-                f"The dataset has fps={meta.fps}, but the policy is configured for fps={self.fps}: set "
-                f"--policy.fps={meta.fps}, or train a new policy for this dataset."
-            )
+        self.check_frame_rate(meta)
         inputs = self.input_features or {}
         for key in [key for key in microphone_pictures(meta) if key in inputs]:
             if audio_key_of(key) not in meta.features:

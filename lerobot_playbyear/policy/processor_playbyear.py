@@ -139,9 +139,7 @@ class MicrophonePicturesToAudioStep(SoundStep):
         return round(sample_rate / self.fps) * self.fps
 
     def _block(self, key: str, number: int, strip: Strip) -> np.ndarray:
-        sound = self._sounds.get((key, number))
-        if sound is None:
-            sound = self._sounds[key, number] = ControlStepSound(self.sample_rate // self.fps)
+        sound = self._sounds.setdefault((key, number), ControlStepSound(self.sample_rate // self.fps))
         block, _ = sound.next(strip)
         if number == 0 and key == self.microphones[0] and sound.n_heard is not None:
             self._watch_pace(sound.n_heard, strip.sample_rate)

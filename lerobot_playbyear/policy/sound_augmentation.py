@@ -181,9 +181,7 @@ class RecordedNoise:
             recording = self._recordings[index]
             start = int(torch.randint(len(recording), ()))
             repeated = torch.arange(start, start + n_samples) % len(recording)
-            found[row] = (
-                recording[repeated] if start + n_samples > len(recording) else recording[start : start + n_samples]
-            )
+            found[row] = recording[repeated]
         return found
 
 

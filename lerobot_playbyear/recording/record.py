@@ -22,7 +22,7 @@ from lerobot_playbyear.episodes.experts import ExpertConfig, ScriptedExpertConfi
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed, save_episode
 from lerobot_playbyear.episodes.play import Episode, Observation, Verdict, play
 from lerobot_playbyear.episodes.pool import RolloutPool
-from lerobot_playbyear.hub.push import PushOptions, check_name, push_dataset, warn_without_login
+from lerobot_playbyear.hub.push import PushOptions, check_upload, push_dataset
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
 _POLICY_FPS = 20  # of a policy that is not told
@@ -140,7 +140,7 @@ Demonstrations = Callable[[Iterable[int]], Iterator[Episode]]
 def _demonstrations(cfg: RecordConfig) -> Iterator[tuple[EnvFacts, Demonstrations]]:
     """What the environment looks like, and where episodes come from: a script in several processes, or a person."""
     if not isinstance(cfg.expert, TeleopExpertConfig):
-        with RolloutPool(env_spec(cfg.env), cfg.num_workers or 0) as pool:
+        with closing(RolloutPool(env_spec(cfg.env), cfg.num_workers or 0)) as pool:
             with errors_of_input():
                 facts = pool.facts()
             yield facts, pool.episodes
@@ -205,8 +205,7 @@ def _check_options(cfg: RecordConfig) -> None:
     if not cfg.dataset.video and cfg.dataset.rgb_encoder != RGBEncoderConfig():
         raise InputError("--dataset.rgb_encoder.* encodes video: give --dataset.video=true, too, or leave it out.")
     if cfg.dataset.push_to_hub:
-        check_name("dataset.repo_id", cfg.dataset.repo_id, needs_user=True)
-        warn_without_login()
+        check_upload("dataset.repo_id", cfg.dataset.repo_id, needs_user=True)
 
 
 def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:

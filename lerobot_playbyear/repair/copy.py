@@ -51,7 +51,7 @@ def write_copy(survey: Survey, target: Path) -> None:
     table = pa.table({column: [row.get(column) for row in rows] for column in columns})
     write_rows(table, target / EPISODES_DIR / "chunk-000/file-000.parquet")
     if not any(each.check == "tasks" for each in survey.damage):
-        shutil.copy2(survey.root / TASKS_PATH, target / TASKS_PATH)
+        shutil.copy2(survey.root / TASKS_PATH, target / TASKS_PATH)  # it may have columns of its own
     else:
         write_tasks(_tasks_table(survey), target)
     write_stats(add_stats(None, map(row_stats, rows)), target)

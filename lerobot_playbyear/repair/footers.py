@@ -28,7 +28,6 @@ BOOL_TRUE, BOOL_FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRU
 _MAGIC = b"PAR1"
 _DATA_PAGE, _DICTIONARY_PAGE, _DATA_PAGE_V2 = 0, 2, 3
 _MAX_HEADER_BYTES = 2**16
-_MAX_DEPTH = 32
 
 
 class ThriftError(ValueError):
@@ -206,8 +205,8 @@ def read_struct(data: bytes) -> tuple[Struct, int]:
     """
     stream = io.BytesIO(data)
     try:
-        return _read_value(STRUCT, stream, 0), stream.tell()
-    except (IndexError, OverflowError) as error:
+        return _read_struct(stream), stream.tell()
+    except (IndexError, OverflowError, RecursionError) as error:
         raise ThriftError("the structure is cut off") from error
 
 
@@ -225,19 +224,17 @@ def write_struct(struct: Struct) -> bytes:
     return bytes(out)
 
 
-def _read_struct(stream: io.BytesIO, depth: int) -> Struct:
+def _read_struct(stream: io.BytesIO) -> Struct:
     struct, last = Struct(), 0
     while head := stream.read(1)[0]:
         kind, delta = head & 15, head >> 4
         last = last + delta if delta else _read_integer(stream)
         is_bool = kind in (BOOL_TRUE, BOOL_FALSE)
-        struct[last] = (kind, kind == BOOL_TRUE if is_bool else _read_value(kind, stream, depth + 1))
+        struct[last] = (kind, kind == BOOL_TRUE if is_bool else _read_value(kind, stream))
     return struct
 
 
-def _read_value(kind: int, stream: io.BytesIO, depth: int) -> Any:
-    if depth > _MAX_DEPTH:
-        raise ThriftError("the structure is nested too deeply")
+def _read_value(kind: int, stream: io.BytesIO) -> Any:
     if kind in (I16, I32, I64):
         return _read_integer(stream)
     if kind in (BYTE, BOOL_TRUE, BOOL_FALSE):
@@ -251,9 +248,9 @@ def _read_value(kind: int, stream: io.BytesIO, depth: int) -> Any:
     if kind == LIST:
         head = stream.read(1)[0]
         size = head >> 4 if head >> 4 != 15 else _read_varint(stream)
-        return Elements(head & 15, [_read_value(head & 15, stream, depth + 1) for _ in range(size)])
+        return Elements(head & 15, [_read_value(head & 15, stream) for _ in range(size)])
     if kind == STRUCT:
-        return _read_struct(stream, depth)
+        return _read_struct(stream)
     raise ThriftError(f"type {kind} does not occur in parquet")
 
 

@@ -4,17 +4,15 @@ The dataset itself is not changed. So nothing has to be proven before it may be 
 there. LeRobot is imported when there is a dataset.
 """
 
-import contextlib
 import shlex
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import INFO_PATH, FolderLockedError, check_can_be_made, new_folder
+from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder
 from lerobot_playbyear.datasets.findings import Finding
 from lerobot_playbyear.datasets.info import check_links
-from lerobot_playbyear.datasets.journal import finish_journal, lock_dataset
+from lerobot_playbyear.datasets.journal import finish_journal, held
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
 from lerobot_playbyear.repair.footers import rescue
 
@@ -55,11 +53,6 @@ class RepairReport:
     def kept(self) -> dict[int, int]:
         """The number of every whole episode, and its number in the copy."""
         return {episode.number: number for number, episode in enumerate(self.survey.whole)}
-
-    @property
-    def dropped(self) -> dict[int, str]:
-        """The number of every other episode, and what is wrong with it."""
-        return {episode.number: episode.reason for episode in self.survey.episodes if not episode.frames}
 
     @property
     def left(self) -> list[Finding]:
@@ -139,7 +132,9 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
         raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
     real = root.absolute()
     target = Path(target) if target is not None else real.with_name(f"{real.name}_repaired")
-    with _held(root):
+    with held(root) as is_held:
+        if is_held:
+            finish_journal(root)
         report = look(root, like)
         if not report.survey.damage:
             return report
@@ -157,18 +152,3 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
             if again.damage:
                 raise DatasetDamagedError(f"The copy of {root} is not sound, and was not kept. {again}")
     return RepairReport(report.survey, target)
-
-
-@contextlib.contextmanager
-def _held(root: Path) -> Iterator[None]:
-    """Nobody writes to the dataset meanwhile; where no lock can be made, nobody can write to it."""
-    try:
-        lock = lock_dataset(root)
-    except FolderLockedError as error:
-        raise InputError(str(error)) from error
-    except OSError:
-        yield
-        return
-    with lock:
-        finish_journal(root)
-        yield

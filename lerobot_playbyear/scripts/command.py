@@ -21,7 +21,9 @@ OPTIONS_FILE = Path(__file__).with_name("options.json")
 """The names of all options of each command; `python tools/list_options.py` writes it."""
 
 
-def command(interrupted: int | str = 130, flag: str = "") -> Callable[[Callable[[], object]], Callable[[], None]]:
+def command(
+    interrupted: int | str = 130, flag: str = "", is_file_work: bool = False
+) -> Callable[[Callable[[], object]], Callable[[], None]]:
     """Decorates a function that imports what it needs and does a command's work, and has the command's name.
 
     What needs no imports is answered at once, and what cannot be done is said in one line.
@@ -29,6 +31,7 @@ def command(interrupted: int | str = 130, flag: str = "") -> Callable[[Callable[
     Args:
         interrupted: What Ctrl-C ends it with: an exit status, or what is to be said.
         flag: An option that needs no value.
+        is_file_work: Whether all that it does is to read and write files: what these raise is then said in one line, too.
     """
 
     def decorate(work: Callable[[], object]) -> Callable[[], None]:
@@ -40,12 +43,13 @@ def command(interrupted: int | str = 130, flag: str = "") -> Callable[[Callable[
 
             from lerobot_playbyear.datasets.errors import PlaybyearError
 
+            said = (OSError, ValueError) if is_file_work else ()
             try:
                 work()
-            except (PlaybyearError, MemoryError) as error:
-                sys.exit(f"error: {str(error) or 'there is not enough memory'}")
             except ParsingError as error:
                 sys.exit(f"error: {_reason(error)}")
+            except (PlaybyearError, MemoryError, *said) as error:
+                sys.exit(f"error: {str(error) or 'there is not enough memory'}")
             except KeyboardInterrupt:
                 sys.exit(interrupted)
 
@@ -177,10 +181,8 @@ def check_local_dataset(repo_id: str, root: str | None) -> None:
     Raises:
         InputError: A file is damaged, or leads out of the folder.
     """
-    from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
     from lerobot_playbyear.datasets.info import check_dataset_files
 
     if (Path(root or HF_LEROBOT_HOME / repo_id) / INFO_PATH).is_file():
-        with errors_of_input():
-            check_dataset_files(repo_id, root)
+        check_dataset_files(repo_id, root)

@@ -48,14 +48,12 @@ def dagger() -> None:
     run_with_lerobot(correct)
 
 
-@command()
+@command(is_file_work=True)
 def video() -> None:
     logging.basicConfig(level=logging.WARNING)
-    from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.film.rollout_film import film
 
-    with errors_of_input(OSError):
-        run_with_lerobot(film)
+    run_with_lerobot(film)
 
 
 @command(flag="--json")
@@ -73,49 +71,39 @@ def inspect() -> None:
     sys.exit(worst(findings) == "error")
 
 
-@command()
+@command(is_file_work=True)
 def repair() -> None:
-    from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.repair.repair import repair
 
-    with errors_of_input():
-        try:
-            report = run_alone(repair)
-        except (OSError, MemoryError) as error:
-            sys.exit(
-                f"error: {str(error) or 'there is not enough memory'}\n"
-                "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
-            )
+    try:
+        report = run_alone(repair)
+    except (OSError, MemoryError) as error:
+        sys.exit(
+            f"error: {str(error) or 'there is not enough memory'}\n"
+            "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
+        )
     sys.exit(0 if report.is_done else 1)
 
 
-@command()
+@command(is_file_work=True)
 def attach_audio() -> None:
-    from lerobot_playbyear.audio.attach_audio import AttachError, attach_audio
+    from lerobot_playbyear.audio.attach_audio import attach_audio
 
-    try:
-        run_alone(attach_audio)
-    except OSError as error:
-        raise AttachError(f"The copy cannot be written: {error}") from error
+    run_alone(attach_audio)
 
 
-@command()
+@command(is_file_work=True)
 def attach_spectrogram() -> None:
-    from lerobot_playbyear.audio.attach_spectrogram import AttachSpectrogramError, attach_spectrogram
+    from lerobot_playbyear.audio.attach_spectrogram import attach_spectrogram
 
-    try:
-        run_alone(attach_spectrogram)
-    except OSError as error:
-        raise AttachSpectrogramError(f"The copy cannot be written: {error}") from error
+    run_alone(attach_spectrogram)
 
 
-@command()
+@command(is_file_work=True)
 def find_microphones() -> None:
-    from lerobot_playbyear.datasets.errors import errors_of_input
     from lerobot_playbyear.microphones.finding import find_microphones
 
-    with errors_of_input(OSError):
-        run_alone(find_microphones)
+    run_alone(find_microphones)
 
 
 @command("Interrupted. The same command goes on; what has arrived is not sent again.")

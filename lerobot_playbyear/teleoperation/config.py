@@ -110,9 +110,7 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoper
             teleop = make_teleoperator_from_config(config)
         teleop.connect()
         _ = teleop.action_features  # LeRobot's `keyboard`, which is for one robot's joints, has none
-    except ImportError as error:
-        raise ExpertError(f"{option}: {error} --expert.teleop.type=keyboard_window needs nothing.") from error
-    except Exception as error:  # whatever a device may say
+    except Exception as error:  # also what is not installed, and whatever a device may say
         raise ExpertError(
             f"{option} cannot be connected: {error}. --expert.teleop.type=keyboard_window needs nothing."
         ) from error

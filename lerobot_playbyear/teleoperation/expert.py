@@ -142,7 +142,6 @@ class TeleopExpert(Expert):
         status.note = _NOTES[self._verdict] if self._verdict else ""
         self._verdict, self._last_command, self._is_paused = None, None, self._begins_paused
         status.control = Control.PERSON if self.demonstrates else Control.POLICY
-        self._controls.reset()
         if self._controls.read().leaves:  # all else that was pressed meanwhile was not meant for this attempt
             raise PersonLeftError
         self._controls.reset()

@@ -17,7 +17,8 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_playbyear.datasets import audio_keys, check_audio_features
+from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
+from lerobot_playbyear.datasets.parquet import stretches
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.store import EpisodeStore, features_at, sample_rate_in
@@ -223,9 +224,8 @@ def runs_of_each_frame(store: EpisodeStore, n_windows: int, chosen: Tensor | Non
     ends = []
     for start, end in zip(store.starts, store.ends, strict=True):
         counts = torch.ones(end - start, dtype=torch.bool) if chosen is None else chosen[start:end]
-        edges = counts.int().diff(prepend=torch.zeros(1, dtype=torch.int), append=torch.zeros(1, dtype=torch.int))
-        stretches = zip((edges > 0).nonzero().squeeze(1), (edges < 0).nonzero().squeeze(1), strict=True)
-        ends += [torch.arange(start + int(last) - 1, start + int(first) - 1, -n_windows) for first, last in stretches]
+        both = stretches(counts.numpy()) + start
+        ends += [torch.arange(after - 1, first - 1, -n_windows) for first, after in both.tolist()]
     return torch.cat(ends)
 
 

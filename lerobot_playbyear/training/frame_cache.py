@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from filelock import FileLock, Timeout
+from filelock import FileLock
 from torch import Tensor
 
 from lerobot_playbyear.datasets.errors import InputError
@@ -62,22 +62,19 @@ def cached_columns(
         CacheError: There is no room on the disk, or it cannot be written.
         ValueError: Whatever `pieces` says of the dataset.
     """
-    cache = (cache or DEFAULT_CACHE).expanduser()
+    cache = (cache or DEFAULT_CACHE).expanduser().absolute()
     content = json.dumps([identity, list(row_bytes), n_rows], sort_keys=True)
     folder = cache / hashlib.blake2b(content.encode(), digest_size=16).hexdigest()
     files = {key: folder / f"{number}.npy" for number, key in enumerate(row_bytes)}
     with _telling(cache):
         folder.mkdir(parents=True, exist_ok=True)
-        with _alone(folder):
+        with FileLock(folder / ".lock", thread_local=False):  # others wait; it ends with its process
             found = {key: _mapped(path, n_rows) for key, path in files.items()}
             missing = {key: files[key] for key, column in found.items() if column is None}
             _check_room(folder, sum(row_bytes[key] for key in missing) * n_rows)
             _make(missing, n_rows, pieces)
             found |= {key: _mapped(path, n_rows) for key, path in missing.items()}
-    columns = {key: column for key, column in found.items() if column is not None}
-    if len(columns) < len(found):
-        raise CacheError(f"'{folder}' was made and is gone again: does another program empty '{cache}'?")
-    return columns
+    return {key: column for key, column in found.items() if column is not None}
 
 
 def dataset_identity(reader: DatasetReader, features: Mapping[str, Any]) -> dict[str, Any]:
@@ -129,32 +126,10 @@ def _telling(cache: Path) -> Iterator[None]:
                 f"The disk of '{cache}' became full; columns that were complete stay, and the next run goes on with them. Make "
                 "room, or name a folder on another disk with --store.cache."
             ) from error
-        if not _concerns(error, cache):  # the dataset cannot be read now, which another folder would not mend
-            raise
+        named = Path(str(error.filename))
+        if not (named.is_relative_to(cache) or cache.is_relative_to(named)):
+            raise  # the dataset cannot be read now, which another folder would not mend
         raise CacheError(f"'{cache}' cannot be used ({error}): name another folder with --store.cache.") from error
-
-
-def _concerns(error: OSError, cache: Path) -> bool:
-    """Whether an error is about the cache's folder, something in it, or a folder that it lies in."""
-    if not isinstance(error.filename, str | os.PathLike):
-        return False
-    path = Path(error.filename)
-    return path == cache or cache in path.parents or path in cache.parents
-
-
-@contextlib.contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """One process makes the files, and the others wait for it. The lock ends with the process that holds it."""
-    lock = FileLock(folder / ".lock", thread_local=False)
-    try:
-        lock.acquire(timeout=1)
-    except Timeout:
-        logger.info(f"Another process is filling '{folder}': waiting for it.")
-        lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def _mapped(path: Path, n_rows: int) -> Tensor | None:

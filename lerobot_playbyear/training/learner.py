@@ -149,8 +149,7 @@ class Learner:
 
     def evaluate(self, cfg: PlaybyearTrainConfig, n_videos: int = 4) -> dict[str, Any]:
         """Roll the policy out in the run's environment through LeRobot's `eval_policy_all`, and return its report."""
-        if cfg.env is None:
-            raise ValueError("An evaluation needs an environment: give --env.type and --env.task.")
+        assert cfg.env is not None
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg=cfg.env, policy_cfg=cfg.policy)
         envs = make_env(cfg.env, n_envs=cfg.eval.batch_size, use_async_envs=cfg.eval.use_async_envs)
         videos = Path(str(cfg.output_dir)) / "eval" / f"videos_step_{get_step_identifier(self.step, cfg.steps)}"
@@ -322,11 +321,7 @@ def check_dataset_suits(
     Raises:
         ValueError: Naming what was seen, what is wanted, and what to do.
     """
-    if policy.fps != meta.fps:
-        raise ValueError(
-            f"The dataset '{meta.repo_id}' has {meta.fps} frames per second, and the policy is configured for {policy.fps}: "
-            f"give --policy.fps={meta.fps}, or a dataset recorded at {policy.fps}."
-        )
+    policy.check_frame_rate(meta)
     missing = [key for key in dataset_names(policy, rename_map).values() if key not in meta.features]
     if missing:
         seen = [key for key in meta.features if key.startswith(OBS_STR)]

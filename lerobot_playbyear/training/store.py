@@ -21,13 +21,11 @@ from lerobot_playbyear.audio.audio_files import resample
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import IS_FIRST, check_audio_features, samples_per_frame, to_pcm_s16
 from lerobot_playbyear.datasets.free_memory import available_memory
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS
 from lerobot_playbyear.datasets.parquet import episode_bounds
 from lerobot_playbyear.datasets.pictures import kept_shape, shrink
 from lerobot_playbyear.datasets.reader import DatasetReader, check_finite
 from lerobot_playbyear.training.frame_cache import cached_columns, dataset_identity
-
-INDEX_KEYS = ("index", "episode_index", "frame_index", "task_index", "timestamp")
-"""The columns that every LeRobotDataset has."""
 
 PLACES = ("memory", "disk", "auto")
 """Where a dataset's frames are kept."""
@@ -145,17 +143,6 @@ class EpisodeStore:
             columns, starts, ends, reader.fps, list(reader.meta.tasks.index), columns["index"].device, image_size
         )
 
-    @classmethod
-    def load(
-        cls, repo_id: str, root: str | None = None, episodes: list[int] | None = None, **kwargs: Any
-    ) -> "EpisodeStore":
-        """Open a dataset and read it; `kwargs` as for `from_dataset`.
-
-        Raises:
-            ValueError: Also if a file of the dataset is truncated.
-        """
-        return cls.from_dataset(DatasetReader(repo_id, root, episodes), **kwargs)
-
     def __len__(self) -> int:
         """The number of frames, N."""
         return self.ends[-1] if self.ends else 0
@@ -223,18 +210,17 @@ class EpisodeStore:
         """Add an episode at the end.
 
         Args:
-            frames: The episode's frames, as `LeRobotDataset.add_frame` takes them: a value for every feature of the
-                store, images (H, W, C) or (C, H, W) uint8, and optionally `task`. Index columns are filled in.
+            frames: The episode's frames, as a `DurableWriter` of the store's features has taken them: a value for every
+                feature, images (H, W, C) or (C, H, W) uint8, and optionally `task`. Index columns are filled in.
 
         Raises:
-            InputError: If there are no frames, a feature is missing or has another shape or dtype, or a value is NaN
-                or infinite. The store is then unchanged.
+            InputError: If there are no frames, or a value is NaN or infinite. The store is then unchanged.
         """
         if len(frames) == 0:
             raise InputError("An episode without frames cannot be appended.")
         start, end = len(self), len(self) + len(frames)
         tasks = list(self.tasks)
-        columns = {key: self._stacked(key, frames) for key in self._columns if key not in INDEX_KEYS}
+        columns = {key: self._stacked(key, frames) for key in self._columns if key not in INDEX_COLUMNS}
         columns.update(self._index_columns(frames, start, tasks))
         for key, values in columns.items():
             self._columns[key] = _with_rows(self._columns[key], start, values.to(self.device))
@@ -254,13 +240,8 @@ class EpisodeStore:
 
     def _stacked(self, key: str, frames: Sequence[Mapping[str, Any]]) -> Tensor:
         """One feature of new frames, (n, ...), in the store's shape and dtype."""
-        missing = [i for i, frame in enumerate(frames) if key not in frame]
-        if missing:
-            raise InputError(f"'{key}' is missing in frame {missing[0]} of an episode; the store holds {self.keys}.")
         shape, dtype = self._columns[key].shape[1:], self._columns[key].dtype
         values = torch.from_numpy(np.stack([np.asarray(frame[key]) for frame in frames]))
-        if _kind(values.dtype) != _kind(dtype):
-            raise InputError(f"'{key}' has dtype {values.dtype} in the new episode, and {dtype} in the store.")
         if len(shape) == 3 and values.dim() == 4:  # pictures
             if values.shape[1] != shape[0]:
                 values = values.movedim(-1, 1)  # (n, H, W, C) -> (n, C, H, W)
@@ -268,8 +249,6 @@ class EpisodeStore:
                 values = torch.from_numpy(shrink(values.numpy(), self.image_size))
         if not shape and values.shape[1:] == (1,):
             values = values.squeeze(1)
-        if values.shape[1:] != shape:
-            raise InputError(f"'{key}' has shape {tuple(values.shape[1:])} in an episode, {tuple(shape)} in the store.")
         if values.dtype.is_floating_point and not values.isfinite().all():
             raise InputError(f"'{key}' holds NaN or infinite values in the new episode; wanted finite numbers.")
         return values.to(dtype)
@@ -287,10 +266,6 @@ class EpisodeStore:
             "timestamp": frame_index.to(torch.float32) / self.fps,
         }
         return {key: values for key, values in columns.items() if key in self._columns}
-
-
-def _kind(dtype: torch.dtype) -> str:
-    return "bool" if dtype == torch.bool else "float" if dtype.is_floating_point else "int"
 
 
 def _sent_to(device: torch.device, values: Tensor) -> Tensor:
@@ -414,7 +389,7 @@ def _select_features(reader: DatasetReader, keys: Iterable[str] | None) -> dict[
     others |= {key for key, feature in features.items() if feature["dtype"] == "string"}
     if keys is None:
         keys = [key for key in features if key not in others]
-    keys = list(dict.fromkeys([*keys, *INDEX_KEYS, *([IS_FIRST] if _has_is_first(features) else [])]))
+    keys = list(dict.fromkeys([*keys, *INDEX_COLUMNS, *([IS_FIRST] if _has_is_first(features) else [])]))
     for key in keys:
         if key not in features:
             raise ValueError(f"The dataset '{reader.repo_id}' has no '{key}'; it has {sorted(features)}.")

@@ -20,7 +20,7 @@ from lerobot_playbyear.datasets.errors import errors_of_input
 from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.reader import DatasetReader
-from lerobot_playbyear.hub.push import PushOptions, check_name, push_policy, warn_without_login
+from lerobot_playbyear.hub.push import PushOptions, check_upload, push_policy
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import (
     Batch,
@@ -132,8 +132,7 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
             "or use lerobot-train."
         )
     if cfg.policy.push_to_hub:
-        check_name("policy.repo_id", str(cfg.policy.repo_id))
-        warn_without_login()
+        check_upload("policy.repo_id", str(cfg.policy.repo_id))
 
 
 def _loss_of(
