@@ -226,12 +226,12 @@ def tapping(*names):
     return lambda window: press(window.keys, *names)
 
 
-def make_person(env, window, teleop=None, demonstrates=False, begin_paused=False, **options):
+def make_person(env, window, teleop=None, demonstrates=False, **options):
     """A person to whom time is made up."""
     if teleop is None:
         teleop = KeyboardWindowTeleop(KeyboardWindowTeleopConfig(), window.keys)
         teleop.connect()
-    config = TeleopExpertConfig(play_sound=False, begin_paused=begin_paused, directions="x,y,z", **options)
+    config = TeleopExpertConfig(play_sound=False, begin_paused=False, directions="x,y,z", **options)
     person, clock = TeleopExpert(config, env, window, teleop, demonstrates), Clock()
     person.pace = Pace(20, clock, clock.sleep)
     return person
@@ -298,12 +298,6 @@ def test_a_pause_stops_the_simulation_and_nothing_else():
     np.testing.assert_array_equal(paused.actions, without.actions)
     last = [attempt.observations[-1]["agent_pos"] for attempt in (paused, without)]
     np.testing.assert_array_equal(*last)
-
-
-def test_an_attempt_can_wait_for_the_person():
-    attempt, window = play({"paused": tapping("p")}, begin_paused=True)
-    assert len(attempt) == 30
-    assert [status.note for status, _ in window.shown if status.control is Control.PAUSED] == ["Press P to begin"] * 3
 
 
 @pytest.mark.parametrize(
