@@ -46,7 +46,7 @@ def trained(noise, tmp_path_factory):
     """The output folder of a run of six updates with checkpoints every three."""
     output = tmp_path_factory.mktemp("run") / "out"
     options = ("--steps=6", "--save_freq=3", "--store.place=memory")
-    validation = ("--dataset.eval_split=0.34", "--eval_steps=3")
+    validation = ("--dataset.eval_split=0.3", "--eval_steps=3")
     run_in_process(train, *TINY, *data(noise), *options, *validation, f"--output_dir={output}")
     return output
 
@@ -65,7 +65,7 @@ def test_a_run_leaves_lerobots_checkpoints_and_its_figures(trained):
 
 
 def test_measuring_held_out_episodes_changes_nothing_that_is_learned(trained, noise, tmp_path):
-    held_out = ("--dataset.eval_split=0.34", "--eval_steps=0")
+    held_out = ("--dataset.eval_split=0.3", "--eval_steps=0")
     run_in_process(train, *TINY, *data(noise), "--steps=6", *held_out, f"--output_dir={tmp_path / 'out'}")
     ours, theirs = (weights_of(folder / "checkpoints" / "last") for folder in (tmp_path / "out", trained))
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
