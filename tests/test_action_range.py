@@ -1,17 +1,17 @@
 """Actions that no demonstration holds: a policy says which of them it cannot learn, and learns them with a larger range."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
 import torch
-from dagger_factory import ENV, QUICK, SMALL, command
+from dagger_factory import SMALL, command
 from dataset_factory import TASK, dataset_features, random_frame
 from lerobot.configs import parser
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
+from support.shared import TINY, run_in_process
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
@@ -23,17 +23,7 @@ train = parser.wrap()(loop.train)
 
 FEATURES = dataset_features(image_size=16)
 FEATURES["action"]["names"] = ["pan", "lift", "elbow", "gripper"]
-TINY = (
-    "--policy.device=cpu",
-    "--policy.push_to_hub=false",
-    "--policy.use_vision=false",
-    "--policy.use_audio=false",
-    "--policy.n_supervised_steps=4",
-    "--policy.hidden_size=32",
-    "--num_workers=0",
-    "--batch_size=2",
-    "--steps=1",
-)
+BLIND_AND_DEAF = ("--policy.use_vision=false", "--policy.use_audio=false", "--steps=1")
 
 
 def write(root, actions, by_expert=None):
@@ -48,12 +38,6 @@ def write(root, actions, by_expert=None):
     dataset.finalize()
 
 
-def run_training(*options):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["train", *TINY, *map(str, options)])
-        train()
-
-
 @pytest.fixture(scope="module")
 def base(tmp_path_factory):
     """`demos`, whose actions lie in [-0.1, 0.1], and `policy`, a checkpoint of a policy that was trained on them."""
@@ -62,7 +46,7 @@ def base(tmp_path_factory):
     actions[:2] = [[-0.1] * 4, [0.1] * 4]
     write(folder / "demos", actions)
     data = ("--dataset.repo_id=tests/reach", f"--dataset.root={folder / 'demos'}")
-    run_training("--policy.type=playbyear", *data, f"--output_dir={folder / 'train'}")
+    run_in_process(train, *TINY, *BLIND_AND_DEAF, *data, f"--output_dir={folder / 'train'}")
     (folder / "policy").symlink_to(folder / "train/checkpoints/last/pretrained_model")
     return folder
 
@@ -84,31 +68,6 @@ def warnings(capfd):
     return [line for line in "\n".join(capfd.readouterr()).splitlines() if "out of the policy's reach" in line]
 
 
-def small_config(**options):
-    return PlaybyearConfig(
-        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
-        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
-        use_vision=False,
-        use_audio=False,
-        n_supervised_steps=1,
-        hidden_size=32,
-        device="cpu",
-        push_to_hub=False,
-        **options,
-    )
-
-
-STATS = {
-    "action": {"min": [0.0, -1.0], "max": [2.0, 1.0], "mean": [1.0, 0.0], "std": [0.5, 0.5]},
-    "observation.state": {"mean": [0.0] * 3, "std": [1.0] * 3},
-}
-
-
-def processors(config):
-    stats = {key: {name: torch.tensor(value) for name, value in entry.items()} for key, entry in STATS.items()}
-    return make_pre_post_processors(config, dataset_stats=stats)
-
-
 # What can be learned
 
 
@@ -116,8 +75,17 @@ def processors(config):
 def test_an_action_outside_the_demonstrations_is_learned_only_within_the_range(action_range, learned):
     """The expert wants 2.5 where the demonstrations end at 2."""
     torch.manual_seed(0)
-    config = small_config(action_range=action_range)
-    policy, (before, after) = PlaybyearPolicy(config), processors(config)
+    config = PlaybyearConfig(
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (3,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+        **{"use_vision": False, "use_audio": False, "n_supervised_steps": 1, "hidden_size": 32, "device": "cpu"},
+        action_range=action_range,
+    )
+    stats = {
+        "action": {"min": torch.tensor([0.0, -1.0]), "max": torch.tensor([2.0, 1.0])},
+        "observation.state": {"mean": torch.zeros(3), "std": torch.ones(3)},
+    }
+    policy, (before, after) = PlaybyearPolicy(config), make_pre_post_processors(config, dataset_stats=stats)
     batch = before({"observation.state": torch.randn(8, 10, 3), "action": torch.tensor([2.5, 0.5]).expand(8, 1, 2)})
     optimizer = torch.optim.Adam(policy.parameters(), 3e-3)
     for _ in range(150):
@@ -148,17 +116,9 @@ def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wide
 
     data = ("--dataset.repo_id=tests/reach", f"--dataset.root={base / 'demos'}")
     wider = ("--policy.action_range=1.6", f"--policy.path={base / 'policy'}")
-    run_training(*wider, *data, f"--output_dir={tmp_path / 'wide'}")
+    once = ("--policy.push_to_hub=false", "--num_workers=0", "--batch_size=2", "--steps=1")
+    run_in_process(train, *wider, *data, *once, f"--output_dir={tmp_path / 'wide'}")
     policy = tmp_path / "wide/checkpoints/last/pretrained_model"
     assert json.loads((policy / "config.json").read_text())["action_range"] == 1.6
     dagger(base, tmp_path, *offline, f"--output_dir={tmp_path / 'out_wide'}", policy=policy)
     assert warnings(capfd) == []
-
-
-def test_corrections_that_arrive_are_told_once_per_round(base, tmp_path, capfd):
-    """The expert of these tests does 0.2, 0.1 and -0.2, and closes the gripper with -1."""
-    dagger(base, tmp_path, *ENV, *QUICK, "--episodes=2")
-    messages = warnings(capfd)
-    assert len(messages) == 2
-    for message in messages:
-        assert "'pan' in 100.0 %, 'elbow' in 100.0 %, 'gripper' in 100.0 % of 3 frames" in message

@@ -1,4 +1,4 @@
-"""How the package is laid out: who imports whom, where modules lie, how long they are, and which one steps environments."""
+"""How the package is laid out: who imports whom, where modules lie, and how long they are."""
 
 import ast
 import io
@@ -34,8 +34,6 @@ _MOST_LINES, _FEWEST_LINES = 400, 25
 _SHORT = {
     "datasets/errors.py": "the error that all of the package raise; whoever catches it needs none of the rest",
 }
-
-_LOOP = "episodes/play.py"
 
 
 def modules() -> dict[str, str]:
@@ -93,12 +91,3 @@ def test_no_module_is_too_long_to_be_read_nor_too_short_to_be_one():
     short = {path: n for path, n in lengths.items() if n < _FEWEST_LINES and not path.endswith("__init__.py")}
     assert not long
     assert not set(short) - set(_SHORT), short
-
-
-def test_one_loop_steps_environments():
-    def steps(text: str) -> bool:
-        """Whether something is stepped with an argument; optimizers and metrics take none."""
-        calls = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call) and node.args)
-        return any(isinstance(call.func, ast.Attribute) and call.func.attr == "step" for call in calls)
-
-    assert [path for path, text in modules().items() if steps(text)] == [_LOOP]

@@ -19,12 +19,8 @@ N_FRAMES = 16
 LEFT, RIGHT = (f"observation.audio.{side}" for side in ("left", "right"))
 SMALL = {"audio_window_s": 0.9, "n_memory_steps": 3, "n_supervised_steps": 5, "n_frame_stack": 2}
 HEADS = {"auxiliary_onset": 0.1, "auxiliary_balance": 0.1, "auxiliary_way": 0.1}
-INPUTS = {
-    "audio_envelope_gain": 0.3,
-    "memory_displacement_gain": 10.0,
-    "memory_readers": 2,
-    "low_dimensional_offset": 0.1,
-}
+INPUTS = {"audio_envelope_gain": 0.3, "memory_displacement_gain": 10.0, "memory_readers": 2}
+INPUTS |= {"low_dimensional_offset": 0.1}
 
 
 def make_policy(**options) -> PlaybyearPolicy:
@@ -91,24 +87,13 @@ def test_an_offset_moves_all_frames_of_an_item_by_the_same():
     assert moved[:, 0].std() > 0.5  # drawn for every item and number
 
 
-def test_displacements_are_in_normalised_units_times_their_gain():
-    policy = make_policy(memory_displacement_gain=10.0, low_dimensional_gain=4.0, use_vision=False).eval()
-    read = []
-    policy.model.memory_head.lstm.register_forward_pre_hook(lambda _, inputs: read.append(inputs[0]))
-    batch = batch_of(policy)
-    policy.predict_run(batch, n_steps=1)
-    state = batch[STATE][:, -policy.config.memory_steps :]
-    displacement = read[0][..., policy.config.embedding_size :]
-    torch.testing.assert_close(displacement, 10 * (state - state[:, -1:]), atol=1e-4, rtol=1e-4)
-
-
 def test_an_envelope_keeps_how_loud_it_was():
     """Brought to the same size, the encodings of a faint and of a loud click are nearly the same."""
     policy = make_policy(audio_envelope_gain=0.3).eval()
     n = policy.config.n_segments
     heard = []
     for factor in (1, 4):
-        episode = clicks(policy, ())
+        episode = clicks(policy, {})
         episode[MICROPHONE][15, 300:340] += 2000 * factor
         heard.append(policy.model._hear(run_ending_at(episode, 15, policy.config), MICROPHONE, 2))
     faint, loud = (one.detach() for one in heard)
@@ -158,13 +143,8 @@ def test_sample_weights_get_every_part_of_the_loss_per_item():
         torch.testing.assert_close(policy.forward(batch)[0], loss, rtol=1e-4, atol=1e-5)
 
 
-def clicks(policy, frames):
-    """An episode of faint noise with a click in some frames."""
-    return clicks_of_two(policy, dict.fromkeys(frames, MICROPHONE))
-
-
-def clicks_of_two(policy, clicked):
-    """The same, a tenth as loud at the other microphone: {frame: microphone}."""
+def clicks(policy, clicked):
+    """An episode of faint noise with a click in some frames, a tenth as loud at the other microphone: {frame: microphone}."""
     episode = make_episode(1, policy.config, N_FRAMES)
     generator = torch.Generator().manual_seed(1)
     for key in policy.config.audio_keys:
@@ -186,8 +166,8 @@ def test_an_onset_is_a_click_and_neither_what_rings_on_nor_steady_noise_nor_what
     def heard(episode):  # in frames 11 to 15
         return onsets(levels_of(policy, episode), 5).tolist()
 
-    assert heard(clicks(policy, (12, 13, 15))) == [[0, 1, 0, 0, 1]]
-    steady = clicks(policy, ())
+    assert heard(clicks(policy, dict.fromkeys((12, 13, 15), MICROPHONE))) == [[0, 1, 0, 0, 1]]
+    steady = clicks(policy, {})
     assert heard(steady | {MICROPHONE: steady[MICROPHONE] * 40}) == [[0] * 5]
     for k, frame in enumerate(range(12, 16), start=1):  # 7 dB louder each, over the threshold all the same
         steady[MICROPHONE][frame] = (steady[MICROPHONE][frame] * 2.2**k).to(torch.int16)
@@ -199,17 +179,18 @@ def test_an_onset_is_a_click_and_neither_what_rings_on_nor_steady_noise_nor_what
 def test_the_way_is_from_the_last_onset_that_the_memory_holds():
     policy = make_policy()  # three frames of memory
     places = torch.arange(N_FRAMES * 1.0).square()[None, -7:, None].expand(1, 7, 7) * 0.03
-    ways, is_known = ways_from_onsets(levels_of(policy, clicks(policy, (11, 14))), places, 3)
+    twice, once = (clicks(policy, dict.fromkeys(frames, MICROPHONE)) for frames in ((11, 14), (11,)))
+    ways, is_known = ways_from_onsets(levels_of(policy, twice), places, 3)
     assert is_known.tolist() == [[1, 1, 1, 1, 1]]
     assert ways[0, :, 0].tolist() == pytest.approx([0, -0.69, -1, 0, -0.87], abs=1e-5)  # frames 11 to 15; -1.44 is far
-    assert ways_from_onsets(levels_of(policy, clicks(policy, (11,))), places, 3)[1].tolist() == [[1, 1, 1, 0, 0]]
+    assert ways_from_onsets(levels_of(policy, once), places, 3)[1].tolist() == [[1, 1, 1, 0, 0]]
 
 
 def test_the_balance_is_who_hears_an_onset_louder_and_needs_two_ears():
     policy = PlaybyearPolicy(
         make_config(microphones=("left", "right"), use_vision=False, auxiliary_balance=1.0, **SMALL)
     )
-    batch = run_ending_at(clicks_of_two(policy, {12: LEFT, 15: RIGHT}), N_FRAMES - 1, policy.config)
+    batch = run_ending_at(clicks(policy, {12: LEFT, 15: RIGHT}), N_FRAMES - 1, policy.config)
     head = policy.model.auxiliary.heads["balance"]
     for parameter in head.parameters():
         torch.nn.init.zeros_(parameter)

@@ -69,14 +69,6 @@ def test_a_package_that_cannot_be_imported_does_not_keep_the_others_out(tmp_path
     assert "makers.broken" not in sys.modules
 
 
-def test_functions_are_imported_by_their_name():
-    from lerobot.common.train_utils import update_last_checkpoint
-
-    assert compat.update_last_checkpoint is update_last_checkpoint
-    with pytest.raises(ImportError, match="cannot import name 'update_last_checkpoin'"):
-        from lerobot_playbyear.compat import update_last_checkpoin  # noqa: F401
-
-
 def test_nothing_is_borrowed_elsewhere():
     """Neither from LeRobot's commands, nor private names of modules and objects that are not one's own."""
     found = []

@@ -44,14 +44,6 @@ def task(*props: Prop, **traits) -> Task:
     )
 
 
-def test_which_contacts_are_measured_follows_from_the_parts():
-    env = TaskEnv(task(block("a"), block("b")), sound="none")
-    env.reset_physics(seed=0)
-    pairs = [("gripper", "a"), ("gripper", "b"), ("a", "b"), ("gripper", "table"), ("a", "table"), ("b", "table")]
-    assert list(env.pairs) == pairs
-    assert list(env.contact_forces) == ["-".join(pair) for pair in pairs]
-
-
 @pytest.mark.parametrize("bits", ["", 'contype="2" conaffinity="3"'])
 def test_loose_things_may_lie_on_each_other(bits):
     body = '<body name="{0}"><freejoint name="{0}"/><geom type="box" size=".02 .02 .02" mass=".1" {1}/></body>'

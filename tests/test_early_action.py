@@ -2,7 +2,6 @@
 
 import copy
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +9,6 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from support.playing import finish, make
 
 from gym_playbyear import TASKS
-from gym_playbyear.environment import TaskEnv
-from gym_playbyear.terminations import ClosedUnheard
 from lerobot_env_playbyear import PlaybyearEnvConfig
 
 OPEN, CLOSE = -1.0, 1.0
@@ -21,7 +18,7 @@ OPEN, CLOSE = -1.0, 1.0
 def test_experts_solve_the_tasks_and_hear_first(task):
     """Of 100 episodes: the slow test of `test_check.py`."""
     env = make(task)
-    for seed in range(3):
+    for seed in range(2):
         env.reset_physics(seed=seed)
         info = finish(env, env.scripted_expert())
         assert info["is_success"]
@@ -44,31 +41,6 @@ def test_a_hand_that_closes_in_the_air_was_early_and_one_that_stays_open_was_not
         assert after(env, *commands) == told
 
 
-def test_only_the_first_closing_counts():
-    """A grasp that missed after the touch is followed by another one: it was not early, nor does hearing later excuse."""
-    env = make("OccludedGrasp-v1")
-    env.reset_physics(seed=3)
-    watch = ClosedUnheard("cube")
-
-    class World:
-        definition = env.definition
-
-        def __init__(self, opening, force):
-            self.finger_positions, self.contact_forces = np.array([opening / 2] * 2), {"gripper-cube": force}
-
-    wide = env.definition.arm.max_opening
-    for steps, early in (
-        ([(wide, 3.0), (wide, 0.0), (0.0, 0.0), (wide, 0.0), (0.0, 0.0)], False),
-        ([(0.0, 0.0), (wide, 3.0), (0.0, 3.0)], True),
-        ([(wide, 0.1), (0.8 * wide, 30.0)], True),  # closing itself touches it: the action was chosen before
-        ([(wide, 3.0), (0.8 * wide, 30.0)], False),
-    ):
-        watch.begin(env)
-        for step in steps:
-            watch.look(World(*step))
-        assert watch.acted_early is early
-
-
 @pytest.mark.parametrize(("sideways", "early"), [(0.0, False), (0.6, True)])
 def test_a_hand_that_moves_on_while_the_pouch_falls_was_early(sideways, early):
     env = make("TellApart-v1")
@@ -85,13 +57,6 @@ def test_a_hand_that_moves_on_while_the_pouch_falls_was_early(sideways, early):
     assert copy.deepcopy(env)._early_action.acted_early is early
     env.reset_physics(seed=2)
     assert env._early_action.acted_early is False
-
-
-def test_a_task_made_of_another_one_without_the_thing_does_not_ask():
-    task = replace(make("OccludedGrasp-v1").definition, early_action=ClosedUnheard("pouch"), horizon=2)
-    env = TaskEnv(task)
-    env.reset_physics(seed=0)
-    assert after(env, (0, 2, CLOSE)) == {"is_success": False, "end": "time"}
 
 
 def vector_env(path, **options):

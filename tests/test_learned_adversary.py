@@ -11,26 +11,6 @@ from experiments.numeric_task import N_HEARD, N_PLAYER, NumericTask
 EASY, HARD, POUCH = "KeyBag-Easy-v1", "KeyBag-Hard-v1", "TellApart-v1"
 
 
-def test_a_deaf_learner_gets_no_contact_signal_and_one_that_hears_does():
-    env = NumericTask("OccludedGrasp-v1", hears=True, repeat=1)
-    env.reset(seed=0)
-    expert = env.task.env.scripted_expert()
-    actions = []
-    while not env.task.has_touched:
-        env.begin_action()
-        control = expert.act()
-        env.advance(control)
-        actions.append(np.append(control[:3] * 2, -1.0))
-    heard = env.end_action(actions[-1])
-    env.hears = False
-    deaf = env.end_action(actions[-1])
-    different = np.flatnonzero(heard != deaf)
-    assert different.size
-    assert different.min() >= N_PLAYER - 4
-    assert different.max() < N_PLAYER
-    assert not deaf[N_PLAYER - 4 : N_PLAYER].any()
-
-
 def test_the_recurrent_players_actions_do_not_depend_on_the_truth():
     torch = pytest.importorskip("torch")
     recurrent_player = pytest.importorskip("experiments.recurrent_player")

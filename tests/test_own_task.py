@@ -3,7 +3,6 @@
 import sys
 from dataclasses import replace
 
-import draccus
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from gym_playbyear.environment import TaskEnv
 from gym_playbyear.registry import PluginError, make_definition
 from gym_playbyear.sound.materials import material
 from lerobot_env_playbyear import PlaybyearEnvConfig
-from lerobot_playbyear.recording.record import RecordConfig
 from lerobot_playbyear.scripts.commands import record, train
 
 ENV = ["--env.type=playbyear", "--env.task=StopAtTheTin-v1", "--env.image_size=16"]
@@ -82,18 +80,6 @@ def test_lerobot_records_trains_and_evaluates_it_without_a_change_here(tmp_path)
     assert '"n_episodes": 1' in (tmp_path / "eval/eval_info.json").read_text()
 
 
-def test_a_tasks_own_options_keep_their_types(monkeypatch):
-    given = {}
-    monkeypatch.setitem(
-        gym_playbyear.ALL_TASKS._own,
-        "Own-v1",
-        lambda *, slippery, height: given.update(a=slippery, b=height) or make_definition("OccludedGrasp-v1", {}),
-    )
-    options = ["--env.type=playbyear", "--env.task=Own-v1", "--env.task_options={slippery: false, height: 0.2}"]
-    draccus.parse(RecordConfig, args=[*options, "--dataset.repo_id=a/b"])
-    assert given == {"a": False, "b": 0.2}
-
-
 def test_a_broken_distribution_says_so_and_breaks_nothing_else():
     with pytest.raises(PluginError, match=r"'Broken-v1' of broken .*module_that_is_not_there"):
         TaskEnv("Broken-v1")
@@ -107,8 +93,7 @@ def test_a_broken_distribution_says_so_and_breaks_nothing_else():
         ValueError, match=r"'no_microphone' of the entry points gym_playbyear\.microphones is a builtins"
     ):
         TaskEnv("OccludedGrasp-v1", microphones=("no_microphone",))
-    with pytest.raises(ValueError, match=r"microphones=\('none',\).*name at least one of .*base"):
-        TaskEnv("OccludedGrasp-v1", microphones=("none",))
+
     assert TaskEnv("OccludedGrasp-v1", sound="none").task == "OccludedGrasp-v1"  # ours: nobody replaces it
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
-from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.factory import make_policy as make_policy_for
 from lerobot.policies.factory import make_pre_post_processors
@@ -38,17 +38,16 @@ NO_AUGMENTATION = {
 # Configuration
 
 
-def dataset_meta(fps: int = 20, sample_rate: int | None = 16000, samples: int = 800, audio: bool = True):
+def dataset_meta(fps: int = 20):
     """What `make_policy` reads of a dataset."""
-    info = {"encoding": "pcm_s16"} | ({} if sample_rate is None else {"sample_rate": sample_rate})
+    info = {"encoding": "pcm_s16", "sample_rate": 16000}
     names = ["height", "width", "channels"]
     features = {
         "observation.images.front": {"dtype": "image", "shape": (40, 40, 3), "names": names},
         "observation.state": {"dtype": "float32", "shape": (7,), "names": None},
         "action": {"dtype": "float32", "shape": (4,), "names": None},
+        MICROPHONE: {"dtype": "int16", "shape": (800,), "names": None, "info": info},
     }
-    if audio:
-        features[MICROPHONE] = {"dtype": "int16", "shape": (samples,), "names": None, "info": info}
     return SimpleNamespace(features=features, fps=fps, stats={}, root=None)
 
 
@@ -66,46 +65,19 @@ def test_lerobot_finds_and_makes_the_policy_from_its_name_and_a_dataset():
 @pytest.mark.parametrize(("fps", "frames"), [(5, 10), (20, 40), (30, 60)])
 def test_two_seconds_are_as_many_frames_as_the_frame_rate_says(fps, frames):
     config = PlaybyearConfig(fps=fps, n_supervised_steps=1, device="cpu")
-    meta = dataset_meta(fps=fps)
-    windows = resolve_delta_timestamps(config, meta)
+    windows = resolve_delta_timestamps(config, dataset_meta(fps))
     assert config.n_audio_frames == frames + 9
     assert len(windows[MICROPHONE]) == max(frames + 9, 12)
     assert windows[MICROPHONE][-1] == 0
     assert windows["action"] == [0]
 
 
-@pytest.mark.parametrize(
-    ("options", "meta", "message"),
-    [
-        ({"sample_rate": 48000}, {}, r"gripper.*16000 Hz.*48000 Hz.*--policy\.sample_rate=16000"),
-        ({"fps": 30}, {"fps": 30, "samples": 533}, r"16000 / fps 30 is not an integer"),
-        ({}, {"sample_rate": None}, r"info\.sample_rate.*--policy\.sample_rate"),
-        ({"use_audio": False}, {"fps": 30}, r"fps=30.*fps=20.*--policy\.fps=30"),
-    ],
-    ids=["other rate", "S not an integer", "rate unknown", "other fps, deaf"],
-)
-def test_a_dataset_that_does_not_fit_is_refused(options, meta, message):
-    with pytest.raises(ValueError, match=message):
-        make_policy_for(PlaybyearConfig(**TINY, **options), ds_meta=dataset_meta(**meta))
-
-
-def test_only_low_dimensional_observations_and_the_action_are_normalised(tmp_path):
+def test_only_low_dimensional_observations_and_the_action_are_normalised():
     config = make_config()
     stats = {key: {"mean": torch.full(f.shape, 2.0), "std": torch.full(f.shape, 4.0)} for key, f in
              config.input_features.items()}  # fmt: skip
     stats["action"] = {"min": torch.full((4,), -3.0), "max": torch.full((4,), 1.0)}
-    before, after = make_pre_post_processors(config, dataset_stats=stats)
-    before.save_pretrained(tmp_path)
-    after.save_pretrained(tmp_path)
-    # The overrides with which `lerobot-train` opens a checkpoint.
-    overrides = {
-        "normalizer_processor": {
-            "features": {**config.input_features, **config.output_features},
-            "norm_map": config.normalization_mapping,
-            "stats": stats,
-        }
-    }
-    reopened = make_pre_post_processors(config, pretrained_path=str(tmp_path), preprocessor_overrides=overrides)
+    preprocessor, postprocessor = make_pre_post_processors(config, dataset_stats=stats)
     batch = {
         "observation.images.front": torch.rand(2, 5, 3, 40, 40),
         MICROPHONE: torch.randint(-3000, 3000, (2, 5, 800)),
@@ -113,15 +85,12 @@ def test_only_low_dimensional_observations_and_the_action_are_normalised(tmp_pat
         "action": torch.full((2, 5, 4), 0.0),
         "observation.state_is_pad": torch.zeros(2, 5, dtype=torch.bool),
     }
-    for preprocessor, postprocessor in ((before, after), reopened):
-        processed = preprocessor(dict(batch))
-        torch.testing.assert_close(processed["observation.images.front"], batch["observation.images.front"])
-        assert torch.equal(processed[MICROPHONE], batch[MICROPHONE])
-        torch.testing.assert_close(processed["observation.state"], torch.full((2, 5, 7), 2.0))
-        torch.testing.assert_close(processed["action"], torch.full((2, 5, 4), 0.5))
-        assert "observation.state_is_pad" in processed
-        torch.testing.assert_close(postprocessor(torch.full((1, 4), 0.5)), torch.zeros(1, 4))
-    assert config.normalization_mapping["VISUAL"] is NormalizationMode.IDENTITY
+    processed = preprocessor(dict(batch))
+    for key in ("observation.images.front", MICROPHONE, "observation.state_is_pad"):
+        assert torch.equal(processed[key], batch[key])
+    torch.testing.assert_close(processed["observation.state"], torch.full((2, 5, 7), 2.0))
+    torch.testing.assert_close(processed["action"], torch.full((2, 5, 4), 0.5))
+    torch.testing.assert_close(postprocessor(torch.full((1, 4), 0.5)), torch.zeros(1, 4))
 
 
 # Training and rollout are one function: stepping through an episode equals one forward over it
@@ -131,8 +100,8 @@ def test_only_low_dimensional_observations_and_the_action_are_normalised(tmp_pat
     "options",
     [
         {},
-        {"normalize_encodings": False, "low_dimensional_gain": 1.0},
-        {"action_range": 2.0},
+        {"normalize_encodings": False, "low_dimensional_gain": 1.0, "action_range": 2.0},
+        {"low_dimensional_noise": 0.5},
         {"use_audio": False},
         {"use_vision": False},
         {"use_memory": False},
@@ -156,7 +125,7 @@ def test_training_windows_equal_stepping_at_every_frame(n_supervised_steps):
     policy = make_policy(n_supervised_steps=n_supervised_steps)
     episode = make_episode(seed=2, config=policy.config)
     stepped = step_through(policy, [episode])
-    for last in range(N_STEPS):
+    for last in (0, 1, 5, 9, 10, 39, 40, 41, N_STEPS - 1):
         with torch.enable_grad():
             predicted = policy.predict_run(run_ending_at(episode, last, policy.config))
         for back in range(min(n_supervised_steps, last + 1)):
@@ -166,7 +135,7 @@ def test_training_windows_equal_stepping_at_every_frame(n_supervised_steps):
 @torch.no_grad()
 def test_two_environments_in_one_batch_equal_each_alone():
     policy = make_policy()
-    episodes = [make_episode(seed, policy.config) for seed in (3, 4)]
+    episodes = [make_episode(seed, policy.config, 15) for seed in (3, 4)]
     together = step_through(policy, episodes)
     alone = torch.cat([step_through(policy, [episode]) for episode in episodes])
     torch.testing.assert_close(together, alone, atol=1e-5, rtol=0)
@@ -196,24 +165,9 @@ def test_windows_before_the_episode_are_not_supervised():
     assert policy.forward(batch)[0] > loss
 
 
-def test_noise_on_low_dimensional_observations_is_for_training_alone():
-    policy = make_policy(low_dimensional_noise=0.5, use_vision=False, use_audio=False)
-    batch = run_ending_at(make_episode(seed=10, config=policy.config), 30, policy.config)
-    with torch.no_grad():
-        torch.testing.assert_close(policy.predict_run(batch), policy.predict_run(batch), atol=0, rtol=0)
-        policy.train()
-        assert not torch.equal(policy.predict_run(batch), policy.predict_run(batch))
-
-
 def test_cameras_microphones_and_states_of_any_number_and_size():
     config = PlaybyearConfig(
-        fps=30,
-        sample_rate=48000,
-        image_size=32,
-        vision_width=4,
-        hidden_size=32,
-        n_supervised_steps=2,
-        device="cpu",
+        **(TINY | {"fps": 30, "sample_rate": 48000, "n_supervised_steps": 2}),
         input_features={
             "observation.images.front": PolicyFeature(FeatureType.VISUAL, (3, 48, 64)),
             "observation.images.wrist": PolicyFeature(FeatureType.VISUAL, (3, 20, 20)),
@@ -253,17 +207,6 @@ def test_an_action_of_one_number_is_supervised():
         loss, _ = policy.forward(batch)
         expected = (policy.predict_run(batch)[..., 0] - batch["action"]).square().mean()
     torch.testing.assert_close(loss, expected)
-
-
-@pytest.mark.parametrize(
-    ("option", "prefix"), [("use_vision", "observation.images."), ("use_audio", "observation.audio.")]
-)
-def test_a_sense_that_is_switched_off_does_not_matter(option, prefix):
-    policy = make_policy(**{option: False}, n_supervised_steps=2)
-    batch = batch_of(policy)
-    without = {key: value for key, value in batch.items() if not key.startswith(prefix)}
-    with torch.no_grad():
-        assert policy.forward(without)[0] == policy.forward(batch)[0]
 
 
 def test_a_renamed_observation_that_lost_its_padding_flags_is_still_padded():
@@ -363,13 +306,6 @@ def test_fusion_memory_and_head_have_the_papers_sizes(of_the_paper):
     assert actions.abs().max() <= 1
 
 
-def test_a_training_item_has_as_many_frames_as_its_windows_reach_back(of_the_paper):
-    config = of_the_paper.config
-    assert (config.n_run_frames, config.n_image_frames, config.n_audio_frames) == (17, 19, 56)
-    assert config.observation_delta_indices == list(range(-55, 1))
-    assert config.action_delta_indices == list(range(-7, 1))
-
-
 # Augmentation of images
 
 
@@ -390,16 +326,6 @@ def test_shrinking_averages_instead_of_skipping_pixels():
     plain = Augmentation(make_config(**NO_AUGMENTATION))
     for shrunk in (resize(stripes, 32), plain(stripes, 32)):
         torch.testing.assert_close(shrunk, torch.full_like(shrunk, 0.5), rtol=0, atol=0.1)
-
-
-def test_brightness_and_hue_leave_grey_grey():
-    grey = torch.full((4, 2, 3, 20, 20), 0.5)
-    colours = NO_AUGMENTATION | {"augmentation_brightness": 0.05, "augmentation_hue": 0.05}
-    augmented = Augmentation(make_config(**colours))(grey, 20)
-    torch.testing.assert_close(augmented[:, :, 0], augmented[:, :, 2], rtol=0, atol=5e-3)
-    levels = augmented[:, 0, 0, 0, 0]
-    assert ((levels > 0.5 * 0.94) & (levels < 0.5 * 1.06)).all()
-    assert levels.std() > 0
 
 
 # What acts is a folded copy of what learns: the same function, never that of earlier weights, and in no checkpoint
@@ -432,10 +358,6 @@ def assert_same(encoder: FoldedVisionEncoder) -> None:
     torch.testing.assert_close(acting, learning, rtol=1e-4, atol=max(1e-4, 1e-5 * float(learning.abs().max())))
 
 
-def change_statistics(encoder):
-    encoder.network.bn1.running_mean.add_(0.5)
-
-
 def update(encoder):
     optimizer = torch.optim.Adam(encoder.parameters(), lr=0.1)
     encoder(torch.rand(2, 9, 32, 32)).square().mean().backward()
@@ -447,7 +369,7 @@ def load_by_assignment(encoder):
     encoder.load_state_dict(weights, assign=True)
 
 
-@pytest.mark.parametrize("change", [change_statistics, update, load_by_assignment])
+@pytest.mark.parametrize("change", [update, load_by_assignment])
 def test_the_folded_copy_follows_every_change_of_the_weights(change, encoder):
     assert_same(encoder)
     before, _ = both(encoder)
@@ -457,30 +379,20 @@ def test_the_folded_copy_follows_every_change_of_the_weights(change, encoder):
     assert_same(encoder)
 
 
-def test_a_new_episode_sees_even_what_torch_does_not_count_as_a_change():
-    policy = make_policy()
-    encoder = policy.model.vision["images_front"]
-    policy.reset()
-    before, _ = both(encoder)
-    encoder.network.layer1[0].conv1.weight.data.neg_()
-    policy.reset()
-    after, _ = both(encoder)
-    assert (after - before).abs().max() > 1e-2 * before.abs().max()
-    assert_same(encoder)
-
-
 def test_the_copy_is_made_once_per_episode_and_is_in_no_checkpoint():
     policy = make_policy()
-    keys = list(policy.state_dict())
+    keys, encoder = list(policy.state_dict()), policy.model.vision["images_front"]
     policy.reset()
-    made = policy.model.vision["images_front"]._folded._copy
+    made = encoder._folded._copy
     assert made is not None
     episode = make_episode(1, policy.config, 3)
     for t in range(3):
         policy.select_action({key: episode[key][t : t + 1] for key in policy.config.input_features})
-    assert policy.model.vision["images_front"]._folded._copy is made
+    assert encoder._folded._copy is made
     assert list(policy.state_dict()) == keys
-    assert len(list(made.parameters())) < len(list(policy.model.vision["images_front"].network.parameters()))
+    encoder.network.layer1[0].conv1.weight.data.neg_()  # which torch does not count as a change
+    policy.reset()
+    assert_same(encoder)
     assert policy.train().model.vision["images_front"]._folded._copy is None
 
 
@@ -497,7 +409,7 @@ def test_acting_is_exact_in_inference_mode_and_under_autocast():
     policy.forward(run_ending_at(episode, 11, policy.config))[0].backward()  # and it still learns
 
 
-@pytest.mark.parametrize(("width", "size"), [(8, 33), (16, 84), (64, 96)])
+@pytest.mark.parametrize(("width", "size"), [(8, 33), (64, 96)])
 def test_packed_convolutions_compute_the_same_for_one_picture_and_many(width, size):
     torch.manual_seed(width)
     encoder = FoldedVisionEncoder(VisionEncoder(3, width)).eval()

@@ -2,12 +2,11 @@
 
 import dataclasses
 
-import mujoco
 import numpy as np
 import pytest
 
 from experiments import sound_physics
-from experiments.sound_scenes import Scene, box_on_table, level
+from experiments.sound_scenes import level
 from gym_playbyear.contacts import ContactPair, Contacts
 from gym_playbyear.sound import Bending, Synthesizer
 
@@ -66,43 +65,6 @@ def hear(made: Synthesizer, contacts: Contacts, finger_speed=0.0, bending=None) 
 def test_sound_follows_physics(measure):
     wrong = [row for row in measure() if not row.holds]
     assert not wrong, wrong
-
-
-# What the sensors tell
-
-
-def tumbling_box() -> Scene:
-    scene = box_on_table(softness=0.02)
-    scene.data.qpos[2], scene.data.qvel[:] = 0.06, (0.4, -0.2, -0.5, 6.0, -4.0, 3.0)
-    return scene
-
-
-def test_speeds_are_those_of_the_bodies_at_the_contact():
-    scene = tumbling_box()
-    other = mujoco.MjData(scene.model)
-    other.qpos[:], other.qvel[:] = scene.data.qpos, scene.data.qvel
-    contacts = scene.contacts(0.3)
-    table = {name: np.concatenate([getattr(c, name) for c in contacts])[:, 0] for name in
-             ("approach_speed", "slip_speed", "normal_force", "tangential_force")}  # fmt: skip
-    places = np.concatenate([c.position for c in contacts])[:, 0]
-    compared = 0
-    for step in range(len(table["slip_speed"])):
-        mujoco.mj_forward(scene.model, other)
-        points = [other.contact[i] for i in range(other.ncon)]
-        near = [i for i, point in enumerate(points) if np.allclose(point.pos, places[step], atol=1e-6)]
-        if table["normal_force"][step] > 0.01 and near:
-            jacobian = np.zeros((3, scene.model.nv))
-            mujoco.mj_jac(scene.model, other, jacobian, None, places[step], scene.model.body("box").id)
-            velocity, force = jacobian @ other.qvel, np.zeros(6)
-            assert table["approach_speed"][step] == pytest.approx(-velocity[2], abs=1e-3)
-            assert table["slip_speed"][step] == pytest.approx(np.hypot(*velocity[:2]), abs=1e-3)
-            if other.ncon == 1:
-                mujoco.mj_contactForce(scene.model, other, near[0], force)
-                assert table["normal_force"][step] == pytest.approx(force[0], rel=1e-2, abs=1e-2)
-                assert table["tangential_force"][step] == pytest.approx(np.hypot(*force[1:3]), rel=1e-2, abs=1e-2)
-            compared += 1
-        mujoco.mj_step(scene.model, other)
-    assert compared > 10
 
 
 # Episodes

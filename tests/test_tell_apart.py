@@ -79,12 +79,10 @@ def test_only_the_rattle_differs():
 @pytest.mark.parametrize("contents", CONTENTS)
 def test_the_expert_lifts_screws_and_leaves_peanuts(contents):
     env = make(TASK)
-    for seed in range(2):
-        env.reset_physics(seed=seed, options={"contents": contents})
-        expert = env.scripted_expert()
-        info = finish(env, expert)
-        assert info == {"is_success": True, "end": "success", "contents": contents, "acted_early": False}
-        assert expert.phase == {"screws": "keep", "peanuts": "rest"}[contents]
+    env.reset_physics(seed=0, options={"contents": contents})
+    expert = env.scripted_expert()
+    assert finish(env, expert) == {"is_success": True, "end": "success", "contents": contents, "acted_early": False}
+    assert expert.phase == {"screws": "keep", "peanuts": "rest"}[contents]
 
 
 @pytest.mark.parametrize("contents", CONTENTS)

@@ -72,32 +72,21 @@ def test_two_microphones_are_left_and_right(tmp_path):
 
 
 def test_a_film_without_microphones_is_silent(tmp_path):
-    path = film(VideoConfig(small_env(sound="none", episode_length=5), output=tmp_path / "film.mp4"))
+    """Here of a script that does not hear."""
+    env = small_env(sound="none", episode_length=5)
+    path = film(VideoConfig(env, output=tmp_path / "film.mp4", baseline="search"))
     with av.open(str(path)) as container:
         assert not container.streams.audio
         assert container.streams.video[0].frames == 6
 
 
-def test_a_blind_baseline_can_be_filmed(tmp_path):
-    env = small_env(episode_length=5)
-    assert film(VideoConfig(env, output=tmp_path / "blind.mp4", baseline="search")).exists()
-
-
 def save_act(env: PlaybyearEnvConfig, folder: Path, **options) -> ACTConfig:
     """A small policy of LeRobot's own, untrained."""
     features = env_to_policy_features(env)
-    config = make_policy_config(
-        "act",
-        device="cpu",
-        push_to_hub=False,
-        pretrained_backbone_weights=None,
-        dim_model=32,
-        n_heads=2,
-        dim_feedforward=32,
-        input_features={key: features[key] for key in ("observation.state", "observation.images.front")},
-        output_features={"action": features["action"]},
-        **options,
-    )
+    small = {"pretrained_backbone_weights": None, "dim_model": 32, "n_heads": 2, "dim_feedforward": 32}
+    inputs = {key: features[key] for key in ("observation.state", "observation.images.front")}
+    kinds = {"input_features": inputs, "output_features": {"action": features["action"]}}
+    config = make_policy_config("act", device="cpu", push_to_hub=False, **small, **kinds, **options)
     make_policy(config, env_cfg=env).save_pretrained(folder)
     for processor in make_pre_post_processors(config, dataset_stats={}):
         processor.save_pretrained(folder)
@@ -105,18 +94,12 @@ def save_act(env: PlaybyearEnvConfig, folder: Path, **options) -> ACTConfig:
     return config
 
 
-def test_any_lerobot_policy_can_be_filmed(tmp_path):
-    env = small_env(episode_length=5)
-    path = film(VideoConfig(env, policy=save_act(env, tmp_path), output=tmp_path / "policy.mp4", attempts=2))
-    pictures, sound = decode(path)
-    assert len(pictures) == 6
-    assert sound.any()
-
-
 @pytest.mark.parametrize("use_amp", [False, True])
-def test_a_loaded_policy_acts_bit_for_bit_as_in_lerobot_eval(tmp_path, use_amp):
+def test_any_lerobot_policy_acts_bit_for_bit_as_in_lerobot_eval_and_is_filmed(tmp_path, use_amp):
     env_cfg = small_env(episode_length=4)
     policy_cfg = save_act(env_cfg, tmp_path, use_amp=use_amp, n_action_steps=1)
+    pictures, _ = decode(film(VideoConfig(env_cfg, policy=policy_cfg, output=tmp_path / "film.mp4", attempts=2)))
+    assert len(pictures) == 5
     env = env_spec(env_cfg).make()
     episode = play(env, load_policy_actor(policy_cfg, env_cfg), seed=5)
     env.close()
