@@ -10,9 +10,7 @@ import numpy as np
 import psutil
 import pyarrow.parquet as pq
 import pytest
-import torch
 from dataset_factory import CAMERA, make_dataset
-from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.compute_stats import get_feature_stats
 from PIL import Image
 
@@ -68,32 +66,9 @@ def write_video(path: Path, n_frames: int, size: tuple[int, int], **options: str
         container.mux(stream.encode(None))
 
 
-@pytest.mark.parametrize("episodes", [None, [0, 2]])
-@pytest.mark.parametrize("use_videos", [False, True], ids=["image", "video"])
-def test_every_row_and_picture_is_read_as_lerobot_reads_it(tmp_path, use_videos, episodes):
-    make_dataset(tmp_path / "data", use_videos=use_videos, image_size=16)
-    stock = LeRobotDataset("tests/noise", tmp_path / "data", episodes, video_backend="pyav", return_uint8=True)
-    reader = DatasetReader("tests/noise", tmp_path / "data", episodes)
-    assert len(reader) == len(stock)
-    assert [episode.index for episode in reader.episodes] == (episodes or list(range(stock.meta.total_episodes)))
-    for key, feature in reader.features.items():
-        expected = torch.stack([stock[i][key] for i in range(len(stock))]).numpy()
-        if feature["dtype"] in ("image", "video"):
-            if expected.dtype != np.uint8:  # of images LeRobot 0.6.1 makes floats all the same
-                expected = np.rint(255 * expected).astype(np.uint8)
-            pictures = [picture for episode in reader.episodes for picture in reader.pictures(key, episode)]
-            np.testing.assert_array_equal(np.stack(pictures).transpose(0, 3, 1, 2), expected)
-            last = reader.episodes[-1]
-            assert len(list(reader.pictures(key, last, first=2))) == len(last) - 2
-            continue
-        np.testing.assert_array_equal(reader.values(key), expected)
-        parts = [reader.values(key, episode) for episode in reader.episodes]
-        np.testing.assert_array_equal(np.concatenate(parts), expected)
-
-
 @pytest.mark.parametrize("use_videos", [False, True], ids=["image", "video"])
 def test_pictures_of_a_long_episode_come_a_few_at_a_time(tmp_path, use_videos):
-    n_frames, size = 150, 1024
+    n_frames, size = 100, 640
     make_dataset(tmp_path / "data", (n_frames,), image_size=16, use_videos=use_videos)
     if use_videos:
         (path,) = tmp_path.rglob("*.mp4")
