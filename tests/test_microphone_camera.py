@@ -137,7 +137,7 @@ def test_a_picture_carries_its_samples_and_one_wrong_bit_is_noticed(rate, tmp_pa
     "options", [{}, {"streaming_encoding": True, "encoder_queue_maxsize": 150}], ids=["after", "streaming"]
 )
 def test_timecodes_survive_lerobots_video_encoder_at_its_defaults(options, tmp_path):
-    session, counters = Session(tmp_path, sound(8)), counters_of(150)
+    session, counters = Session(tmp_path, sound(5)), counters_of(60)
     root = recorded(tmp_path / "heard", session, [counters], video=True, **options)
     dataset = LeRobotDataset("me/heard", root=root, video_backend="pyav", return_uint8=True)
     pictures = [dataset[i][PICTURE].permute(1, 2, 0).numpy() for i in range(len(dataset))]

@@ -14,9 +14,9 @@ import pytest
 from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.utils.errors import DeviceNotConnectedError
 from sound_server import RATE, Player, SoundServer, started, why_not
+from support.distributions import install
 
 from lerobot_playbyear.audio.audio_files import read_audio, write_audio
-from lerobot_playbyear.audio.control_steps import HALF
 from lerobot_playbyear.audio.microphone_pictures import SessionSound, Strip, find_session, read_strip
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.microphones.card import CardRecording
@@ -160,7 +160,7 @@ def test_two_microphones_of_one_card_share_its_stream_and_are_alike_to_the_sampl
 @needs_server
 def test_a_tap_is_heard_soon_after_it_was_played_and_always_as_late(server):
     with Player(server.fifo("table"), 2) as player, listening(mic=options(device="table")) as cameras:
-        taps = time.perf_counter() + 0.3 + np.arange(20) * 0.21
+        taps = time.perf_counter() + 0.3 + np.arange(10) * 0.21
         for tap in taps:
             player.play(TAP, tap)
         late, last = [], 0
@@ -172,33 +172,9 @@ def test_a_tap_is_heard_soon_after_it_was_played_and_always_as_late(server):
                 at = now - (strip.counter - new[0]) / RATE  # when it was heard, if the newest sample is of now
                 late.append(float(at - taps[np.abs(taps - at).argmin()]))
                 last = int(new[0])
-    assert len(late) >= 18
+    assert len(late) >= 9
     assert 0 <= np.median(late) < 0.05  # the server's own latency and a chunk
     assert np.percentile(np.abs(late - np.median(late)), 90) < 0.005
-
-
-def test_a_pictures_sound_is_of_its_moment_to_5_ms():
-    """With a card that has no delay of its own; what attaching and acting take is in it."""
-    begun: list[float] = []
-
-    @register_source("timed")
-    def timed(config: MicrophoneCameraConfig, channels: int) -> PlayedMicrophone:
-        class Timed(PlayedMicrophone):
-            def _play(self) -> None:
-                begun.append(time.perf_counter())
-                super()._play()
-
-        return Timed("the clock", np.ones((RATE, channels), np.int16), config.sample_rate)
-
-    late = []
-    with listening(mic=options(source="timed")) as cameras:
-        for _ in range(60):
-            now = time.perf_counter()
-            late.append(now - begun[0] - (heard(cameras["mic"]).counter - HALF) / RATE)
-            time.sleep(max(now + TICK_S - time.perf_counter(), 0))
-    assert np.median(late) < 0.005
-    assert np.percentile(late, 90) < 0.007  # a busy machine may be late for once
-    assert min(late) > 0
 
 
 @pytest.mark.parametrize(
@@ -360,10 +336,8 @@ def tin_can(config, channels):
 
 
 def test_an_installed_distribution_brings_its_own_source_and_a_broken_one_harms_no_other(tmp_path, monkeypatch, caplog):
-    for name, text in {"lerobot_microphone_broken": "import no_such_module", "lerobot_microphone_tin": _PLUGIN}.items():
-        (tmp_path / f"{name}.py").write_text(text)
-        (tmp_path / f"{name}-0.1.dist-info").mkdir()
-        (tmp_path / f"{name}-0.1.dist-info/METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+    install("lerobot_microphone_broken", tmp_path, "import no_such_module")
+    install("lerobot_microphone_tin", tmp_path, _PLUGIN)
     monkeypatch.syspath_prepend(str(tmp_path))
     with listening(mic=options(source="tin_can", device="string")) as cameras:
         assert set(np.unique(heard(cameras["mic"]).samples)) == {7}
