@@ -150,17 +150,6 @@ def test_a_rate_that_the_frame_rate_does_not_divide_is_resampled(silent, tmp_pat
     assert np.abs(waveform - wanted)[100:-100].max() < 200
 
 
-def test_only_what_belongs_to_the_first_frame_is_taken_of_the_time_before_it(silent, tmp_path):
-    """A click half a block before the first frame is in block 0, one a block and a half before it is nowhere."""
-    shutil.copytree(silent, tmp_path / "files")
-    sounds = [np.zeros_like(heard(i, 1)) for i in range(3)]
-    for sound in sounds:
-        sound[RATE - SIZE // 2], sound[RATE - 3 * SIZE // 2] = 20_000, 10_000
-    add_files_of_sound(tmp_path / "files", TABLE, sounds, RATE)
-    waveform, _ = episode_waveform(load(attach(tmp_path / "files", tmp_path / "columns")), 1, TABLE)
-    assert np.flatnonzero(waveform).tolist() == [SIZE // 2]
-
-
 def test_sound_that_begins_with_the_first_frame_has_a_silent_first_block(with_files, tmp_path):
     """Where the dataset does not say when sound begins, the user does."""
     shutil.copytree(with_files, tmp_path / "files")

@@ -199,30 +199,15 @@ def path_as_file_number(root: Path) -> None:
 def larger_film(root: Path) -> None:
     with av.open(str(next(root.rglob("*.mp4"))), "w") as film:
         stream = film.add_stream("libx264", rate=20)
-        stream.width, stream.height = 1920, 1080
+        stream.width, stream.height = 640, 480
         for _ in range(11):
-            film.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((1080, 1920, 3), np.uint8), "rgb24")))
+            film.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((480, 640, 3), np.uint8), "rgb24")))
         film.mux(stream.encode(None))
 
 
 def missing_picture(root: Path) -> None:
     numbers = iter(range(11))
     edit_column(root, CAMERA, lambda value: None if next(numbers) == 3 else value)
-
-
-def flipped_bit(column: str) -> Callable[[Path], None]:
-    """In the last byte of a column's page, which has a checksum, of the table of episodes."""
-
-    def flip(root: Path) -> None:
-        (path,) = root.glob("meta/episodes/*/*.parquet")
-        pq.write_table(pq.read_table(path), path, write_page_checksum=True, use_dictionary=False)
-        group = pq.read_metadata(path).row_group(0)
-        chunk = next(c for c in map(group.column, range(group.num_columns)) if c.path_in_schema == column)
-        data = bytearray(path.read_bytes())
-        data[chunk.data_page_offset + chunk.total_compressed_size - 1] ^= 0xFF
-        path.write_bytes(data)
-
-    return flip
 
 
 OUTSIDE, NO_PAGE = "outside its folder", r"No page is written.* is a link to .*--dataset\.root"
@@ -237,7 +222,7 @@ TEMPLATES = (
 )
 BOMB = encoded(Image.new("L", (12_000, 7_000)), "PNG")  # 100 kB, 250 MB when decoded as RGB
 POSTSCRIPT = encoded(Image.new("RGB", (16, 16)), "EPS")
-OTHER_SIZE = rf"'{FILM}': .*file-000.mp4' have 1920 x 1080 pixels; .*\(16, 16, 3\)"
+OTHER_SIZE = rf"'{FILM}': .*file-000.mp4' have 640 x 480 pixels; .*\(16, 16, 3\)"
 
 # What is done to the dataset, and what each reader says of it; None: it reads on
 HOSTILE: dict[str, tuple[Callable[[Path], object], dict[str, str | None]]] = {
@@ -259,15 +244,13 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], dict[str, str | None]]] = {
     ),
     "picture: bomb": (picture(data=BOMB), {"train": "12000 x 7000 pixels", "inspect": "12000 x 7000 pixels"}),
     "picture: missing": (missing_picture, {"train": f"'{CAMERA}': a picture is missing"}),
-    "film: size": (larger_film, {"train": OTHER_SIZE, "inspect": "1920 x 1080"}),
+    "film: size": (larger_film, {"train": OTHER_SIZE, "inspect": "640 x 480"}),
     "film: number": (path_as_file_number, {"page": f"its pictures of '{FILM}' are lost"}),
     **{
         f"{name}: {value}": (template(name, value), dict.fromkeys(("train", "inspect"), ELSEWHERE.format(name)))
         for name, value in TEMPLATES
     },
     "camera's name": (lambda root: rename_feature(root, FILM, "../../secret"), {"inspect": "not in its folder"}),
-    "table: statistics": (flipped_bit("stats/action/mean.list.element"), {"attach": DAMAGED}),
-    "table: length": (flipped_bit("length"), {"attach": DAMAGED}),
     "table: more frames": (lambda root: edit_column(root, "episode_index", lambda _: 1), {"attach": DAMAGED}),
     "table: no number": (lambda root: edit_column(root, "frame_index", lambda n: n or None), {"attach": DAMAGED}),
     "link: file": (
