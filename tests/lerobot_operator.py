@@ -21,7 +21,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent / "sim_robot"))
 
@@ -75,19 +75,6 @@ class Done:
     pressed: list[str] = field(default_factory=list)
     late: int = 0
     output: str = ""
-
-
-class Operator(Protocol):
-    outcomes: list[Outcome]
-
-    def prepare(self) -> None:
-        """Before the command begins."""
-
-    def hears(self, line: str) -> str | None:
-        """The command said a line. Returns a key."""
-
-    def looks(self) -> str | None:
-        """Looks at the arm. Returns a key."""
 
 
 class Episodes:
@@ -194,6 +181,10 @@ class Corrections:
             self._set_up()
             return "space"
         return "space" if self._came_from == "correcting" else "tab"
+
+
+Operator = Episodes | Corrections
+"""Each prepares before the command begins, hears its lines and looks at the arm, and may return a key then."""
 
 
 def ending(now: Mapping[str, Any]) -> str | None:
