@@ -1,7 +1,6 @@
 """Sound in files beside the frames (LeRobot's pull request 2824) becomes columns with the same samples."""
 
 import itertools
-import json
 import shutil
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from support.recording import edit_column, edit_info
 from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, contents, load
 
 from lerobot_playbyear.datasets import AUDIO_PREFIX, episode_waveform
@@ -65,13 +65,11 @@ def add_files_of_sound(
         if ends or name != "to_timestamp":
             rows = rows.append_column(f"audio/{key}/{name}", pa.array(values))
     pq.write_table(rows, table)
-    path = root / "meta/info.json"
-    info = json.loads(path.read_text())
     n_channels = sounds[0].shape[1]
     notes = {"sample_rate": rate, "audio.codec": codec, "audio.channels": n_channels, "start_time_s": PRE_ROLL_S}
-    info["features"][key] = {"dtype": "audio", "shape": [n_channels], "names": ["channels"], "info": notes}
-    info["audio_path"] = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
-    path.write_text(json.dumps(info))
+    feature = {"dtype": "audio", "shape": [n_channels], "names": ["channels"], "info": notes}
+    path = "audio/{audio_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.m4a"
+    edit_info(root, lambda info: info.update(features={**info["features"], key: feature}, audio_path=path))
 
 
 def heard(episode: int, n_channels: int, rate: int = RATE) -> np.ndarray:
@@ -153,7 +151,7 @@ def test_a_rate_that_the_frame_rate_does_not_divide_is_resampled(silent, tmp_pat
 def test_sound_that_begins_with_the_first_frame_has_a_silent_first_block(with_files, tmp_path):
     """Where the dataset does not say when sound begins, the user does."""
     shutil.copytree(with_files, tmp_path / "files")
-    change_info(tmp_path / "files", lambda info: info["features"][TABLE]["info"].pop("start_time_s"))
+    edit_info(tmp_path / "files", lambda info: info["features"][TABLE]["info"].pop("start_time_s"))
     with pytest.raises(InputError, match=rf"'{TABLE}': info.start_time_s is None; wanted.*--offset=1"):
         attach(tmp_path / "files", tmp_path / "columns")
     waveform, _ = episode_waveform(load(attach(tmp_path / "files", tmp_path / "c", offset=0)), 0, TABLE)
@@ -161,26 +159,18 @@ def test_sound_that_begins_with_the_first_frame_has_a_silent_first_block(with_fi
     np.testing.assert_array_equal(waveform[SIZE:], heard(0, 1)[: (LENGTHS[0] - 1) * SIZE, 0])
 
 
-def change_info(root: Path, change) -> None:
-    info = json.loads((root / "meta/info.json").read_text())
-    change(info)
-    (root / "meta/info.json").write_text(json.dumps(info))
-
-
-def change_column(root: Path, name: str, values: list) -> None:
-    (table,) = root.glob("meta/episodes/*/*.parquet")
-    rows = pq.read_table(table)
-    place = rows.column_names.index(f"audio/{TABLE}/{name}")
-    pq.write_table(rows.set_column(place, f"audio/{TABLE}/{name}", pa.array(values)), table)
-
-
 def place(name: str, *values: float | None):
     """Where a microphone's sound is, episode by episode."""
-    return lambda root: change_column(root, name, list(values))
+
+    def change(root: Path) -> None:
+        (table,) = root.glob("meta/episodes/*/*.parquet")
+        edit_column(table, f"audio/{TABLE}/{name}", lambda _: list(values))
+
+    return change
 
 
 def info(change):
-    return lambda root: change_info(root, change)
+    return lambda root: edit_info(root, change)
 
 
 def microphone(**notes: float):

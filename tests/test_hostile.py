@@ -26,6 +26,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDatasetMetadata
 from PIL import Image
 from support.hub import HubServer, come_here
+from support.recording import edit_column, edit_info
 
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
@@ -76,23 +77,14 @@ def hub(monkeypatch):
         yield hub
 
 
-def edit_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    info = json.loads((root / "meta/info.json").read_text())
-    change(info)
-    (root / "meta/info.json").write_text(json.dumps(info))
-
-
-def edit_column(root: Path, key: str, change: Callable[[Any], Any]) -> None:
+def edit_frames(root: Path, key: str, change: Callable[[Any], Any]) -> None:
     """`change` gets the column's values, row by row."""
     (path,) = root.glob("data/*/*.parquet")
-    table = pq.read_table(path)
-    field = table.schema.field(key)
-    values = pa.array([change(value) for value in table.column(key).to_pylist()], field.type)
-    pq.write_table(table.set_column(table.column_names.index(key), field, values), path)
+    edit_column(path, key, lambda values: [change(value) for value in values])
 
 
 def picture(path: str | None = None, data: bytes | None = None) -> Callable[[Path], None]:
-    return lambda root: edit_column(root, CAMERA, lambda _: {"bytes": data, "path": path})
+    return lambda root: edit_frames(root, CAMERA, lambda _: {"bytes": data, "path": path})
 
 
 def encoded(image: Image.Image, kind: str) -> bytes:
@@ -207,7 +199,7 @@ def larger_film(root: Path) -> None:
 
 def missing_picture(root: Path) -> None:
     numbers = iter(range(11))
-    edit_column(root, CAMERA, lambda value: None if next(numbers) == 3 else value)
+    edit_frames(root, CAMERA, lambda value: None if next(numbers) == 3 else value)
 
 
 OUTSIDE, NO_PAGE = "outside its folder", r"No page is written.* is a link to .*--dataset\.root"
@@ -251,8 +243,8 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], dict[str, str | None]]] = {
         for name, value in TEMPLATES
     },
     "camera's name": (lambda root: rename_feature(root, FILM, "../../secret"), {"inspect": "not in its folder"}),
-    "table: more frames": (lambda root: edit_column(root, "episode_index", lambda _: 1), {"attach": DAMAGED}),
-    "table: no number": (lambda root: edit_column(root, "frame_index", lambda n: n or None), {"attach": DAMAGED}),
+    "table: more frames": (lambda root: edit_frames(root, "episode_index", lambda _: 1), {"attach": DAMAGED}),
+    "table: no number": (lambda root: edit_frames(root, "frame_index", lambda n: n or None), {"attach": DAMAGED}),
     "link: file": (
         link("videos/more/x.mp4", "../secret.png"),
         {"push": "Not pushed.*x.mp4' is a link to", "attach": "is a link to"},

@@ -27,7 +27,7 @@ from recording_factory import (
     episode_frames,
     load,
 )
-from support.recording import ENCODER, everything, write
+from support.recording import ENCODER, edit_column, edit_info, everything, write
 from support.shared import run_in_process
 
 from lerobot_playbyear.datasets import episode_files
@@ -94,20 +94,11 @@ def flip(path: Path) -> None:
 
 
 def change(path: Path, column: str, row: int, value: Any) -> None:
-    """Puts another value into a table, of the column's type where it can be."""
-    table = pq.read_table(path)
-    values = table.column(column).to_pylist()
-    values[row] = value
-    kind = table.schema.field(column).type
-    try:
-        array = pa.array(values, kind)
-    except (pa.ArrowInvalid, pa.ArrowTypeError):
-        array = pa.array([float(each) for each in values])
-    pq.write_table(table.set_column(table.column_names.index(column), column, array), path)
+    edit_column(path, column, lambda values: [*values[:row], value, *values[row + 1 :]])
 
 
 def change_info(root: Path, **fields: Any) -> None:
-    (root / INFO).write_text(json.dumps(json.loads((root / INFO).read_text()) | fields))
+    edit_info(root, lambda info: info.update(fields))
 
 
 def write_tasks(root: Path, *texts: str) -> None:
@@ -291,9 +282,10 @@ def test_a_number_that_disagrees_with_the_frames_costs_no_episode(copy, path, ch
 )
 def test_what_only_a_person_can_decide_is_named_and_left(copy, field, value, said):
     root = copy("one file")
-    info = json.loads((root / INFO).read_text())
-    (info if field == "fps" else info["features"]["observation.audio.gripper"]["info"])[field] = value
-    (root / INFO).write_text(json.dumps(info))
+    notes = (
+        (lambda info: info) if field == "fps" else lambda info: info["features"]["observation.audio.gripper"]["info"]
+    )
+    edit_info(root, lambda info: notes(info).update({field: value}))
     report = repair_dataset(root)
     assert (report.target, report.is_done) == (None, False)
     assert said in str(report)
