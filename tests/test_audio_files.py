@@ -110,26 +110,14 @@ def write_sound_with_a_gap(path, gap_s: float) -> None:
         container.mux(stream.encode(None))
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("missing.wav", None, "There is no sound file"),
-        ("text.wav", b"hello", "cannot be decoded"),
-        ("empty.flac", b"", "holds no samples"),
-    ],
-)
-def test_files_without_sound_are_named(tmp_path, name, content, message):
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(AudioFileError, match=message) as error:
-        read_audio(tmp_path / name)
-    assert name in str(error.value)
-
-
-def test_a_film_without_sound_and_another_ending_are_named(tmp_path):
+def test_what_holds_no_sound_is_named(tmp_path):
+    (tmp_path / "text.wav").write_bytes(b"hello")
+    (tmp_path / "empty.flac").touch()
     write_film(tmp_path / "silent.mp4", 0.5, None)
-    with pytest.raises(AudioFileError, match="holds no sound"):
-        read_audio(tmp_path / "silent.mp4")
+    said = {"text.wav": "cannot be decoded", "empty.flac": "holds no samples", "silent.mp4": "holds no sound"}
+    for name, message in said.items():
+        with pytest.raises(AudioFileError, match=f"{name}.*{message}"):
+            read_audio(tmp_path / name)
     with pytest.raises(AudioFileError, match=r"written as \.wav or \.flac"):
         write_audio(tmp_path / "sound.mp3", noise(10), RATE)
     with pytest.raises(ValueError, match="NaN"):
