@@ -23,7 +23,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
-from unittest import mock
 
 import numpy as np
 
@@ -61,22 +60,27 @@ class SoundServer:
         self._modules: dict[str, str] = {}
         self._listeners: dict[str, subprocess.Popen] = {}
         self._process: subprocess.Popen | None = None
+        self._before: dict[str, str | None] = {}
         cards = "".join(
             f'pcm.{name} {{ type pulse device "{name}" server "unix:{self._socket}" }}\n' for name in self._sources
         )
         (folder / "alsa.conf").write_text(f"<{_ALSA}>\n{cards}")
         self.environment = {"ALSA_CONFIG_PATH": str(folder / "alsa.conf"), "PULSE_COOKIE": str(folder / "cookie")}
-        self._here = mock.patch.dict(os.environ, self.environment)
 
     def __enter__(self) -> Self:
-        self._here.start()
+        self._before = {name: os.environ.get(name) for name in self.environment}
+        os.environ.update(self.environment)
         self.start()
         look_again()
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.kill()
-        self._here.stop()
+        for name, value in self._before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
         look_again()
 
     def fifo(self, name: str) -> Path:
