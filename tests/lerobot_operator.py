@@ -65,14 +65,12 @@ class Done:
     Args:
         status: Its exit status; -9 where it was killed.
         outcomes: Of its scenes.
-        pressed: The keys.
         late: How many of its control steps took longer than they may.
         output: What it said.
     """
 
     status: int
     outcomes: list[Outcome] = field(default_factory=list)
-    pressed: list[str] = field(default_factory=list)
     late: int = 0
     output: str = ""
 
@@ -292,7 +290,6 @@ def run_command(
             keys = [*(operator.hears(line) for line in lines), operator.looks()]
             for key in filter(None, keys):
                 terminal.press(key)
-                done.pressed.append(key)
             done.late += sum("running slower" in line for line in lines)
             if outcomes and len(done.outcomes) > n_written:
                 with outcomes.open("a") as file:
