@@ -160,7 +160,7 @@ def test_two_microphones_of_one_card_share_its_stream_and_are_alike_to_the_sampl
 @needs_server
 def test_a_tap_is_heard_soon_after_it_was_played_and_always_as_late(server):
     with Player(server.fifo("table"), 2) as player, listening(mic=options(device="table")) as cameras:
-        taps = time.perf_counter() + 0.3 + np.arange(10) * 0.21
+        taps = time.perf_counter() + 0.3 + np.arange(20) * 0.21
         for tap in taps:
             player.play(TAP, tap)
         late, last = [], 0
@@ -172,7 +172,7 @@ def test_a_tap_is_heard_soon_after_it_was_played_and_always_as_late(server):
                 at = now - (strip.counter - new[0]) / RATE  # when it was heard, if the newest sample is of now
                 late.append(float(at - taps[np.abs(taps - at).argmin()]))
                 last = int(new[0])
-    assert len(late) >= 9
+    assert len(late) >= 18
     assert 0 <= np.median(late) < 0.05  # the server's own latency and a chunk
     assert np.percentile(np.abs(late - np.median(late)), 90) < 0.005
 
