@@ -21,7 +21,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent / "sim_robot"))
 
@@ -65,29 +65,14 @@ class Done:
     Args:
         status: Its exit status; -9 where it was killed.
         outcomes: Of its scenes.
-        pressed: The keys.
         late: How many of its control steps took longer than they may.
         output: What it said.
     """
 
     status: int
     outcomes: list[Outcome] = field(default_factory=list)
-    pressed: list[str] = field(default_factory=list)
     late: int = 0
     output: str = ""
-
-
-class Operator(Protocol):
-    outcomes: list[Outcome]
-
-    def prepare(self) -> None:
-        """Before the command begins."""
-
-    def hears(self, line: str) -> str | None:
-        """The command said a line. Returns a key."""
-
-    def looks(self) -> str | None:
-        """Looks at the arm. Returns a key."""
 
 
 class Episodes:
@@ -196,6 +181,10 @@ class Corrections:
         return "space" if self._came_from == "correcting" else "tab"
 
 
+Operator = Episodes | Corrections
+"""Each prepares before the command begins, hears its lines and looks at the arm, and may return a key then."""
+
+
 def ending(now: Mapping[str, Any]) -> str | None:
     """How a scene ended, by the simulation's status; None as long as it goes on."""
     if now["success"] or now["failed"]:
@@ -301,7 +290,6 @@ def run_command(
             keys = [*(operator.hears(line) for line in lines), operator.looks()]
             for key in filter(None, keys):
                 terminal.press(key)
-                done.pressed.append(key)
             done.late += sum("running slower" in line for line in lines)
             if outcomes and len(done.outcomes) > n_written:
                 with outcomes.open("a") as file:

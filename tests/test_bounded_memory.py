@@ -1,23 +1,14 @@
-"""What reads or records a dataset holds a bounded part of it, and reads the same as LeRobot, which has all in memory."""
+"""What reads or records a dataset holds a bounded part of it; statistics are those that LeRobot has of all in memory."""
 
-import io
-import json
 import tracemalloc
-from pathlib import Path
 
-import av
 import numpy as np
 import psutil
-import pyarrow.parquet as pq
 import pytest
-import torch
 from dataset_factory import CAMERA, make_dataset
-from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.compute_stats import get_feature_stats
-from PIL import Image
 
 from lerobot_playbyear.datasets.free_memory import available_memory
-from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import sound_stats
 from lerobot_playbyear.film.dataset_film import encode
@@ -55,63 +46,10 @@ def test_a_containers_limit_counts_as_the_memory_that_is_free(tmp_path, version)
     assert available_memory(tmp_path / "proc", tmp_path / "groups") > 900000
 
 
-def write_video(path: Path, n_frames: int, size: tuple[int, int], **options: str) -> None:
-    rng = np.random.default_rng(0)
-    picture = rng.integers(0, 256, (*size, 3), dtype=np.uint8)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=FPS)
-        stream.height, stream.width = size
-        stream.pix_fmt, stream.options = "yuv420p", {"preset": "ultrafast", **options}
-        for i in range(n_frames):
-            shifted = np.ascontiguousarray(np.roll(picture, 3 * i, axis=1))
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(shifted, "rgb24")))
-        container.mux(stream.encode(None))
-
-
-@pytest.mark.parametrize("episodes", [None, [0, 2]])
-@pytest.mark.parametrize("use_videos", [False, True], ids=["image", "video"])
-def test_every_row_and_picture_is_read_as_lerobot_reads_it(tmp_path, use_videos, episodes):
-    make_dataset(tmp_path / "data", use_videos=use_videos, image_size=16)
-    stock = LeRobotDataset("tests/noise", tmp_path / "data", episodes, video_backend="pyav", return_uint8=True)
-    reader = DatasetReader("tests/noise", tmp_path / "data", episodes)
-    assert len(reader) == len(stock)
-    assert [episode.index for episode in reader.episodes] == (episodes or list(range(stock.meta.total_episodes)))
-    for key, feature in reader.features.items():
-        expected = torch.stack([stock[i][key] for i in range(len(stock))]).numpy()
-        if feature["dtype"] in ("image", "video"):
-            if expected.dtype != np.uint8:  # of images LeRobot 0.6.1 makes floats all the same
-                expected = np.rint(255 * expected).astype(np.uint8)
-            pictures = [picture for episode in reader.episodes for picture in reader.pictures(key, episode)]
-            np.testing.assert_array_equal(np.stack(pictures).transpose(0, 3, 1, 2), expected)
-            last = reader.episodes[-1]
-            assert len(list(reader.pictures(key, last, first=2))) == len(last) - 2
-            continue
-        np.testing.assert_array_equal(reader.values(key), expected)
-        parts = [reader.values(key, episode) for episode in reader.episodes]
-        np.testing.assert_array_equal(np.concatenate(parts), expected)
-
-
 @pytest.mark.parametrize("use_videos", [False, True], ids=["image", "video"])
 def test_pictures_of_a_long_episode_come_a_few_at_a_time(tmp_path, use_videos):
-    n_frames, size = 150, 1024
-    make_dataset(tmp_path / "data", (n_frames,), image_size=16, use_videos=use_videos)
-    if use_videos:
-        (path,) = tmp_path.rglob("*.mp4")
-        write_video(path, n_frames, (size, size))
-    else:
-        (path,) = (tmp_path / "data").glob("data/*/*.parquet")
-        picture = io.BytesIO()
-        Image.new("RGB", (size, size), (250, 5, 120)).save(picture, "PNG")
-        rows = [{"bytes": picture.getvalue(), "path": None}] * n_frames
-        pq.write_table(with_values(pq.read_table(path), CAMERA, rows), path)
-    info = json.loads((tmp_path / "data/meta/info.json").read_text())
-    info["features"][CAMERA]["shape"] = [size, size, 3]
-    if use_videos:
-        info["fps"] = FPS
-        (table,) = (tmp_path / "data").glob("data/*/*.parquet")
-        times = (np.arange(n_frames) / FPS).astype(np.float32)
-        pq.write_table(with_values(pq.read_table(table), "timestamp", times), table)
-    (tmp_path / "data/meta/info.json").write_text(json.dumps(info))
+    n_frames, size = 400, 128
+    make_dataset(tmp_path / "data", (n_frames,), image_size=size, use_videos=use_videos, microphones=())
     reader = DatasetReader("tests/noise", tmp_path / "data")
     tracemalloc.start()
     n_read = sum(1 for _ in reader.pictures(CAMERA, reader.episodes[0]))

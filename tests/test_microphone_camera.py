@@ -1,7 +1,6 @@
 """A microphone's picture from camera to policy: through encoders, into a dataset's columns, and while acting."""
 
 import itertools
-import json
 import shutil
 import time
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_policy
 from lerobot.utils.feature_utils import hw_to_dataset_features
+from support.recording import edit_info
 
 from lerobot_playbyear.audio import camera_sound
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
@@ -137,7 +137,7 @@ def test_a_picture_carries_its_samples_and_one_wrong_bit_is_noticed(rate, tmp_pa
     "options", [{}, {"streaming_encoding": True, "encoder_queue_maxsize": 150}], ids=["after", "streaming"]
 )
 def test_timecodes_survive_lerobots_video_encoder_at_its_defaults(options, tmp_path):
-    session, counters = Session(tmp_path, sound(8)), counters_of(150)
+    session, counters = Session(tmp_path, sound(5)), counters_of(60)
     root = recorded(tmp_path / "heard", session, [counters], video=True, **options)
     dataset = LeRobotDataset("me/heard", root=root, video_backend="pyav", return_uint8=True)
     pictures = [dataset[i][PICTURE].permute(1, 2, 0).numpy() for i in range(len(dataset))]
@@ -234,8 +234,7 @@ def test_a_rate_that_the_frame_rate_does_not_divide_becomes_one_that_it_does(tmp
     """LeRobot's own 30 frames per second, and 16,000 Hz."""
     session = Session(tmp_path / "sessions", sound(8))
     root = recorded(tmp_path / "heard", session, [[8000 + round(i * RATE / 30) for i in range(40)]])
-    info = json.loads((root / "meta/info.json").read_text())
-    (root / "meta/info.json").write_text(json.dumps({**info, "fps": 30}))
+    edit_info(root, lambda info: info.update(fps=30))
     dataset = attached(root)
     assert dataset.meta.features[KEY]["info"]["sample_rate"] == 15990
     assert column(dataset).shape == (40, 533)

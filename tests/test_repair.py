@@ -4,8 +4,7 @@ import json
 import os
 import shutil
 import signal
-import sys
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot.configs.video import RGBEncoderConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from PIL import Image
 from recording_factory import (
@@ -29,9 +27,10 @@ from recording_factory import (
     episode_frames,
     load,
 )
+from support.recording import ENCODER, edit_column, edit_info, everything, write
+from support.shared import run_in_process
 
 from lerobot_playbyear.datasets import episode_files
-from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.journal import lock_dataset
@@ -43,7 +42,6 @@ from lerobot_playbyear.scripts.commands import repair as repair_command
 N_EPISODES = 6
 EPISODES, TASKS_TABLE = "meta/episodes/chunk-000/file-000.parquet", "meta/tasks.parquet"
 INFO, STATS = "meta/info.json", "meta/stats.json"
-ENCODER = {"vcodec": "h264", "preset": "ultrafast"}
 
 
 def dropped(report: RepairReport) -> set[int]:
@@ -51,19 +49,9 @@ def dropped(report: RepairReport) -> set[int]:
     return {episode.number for episode in report.survey.episodes} - set(report.kept)
 
 
-def write_ours(root: Path, features: dict[str, Any], numbers: Iterable[int] = range(N_EPISODES)) -> None:
-    with DurableWriter(REPO_ID, root, FPS, features, resume=True, rgb_encoder=RGBEncoderConfig(**ENCODER)) as writer:
-        for number in numbers:
-            for frame in episode_frames(number, features):
-                writer.add_frame(frame)
-            writer.save_episode()
-
-
 def write_lerobots(root: Path, features: dict[str, Any]) -> LeRobotDataset:
     """A recording with plain LeRobot that goes on: its files have no end yet."""
-    dataset = LeRobotDataset.create(
-        REPO_ID, FPS, features, root=root, video_backend="pyav", rgb_encoder=RGBEncoderConfig(**ENCODER)
-    )
+    dataset = LeRobotDataset.create(REPO_ID, FPS, features, root=root, video_backend="pyav", rgb_encoder=ENCODER)
     for number in range(N_EPISODES):
         for frame in episode_frames(number, features):
             dataset.add_frame(frame)
@@ -77,8 +65,8 @@ def originals(tmp_path_factory) -> dict[str, tuple[Path, dict[str, Any]]]:
     folder = tmp_path_factory.mktemp("originals")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(episode_files, "SMALL_DATA_BYTES", 20_000)
-        write_ours(folder / "ours", RICH_FEATURES)
-    write_ours(folder / "one file", FEATURES)
+        write(folder / "ours", range(N_EPISODES), RICH_FEATURES)
+    write(folder / "one file", range(N_EPISODES))
     dataset = write_lerobots(folder / "lerobot", RICH_FEATURES)
     shutil.copytree(folder / "lerobot", folder / "killed")  # as SIGKILL leaves it
     dataset.finalize()
@@ -100,11 +88,6 @@ def files(root: Path) -> list[Path]:
     return sorted(path for path in root.rglob("*") if path.is_file())
 
 
-def everything(root: Path) -> dict[Path, tuple[bytes, int]]:
-    """All that a folder holds; the lock of who looked at it aside."""
-    return {path: (path.read_bytes(), path.stat().st_mtime_ns) for path in files(root) if path.name != ".lock"}
-
-
 def truncate(path: Path, share: float = 0.3) -> None:
     path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
 
@@ -115,28 +98,12 @@ def flip(path: Path) -> None:
     path.write_bytes(data)
 
 
-def spoil(path: Path) -> None:
-    """A block in the middle of a film that the disk lost."""
-    data = bytearray(path.read_bytes())
-    data[len(data) // 4 : len(data) // 2] = bytes(len(data) // 2 - len(data) // 4)
-    path.write_bytes(data)
-
-
 def change(path: Path, column: str, row: int, value: Any) -> None:
-    """Puts another value into a table, of the column's type where it can be."""
-    table = pq.read_table(path)
-    values = table.column(column).to_pylist()
-    values[row] = value
-    kind = table.schema.field(column).type
-    try:
-        array = pa.array(values, kind)
-    except (pa.ArrowInvalid, pa.ArrowTypeError):
-        array = pa.array([float(each) for each in values])
-    pq.write_table(table.set_column(table.column_names.index(column), column, array), path)
+    edit_column(path, column, lambda values: [*values[:row], value, *values[row + 1 :]])
 
 
 def change_info(root: Path, **fields: Any) -> None:
-    (root / INFO).write_text(json.dumps(json.loads((root / INFO).read_text()) | fields))
+    edit_info(root, lambda info: info.update(fields))
 
 
 def write_tasks(root: Path, *texts: str) -> None:
@@ -194,7 +161,7 @@ def test_a_recording_that_lerobot_could_not_finish_is_whole_again(copy, original
     """And goes on, in the copy; what was killed is not continued."""
     root = copy("killed")
     with pytest.raises(DatasetDamagedError, match=r"(?s)cannot be read.*playbyear-repair --root="):
-        write_ours(root, RICH_FEATURES, [N_EPISODES])
+        write(root, [N_EPISODES], RICH_FEATURES)
     report = repaired(root, RICH_FEATURES)
     assert "no valid end" in str(report)
     stats, finished = load(report.target).meta.stats, load(originals["lerobot"][0]).meta.stats
@@ -203,7 +170,7 @@ def test_a_recording_that_lerobot_could_not_finish_is_whole_again(copy, original
             if not key.startswith("observation.audio"):  # which LeRobot has per sample
                 tolerance = 0.02 if key == FILM else 1e-6  # the film's from what was encoded
                 np.testing.assert_allclose(stats[key][name], value, atol=tolerance, err_msg=key)
-    write_ours(report.target, RICH_FEATURES, [N_EPISODES])
+    write(report.target, [N_EPISODES], RICH_FEATURES)
     assert not differences(load(report.target), {n: n for n in range(N_EPISODES + 1)}, RICH_FEATURES)
 
 
@@ -221,17 +188,23 @@ def test_what_is_lost_takes_only_its_episodes_with_it(copy, folder, how):
     assert "Numbered anew" in str(report)
 
 
-@pytest.mark.parametrize("victim", [STATS, TASKS_TABLE, "meta/episodes"])
-def test_tables_that_are_lost_are_made_anew(copy, originals, victim):
-    for name, how in (("ours", Path.unlink), ("lerobot", truncate)):
-        root = copy(name)
-        for path in files(root / victim) or [root / victim]:
-            how(path)
-        report = repaired(root, RICH_FEATURES)
-        stats, original = load(report.target).meta.stats, load(originals[name][0]).meta.stats
-        assert stats.keys() == original.keys()
-        np.testing.assert_allclose(stats["action"]["q90"], original["action"]["q90"], atol=1e-6)
-        shutil.rmtree(root.parent)
+@pytest.mark.parametrize(
+    ("victim", "name", "how"),
+    [
+        (STATS, "ours", Path.unlink),
+        (TASKS_TABLE, "lerobot", truncate),
+        ("meta/episodes", "ours", Path.unlink),
+        ("meta/episodes", "lerobot", truncate),
+    ],
+)
+def test_tables_that_are_lost_are_made_anew(copy, originals, victim, name, how):
+    root = copy(name)
+    for path in files(root / victim) or [root / victim]:
+        how(path)
+    report = repaired(root, RICH_FEATURES)
+    stats, original = load(report.target).meta.stats, load(originals[name][0]).meta.stats
+    assert stats.keys() == original.keys()
+    np.testing.assert_allclose(stats["action"]["q90"], original["action"]["q90"], atol=1e-6)
 
 
 def test_all_else_is_in_the_copy_as_it_was(copy):
@@ -273,7 +246,7 @@ def test_without_its_features_a_dataset_needs_one_that_is_like_it(copy, original
     assert "made from that of" in str(repaired(root, RICH_FEATURES, like=originals["lerobot"][0]))
     for text in ("[]", "{}", '{"features": 1}'):
         (root / INFO).write_text(text)
-        assert "info.json is damaged" in str(command(f"--root={root}", f"--like={root}"))
+        assert "info.json is damaged" in str(run_in_process(repair_command, f"--root={root}", f"--like={root}"))
 
 
 def test_features_that_the_files_do_not_have_are_not_believed(copy, originals):
@@ -289,24 +262,19 @@ def test_features_that_the_files_do_not_have_are_not_believed(copy, originals):
 
 
 @pytest.mark.parametrize(
-    ("path", "column", "row", "value"),
+    ("path", "changes"),
     [
-        ("data/chunk-000/file-000.parquet", "index", 8, 4000),
-        (EPISODES, "length", 1, 64),
-        (EPISODES, "dataset_to_index", 1, 64),
-        (EPISODES, "data/file_index", 1, 3),
-        (EPISODES, "episode_index", 1, 0),
-        (EPISODES, "stats/action/mean", 1, [None] * 4),
-        (EPISODES, "stats/action/mean", 1, None),
-        (EPISODES, f"videos/{FILM}/from_timestamp", 2, 64.0),
-        (EPISODES, f"videos/{FILM}/to_timestamp", 2, float("nan")),
-        (EPISODES, f"videos/{FILM}/file_index", 1, float("inf")),
-        (EPISODES, f"videos/{FILM}/chunk_index", 1, -1),
+        ("data/chunk-000/file-000.parquet", [("index", 8, 4000)]),
+        (EPISODES, [("length", 1, 64), ("dataset_to_index", 2, 64), ("data/file_index", 3, 3)]),
+        (EPISODES, [("episode_index", 1, 0), ("stats/action/mean", 1, [None] * 4), ("stats/action/mean", 2, None)]),
+        (EPISODES, [(f"videos/{FILM}/from_timestamp", 2, 64.0), (f"videos/{FILM}/chunk_index", 1, -1)]),
+        (EPISODES, [(f"videos/{FILM}/to_timestamp", 2, float("nan")), (f"videos/{FILM}/file_index", 1, float("inf"))]),
     ],
 )
-def test_a_number_that_disagrees_with_the_frames_costs_no_episode(copy, path, column, row, value):
+def test_a_number_that_disagrees_with_the_frames_costs_no_episode(copy, path, changes):
     root = copy("lerobot")
-    change(root / path, column, row, value)
+    for column, row, value in changes:
+        change(root / path, column, row, value)
     repaired(root, RICH_FEATURES)
 
 
@@ -319,9 +287,10 @@ def test_a_number_that_disagrees_with_the_frames_costs_no_episode(copy, path, co
 )
 def test_what_only_a_person_can_decide_is_named_and_left(copy, field, value, said):
     root = copy("one file")
-    info = json.loads((root / INFO).read_text())
-    (info if field == "fps" else info["features"]["observation.audio.gripper"]["info"])[field] = value
-    (root / INFO).write_text(json.dumps(info))
+    notes = (
+        (lambda info: info) if field == "fps" else lambda info: info["features"]["observation.audio.gripper"]["info"]
+    )
+    edit_info(root, lambda info: notes(info).update({field: value}))
     report = repair_dataset(root)
     assert (report.target, report.is_done) == (None, False)
     assert said in str(report)
@@ -329,14 +298,12 @@ def test_what_only_a_person_can_decide_is_named_and_left(copy, field, value, sai
     report = repair_dataset(root)  # what can be made good is
     assert report.target is not None
     assert "What is left to be done in the copy" in str(report)
-    assert command(f"--root={root}", f"--output={root.parent / 'other'}") == 1
+    assert run_in_process(repair_command, f"--root={root}", f"--output={root.parent / 'other'}") == 1
 
 
 def test_tasks_are_named_by_what_says_so_alone(copy):
     root = copy("lerobot")
-    pd.DataFrame({"task_index": [0, 1]}, index=pd.Index(["Grasp the cubf.", TASKS[1]], name="task")).to_parquet(
-        root / TASKS_TABLE
-    )
+    write_tasks(root, "Grasp the cubf.", TASKS[1])
     report = repair_dataset(root)
     assert (report.target, report.is_done) == (None, True)  # somebody may have renamed it
     assert f"task 0 reads 'Grasp the cubf.'; the rows of episodes 0, 2, 4 say {TASKS[0]!r}" in str(report)
@@ -462,33 +429,17 @@ def test_what_is_no_whole_dataset_is_named_as_such(copy, tmp_path):
         (tmp_path / name).unlink()
 
 
-def test_a_dataset_that_lerobot_had_only_begun_can_be_continued(tmp_path):
-    root = tmp_path / "dataset"
-    LeRobotDataset.create(REPO_ID, FPS, FEATURES, root=root, use_videos=False)
-    assert survey(root).is_sound
-    write_ours(root, FEATURES, range(2))
-    assert not differences(load(root), {0: 0, 1: 1}, FEATURES)
-
-
-def command(*arguments: str) -> int | str | None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["playbyear-repair", *arguments])
-        with pytest.raises(SystemExit) as end:
-            repair_command()
-    return end.value.code
-
-
 def test_the_command_looks_and_repairs(copy, capsys):
     root = copy("killed")
-    assert command(f"--root={root}", "--dry_run=true") == 1
+    assert run_in_process(repair_command, f"--root={root}", "--dry_run=true") == 1
     assert "it is damaged" in capsys.readouterr().out
-    assert command(f"--root={root}") == 0
+    assert run_in_process(repair_command, f"--root={root}") == 0
     said = capsys.readouterr().out
     assert f"A copy with 6 whole episodes is in {root}_repaired" in said
     assert f"mv {root} {root}_damaged && mv {root}_repaired {root}" in said
-    assert command(f"--root={root}_repaired", "--dry_run=true") == 0
+    assert run_in_process(repair_command, f"--root={root}_repaired", "--dry_run=true") == 0
     assert "nothing wrong" in capsys.readouterr().out
-    assert str(command(f"--root={root}/nowhere")).startswith("error: ")
+    assert str(run_in_process(repair_command, f"--root={root}/nowhere")).startswith("error: ")
 
 
 # Damage of every kind, at random

@@ -1,10 +1,13 @@
 """Datasets that are recorded with `DurableWriter`, and what is left of them on the disk."""
 
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 from lerobot.configs.video import RGBEncoderConfig
 from recording_factory import FEATURES, FILM, FPS, REPO_ID, differences, episode_frames, load
 
@@ -43,6 +46,23 @@ def assert_recorded(root: Path, numbers: Sequence[int], features: dict[str, Any]
     assert not differences(dataset, dict(enumerate(numbers)), known)
     assert int(dataset.meta.stats["action"]["count"][0]) == dataset.num_frames
     assert survey(root).is_sound
+
+
+def edit_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    info = json.loads((root / "meta/info.json").read_text())
+    change(info)
+    (root / "meta/info.json").write_text(json.dumps(info))
+
+
+def edit_column(path: Path, column: str, change: Callable[[list], list]) -> None:
+    """Gives a table's column other values, of its type where they can be."""
+    table = pq.read_table(path)
+    field, values = table.schema.field(column), change(table.column(column).to_pylist())
+    try:
+        array = pa.array(values, field.type)
+    except (pa.ArrowInvalid, pa.ArrowTypeError):
+        array = pa.array([float(each) for each in values])
+    pq.write_table(table.set_column(table.column_names.index(column), field.with_type(array.type), array), path)
 
 
 def everything(folder: Path) -> dict[str, Any]:

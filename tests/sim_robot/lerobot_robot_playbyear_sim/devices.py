@@ -1,15 +1,14 @@
 """The robot and its leader, as LeRobot sees them."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from lerobot.cameras import CameraConfig
-from lerobot.cameras.utils import make_cameras_from_configs
-from lerobot.robots import Robot, RobotConfig
-from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
+from lerobot.robots import RobotConfig
+from lerobot.teleoperators import TeleoperatorConfig
 
+from lerobot_robot_playbyear_sim.arm import SimulatedArm, SimulatedLeader
 from lerobot_robot_playbyear_sim.link import Link
 
 # In the order of the environment's `action` and `agent_pos`; LeRobot hands on what ends in .pos or .vel.
@@ -36,25 +35,15 @@ class PlaybyearSimConfig(RobotConfig):
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
 
 
-class PlaybyearSim(Robot):
+class PlaybyearSim(SimulatedArm):
     config_class = PlaybyearSimConfig
     name = "playbyear_sim"
-    is_calibrated = True
+    states, actions = STATES, ACTIONS
 
     def __init__(self, config: PlaybyearSimConfig) -> None:
         super().__init__(config)
-        self.config = config
-        self.cameras = make_cameras_from_configs(config.cameras)
+        self.front_size = (config.image_size, config.image_size)
         self._link: Link | None = None
-
-    @cached_property
-    def observation_features(self) -> dict[str, Any]:
-        further = {name: (camera.height, camera.width, 3) for name, camera in self.cameras.items()}
-        return {**dict.fromkeys(STATES, float), "front": (self.config.image_size, self.config.image_size, 3), **further}
-
-    @cached_property
-    def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(ACTIONS, float)
 
     @property
     def is_connected(self) -> bool:
@@ -65,14 +54,9 @@ class PlaybyearSim(Robot):
         for camera in self.cameras.values():
             camera.connect()
 
-    def calibrate(self) -> None: ...
-
-    def configure(self) -> None: ...
-
     def get_observation(self) -> dict[str, Any]:
         answer = self._ask("observe")
-        pictures = {name: camera.read_latest() for name, camera in self.cameras.items()}
-        return {**dict(zip(STATES, answer["state"], strict=True)), "front": answer["picture"], **pictures}
+        return {**dict(zip(STATES, answer["state"], strict=True)), "front": answer["picture"], **self.pictures()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         if not action.keys() >= set(ACTIONS):  # a place to go to: this arm knows speeds alone, and holds
@@ -114,20 +98,11 @@ class PlaybyearSimLeaderConfig(TeleoperatorConfig):
     demonstrates: bool = False
 
 
-class PlaybyearSimLeader(Teleoperator):
+class PlaybyearSimLeader(SimulatedLeader):
     config_class = PlaybyearSimLeaderConfig
     name = "playbyear_sim_leader"
-    feedback_features: dict[str, Any] = {}  # noqa: RUF012
-    is_calibrated = True
-
-    def __init__(self, config: PlaybyearSimLeaderConfig) -> None:
-        super().__init__(config)
-        self.config = config
-        self._link: Link | None = None
-
-    @cached_property
-    def action_features(self) -> dict[str, Any]:
-        return dict.fromkeys(ACTIONS, float)
+    actions = ACTIONS
+    _link: Link | None = None
 
     @property
     def is_connected(self) -> bool:
@@ -136,16 +111,10 @@ class PlaybyearSimLeader(Teleoperator):
     def connect(self, calibrate: bool = True) -> None:
         self._link = Link(self.config.socket)
 
-    def calibrate(self) -> None: ...
-
-    def configure(self) -> None: ...
-
     def get_action(self) -> dict[str, Any]:
         assert self._link is not None
         answer = self._link.ask("script", demonstrates=self.config.demonstrates)
         return dict(zip(ACTIONS, answer["action"], strict=True))
-
-    def send_feedback(self, feedback: dict[str, Any]) -> None: ...
 
     def disconnect(self) -> None:
         link, self._link = self._link, None
