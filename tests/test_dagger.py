@@ -19,7 +19,9 @@ from dagger_factory import (
     scene,
     seeds,
     state,
+    weights,
 )
+from dataset_factory import rollout_dataset
 from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 from support.shared import ENV, run_in_process, trained
@@ -31,6 +33,7 @@ from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.scripts.commands import dagger as dagger_script
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -254,3 +257,28 @@ def test_without_an_environment_it_learns_from_what_is_there(finished, tmp_path)
     assert [line["step"] for line in metrics(tmp_path, "round")] == [2, 4, 5]
     assert (out / "checkpoints/last").resolve().name == "000005"
     check_normalisation_is_kept(out / "checkpoints/last/pretrained_model")
+
+
+def test_it_learns_from_what_lerobots_rollout_recorded_and_nothing_of_what_the_policy_did(tmp_path):
+    """Of whole attempts with tags, as videos: LeRobot's default."""
+    learned = []
+    for by_policy in (0.0, 5.0):
+        folder = tmp_path / str(by_policy)
+        rollout_dataset(folder / "rollout", (20, 14), lambda step: 5 <= step < 12, use_videos=True, by_policy=by_policy)
+        recorded = ("--episodes=0", "--updates=2", f"--interventions.root={folder / 'rollout'}")
+        dagger(folder, *recorded, env=())
+        assert metrics(folder, "round")[-1]["loss_interventions"] > 0
+        learned.append(weights(folder))
+    before = load_file(trained() / "model.safetensors")
+    assert any(not torch.equal(learned[0][key], before[key]) for key in before)
+    assert all(torch.equal(learned[0][key], learned[1][key]) for key in before)
+
+
+def test_a_fault_of_the_program_shows_where_it_happened(monkeypatch, tmp_path):
+    def check(cfg):
+        raise ValueError("a fault")
+
+    monkeypatch.setattr("lerobot_playbyear.dagger.run._check_places", check)
+    with pytest.raises(ValueError, match=r"^a fault$") as error:
+        run_in_process(dagger_script, *arguments(tmp_path, *QUICK))
+    assert not isinstance(error.value, PlaybyearError)

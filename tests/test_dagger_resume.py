@@ -4,7 +4,9 @@ import contextlib
 import json
 import multiprocessing
 import os
+import re
 import resource
+import shutil
 import signal
 
 import numpy as np
@@ -120,6 +122,38 @@ def test_a_finished_run_stays_as_it_is(finished_run):
     before = figures(finished_run), state(finished_run), seeds(finished_run)
     command("--resume=true", f"--output_dir={finished_run / 'out'}")
     assert (figures(finished_run), state(finished_run), seeds(finished_run)) == before
+
+
+def test_only_one_run_works_in_a_folder(tmp_path):
+    at_work = folder_module.RunFolder(tmp_path / "out").locked()
+    with at_work, pytest.raises(PlaybyearError, match="another playbyear-dagger is at work there"):
+        dagger(tmp_path, *RUN)
+    assert not (tmp_path / "out").exists()
+
+
+def test_resuming_another_run_names_the_differences(finished_run):
+    changed = ("--env.task=OccludedPickPlace-v1", "--demos.repo_id=other/demos", "--expert.n_steps=9")
+    more = ("--episode_seed=5", "--policy.path=elsewhere", "--episodes=0", "--updates=5")
+    with pytest.raises(PlaybyearError, match="holds another run: ") as refused:
+        dagger(finished_run, "--resume=true", *QUICK, *changed, *more)
+    for difference in (
+        r"--env was .*OccludedGrasp-v1.* and is .*OccludedPickPlace-v1",
+        r"--demos was .*tests/demos.* and is .*other/demos",
+        r"--expert was .*'n_steps': 8.* and is .*'n_steps': 9",
+        "--episode_seed was 10000 and is 5",
+        "--policy.path was .*pretrained_model and is elsewhere",
+        "--episodes was 3 and is 0",
+    ):
+        assert re.search(difference, str(refused.value))
+
+
+def test_a_dataset_that_something_else_changed_is_refused(finished_run, tmp_path):
+    shutil.copytree(finished_run / "out", tmp_path / "out")
+    state = json.loads((tmp_path / "out/dagger_state.json").read_text())
+    state["kept"] = state["round"] = 5
+    (tmp_path / "out/dagger_state.json").write_text(json.dumps(state))
+    with pytest.raises(PlaybyearError, match="holds 3 attempts, and this run knows of 5"):
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=8")
 
 
 # SIGKILL: a process of its own, killed by the operating system
