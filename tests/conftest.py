@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 from support import shared
-from support.commands import Commands, speed_up_parsers
+from support.commands import Commands, speed_up
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _parsers_are_quick():
     """A command builds its parser whenever it starts: here several hundred times."""
     logging.getLogger("draccus").setLevel(logging.INFO)  # else as many lines of what it decodes are kept for each test
-    speed_up_parsers()
+    speed_up()
 
 
 @pytest.fixture(scope="module")

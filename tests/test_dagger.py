@@ -11,7 +11,6 @@ from dagger_factory import (
     Scripted,
     arguments,
     column,
-    command,
     corrections,
     dagger,
     finished,
@@ -28,7 +27,6 @@ from support.shared import ENV, run_in_process, trained
 
 from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
 from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.dagger.methods import Method
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.play import play
@@ -63,18 +61,6 @@ def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the
     seen = [actor.act(observation) for observation in episode.observations[:-1]]
     env.close()
     np.testing.assert_allclose(np.clip(seen[9], -1, 1), episode.actions[9], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("verdict", "outcome"), [(Verdict.SUCCESS, "kept"), (Verdict.FAILURE, "failed"), (Verdict.DISCARD, "discarded")]
-)
-def test_an_expert_can_end_an_attempt(verdict, outcome):
-    env, actor, _ = scene()
-    episode = play(env, actor, seed=5, expert=Scripted(steps=(2,), verdicts={6: verdict}))
-    env.close()
-    assert len(episode) == 7
-    assert episode.success is (verdict is Verdict.SUCCESS)
-    assert Method().outcome(episode) == outcome
 
 
 # A run
@@ -224,6 +210,7 @@ def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_
     outcomes = ["failed", "unneeded", "kept", "failed", "discarded", "kept"]
     told = [(line["seed"], line["outcome"]) for line in metrics(tmp_path, "attempt")]
     assert told == list(zip([10, 11, 12, 13, 14, 17], outcomes, strict=True))
+    assert all(line["n_frames"] == 3 for line in metrics(tmp_path, "attempt"))  # the expert ends them
 
 
 def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
@@ -232,11 +219,6 @@ def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
     assert "needed no help in 3 attempts in a row" in "".join(capfd.readouterr())
     assert seeds(tmp_path) == [10]
     assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
-
-
-def test_an_expert_that_rescues_nothing_is_an_error(tmp_path):
-    with pytest.raises(PlaybyearError, match="3 of 3 attempts in a row failed in spite of the expert"):
-        dagger(tmp_path, "--expert.type=test_verdicts", "--max_attempts=3")
 
 
 def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
@@ -251,11 +233,16 @@ def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
 # From recorded corrections alone
 
 
-def test_without_an_environment_it_learns_from_what_is_there(finished, tmp_path):
-    offline = ("--episodes=0", "--updates=5", f"--interventions.root={finished / 'corrections'}")
-    out = command(*arguments(tmp_path, *offline, env=()))
-    assert [line["step"] for line in metrics(tmp_path, "round")] == [2, 4, 5]
-    assert (out / "checkpoints/last").resolve().name == "000005"
+def test_without_an_environment_it_learns_from_what_is_there_but_for_the_beginning_of_corrections(tmp_path, capfd):
+    corrected = ("--episodes=0", f"--interventions.root={finished() / 'corrections'}")
+    for options, n in (((), 3), (("--skip_s=0",), 9)):  # three corrections of 3 frames, a memory of 2
+        out = dagger(tmp_path / str(n), *corrected, "--updates=5", *options, env=())
+        said = capfd.readouterr()
+        assert "No correction is longer" not in said.err
+        assert f"Corrections: {n} of 9 frames that the expert chose are learned from" in said.out
+        assert ("the first 0.1 s of every correction are left out" in said.out) is (n == 3)
+        assert [line["step"] for line in metrics(tmp_path / str(n), "round")] == [2, 4, 5]
+        assert (out / "checkpoints/last").resolve().name == "000005"
     check_normalisation_is_kept(out / "checkpoints/last/pretrained_model")
 
 

@@ -54,7 +54,7 @@ def supervised(batch):
 ATTEMPTS = "....xxxxxxxxxxxx..........xxx.....x" + "xx............" + "xxxxxxxxxx"
 
 
-@pytest.mark.parametrize("n_windows", [1, 4, 8])
+@pytest.mark.parametrize("n_windows", [1, 8])
 def test_half_of_every_batchs_windows_end_on_an_intervention_frame(n_windows):
     demonstrations = store([40, 30])
     interventions = store([35, 14, 10], ATTEMPTS, first=N_DEMONSTRATIONS)
@@ -72,11 +72,10 @@ def test_half_of_every_batchs_windows_end_on_an_intervention_frame(n_windows):
         assert len(ends) > 6 * n_windows  # most of the windows that are computed are learned from
 
 
-@pytest.mark.parametrize("n_windows", [1, 4, 8])
-@pytest.mark.parametrize("n_skipped", [0, 2, 5])
-def test_the_beginning_of_every_correction_can_be_left_out(n_windows, n_skipped):
+@pytest.mark.parametrize("n_skipped", [2, 5])
+def test_the_beginning_of_every_correction_can_be_left_out(n_skipped):
     interventions = store([35, 14, 10], ATTEMPTS, first=N_DEMONSTRATIONS)
-    batches = BalancedBatches(windows(n_windows), store([40]), interventions, 12, n_skipped=n_skipped)
+    batches = BalancedBatches(windows(4), store([40]), interventions, 12, n_skipped=n_skipped)
     wanted, length, episode = [], 0, np.repeat([0, 1, 2], [35, 14, 10])
     for frame, mark in enumerate(ATTEMPTS):
         begins_episode = frame == 0 or episode[frame] != episode[frame - 1]

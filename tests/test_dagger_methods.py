@@ -13,7 +13,6 @@ from dagger_factory import (
     column,
     corrections,
     dagger,
-    finished,
     metrics,
     scene,
 )
@@ -152,25 +151,6 @@ def test_what_a_policy_solves_alone_is_not_shown_and_what_it_fails_at_unseen_is(
         dagger(tmp_path, *QUICK, "--method.type=redo", *options)
     told = [(line["outcome"], line["n_expert_steps"]) for line in metrics(tmp_path / "b", "attempt")]
     assert told == [("failed", 0), ("failed", 8)]
-
-
-def test_what_is_shown_is_no_place_for_corrections(tmp_path):
-    corrected = f"--interventions.root={finished() / 'corrections'}"
-    with pytest.raises(PlaybyearError, match=r"frames that the policy chose.*another --method\.type"):
-        dagger(tmp_path, "--method.type=redo", "--episodes=0", "--updates=1", corrected, env=())
-
-
-def test_a_run_skips_the_beginning_of_corrections(tmp_path, capfd):
-    losses, corrected = [], f"--interventions.root={finished() / 'corrections'}"
-    for options, n in (((), 3), (("--skip_s=0",), 9)):  # three corrections of 3 frames, a memory of 2
-        folder = tmp_path / str(n)
-        dagger(folder, "--episodes=0", "--updates=1", corrected, *options, env=())
-        losses.append([line["loss_interventions"] for line in metrics(folder, "round")])
-        said = capfd.readouterr()
-        assert "No correction is longer" not in said.err
-        assert f"Corrections: {n} of 9 frames that the expert chose are learned from" in said.out
-        assert ("the first 0.1 s of every correction are left out" in said.out) is (n == 3)
-    assert losses[0] != losses[1]
 
 
 GATED = ("--method.type=robot_gated", "--method.rollouts=2", "--method.intervention_share=0.4")

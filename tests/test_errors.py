@@ -163,6 +163,7 @@ dagger | --env.task=TellApart-v1 --method.type=no_handback | TellApart-v1 | no_h
 dagger | --env.task=TellApart-v1 --method.type=redo --expert.person=true | `intervention_gate()` | own_expert.py
 dagger | --output_dir={finished}/out | {finished}/out holds a run already | --resume=true
 dagger | --interventions.root={finished}/corrections --episodes=1 | holds 3 attempts already, and --episodes=1
+learn | --method.type=redo --interventions.root={finished}/corrections | frames that the policy chose | another --method.type
 learn | --interventions.root={untagged} | wanted 'intervention', bool (1,), and there is no such feature
 learn | --interventions.root={uncorrected} | None of the 5 frames | has 'intervention' set
 learn | --interventions.root={empty} | {empty} | is empty
