@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from support import shared
 from support.commands import Commands, speed_up
+from support.hub import HubServer
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -63,9 +64,16 @@ def trained() -> Path:
 
 
 @pytest.fixture(scope="session")
-def commands(tmp_path_factory):
+def hub_server():
+    """The Hub that `commands` speak to, on loopback."""
+    with HubServer() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def commands(hub_server, tmp_path_factory):
     """Runs commands as they are typed, each in a process of its own; see `support/commands.py`."""
-    runner = Commands(tmp_path_factory.mktemp("commands"))
+    runner = Commands(tmp_path_factory.mktemp("commands"), hub_server.environment())
     yield runner
     runner.close()
 

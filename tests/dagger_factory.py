@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -150,11 +151,13 @@ class Scripted(Expert):
         return self.verdicts.get(self.n)
 
 
-def scene(expert=None, n_steps=20):
+@cache
+def scene(n_steps=20):
+    """An environment and the policy in it. Made once: leave it open."""
     env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=n_steps)
     policy = PlaybyearPolicy.from_pretrained(trained())
     processors = make_pre_post_processors(policy.config, str(trained()))
-    return env_spec(env_cfg).make(), PolicyActor(policy, env_cfg, *processors), expert or Scripted()
+    return env_spec(env_cfg).make(), PolicyActor(policy, env_cfg, *processors)
 
 
 # Runs that are stopped

@@ -46,7 +46,7 @@ def _finished():
 
 def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the_policy_remembers_it_all():
     expert = Scripted(steps=range(4, 9))
-    env, actor, _ = scene()
+    env, actor = scene()
     episode = play(env, actor, seed=5, expert=expert)
     assert np.flatnonzero(episode.interventions).tolist() == list(range(4, 9))
     for step, action in expert.actions.items():
@@ -59,7 +59,6 @@ def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the
     assert len(episode) == t + 1
     actor.reset(env)
     seen = [actor.act(observation) for observation in episode.observations[:-1]]
-    env.close()
     np.testing.assert_allclose(np.clip(seen[9], -1, 1), episode.actions[9], atol=1e-6)
 
 

@@ -2,12 +2,12 @@
 
 import contextlib
 import json
-import multiprocessing
 import os
 import re
 import resource
 import shutil
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -33,7 +33,6 @@ from dagger_factory import (
     weights,
 )
 from lerobot.configs import parser
-from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from support.shared import trained
 
@@ -63,8 +62,9 @@ RUN = (*QUICK, *FINISHED)
         pytest.param(folder_module.RunFolder, "clean", 3, marks=pytest.mark.slow),  # `last` is behind
         pytest.param(DurableWriter, "add_frame", 20, marks=pytest.mark.slow),  # while an attempt is written
         pytest.param(folder_module.RunFolder, "save_checkpoint", 1, marks=pytest.mark.slow),
+        pytest.param(Learner, "evaluate", 1, marks=pytest.mark.slow),
     ],
-    ids=["counting", "placing", "cleaning", "writing", "saving"],
+    ids=["counting", "placing", "cleaning", "writing", "saving", "evaluating"],
 )
 def test_wherever_it_stops_it_ends_alike(finished_run, tmp_path, owner, name, after):
     assert_a_power_cut_changes_nothing(tmp_path, finished_run, RUN, after, owner, name)
@@ -159,51 +159,16 @@ def test_a_dataset_that_something_else_changed_is_refused(finished_run, tmp_path
 # SIGKILL: a process of its own, killed by the operating system
 
 
-def _run_command(args):
-
-    torch.set_num_threads(1)
-    register_third_party_plugins()
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
-        command(*args)
-
-
-@pytest.fixture(scope="module")
-def processes():
-    """Makes processes that have LeRobot imported already, and nothing else done."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["dagger_factory", "lerobot_env_playbyear", "lerobot.scripts.lerobot_eval"])
-    return context
-
-
-def run_and_kill(processes, folder, n_kills, shortest, longest, *options):
-    """Runs the command, kills it n times after random times [s], and lets it end. Returns what each kill found."""
+def run_and_kill(commands, folder, n_kills, *options):
+    """Runs the command, kills it n times after random times, and lets it end."""
     rng = np.random.default_rng(0)
-    args = [*arguments(folder, *options), "--resume=true"]
-    found = []
-    for number in range(n_kills + 1):
-        process = processes.Process(target=_run_command, args=(args,))
-        process.start()
-        process.join(rng.uniform(shortest, longest) if number < n_kills else None)
-        if process.exitcode is None:
-            os.kill(process.pid, signal.SIGKILL)
-            process.join()
-            found.append(_what_is_there(folder))
-            assert_everything_loads(folder)
-        else:
-            assert process.exitcode == 0
-            break
-    return found
-
-
-def _what_is_there(folder):
-    """How far the run was when it was killed."""
-    if not (folder / "out/dagger_state.json").exists():
-        return "starting"
-    counters = state(folder)
-    half_done = sorted(path.name for path in folder.rglob("*.partial")) + [
-        p.name for p in folder.rglob(".journal.json")
-    ]
-    return f"attempt {counters['attempts']}, round {counters['round']}, kept {counters['kept']} {half_done}"
+    run = ("playbyear-dagger", *arguments(folder, *options), "--resume=true")
+    for _ in range(n_kills):
+        end = time.monotonic() + rng.uniform(2.0, 12.0)
+        assert commands.run(*run, kill_when=lambda end=end: time.monotonic() > end).status == -signal.SIGKILL
+        assert_everything_loads(folder)
+    result = commands.run(*run)
+    assert result.status == 0, result.output[-3000:]
 
 
 def assert_everything_loads(folder):
@@ -231,19 +196,8 @@ def assert_complete(folder, n_episodes):
 
 
 @pytest.mark.slow
-def test_killed_in_an_evaluation_it_evaluates_again(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        cut_power(patch, Learner, "evaluate", 1)
-        with pytest.raises(PowerCut):
-            dagger(tmp_path, *RUN)
-    assert [line["round"] for line in metrics(tmp_path, "eval")] == [0]
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}")
-    assert [line["round"] for line in metrics(tmp_path, "eval")] == [0, 2, 3]
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_killed_twenty_times_it_ends_complete_and_alike(processes, tmp_path):
+def test_killed_twenty_times_it_ends_complete_and_alike(commands, tmp_path):
     """The scripted expert, whole attempts, evaluations; and the weights of a run that was never killed."""
     options = (
         "--eval_every=2",
@@ -254,11 +208,9 @@ def test_killed_twenty_times_it_ends_complete_and_alike(processes, tmp_path):
         "--env.episode_length=200",  # in less the expert rescues nobody
         "--max_attempts=1000",  # attempts in vain count on after each kill
     )
-    found = run_and_kill(processes, tmp_path / "killed", 20, 2.0, 12.0, *options)
-    print("\n".join(found))
-    assert len(found) == 20
+    run_and_kill(commands, tmp_path / "killed", 20, *options)
     assert_complete(tmp_path / "killed", 8)
-    assert run_and_kill(processes, tmp_path / "calm", 0, 0, 0, *options) == []
+    run_and_kill(commands, tmp_path / "calm", 0, *options)
     assert_ended_alike(tmp_path / "killed", tmp_path / "calm")
 
 
