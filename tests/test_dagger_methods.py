@@ -140,32 +140,16 @@ def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, capfd, k
 
 def test_what_a_policy_solves_alone_is_not_shown_and_what_it_fails_at_unseen_is(tmp_path, monkeypatch):
     monkeypatch.setattr(Quick, "wants_control", lambda self, *_: setattr(self, "n", self.n + 1) is not None)
-    dagger(tmp_path, *QUICK, "--method.type=redo", "--episodes=1", "--max_attempts=1", "--episode_seed=10000")
-    (line,) = metrics(tmp_path, "attempt")  # seeds that 3 does not divide end as successes
-    assert (line["outcome"], line["n_expert_steps"], line["autonomy"]) == ("unneeded", 0, 1.0)
-    options = ("--episodes=1", "--max_attempts=1", "--episode_seed=9999", f"--output_dir={tmp_path / 'b/out'}")
-    with pytest.raises(PlaybyearError, match="2 of 2 attempts in a row failed"):
-        dagger(tmp_path, *QUICK, "--method.type=redo", *options)
-    told = [(line["outcome"], line["n_expert_steps"]) for line in metrics(tmp_path / "b", "attempt")]
-    assert told == [("failed", 0), ("failed", 8)]
+    seeds = ("--episodes=1", "--max_attempts=2", "--episode_seed=9998")  # those that 3 divides end as failures
+    with pytest.raises(PlaybyearError, match="2 of 3 attempts in a row failed"):
+        dagger(tmp_path, *QUICK, "--method.type=redo", *seeds)
+    told = [(line["outcome"], line["n_expert_steps"]) for line in metrics(tmp_path, "attempt")]
+    assert told == [("unneeded", 0), ("failed", 0), ("failed", 8)]
+    assert metrics(tmp_path, "attempt")[0]["autonomy"] == 1
 
 
 GATED = ("--method.type=robot_gated", "--method.rollouts=2", "--method.intervention_share=0.4")
 ALONE = (*GATED, "--method.redo_failed=false")
-
-
-@pytest.mark.slow
-def test_a_robot_that_asks_resumes_exactly(tmp_path):
-    """Killed before it learned from its second round's attempts, after an attempt that is no correction was saved."""
-    run = (*QUICK, *ALONE, "--episodes=3", "--warmup_episodes=1")
-    dagger(tmp_path / "calm", *run)
-    attempts = metrics(tmp_path / "calm", "attempt")
-    assert all(line["n_calls"] == 0 for line in attempts[:2])
-    assert any(line["n_calls"] > 0 for line in attempts[2:])
-    assert all(line["n_asked_steps"] == line["n_expert_steps"] for line in attempts)
-    assert any(line["outcome"] in ("failed", "unneeded") for line in attempts)
-    for after in (2, 4, len(attempts) + 2):
-        assert_a_power_cut_changes_nothing(tmp_path / f"killed{after}", tmp_path / "calm", run, after)
 
 
 def test_a_robot_asks_once_its_first_attempts_are_made_and_leaves_the_rest_to_the_expert(tmp_path):

@@ -77,9 +77,7 @@ attach-audio | --dataset.root={out}/no | There is no dataset in {out}/no
 inspect | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no' | Check --dataset.root
 inspect | --dataset.root={truncated} | {truncated} | file-000.parquet | playbyear-repair --root={truncated}
 inspect | --html={file}/page.html | The page cannot be written | {file}
-repair | --root={out}/no | {out}/no holds no LeRobotDataset
 repair | --like={full} | --like={full} holds no LeRobotDataset | the same settings
-push | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no'
 push policy | --policy.path={noise} | there is no checkpoint with config.json | {noise}
 video | --output={out}/film | --output={out}/film: films are mp4 | ends with .mp4
 video | --output={folder_mp4} | --output={folder_mp4}: that is a folder; give the name of a file
@@ -103,7 +101,6 @@ record | --env.sample_rate=16001 | `env.sample_rate`: 16001 | a multiple of 20
 record | --env.fps=30 | `env.fps`: 30 | give 20, or leave it out
 record | --env.microphones=[] | env.microphones | at least one
 record | --env.visualization_width=100 | `env.visualization_width`: 100 | square
-record | --env.noise_level=-1 | `env.noise_level`: -1.0 | 0 (silent) or more
 record | --env.render_mode=video | `env.render_mode`: 'video' | rgb_array, human
 record | --env.room_noise_level=8 | `env.room_noise_level`: 8.0 | name a WAV file with --env.room_noise
 record | --env.sound=none --env.microphone_response=phone | env.microphone_response | no sound
@@ -123,7 +120,6 @@ record | --expert.type=teleop --expert.takeover=press | takeover='press' | give 
 record | --expert.type=teleop | No window can be opened (DISPLAY='')
 # Training
 train act | --steps=1 | --policy.type=act | --policy.type=playbyear | lerobot-train
-train | --preset=tpu | --preset=tpu is not known | cpu | gpu | paper
 train | --preset=paper --policy.type=act | --preset=paper is for --policy.type=playbyear, not for act
 train | --store=tape | --store=tape is not known: wanted one of memory, disk, auto
 train | --dataset.streaming=true | --dataset.streaming does not work | --store=disk
@@ -140,7 +136,6 @@ train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={
 dagger | -env.type -env.task -env.image_size | give --env.type and --env.task, or --episodes=0 --updates=N
 dagger | -policy.path | HG-DAgger improves a trained policy: give | --policy.path
 dagger | --batch_size=5 | --batch_size=5 must be even
-dagger | --warmup_episodes=0 | --warmup_episodes=0: give at least 1
 dagger | --learning_rate=0 | --learning_rate=0.0 must be above 0
 dagger | --updates=5 | --updates is for --episodes=0
 dagger | --episodes=0 | give --updates
@@ -150,7 +145,6 @@ dagger | --new_weights=true | --new_weights=true: a policy that knows nothing ca
 dagger | --method.type=redo --skip_s=1 | --skip_s=1 | --method.type=redo the expert chooses every frame
 dagger | --method.type=robot_gated --method.intervention_share=1.5 | intervention_share=1.5: give a share
 dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
-dagger | --expert.type=scripted --expert.person=true --expert.tremor=-1 | --expert.tremor=-1 | give 0 or more
 dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --policy.path
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
 dagger | --env.sound=none | observation.audio.gripper is int16 | there and absent here
@@ -185,15 +179,12 @@ session | --marks=1.0 | '1.0' is no mark; wanted seconds in the sound file = sec
 session | --marks=1=5,2=5 | the same time on the clock
 session | --marks=10=1,20=5 | 2.5000 seconds of sound in a second of the clock
 attach-spectrogram | --microphones=[nose] | --microphones names 'nose'; the dataset in {noise} has gripper
-attach-spectrogram | --microphones=[] | --microphones names none
 attach-spectrogram | --name=front | 'observation.images.front' is in the dataset in {noise} already
 attach-spectrogram | --seconds=3 | 60 frames do not fit into 16 columns | at most 0.80
-attach-spectrogram | --seconds=0 | --seconds=0 | above 0
 attach-spectrogram | --height=3 | --height=3 | 8 to 4096 pixels
 attach-spectrogram | --low_db=10 --high_db=-10 | --low_db=10 | the second above the first
 attach-spectrogram | --dataset.root={deaf} | {deaf} has no sound in columns | playbyear-attach-audio
 # Films, inspection, microphones
-video | --seed=-1 | seed=-1: give 0 or more
 video | --attempts=0 | attempts=0: give at least 1
 video | --baseline=deaf | no blind baseline 'deaf', only | search
 video | --policy.path={policy} --baseline=search | --baseline=search: it acts without a policy
@@ -207,7 +198,6 @@ policy | dtype: half | --policy.dtype must be one of auto, float32, bfloat16, fl
 policy | action_range: 0.0 | --policy.action_range must be above 0 and finite, got 0
 policy | audio_noise_files: here | audio_noise_files=here | how loud | --policy.audio_noise_db=24
 policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (none) and finite, got -1.0
-policy | auxiliary_way: .inf | --policy.auxiliary_way must be at least 0
 policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4
 policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memory_displacement_gain is 0: give 10
 # Environments
@@ -226,16 +216,13 @@ reset | OccludedGrasp-v1, {cube_position: [0, 0.9]} | cube_position= | on the ta
 reset | OccludedPickPlace-v1, {bin_position: 0.1} | bin_position= | give x and y
 reset | TellApart-v1, {pouch_position: [.nan, 0]} | pouch_position
 reset | TellApart-v1, {contents: gravel} | contents='gravel' is not known: choose one of screws, peanuts
-reset | KeyBag-Easy-v1, {botom: 0.1} | botom=0.1 | bottom, contents_position
 # Features of a microphone that is recorded, of 80 samples at 1600 Hz and 20 frames per second
 feature | info: {} | does not say its sample rate
 feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz
-feature | info: {sample_rate: -1600} | positive integer
 feature | info: {sample_rate: 1601} | a frame must hold a whole number of samples
 feature | info: {sample_rate: 3200} | has shape (80,) | must be (160,)
 feature | dtype: int32 | dtype 'int32'; wanted 'int16'
 feature | shape: [80, 2] | every microphone is its own key
-feature | shape: [] | must be (80,)
 action | dtype: float33 | 'action' has dtype 'float33'
 action | shape: [0] | 'action' has shape (0,)
 # A microphone's options

@@ -16,7 +16,6 @@ from support.hub import (
     Repository,
     come_here,
     every_second,
-    everything_fails,
     git_oid,
     nothing_fails,
     one_in,
@@ -43,7 +42,7 @@ def hub(hub_server):
 def recording(commands, hub_server, tmp_path_factory):
     """A recording whose upload at the end failed, and what the command said."""
     root = tmp_path_factory.mktemp("recording") / "grasp"
-    hub_server.fault = everything_fails
+    hub_server.fault = lambda method, path: "cut"  # there is no Hub
     dataset = (f"--dataset.repo_id={DATASET}", f"--dataset.root={root}", "--dataset.num_episodes=1")
     result = commands.run("playbyear-record", *ENV, *dataset, "--dataset.push_to_hub=true", "--num_workers=0")
     hub_server.fault = nothing_fails
@@ -172,8 +171,6 @@ def test_our_commands_load_a_dataset_and_a_policy_from_the_hub_although_one_requ
     pushed, hub, commands, tmp_path
 ):
     hub.fault = one_in(10, seed=1)
-    assert_well(commands.run("playbyear-inspect", f"--dataset.repo_id={DATASET}", "--json"))
-    assert content(commands.snapshot(DATASET)) == content(pushed)
     policy = ("--policy.push_to_hub=true", f"--policy.repo_id={POLICY}")
     run = (*TINY, *policy, "--steps=2", f"--output_dir={tmp_path / 'out'}")
     assert_well(commands.run("playbyear-train", f"--dataset.repo_id={DATASET}", *run))
@@ -337,14 +334,6 @@ def test_nothing_private_goes_to_a_repository_that_is_public(dataset, here, film
     assert here.dataset("tester/new").private
 
 
-def test_a_card_that_the_hub_refuses_costs_no_upload_and_is_told(dataset, here, film):
-    with pytest.raises(
-        HubError, match=r"refuses its card, give another license.*license.* must be one of \[apache-2.0"
-    ):
-        push_dataset("tester/odd", dataset, PushOptions(license="CC BY 4.0", preview=film))
-    assert not here.arrivals
-
-
 @pytest.mark.parametrize("config", ['{"type": "play', '{"type": "none_such"}', '{"type": "act", "device": "cpu"}'])
 def test_a_damaged_policy_is_told_in_one_line(tmp_path, config):
     (tmp_path / "config.json").write_text(config)
@@ -373,15 +362,9 @@ def test_no_link_of_a_checkpoint_or_a_run_is_followed(tmp_path):
 # What is known of a policy's success
 
 
-def test_a_line_of_figures_that_was_cut_off_costs_no_upload(tmp_path):
-    folder = tmp_path / "checkpoints/000010/pretrained_model"
-    state = folder.parent / "training_state/training_step.json"
-    for each in (folder, state.parent):
-        each.mkdir(parents=True)
-    state.write_text('{"step": 10}')
-    lines = ['{"kind": "tr', '{"kind": "eval", "step": 10, "pc_success": 90.0}', '{"kind": "eval", "st']
-    (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
-    figures = evaluation_of(folder)
-    assert figures is not None
-    assert evaluation_of(Path("/policy")) is None  # near the root of a disk
-    assert (figures["pc_success"], figures["step"]) == (90.0, 10)
+def test_a_line_of_figures_that_was_cut_off_costs_no_upload(trained, tmp_path):
+    run = shutil.copytree(trained.parents[2], tmp_path / "run")
+    lines = ['{"kind": "tr', '{"kind": "eval", "step": 2, "pc_success": 90.0}', '{"kind": "eval", "st']
+    (run / "metrics.jsonl").write_text("\n".join(lines))
+    figures = evaluation_of(run / "checkpoints/000002/pretrained_model")
+    assert figures == {"kind": "eval", "step": 2, "pc_success": 90.0}

@@ -58,7 +58,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("wait", [0.0, 0.06])
+@pytest.mark.parametrize("wait", [pytest.param(0.0, marks=pytest.mark.slow), 0.06])
 def test_a_worker_that_is_sending_an_episode_does_not_keep_the_program_from_ending(tmp_path, wait):
     script = tmp_path / "take_one.py"
     script.write_text(TAKE_ONE_AND_CLOSE.format(tests=str(Path(__file__).parent), wait=wait))
