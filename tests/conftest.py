@@ -64,6 +64,14 @@ def trained() -> Path:
 
 
 @pytest.fixture(scope="session")
+def finished() -> Path:
+    """The folder of a run of HG-DAgger that ended: `out` and `corrections`. Copy it to change it."""
+    from dagger_factory import finished
+
+    return finished()
+
+
+@pytest.fixture(scope="session")
 def hub_server():
     """The Hub that `commands` speak to, on loopback."""
     with HubServer() as server:

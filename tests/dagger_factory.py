@@ -49,7 +49,8 @@ class Quick(Expert):
         self.n_steps = n_steps
 
     def reset(self, env):
-        self.n, self.is_success = 0, env.unwrapped.np_random_seed % 3 > 0
+        self.n, self.seed = 0, env.unwrapped.np_random_seed
+        self.is_success = self.seed % 3 > 0
 
     def wants_control(self, observation, policy_action):
         self.n += 1

@@ -1,19 +1,18 @@
 """HG-DAgger: attempts, what is recorded of them, rounds, checkpoints that LeRobot's commands take."""
 
 import shutil
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
 from dagger_factory import (
     QUICK,
+    Quick,
     Scripted,
     arguments,
     column,
     corrections,
     dagger,
-    finished,
     metrics,
     scene,
     seeds,
@@ -25,7 +24,7 @@ from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 from support.shared import ENV, run_in_process, trained
 
-from lerobot_playbyear.dagger import Expert, ExpertConfig, Verdict
+from lerobot_playbyear.dagger import Verdict
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
@@ -34,11 +33,6 @@ from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.scripts.commands import dagger as dagger_script
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module", name="finished")
-def _finished():
-    return finished()
 
 
 # Attempts
@@ -160,48 +154,27 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
 # Who is kept
 
 
-@ExpertConfig.register_subclass("test_verdicts")
-@dataclass
-class VerdictsConfig(ExpertConfig):
-    """Ends attempts after three steps: the seeds named are successes, those that `acts` names with the expert's help."""
-
-    successes: str = ""
-    acts: str = ""
-    discarded: str = ""
-
-    def make(self, env):
-        return Verdicts(self)
-
-
-class Verdicts(Expert):
-    def __init__(self, config):
-        self.config = config
-
-    def reset(self, env):
-        self.n, self.seed = 0, int(env.unwrapped.np_random_seed)
-
-    def _is(self, name):
-        return str(self.seed) in getattr(self.config, name).split("+")
+def attempts_end(monkeypatch, acts, verdicts):
+    """After three steps, with the verdict of their seed, a failure if it has none; in those of `acts` the expert acts."""
 
     def wants_control(self, observation, policy_action):
         self.n += 1
-        return self.n == 2 and self._is("acts")
-
-    def act(self):
-        return np.zeros(4, np.float32)
+        return self.n == 2 and self.seed in acts
 
     def verdict(self):
-        if self.n < 3:
-            return None
-        if self._is("discarded"):
-            return Verdict.DISCARD
-        return Verdict.SUCCESS if self._is("successes") else Verdict.FAILURE
+        return verdicts.get(self.seed, Verdict.FAILURE) if self.n == 3 else None
+
+    monkeypatch.setattr(Quick, "wants_control", wants_control)
+    monkeypatch.setattr(Quick, "verdict", verdict)
 
 
-def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_and_none_of_an_evaluation(tmp_path):
-    choices = ("--expert.type=test_verdicts", "--expert.successes=11+12+14+17", "--expert.acts=10+12+13+14+17")
+def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_and_none_of_an_evaluation(
+    tmp_path, monkeypatch
+):
+    verdicts = {11: Verdict.SUCCESS, 12: Verdict.SUCCESS, 14: Verdict.DISCARD, 17: Verdict.SUCCESS}
+    attempts_end(monkeypatch, {10, 12, 13, 14, 17}, verdicts)
     evaluation = ("--seed=15", "--eval.n_episodes=2", "--eval.batch_size=2")
-    dagger(tmp_path, *choices, "--expert.discarded=14", "--episode_seed=10", "--episodes=2", *evaluation)
+    dagger(tmp_path, *QUICK, "--episode_seed=10", "--episodes=2", *evaluation)
 
     assert seeds(tmp_path) == [12, 17]
     counts = {key: state(tmp_path)[key] for key in ("attempts", "kept", "failed", "unneeded", "discarded")}
@@ -212,9 +185,9 @@ def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_
     assert all(line["n_frames"] == 3 for line in metrics(tmp_path, "attempt"))  # the expert ends them
 
 
-def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
-    choices = ("--expert.type=test_verdicts", "--expert.successes=10+11+12+13", "--expert.acts=10")
-    out = dagger(tmp_path, *choices, "--episode_seed=10", "--episodes=5", "--max_attempts=3")
+def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, monkeypatch, capfd):
+    attempts_end(monkeypatch, {10}, dict.fromkeys(range(10, 14), Verdict.SUCCESS))
+    out = dagger(tmp_path, *QUICK, "--episode_seed=10", "--episodes=5", "--max_attempts=3")
     assert "needed no help in 3 attempts in a row" in "".join(capfd.readouterr())
     assert seeds(tmp_path) == [10]
     assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
@@ -232,8 +205,10 @@ def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
 # From recorded corrections alone
 
 
-def test_without_an_environment_it_learns_from_what_is_there_but_for_the_beginning_of_corrections(tmp_path, capfd):
-    corrected = ("--episodes=0", f"--interventions.root={finished() / 'corrections'}")
+def test_without_an_environment_it_learns_from_what_is_there_but_for_the_beginning_of_corrections(
+    finished, tmp_path, capfd
+):
+    corrected = ("--episodes=0", f"--interventions.root={finished / 'corrections'}")
     for options, n in (((), 3), (("--skip_s=0",), 9)):  # three corrections of 3 frames, a memory of 2
         out = dagger(tmp_path / str(n), *corrected, "--updates=5", *options, env=())
         said = capfd.readouterr()

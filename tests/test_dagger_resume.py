@@ -26,7 +26,6 @@ from dagger_factory import (
     cut_power,
     dagger,
     figures,
-    finished,
     metrics,
     seeds,
     state,
@@ -45,12 +44,6 @@ from lerobot_playbyear.training.learner import Learner
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.fixture(scope="module")
-def finished_run():
-    """A run of three attempts that nothing interrupted."""
-    return finished()
-
-
 RUN = (*QUICK, *FINISHED)
 
 
@@ -66,8 +59,8 @@ RUN = (*QUICK, *FINISHED)
     ],
     ids=["counting", "placing", "cleaning", "writing", "saving", "evaluating"],
 )
-def test_wherever_it_stops_it_ends_alike(finished_run, tmp_path, owner, name, after):
-    assert_a_power_cut_changes_nothing(tmp_path, finished_run, RUN, after, owner, name)
+def test_wherever_it_stops_it_ends_alike(finished, tmp_path, owner, name, after):
+    assert_a_power_cut_changes_nothing(tmp_path, finished, RUN, after, owner, name)
 
 
 def test_attempts_in_vain_count_on_after_a_resume(tmp_path, monkeypatch):
@@ -110,18 +103,19 @@ def test_a_policys_options_stay_until_there_is_a_checkpoint(tmp_path, monkeypatc
     assert len(state(tmp_path)["policy_overrides"]) == 3
 
 
-def test_more_episodes_go_on_with_a_finished_run_that_asked_for_it(finished_run, tmp_path):
+def test_more_episodes_go_on_with_a_finished_run_that_asked_for_it(finished, tmp_path):
     dagger(tmp_path, *RUN, "--episodes=2", "--resume=true")  # where there is none yet
     command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=3")
-    assert seeds(tmp_path) == seeds(finished_run)
-    ours, theirs = weights(tmp_path), weights(finished_run)
+    assert seeds(tmp_path) == seeds(finished)
+    ours, theirs = weights(tmp_path), weights(finished)
     assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 
-def test_a_finished_run_stays_as_it_is(finished_run):
-    before = figures(finished_run), state(finished_run), seeds(finished_run)
-    command("--resume=true", f"--output_dir={finished_run / 'out'}")
-    assert (figures(finished_run), state(finished_run), seeds(finished_run)) == before
+def test_a_finished_run_stays_as_it_is(finished, tmp_path):
+    n_before = len(seeds(finished))
+    shutil.copytree(finished / "out", tmp_path / "out", symlinks=True)
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}")
+    assert (figures(tmp_path), state(tmp_path), len(seeds(finished))) == (figures(finished), state(finished), n_before)
 
 
 def test_only_one_run_works_in_a_folder(tmp_path):
@@ -131,11 +125,12 @@ def test_only_one_run_works_in_a_folder(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_resuming_another_run_names_the_differences(finished_run):
+def test_resuming_another_run_names_the_differences(finished, tmp_path):
+    shutil.copytree(finished / "out", tmp_path / "out", symlinks=True)
     changed = ("--env.task=OccludedPickPlace-v1", "--demos.repo_id=other/demos", "--expert.n_steps=9")
     more = ("--episode_seed=5", "--policy.path=elsewhere", "--episodes=0", "--updates=5")
     with pytest.raises(PlaybyearError, match="holds another run: ") as refused:
-        dagger(finished_run, "--resume=true", *QUICK, *changed, *more)
+        dagger(tmp_path, "--resume=true", *QUICK, *changed, *more)
     for difference in (
         r"--env was .*OccludedGrasp-v1.* and is .*OccludedPickPlace-v1",
         r"--demos was .*tests/demos.* and is .*other/demos",
@@ -147,8 +142,8 @@ def test_resuming_another_run_names_the_differences(finished_run):
         assert re.search(difference, str(refused.value))
 
 
-def test_a_dataset_that_something_else_changed_is_refused(finished_run, tmp_path):
-    shutil.copytree(finished_run / "out", tmp_path / "out")
+def test_a_dataset_that_something_else_changed_is_refused(finished, tmp_path):
+    shutil.copytree(finished / "out", tmp_path / "out", symlinks=True)
     state = json.loads((tmp_path / "out/dagger_state.json").read_text())
     state["kept"] = state["round"] = 5
     (tmp_path / "out/dagger_state.json").write_text(json.dumps(state))

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from dagger_factory import finished
 from dataset_factory import MICROPHONE, dataset_features, make_dataset, rollout_dataset
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -318,7 +317,7 @@ class Places(dict):
 
 
 @pytest.fixture(scope="module")
-def places(noise, recorded, trained, tmp_path_factory):
+def places(noise, recorded, trained, finished, tmp_path_factory):
     return Places(
         made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained, finished=finished()
     )
