@@ -71,21 +71,9 @@ def test_a_person_who_stays_is_not_asked_to_act_in_the_step_that_they_ended(deci
     assert steps == ([4, 5, 6] if decides else [4, 5, 6, 7])  # a script has an action for it
 
 
-def test_an_expert_that_shows_ends_a_try_and_acts_from_the_first_step_in_a_demonstration():
-    expert = Telling(steps=(4, 5))
-    showing = Showing(expert)
-    steps, tried = attempt(showing)
-    assert (len(tried), steps, tried.verdict, expert.told) == (5, [], Verdict.FAILURE, [])
-    showing.demonstrates = True
-    steps, shown = attempt(showing)
-    assert steps == list(range(len(shown)))
-    assert len(shown) > 5
-    assert (shown.verdict, expert.told) == (None, [-1])
-    showing.demonstrates, expert.steps = False, ()
-    steps, tried = attempt(showing)
-    assert (steps, tried.verdict) == ([], None)
-    expert.steps, expert.verdicts = (4,), {4: Verdict.DISCARD}  # a person throws the attempt away while taking over
-    assert attempt(showing)[1].verdict is Verdict.DISCARD
+def test_a_try_that_a_person_throws_away_while_taking_over_did_not_fail():
+    assert attempt(Showing(Scripted((4,))))[1].verdict is Verdict.FAILURE
+    assert attempt(Showing(Scripted((4,), {4: Verdict.DISCARD})))[1].verdict is Verdict.DISCARD
 
 
 def test_the_tasks_script_acts_from_the_first_step_if_it_is_told_to():
