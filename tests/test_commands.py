@@ -119,14 +119,12 @@ def test_the_list_of_options_is_that_of_the_parsers():
 @pytest.mark.parametrize(
     ("command", "options"),
     [
-        ("playbyear-train", (DATA, "--policy.type=act", "--policy.chunk_size=3")),
         ("playbyear-train", (DATA, "--policy.type=of_a_plugin", "--policy.own_option=3")),
         ("playbyear-train", (DATA, "--policy.path=me/act", "--policy.chunk_size=3", "--preset=cpu")),
         ("playbyear-train", (DATA, "--env.type=own", "--env.discover_packages_path=mine", "--env.own=1")),
         ("playbyear-train", (DATA, "--steps", "3", "--seed=-1", "--dataset.eval_split=.5", "--log_freq=1_000")),
         ("playbyear-train", ("--config_path=x.json", "--resume=true", "--policy.anything=1")),
         ("playbyear-train", ("--dataset=dataset.yaml", "--seed=null")),
-        ("playbyear-dagger", ("--resume=true", "--output_dir=x")),
         ("playbyear-record", (DATA, "--env.type=playbyear", "--expert.type=own", "--expert.own=x")),
         ("playbyear-video", ("--env.type=own", "--policy.path=x", "--policy.device=cpu", "--seed", "-3")),
     ],

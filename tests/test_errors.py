@@ -70,11 +70,9 @@ train | --dataset.root={truncated} | file-000.parquet' is truncated | playbyear-
 dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagger
 dagger | --interventions.root={demos} | --demos and --interventions are the same dataset | of their own
 dagger | --interventions.root={out}/dagger | --output_dir={out}/dagger lies in the folder of --interventions
-attach-audio | --output.root={file}/heard | --output.root={file}/heard cannot be written: Not a directory | wanted
 attach-audio | --output.root={noise} | {noise} | is there already
 attach-audio | --dataset.root={out}/no | There is no dataset in {out}/no
 inspect | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no' | Check --dataset.root
-inspect | --dataset.root={truncated} | {truncated} | file-000.parquet | playbyear-repair --root={truncated}
 inspect | --html={file}/page.html | The page cannot be written | {file}
 repair | --like={full} | --like={full} holds no LeRobotDataset | the same settings
 push policy | --policy.path={noise} | there is no checkpoint with config.json | {noise}
@@ -105,7 +103,6 @@ record | --env.room_noise_level=8 | `env.room_noise_level`: 8.0 | name a WAV fil
 record | --env.sound=none --env.microphone_response=phone | env.microphone_response | no sound
 record | --env.attempts_file={full} | attempts_file | {full} | it is a folder, give a file
 record | '--env.task_options={{colour: blue}}' | {'colour': 'blue'} | OccludedGrasp-v1 has no such option
-record | --env.spectrogram={out}/no | {out}/no | cannot be read
 record | --env.spectrogram={noise} | {noise} | names no pictures of sound
 # Recording
 record | --dataset.num_episodes=0 | --dataset.num_episodes=0: give at least 1
@@ -129,27 +126,22 @@ train | --policy.sample_rate=48001 | sample_rate / fps = 48001 / 20
 train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be at least 1, got 0
 train | --policy.audio_window_s=0.5 | audio_window_s | too few for 4 convolutions
 train | --policy.audio_encoder=nobody | --policy.audio_encoder=nobody | spectrogram_cnn | lerobot_policy_
-train | --policy.audio_steps=[nobody] | --policy.audio_steps names 'nobody' | lerobot_policy_
 train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
 # Corrections
 dagger | -env.type -env.task -env.image_size | give --env.type and --env.task, or --episodes=0 --updates=N
 dagger | -policy.path | HG-DAgger improves a trained policy: give | --policy.path
 dagger | --batch_size=5 | --batch_size=5 must be even
-dagger | --learning_rate=0 | --learning_rate=0.0 must be above 0
 dagger | --updates=5 | --updates is for --episodes=0
 dagger | --episodes=0 | give --updates
 dagger | --eval_every=1 --eval.n_episodes=0 | --eval.n_episodes=0: give at least 1, or --eval_every=0
-dagger | --skip_s=-1 | --skip_s=-1.0: give 0 or more seconds
 dagger | --new_weights=true | --new_weights=true: a policy that knows nothing cannot be corrected
 dagger | --method.type=redo --skip_s=1 | --skip_s=1 | --method.type=redo the expert chooses every frame
 dagger | --method.type=robot_gated --method.intervention_share=1.5 | intervention_share=1.5: give a share
 dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
 dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --policy.path
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
-dagger | --env.sound=none | observation.audio.gripper is int16 | there and absent here
 dagger | --demos.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
 dagger | --demos.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)
-dagger | --demos.root={24_pixels} | 'observation.images.front' has shape (24, 24, 3)
 dagger | --policy.path={act} | the type 'act' | --policy.type=playbyear | lerobot-rollout
 dagger | WORLD_SIZE=2 | 2 processes were started, and playbyear-dagger works in one
 dagger | --env.task=TellApart-v1 --method.type=no_handback | TellApart-v1 | no_handback needs one | --method.type=redo
@@ -201,7 +193,6 @@ policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.lo
 policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memory_displacement_gain is 0: give 10
 # Environments
 task | sound: loud | sound='loud'
-task | sample_rate: 16001 | 16001
 task | image_size: 2 | image_size=2
 task | horizon: 0 | horizon=0 | 1 or more
 task | microphones: [hat] | 'hat' | name at least one of gripper
@@ -221,16 +212,13 @@ feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz
 feature | info: {sample_rate: 1601} | a frame must hold a whole number of samples
 feature | info: {sample_rate: 3200} | has shape (80,) | must be (160,)
 feature | dtype: int32 | dtype 'int32'; wanted 'int16'
-feature | shape: [80, 2] | every microphone is its own key
 action | dtype: float33 | 'action' has dtype 'float33'
 action | shape: [0] | 'action' has shape (0,)
 # A microphone's options
 microphone | file: null | nothing: give one of device, file and tone_hz
 microphone | tone_hz: 440.0 | file and tone_hz: give one
 microphone | sample_rate: 0 | sample_rate=0
-microphone | channel: -1 | channel=-1
 microphone | gain_db: .nan | gain_db=nan
-microphone | high_db: .inf | high_db=inf
 microphone | width: 90 | width=96
 microphone | width: 225 | both even
 microphone | height: 98, sample_rate: 48000 | at this width height=100
@@ -295,7 +283,6 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "slow": with_noise(fps=10),
     "48_kHz": with_noise(sample_rate=48000),
     "six_joints": with_noise(state_size=6),
-    "24_pixels": with_noise(image_size=24),
     "deaf": with_noise(microphones=()),
     "untagged": lambda root: make_dataset(root, (5,), features=without("intervention")),
     "uncorrected": lambda root: rollout_dataset(root, (5,), lambda step: False),
