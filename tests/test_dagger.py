@@ -1,6 +1,7 @@
 """HG-DAgger: attempts, what is recorded of them, rounds, checkpoints that LeRobot's commands take."""
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -236,10 +237,10 @@ def test_it_learns_from_what_lerobots_rollout_recorded_and_nothing_of_what_the_p
 
 
 def test_a_fault_of_the_program_shows_where_it_happened(monkeypatch, tmp_path):
-    def check(cfg):
+    def work():
         raise ValueError("a fault")
 
-    monkeypatch.setattr("lerobot_playbyear.dagger.run._check_places", check)
+    monkeypatch.setattr("lerobot_playbyear.dagger.run._make_loop", lambda *_: SimpleNamespace(run=work))
     with pytest.raises(ValueError, match=r"^a fault$") as error:
         run_in_process(dagger_script, *arguments(tmp_path, *QUICK))
     assert not isinstance(error.value, PlaybyearError)
