@@ -305,9 +305,7 @@ class Places(dict):
 
 @pytest.fixture(scope="module")
 def places(noise, recorded, trained, finished, tmp_path_factory):
-    return Places(
-        made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained, finished=finished()
-    )
+    return Places(made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained, finished=finished)
 
 
 def rows_of(table: str) -> list:
