@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 from support import shared
-from support.commands import Commands, speed_up_parsers
+from support.commands import Commands, speed_up
+from support.hub import HubServer
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _parsers_are_quick():
     """A command builds its parser whenever it starts: here several hundred times."""
     logging.getLogger("draccus").setLevel(logging.INFO)  # else as many lines of what it decodes are kept for each test
-    speed_up_parsers()
+    speed_up()
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +64,24 @@ def trained() -> Path:
 
 
 @pytest.fixture(scope="session")
-def commands(tmp_path_factory):
+def finished() -> Path:
+    """The folder of a run of HG-DAgger that ended: `out` and `corrections`. Copy it to change it."""
+    from dagger_factory import finished
+
+    return finished()
+
+
+@pytest.fixture(scope="session")
+def hub_server():
+    """The Hub that `commands` speak to, on loopback."""
+    with HubServer() as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def commands(hub_server, tmp_path_factory):
     """Runs commands as they are typed, each in a process of its own; see `support/commands.py`."""
-    runner = Commands(tmp_path_factory.mktemp("commands"))
+    runner = Commands(tmp_path_factory.mktemp("commands"), hub_server.environment())
     yield runner
     runner.close()
 

@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,8 @@ class Quick(Expert):
         self.n_steps = n_steps
 
     def reset(self, env):
-        self.n, self.is_success = 0, env.unwrapped.np_random_seed % 3 > 0
+        self.n, self.seed = 0, env.unwrapped.np_random_seed
+        self.is_success = self.seed % 3 > 0
 
     def wants_control(self, observation, policy_action):
         self.n += 1
@@ -152,11 +154,13 @@ class Scripted(Expert):
         return self.verdicts.get(self.n)
 
 
-def scene(expert=None, n_steps=20):
+@cache
+def scene(n_steps=20):
+    """An environment and the policy in it. Made once: leave it open."""
     env_cfg = PlaybyearEnvConfig(image_size=16, episode_length=n_steps)
     policy = PlaybyearPolicy.from_pretrained(trained())
     processors = make_pre_post_processors(policy.config, str(trained()))
-    return env_spec(env_cfg).make(), PolicyActor(policy, env_cfg, *processors), expert or Scripted()
+    return env_spec(env_cfg).make(), PolicyActor(policy, env_cfg, *processors)
 
 
 # Runs that are stopped

@@ -1,5 +1,6 @@
 """Small LeRobotDatasets for tests, made with LeRobot's own API."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -78,3 +79,23 @@ def make_dataset(
         dataset.save_episode()
     dataset.finalize()
     return LeRobotDataset(repo_id, root=root, video_backend="pyav")
+
+
+def rollout_dataset(
+    root: Path, lengths: tuple[int, ...], mark: Callable[[int], bool], use_videos: bool = False, by_policy: float = 0.0
+) -> None:
+    """A dataset as `lerobot-rollout --strategy.type=dagger` writes it: observations, action and `intervention`, no more."""
+    features = dataset_features(image_size=16, use_videos=use_videos)
+    del features["next.reward"]
+    options: dict[str, Any] = {"robot_type": "so100", "use_videos": use_videos, "video_backend": "pyav"}
+    if use_videos:  # LeRobot's default encoder does not take pictures as small as these
+        options["rgb_encoder"] = RGBEncoderConfig(vcodec="h264")
+    dataset = LeRobotDataset.create("tests/rollout_corrections", 20, features, root=root, **options)
+    rng = np.random.default_rng(0)
+    for length in lengths:
+        for step in range(length):
+            frame = {**random_frame(features, rng), "intervention": np.array([mark(step)], dtype=bool)}
+            frame["action"] = frame["action"] + np.float32(by_policy * (not mark(step)))
+            dataset.add_frame({**frame, "task": "grasp"})
+        dataset.save_episode()
+    dataset.finalize()

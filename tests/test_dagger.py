@@ -1,43 +1,38 @@
 """HG-DAgger: attempts, what is recorded of them, rounds, checkpoints that LeRobot's commands take."""
 
 import shutil
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from dagger_factory import (
     QUICK,
+    Quick,
     Scripted,
     arguments,
     column,
-    command,
     corrections,
     dagger,
-    finished,
     metrics,
     scene,
     seeds,
     state,
+    weights,
 )
+from dataset_factory import rollout_dataset
 from lerobot.scripts import lerobot_eval, lerobot_train
 from safetensors.torch import load_file
 from support.shared import ENV, run_in_process, trained
 
 from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.dagger.methods import Method
 from lerobot_playbyear.datasets.errors import PlaybyearError
 from lerobot_playbyear.datasets.reader import DatasetPlace
-from lerobot_playbyear.episodes.experts import Expert, ExpertConfig
 from lerobot_playbyear.episodes.play import Verdict, play
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
+from lerobot_playbyear.scripts.commands import dagger as dagger_script
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module", name="finished")
-def _finished():
-    return finished()
 
 
 # Attempts
@@ -45,7 +40,7 @@ def _finished():
 
 def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the_policy_remembers_it_all():
     expert = Scripted(steps=range(4, 9))
-    env, actor, _ = scene()
+    env, actor = scene()
     episode = play(env, actor, seed=5, expert=expert)
     assert np.flatnonzero(episode.interventions).tolist() == list(range(4, 9))
     for step, action in expert.actions.items():
@@ -58,20 +53,7 @@ def test_the_whole_attempt_is_recorded_and_tagged_where_the_expert_acted_and_the
     assert len(episode) == t + 1
     actor.reset(env)
     seen = [actor.act(observation) for observation in episode.observations[:-1]]
-    env.close()
     np.testing.assert_allclose(np.clip(seen[9], -1, 1), episode.actions[9], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("verdict", "outcome"), [(Verdict.SUCCESS, "kept"), (Verdict.FAILURE, "failed"), (Verdict.DISCARD, "discarded")]
-)
-def test_an_expert_can_end_an_attempt(verdict, outcome):
-    env, actor, _ = scene()
-    episode = play(env, actor, seed=5, expert=Scripted(steps=(2,), verdicts={6: verdict}))
-    env.close()
-    assert len(episode) == 7
-    assert episode.success is (verdict is Verdict.SUCCESS)
-    assert Method().outcome(episode) == outcome
 
 
 # A run
@@ -172,48 +154,27 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
 # Who is kept
 
 
-@ExpertConfig.register_subclass("test_verdicts")
-@dataclass
-class VerdictsConfig(ExpertConfig):
-    """Ends attempts after three steps: the seeds named are successes, those that `acts` names with the expert's help."""
-
-    successes: str = ""
-    acts: str = ""
-    discarded: str = ""
-
-    def make(self, env):
-        return Verdicts(self)
-
-
-class Verdicts(Expert):
-    def __init__(self, config):
-        self.config = config
-
-    def reset(self, env):
-        self.n, self.seed = 0, int(env.unwrapped.np_random_seed)
-
-    def _is(self, name):
-        return str(self.seed) in getattr(self.config, name).split("+")
+def attempts_end(monkeypatch, acts, verdicts):
+    """After three steps, with the verdict of their seed, a failure if it has none; in those of `acts` the expert acts."""
 
     def wants_control(self, observation, policy_action):
         self.n += 1
-        return self.n == 2 and self._is("acts")
-
-    def act(self):
-        return np.zeros(4, np.float32)
+        return self.n == 2 and self.seed in acts
 
     def verdict(self):
-        if self.n < 3:
-            return None
-        if self._is("discarded"):
-            return Verdict.DISCARD
-        return Verdict.SUCCESS if self._is("successes") else Verdict.FAILURE
+        return verdicts.get(self.seed, Verdict.FAILURE) if self.n == 3 else None
+
+    monkeypatch.setattr(Quick, "wants_control", wants_control)
+    monkeypatch.setattr(Quick, "verdict", verdict)
 
 
-def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_and_none_of_an_evaluation(tmp_path):
-    choices = ("--expert.type=test_verdicts", "--expert.successes=11+12+14+17", "--expert.acts=10+12+13+14+17")
+def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_and_none_of_an_evaluation(
+    tmp_path, monkeypatch
+):
+    verdicts = {11: Verdict.SUCCESS, 12: Verdict.SUCCESS, 14: Verdict.DISCARD, 17: Verdict.SUCCESS}
+    attempts_end(monkeypatch, {10, 12, 13, 14, 17}, verdicts)
     evaluation = ("--seed=15", "--eval.n_episodes=2", "--eval.batch_size=2")
-    dagger(tmp_path, *choices, "--expert.discarded=14", "--episode_seed=10", "--episodes=2", *evaluation)
+    dagger(tmp_path, *QUICK, "--episode_seed=10", "--episodes=2", *evaluation)
 
     assert seeds(tmp_path) == [12, 17]
     counts = {key: state(tmp_path)[key] for key in ("attempts", "kept", "failed", "unneeded", "discarded")}
@@ -221,19 +182,15 @@ def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_
     outcomes = ["failed", "unneeded", "kept", "failed", "discarded", "kept"]
     told = [(line["seed"], line["outcome"]) for line in metrics(tmp_path, "attempt")]
     assert told == list(zip([10, 11, 12, 13, 14, 17], outcomes, strict=True))
+    assert all(line["n_frames"] == 3 for line in metrics(tmp_path, "attempt"))  # the expert ends them
 
 
-def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, capfd):
-    choices = ("--expert.type=test_verdicts", "--expert.successes=10+11+12+13", "--expert.acts=10")
-    out = dagger(tmp_path, *choices, "--episode_seed=10", "--episodes=5", "--max_attempts=3")
+def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, monkeypatch, capfd):
+    attempts_end(monkeypatch, {10}, dict.fromkeys(range(10, 14), Verdict.SUCCESS))
+    out = dagger(tmp_path, *QUICK, "--episode_seed=10", "--episodes=5", "--max_attempts=3")
     assert "needed no help in 3 attempts in a row" in "".join(capfd.readouterr())
     assert seeds(tmp_path) == [10]
     assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
-
-
-def test_an_expert_that_rescues_nothing_is_an_error(tmp_path):
-    with pytest.raises(PlaybyearError, match="3 of 3 attempts in a row failed in spite of the expert"):
-        dagger(tmp_path, "--expert.type=test_verdicts", "--max_attempts=3")
 
 
 def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
@@ -248,9 +205,41 @@ def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
 # From recorded corrections alone
 
 
-def test_without_an_environment_it_learns_from_what_is_there(finished, tmp_path):
-    offline = ("--episodes=0", "--updates=5", f"--interventions.root={finished / 'corrections'}")
-    out = command(*arguments(tmp_path, *offline, env=()))
-    assert [line["step"] for line in metrics(tmp_path, "round")] == [2, 4, 5]
-    assert (out / "checkpoints/last").resolve().name == "000005"
+def test_without_an_environment_it_learns_from_what_is_there_but_for_the_beginning_of_corrections(
+    finished, tmp_path, capfd
+):
+    corrected = ("--episodes=0", f"--interventions.root={finished / 'corrections'}")
+    for options, n in (((), 3), (("--skip_s=0",), 9)):  # three corrections of 3 frames, a memory of 2
+        out = dagger(tmp_path / str(n), *corrected, "--updates=5", *options, env=())
+        said = capfd.readouterr()
+        assert "No correction is longer" not in said.err
+        assert f"Corrections: {n} of 9 frames that the expert chose are learned from" in said.out
+        assert ("the first 0.1 s of every correction are left out" in said.out) is (n == 3)
+        assert [line["step"] for line in metrics(tmp_path / str(n), "round")] == [2, 4, 5]
+        assert (out / "checkpoints/last").resolve().name == "000005"
     check_normalisation_is_kept(out / "checkpoints/last/pretrained_model")
+
+
+def test_it_learns_from_what_lerobots_rollout_recorded_and_nothing_of_what_the_policy_did(tmp_path):
+    """Of whole attempts with tags, as videos: LeRobot's default."""
+    learned = []
+    for by_policy in (0.0, 5.0):
+        folder = tmp_path / str(by_policy)
+        rollout_dataset(folder / "rollout", (20, 14), lambda step: 5 <= step < 12, use_videos=True, by_policy=by_policy)
+        recorded = ("--episodes=0", "--updates=2", f"--interventions.root={folder / 'rollout'}")
+        dagger(folder, *recorded, env=())
+        assert metrics(folder, "round")[-1]["loss_interventions"] > 0
+        learned.append(weights(folder))
+    before = load_file(trained() / "model.safetensors")
+    assert any(not torch.equal(learned[0][key], before[key]) for key in before)
+    assert all(torch.equal(learned[0][key], learned[1][key]) for key in before)
+
+
+def test_a_fault_of_the_program_shows_where_it_happened(monkeypatch, tmp_path):
+    def work():
+        raise ValueError("a fault")
+
+    monkeypatch.setattr("lerobot_playbyear.dagger.run._make_loop", lambda *_: SimpleNamespace(run=work))
+    with pytest.raises(ValueError, match=r"^a fault$") as error:
+        run_in_process(dagger_script, *arguments(tmp_path, *QUICK))
+    assert not isinstance(error.value, PlaybyearError)

@@ -11,8 +11,6 @@ from lerobot_playbyear.dagger.batches import (
     JoinedBatches,
     frames_learned_from,
 )
-from lerobot_playbyear.dagger.config import DaggerConfig
-from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training import EpisodeStore
 from lerobot_playbyear.training.batches import PolicyWindows
@@ -54,7 +52,7 @@ def supervised(batch):
 ATTEMPTS = "....xxxxxxxxxxxx..........xxx.....x" + "xx............" + "xxxxxxxxxx"
 
 
-@pytest.mark.parametrize("n_windows", [1, 4, 8])
+@pytest.mark.parametrize("n_windows", [1, 8])
 def test_half_of_every_batchs_windows_end_on_an_intervention_frame(n_windows):
     demonstrations = store([40, 30])
     interventions = store([35, 14, 10], ATTEMPTS, first=N_DEMONSTRATIONS)
@@ -72,11 +70,10 @@ def test_half_of_every_batchs_windows_end_on_an_intervention_frame(n_windows):
         assert len(ends) > 6 * n_windows  # most of the windows that are computed are learned from
 
 
-@pytest.mark.parametrize("n_windows", [1, 4, 8])
-@pytest.mark.parametrize("n_skipped", [0, 2, 5])
-def test_the_beginning_of_every_correction_can_be_left_out(n_windows, n_skipped):
+@pytest.mark.parametrize("n_skipped", [2, 5])
+def test_the_beginning_of_every_correction_can_be_left_out(n_skipped):
     interventions = store([35, 14, 10], ATTEMPTS, first=N_DEMONSTRATIONS)
-    batches = BalancedBatches(windows(n_windows), store([40]), interventions, 12, n_skipped=n_skipped)
+    batches = BalancedBatches(windows(4), store([40]), interventions, 12, n_skipped=n_skipped)
     wanted, length, episode = [], 0, np.repeat([0, 1, 2], [35, 14, 10])
     for frame, mark in enumerate(ATTEMPTS):
         begins_episode = frame == 0 or episode[frame] != episode[frame - 1]
@@ -87,19 +84,6 @@ def test_the_beginning_of_every_correction_can_be_left_out(n_windows, n_skipped)
             wanted.append(frame)
     seen = np.concatenate([supervised(batches.batch(number)).numpy() for number in range(150)])
     assert sorted({int(frame) - N_DEMONSTRATIONS for frame in seen if frame >= N_DEMONSTRATIONS}) == wanted
-
-
-def test_by_default_corrections_are_learned_from_once_the_memory_holds_nothing_else():
-    cfg = DaggerConfig(
-        DatasetPlace("demos"),
-        DatasetPlace("corrections"),
-        policy=PlaybyearConfig(n_memory_steps=3, device="cpu", push_to_hub=False),
-    )
-    assert cfg.n_skipped(20) == 3  # n_memory_steps
-    cfg.policy.use_memory = False
-    assert cfg.n_skipped(20) == 0
-    cfg.skip_s = 0.42
-    assert cfg.n_skipped(20) == 9
 
 
 def test_where_nothing_would_remain_all_is_learned_from():

@@ -2,10 +2,12 @@
 
 import contextlib
 import json
-import multiprocessing
 import os
+import re
 import resource
+import shutil
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -24,14 +26,12 @@ from dagger_factory import (
     cut_power,
     dagger,
     figures,
-    finished,
     metrics,
     seeds,
     state,
     weights,
 )
 from lerobot.configs import parser
-from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from support.shared import trained
 
@@ -42,12 +42,6 @@ from lerobot_playbyear.episodes.play import Verdict
 from lerobot_playbyear.training.learner import Learner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture(scope="module")
-def finished_run():
-    """A run of three attempts that nothing interrupted."""
-    return finished()
 
 
 RUN = (*QUICK, *FINISHED)
@@ -61,11 +55,12 @@ RUN = (*QUICK, *FINISHED)
         pytest.param(folder_module.RunFolder, "clean", 3, marks=pytest.mark.slow),  # `last` is behind
         pytest.param(DurableWriter, "add_frame", 20, marks=pytest.mark.slow),  # while an attempt is written
         pytest.param(folder_module.RunFolder, "save_checkpoint", 1, marks=pytest.mark.slow),
+        pytest.param(Learner, "evaluate", 1, marks=pytest.mark.slow),
     ],
-    ids=["counting", "placing", "cleaning", "writing", "saving"],
+    ids=["counting", "placing", "cleaning", "writing", "saving", "evaluating"],
 )
-def test_wherever_it_stops_it_ends_alike(finished_run, tmp_path, owner, name, after):
-    assert_a_power_cut_changes_nothing(tmp_path, finished_run, RUN, after, owner, name)
+def test_wherever_it_stops_it_ends_alike(finished, tmp_path, owner, name, after):
+    assert_a_power_cut_changes_nothing(tmp_path, finished, RUN, after, owner, name)
 
 
 def test_attempts_in_vain_count_on_after_a_resume(tmp_path, monkeypatch):
@@ -108,68 +103,134 @@ def test_a_policys_options_stay_until_there_is_a_checkpoint(tmp_path, monkeypatc
     assert len(state(tmp_path)["policy_overrides"]) == 3
 
 
-def test_more_episodes_go_on_with_a_finished_run_that_asked_for_it(finished_run, tmp_path):
+def test_more_episodes_go_on_with_a_finished_run_that_asked_for_it(finished, tmp_path):
     dagger(tmp_path, *RUN, "--episodes=2", "--resume=true")  # where there is none yet
     command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=3")
-    assert seeds(tmp_path) == seeds(finished_run)
-    ours, theirs = weights(tmp_path), weights(finished_run)
+    assert seeds(tmp_path) == seeds(finished)
+    ours, theirs = weights(tmp_path), weights(finished)
     assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 
-def test_a_finished_run_stays_as_it_is(finished_run):
-    before = figures(finished_run), state(finished_run), seeds(finished_run)
-    command("--resume=true", f"--output_dir={finished_run / 'out'}")
-    assert (figures(finished_run), state(finished_run), seeds(finished_run)) == before
+def test_a_finished_run_stays_as_it_is(finished, tmp_path):
+    n_before = len(seeds(finished))
+    shutil.copytree(finished / "out", tmp_path / "out", symlinks=True)
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}")
+    assert (figures(tmp_path), state(tmp_path), len(seeds(finished))) == (figures(finished), state(finished), n_before)
+
+
+def test_only_one_run_works_in_a_folder(tmp_path):
+    at_work = folder_module.RunFolder(tmp_path / "out").locked()
+    with at_work, pytest.raises(PlaybyearError, match="another playbyear-dagger is at work there"):
+        dagger(tmp_path, *RUN)
+    assert not (tmp_path / "out").exists()
+
+
+def test_resuming_another_run_names_the_differences(finished, tmp_path):
+    shutil.copytree(finished / "out", tmp_path / "out", symlinks=True)
+    changed = ("--env.task=OccludedPickPlace-v1", "--demos.repo_id=other/demos", "--expert.n_steps=9")
+    more = ("--episode_seed=5", "--policy.path=elsewhere", "--episodes=0", "--updates=5")
+    with pytest.raises(PlaybyearError, match="holds another run: ") as refused:
+        dagger(tmp_path, "--resume=true", *QUICK, *changed, *more)
+    for difference in (
+        r"--env was .*OccludedGrasp-v1.* and is .*OccludedPickPlace-v1",
+        r"--demos was .*tests/demos.* and is .*other/demos",
+        r"--expert was .*'n_steps': 8.* and is .*'n_steps': 9",
+        "--episode_seed was 10000 and is 5",
+        "--policy.path was .*pretrained_model and is elsewhere",
+        "--episodes was 3 and is 0",
+    ):
+        assert re.search(difference, str(refused.value))
+
+
+def test_a_dataset_that_something_else_changed_is_refused(finished, tmp_path):
+    shutil.copytree(finished / "out", tmp_path / "out", symlinks=True)
+    state = json.loads((tmp_path / "out/dagger_state.json").read_text())
+    state["kept"] = state["round"] = 5
+    (tmp_path / "out/dagger_state.json").write_text(json.dumps(state))
+    with pytest.raises(PlaybyearError, match="holds 3 attempts, and this run knows of 5"):
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=8")
+
+
+# `checkpoints/best`: the weights of the best evaluation, which are kept until a better one comes
+
+
+EVALUATED = (*QUICK, "--warmup_episodes=1", "--eval_every=2", "--eval.n_episodes=1")
+
+
+@pytest.fixture
+def gives(monkeypatch):
+    """Says what the next evaluations will give [%]."""
+    rates: list[float] = []
+
+    def evaluate(*_):
+        return {"overall": {"pc_success": rates.pop(0), "n_episodes": 1}}
+
+    monkeypatch.setattr(Learner, "evaluate", evaluate)
+    return rates
+
+
+def test_the_best_evaluation_keeps_its_weights(tmp_path, gives, monkeypatch, capfd):
+    checkpoints = tmp_path / "out/checkpoints"
+
+    def go_on(*options):
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", *options)
+        assert gives == []
+        return (checkpoints / "best").resolve(), (checkpoints / "last").resolve()
+
+    def cut_after_the_best(folder, state, clean=folder_module.RunFolder.clean):
+        if state.best.get("success") == 60:
+            raise PowerCut
+        clean(folder, state)
+
+    gives += [10, 30, 60]
+    with monkeypatch.context() as patch:
+        patch.setattr(folder_module.RunFolder, "clean", cut_after_the_best)
+        with pytest.raises(PowerCut):
+            dagger(tmp_path, *EVALUATED, "--episodes=3")  # evaluated after 0, 2 and 3 attempts
+    third = (checkpoints / state(tmp_path)["checkpoint"]).resolve()
+    gives += [20, 50]
+    best, last = go_on("--episodes=5")
+    assert (best, last.name) == (third, state(tmp_path)["checkpoint"])
+    assert (best / "pretrained_model/model.safetensors").is_file()  # though it is no milestone
+    assert best != last
+    assert f"Best:        60.0 % of them: {checkpoints / 'best/pretrained_model'}" in capfd.readouterr().out
+
+    gives += [60, 50]  # of equal ones the last
+    best, last = go_on("--episodes=7")
+    assert best not in (third, last)
+    assert not third.exists()
+    shutil.rmtree(best)  # to make room
+    gives += [40]
+    capfd.readouterr()
+    best, last = go_on("--episodes=8")
+    assert best == last
+    assert "Best:" not in capfd.readouterr().out
+
+
+def test_the_policy_that_a_run_began_with_may_be_the_best_and_other_episodes_are_evaluated(tmp_path, gives, capfd):
+    gives += [30, 20]
+    dagger(tmp_path, *EVALUATED, "--episodes=1")
+    assert not (tmp_path / "out/checkpoints/best").is_symlink()
+    assert f"Best:        30.0 % of them: {state(tmp_path)['policy_path']}" in capfd.readouterr().out
+    gives += [40]
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=2")
+    assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
+    assert [line["pc_success"] for line in metrics(tmp_path, "eval")] == [30, 20, 40]
 
 
 # SIGKILL: a process of its own, killed by the operating system
 
 
-def _run_command(args):
-
-    torch.set_num_threads(1)
-    register_third_party_plugins()
-    with open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere), contextlib.redirect_stderr(nowhere):
-        command(*args)
-
-
-@pytest.fixture(scope="module")
-def processes():
-    """Makes processes that have LeRobot imported already, and nothing else done."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["dagger_factory", "lerobot_env_playbyear", "lerobot.scripts.lerobot_eval"])
-    return context
-
-
-def run_and_kill(processes, folder, n_kills, shortest, longest, *options):
-    """Runs the command, kills it n times after random times [s], and lets it end. Returns what each kill found."""
+def run_and_kill(commands, folder, n_kills, *options):
+    """Runs the command, kills it n times after random times, and lets it end."""
     rng = np.random.default_rng(0)
-    args = [*arguments(folder, *options), "--resume=true"]
-    found = []
-    for number in range(n_kills + 1):
-        process = processes.Process(target=_run_command, args=(args,))
-        process.start()
-        process.join(rng.uniform(shortest, longest) if number < n_kills else None)
-        if process.exitcode is None:
-            os.kill(process.pid, signal.SIGKILL)
-            process.join()
-            found.append(_what_is_there(folder))
-            assert_everything_loads(folder)
-        else:
-            assert process.exitcode == 0
-            break
-    return found
-
-
-def _what_is_there(folder):
-    """How far the run was when it was killed."""
-    if not (folder / "out/dagger_state.json").exists():
-        return "starting"
-    counters = state(folder)
-    half_done = sorted(path.name for path in folder.rglob("*.partial")) + [
-        p.name for p in folder.rglob(".journal.json")
-    ]
-    return f"attempt {counters['attempts']}, round {counters['round']}, kept {counters['kept']} {half_done}"
+    run = ("playbyear-dagger", *arguments(folder, *options), "--resume=true")
+    for _ in range(n_kills):
+        end = time.monotonic() + rng.uniform(2.0, 12.0)
+        assert commands.run(*run, kill_when=lambda end=end: time.monotonic() > end).status == -signal.SIGKILL
+        assert_everything_loads(folder)
+    result = commands.run(*run)
+    assert result.status == 0, result.output[-3000:]
 
 
 def assert_everything_loads(folder):
@@ -197,19 +258,8 @@ def assert_complete(folder, n_episodes):
 
 
 @pytest.mark.slow
-def test_killed_in_an_evaluation_it_evaluates_again(tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        cut_power(patch, Learner, "evaluate", 1)
-        with pytest.raises(PowerCut):
-            dagger(tmp_path, *RUN)
-    assert [line["round"] for line in metrics(tmp_path, "eval")] == [0]
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}")
-    assert [line["round"] for line in metrics(tmp_path, "eval")] == [0, 2, 3]
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_killed_twenty_times_it_ends_complete_and_alike(processes, tmp_path):
+def test_killed_twenty_times_it_ends_complete_and_alike(commands, tmp_path):
     """The scripted expert, whole attempts, evaluations; and the weights of a run that was never killed."""
     options = (
         "--eval_every=2",
@@ -220,11 +270,9 @@ def test_killed_twenty_times_it_ends_complete_and_alike(processes, tmp_path):
         "--env.episode_length=200",  # in less the expert rescues nobody
         "--max_attempts=1000",  # attempts in vain count on after each kill
     )
-    found = run_and_kill(processes, tmp_path / "killed", 20, 2.0, 12.0, *options)
-    print("\n".join(found))
-    assert len(found) == 20
+    run_and_kill(commands, tmp_path / "killed", 20, *options)
     assert_complete(tmp_path / "killed", 8)
-    assert run_and_kill(processes, tmp_path / "calm", 0, 0, 0, *options) == []
+    run_and_kill(commands, tmp_path / "calm", 0, *options)
     assert_ended_alike(tmp_path / "killed", tmp_path / "calm")
 
 

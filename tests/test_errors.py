@@ -1,8 +1,8 @@
 """What is refused: in one line, before any work, with the option, its value and what would work.
 
-A row is a command that works, changed by some options (`-name` takes one away), and what its message says, between bars. What
-stands in braces is made when the first row names it. A command that refuses leaves nothing in `{out}`. The second table is of
-what is refused to whoever calls the package: a function below, its arguments, and the same.
+A row is a command that works, changed by some options (`-name` takes one away, `NAME=value` is of the environment), and what
+its message says, between bars. What stands in braces is made when the first row names it. A command that refuses leaves nothing
+in `{out}`. The second table is of what is refused to whoever calls the package: a function below, its arguments, and the same.
 """
 
 import re
@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from dataset_factory import MICROPHONE, dataset_features, make_dataset
+from dataset_factory import MICROPHONE, dataset_features, make_dataset, rollout_dataset
 from lerobot.datasets import LeRobotDataset
+from lerobot.policies.act.configuration_act import ACTConfig
 from support.shared import ENV, TINY
 
 from gym_playbyear.environment import TaskEnv
@@ -52,14 +53,11 @@ BASE = {
 COMMANDS = """
 # Told from the command line alone
 train | --bach_size=3 | --bach_size is no option; did you mean --batch_size?
-train | --datset.root=x | did you mean --dataset.root?
 train | --policy.image_sise=3 | did you mean --policy.image_size?
 train | --steps=many | steps | 'many' into an int
 train | --steps | --steps needs a value
 train | cpu | 'cpu' is no option
 train | -dataset.repo_id | --dataset.repo_id is needed
-record | -env.type | --env.type is needed
-repair | --dry-run=true | did you mean --dry_run?
 # Places
 record | --dataset.root={noise} | {noise} already holds a dataset | --resume=true
 record | --dataset.root={full} --resume=true | {full} is not empty and holds no dataset
@@ -69,22 +67,14 @@ record | --dataset.root={noise} --resume=true | {noise} does not fit | seed is a
 train | --output_dir={full} | {full} already exists | resume
 train | --output_dir={file}/run | --output_dir={file}/run cannot be written: Not a directory | wanted
 train | --dataset.root={truncated} | file-000.parquet' is truncated | playbyear-repair --root={truncated}
-dagger | --output_dir={file} | --output_dir={file} cannot be written | wanted
 dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagger
 dagger | --interventions.root={demos} | --demos and --interventions are the same dataset | of their own
 dagger | --interventions.root={out}/dagger | --output_dir={out}/dagger lies in the folder of --interventions
-attach-audio | --output.root={file}/heard | --output.root={file}/heard cannot be written: Not a directory | wanted
 attach-audio | --output.root={noise} | {noise} | is there already
 attach-audio | --dataset.root={out}/no | There is no dataset in {out}/no
-attach-spectrogram | --output.root={demos} | {demos} | is there already
-attach-spectrogram | --dataset.root={out}/no | There is no dataset in {out}/no
 inspect | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no' | Check --dataset.root
-inspect | --dataset.root={full} | it has no meta/info.json
-inspect | --dataset.root={truncated} | {truncated} | file-000.parquet | playbyear-repair --root={truncated}
 inspect | --html={file}/page.html | The page cannot be written | {file}
-repair | --root={out}/no | {out}/no holds no LeRobotDataset
 repair | --like={full} | --like={full} holds no LeRobotDataset | the same settings
-push | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no'
 push policy | --policy.path={noise} | there is no checkpoint with config.json | {noise}
 video | --output={out}/film | --output={out}/film: films are mp4 | ends with .mp4
 video | --output={folder_mp4} | --output={folder_mp4}: that is a folder; give the name of a file
@@ -102,27 +92,17 @@ push | --dataset.repo_id=nameless | 'nameless' | give it as user/name
 push | --dataset.repo_id=me/no+name | dataset.repo_id='me/no+name' cannot be pushed: Repo id
 push | --preview={noise}/meta/info.json | {noise}/meta/info.json | cards show mp4
 push policy | -policy.repo_id | needs --policy.repo_id, the policy's name on the Hub
-push policy | --policy.repo_id=me/no+name | policy.repo_id='me/no+name' cannot be pushed: Repo id
 # Environments
 record | --env.task=Nope-v1 | `env.task`: 'Nope-v1' | OccludedGrasp-v1 | KeyBag-Hard-v1
-record | --env.sound=loud | `env.sound`: 'loud' | waveform, contact_force, none
 record | --env.sample_rate=16001 | `env.sample_rate`: 16001 | a multiple of 20
 record | --env.fps=30 | `env.fps`: 30 | give 20, or leave it out
 record | --env.microphones=[] | env.microphones | at least one
-record | --env.microphones=[ceiling] | `env.microphones`: ['ceiling'] | name at least one of gripper
 record | --env.visualization_width=100 | `env.visualization_width`: 100 | square
-record | --env.image_size=4 | `env.image_size`: 4 | 8 or more
-record | --env.noise_level=-1 | `env.noise_level`: -1.0 | 0 (silent) or more
 record | --env.render_mode=video | `env.render_mode`: 'video' | rgb_array, human
-record | --env.episode_length=0 | `env.episode_length`: 0 | 1 or more
 record | --env.room_noise_level=8 | `env.room_noise_level`: 8.0 | name a WAV file with --env.room_noise
-record | --env.room_noise={out}/no.wav | env.room_noise | {out}/no.wav | no such file
-record | --env.microphone_response=vinyl | `env.microphone_response`: 'vinyl' | flat, phone, dull, boomy
 record | --env.sound=none --env.microphone_response=phone | env.microphone_response | no sound
 record | --env.attempts_file={full} | attempts_file | {full} | it is a folder, give a file
 record | '--env.task_options={{colour: blue}}' | {'colour': 'blue'} | OccludedGrasp-v1 has no such option
-record | --env.task=TellApart-v1 '--env.task_options={{contents: gravel}}' | gravel | screws, peanuts
-record | --env.spectrogram={out}/no | {out}/no | cannot be read
 record | --env.spectrogram={noise} | {noise} | names no pictures of sound
 # Recording
 record | --dataset.num_episodes=0 | --dataset.num_episodes=0: give at least 1
@@ -130,15 +110,12 @@ record | --seed=-1 | --seed=-1: give 0 or more
 record | --dataset.rgb_encoder.vcodec=h264 | --dataset.rgb_encoder | give --dataset.video=true
 record | --expert.type=test | --expert.type | test | scripted
 record | --expert.type=teleop --expert.speed=0 | speed=0
-record | --expert.type=teleop --expert.gripper_cooldown_s=-1 | gripper_cooldown_s=-1
-record | --expert.type=teleop --expert.steps_per_second=0 | steps_per_second=0
 record | --expert.type=teleop --expert.takeover_key=f1 | takeover_key='f1' | a letter, a digit
 record | --expert.type=teleop --expert.takeover_key=e | takeover_key='e': it means something else
 record | --expert.type=teleop --expert.takeover=press | takeover='press' | give hold or toggle
 record | --expert.type=teleop | No window can be opened (DISPLAY='')
 # Training
 train act | --steps=1 | --policy.type=act | --policy.type=playbyear | lerobot-train
-train | --preset=tpu | --preset=tpu is not known | cpu | gpu | paper
 train | --preset=paper --policy.type=act | --preset=paper is for --policy.type=playbyear, not for act
 train | --store=tape | --store=tape is not known: wanted one of memory, disk, auto
 train | --dataset.streaming=true | --dataset.streaming does not work | --store=disk
@@ -146,41 +123,32 @@ train | --dataset.image_transforms.enable=true | --dataset.image_transforms.enab
 train | --dataset.root={slow} | 10 frames per second | configured for 20 | --policy.fps=10
 train | --dataset.root={deaf} | observation.audio | --policy.use_audio=false
 train | --policy.sample_rate=48001 | sample_rate / fps = 48001 / 20
-train | --policy.action_range=0 | --policy.action_range must be above 0 and finite, got 0
 train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be at least 1, got 0
-dagger | --policy.fps=0 | --policy.fps must be at least 1, got 0
 train | --policy.audio_window_s=0.5 | audio_window_s | too few for 4 convolutions
 train | --policy.audio_encoder=nobody | --policy.audio_encoder=nobody | spectrogram_cnn | lerobot_policy_
-train | --policy.vision_encoder=nobody | --policy.vision_encoder=nobody | resnet18 | lerobot_policy_
-train | --policy.audio_steps=[nobody] | --policy.audio_steps names 'nobody' | lerobot_policy_
 train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
 # Corrections
 dagger | -env.type -env.task -env.image_size | give --env.type and --env.task, or --episodes=0 --updates=N
-dagger | --policy.audio_noise_db=20 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
 dagger | -policy.path | HG-DAgger improves a trained policy: give | --policy.path
 dagger | --batch_size=5 | --batch_size=5 must be even
-dagger | --warmup_episodes=0 | --warmup_episodes=0: give at least 1
-dagger | --learning_rate=0 | --learning_rate=0.0 must be above 0
 dagger | --updates=5 | --updates is for --episodes=0
 dagger | --episodes=0 | give --updates
 dagger | --eval_every=1 --eval.n_episodes=0 | --eval.n_episodes=0: give at least 1, or --eval_every=0
-dagger | --skip_s=-1 | --skip_s=-1.0: give 0 or more seconds
 dagger | --new_weights=true | --new_weights=true: a policy that knows nothing cannot be corrected
 dagger | --method.type=redo --skip_s=1 | --skip_s=1 | --method.type=redo the expert chooses every frame
 dagger | --method.type=robot_gated --method.intervention_share=1.5 | intervention_share=1.5: give a share
 dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
-dagger | --expert.type=scripted --expert.person=true --expert.tremor=-1 | --expert.tremor=-1 | give 0 or more
 dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --policy.path
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
-dagger | --env.image_size=20 | observation.images.front is picture (16, 16, 3) there and picture (20
-dagger | --env.sound=none | observation.audio.gripper is int16 | there and absent here
-dagger | --env.microphones=[ceiling] | `microphones`: ['ceiling'] | name at least one of gripper
-dagger | --demos.root={slow} | has 10 frames per second, and the policy is configured for 20
 dagger | --demos.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
 dagger | --demos.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)
-dagger | --demos.root={five_actions} | 'action' has shape (5,) | trained with (4,)
-dagger | --demos.root={deaf} | observation.audio.gripper
-dagger | --demos.root={24_pixels} | 'observation.images.front' has shape (24, 24, 3)
+dagger | --policy.path={act} | the type 'act' | --policy.type=playbyear | lerobot-rollout
+dagger | WORLD_SIZE=2 | 2 processes were started, and playbyear-dagger works in one
+dagger | --env.task=TellApart-v1 --method.type=no_handback | TellApart-v1 | no_handback needs one | --method.type=redo
+dagger | --env.task=TellApart-v1 --method.type=redo --expert.person=true | `intervention_gate()` | own_expert.py
+dagger | --output_dir={finished}/out | {finished}/out holds a run already | --resume=true
+dagger | --interventions.root={finished}/corrections --episodes=1 | holds 3 attempts already, and --episodes=1
+learn | --method.type=redo --interventions.root={finished}/corrections | frames that the policy chose | another --method.type
 learn | --interventions.root={untagged} | wanted 'intervention', bool (1,), and there is no such feature
 learn | --interventions.root={uncorrected} | None of the 5 frames | has 'intervention' set
 learn | --interventions.root={empty} | {empty} | is empty
@@ -201,9 +169,7 @@ session | -clock | playbyear_clock.json. Give --clock=times.csv
 session | --marks=1.0 | '1.0' is no mark; wanted seconds in the sound file = seconds on the clock
 session | --marks=1=5,2=5 | the same time on the clock
 session | --marks=10=1,20=5 | 2.5000 seconds of sound in a second of the clock
-session | --microphone=left,right | 1 channels, and --microphone names 2
 attach-spectrogram | --microphones=[nose] | --microphones names 'nose'; the dataset in {noise} has gripper
-attach-spectrogram | --microphones=[] | --microphones names none
 attach-spectrogram | --name=front | 'observation.images.front' is in the dataset in {noise} already
 attach-spectrogram | --seconds=3 | --seconds=3 | at most 0.80 | one of 16 columns | a larger --width
 attach-spectrogram | --seconds=0 | --seconds=0 | above 0
@@ -211,7 +177,6 @@ attach-spectrogram | --height=5000 | height=5000; wanted at most 4096 pixels
 attach-spectrogram | --low_db=10 --high_db=-10 | low_db=10.0; wanted at least -100, and below high_db=-10.0
 attach-spectrogram | --dataset.root={deaf} | {deaf} has no sound in columns | playbyear-attach-audio
 # Films, inspection, microphones
-video | --seed=-1 | seed=-1: give 0 or more
 video | --attempts=0 | attempts=0: give at least 1
 video | --baseline=deaf | no blind baseline 'deaf', only | search
 video | --policy.path={policy} --baseline=search | --baseline=search: it acts without a policy
@@ -221,20 +186,14 @@ find-microphones | --seconds=0 | seconds=0
 
 CALLS = """
 # The policy's configuration
-policy | fps: 0 | fps must be at least 1, got 0
 policy | dtype: half | --policy.dtype must be one of auto, float32, bfloat16, float16, got 'half'
 policy | action_range: 0.0 | --policy.action_range must be above 0 and finite, got 0
-policy | audio_colour_db: -1.0 | --policy.audio_colour_db must be at least 0 (none)
 policy | audio_noise_files: here | audio_noise_files=here | how loud | --policy.audio_noise_db=24
 policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (none) and finite, got -1.0
-policy | auxiliary_way: .inf | --policy.auxiliary_way must be at least 0
-policy | low_dimensional_offset: -0.1 | --policy.low_dimensional_offset must be at least 0 (none) and finite, got -0.1
 policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4
-policy | memory_readers: -1 | --policy.memory_readers must be at least 0 (none) and finite, got -1
 policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memory_displacement_gain is 0: give 10
 # Environments
 task | sound: loud | sound='loud'
-task | sample_rate: 16001 | 16001
 task | image_size: 2 | image_size=2
 task | horizon: 0 | horizon=0 | 1 or more
 task | microphones: [hat] | 'hat' | name at least one of gripper
@@ -248,26 +207,19 @@ reset | OccludedGrasp-v1, {cube_position: [0, 0.9]} | cube_position= | on the ta
 reset | OccludedPickPlace-v1, {bin_position: 0.1} | bin_position= | give x and y
 reset | TellApart-v1, {pouch_position: [.nan, 0]} | pouch_position
 reset | TellApart-v1, {contents: gravel} | contents='gravel' is not known: choose one of screws, peanuts
-reset | KeyBag-Easy-v1, {botom: 0.1} | botom=0.1 | bottom, contents_position
 # Features of a microphone that is recorded, of 80 samples at 1600 Hz and 20 frames per second
 feature | info: {} | does not say its sample rate
 feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz
-feature | info: {sample_rate: -1600} | positive integer
 feature | info: {sample_rate: 1601} | a frame must hold a whole number of samples
 feature | info: {sample_rate: 3200} | has shape (80,) | must be (160,)
 feature | dtype: int32 | dtype 'int32'; wanted 'int16'
-feature | shape: [80, 2] | every microphone is its own key
-feature | shape: [] | must be (80,)
 action | dtype: float33 | 'action' has dtype 'float33'
 action | shape: [0] | 'action' has shape (0,)
 # A microphone's options
 microphone | file: null | nothing: give one of device, file and tone_hz
 microphone | tone_hz: 440.0 | file and tone_hz: give one
 microphone | sample_rate: 0 | sample_rate=0
-microphone | channel: -1 | channel=-1
 microphone | gain_db: .nan | gain_db=nan
-microphone | low_db: -10.0 | low_db=-10.0
-microphone | high_db: .inf | high_db=inf
 microphone | width: 90 | width=96
 microphone | width: 225 | both even
 microphone | height: 98, sample_rate: 48000 | at this width height=100
@@ -309,19 +261,6 @@ def without(*keys: str) -> dict[str, dict]:
     return {key: feature for key, feature in dataset_features(image_size=16).items() if key not in keys}
 
 
-def uncorrected(root: Path) -> None:
-    features = dataset_features(image_size=16)
-    dataset = LeRobotDataset.create("t/uncorrected", 20, features, root=root, use_videos=False)
-    for _ in range(5):
-        zeros = {
-            key: np.zeros(feature["shape"], feature["dtype"].replace("image", "uint8"))
-            for key, feature in features.items()
-        }
-        dataset.add_frame({**zeros, "task": "Wait."})
-    dataset.save_episode()
-    dataset.finalize()
-
-
 def truncated(root: Path) -> None:
     make_dataset(root, (5,), image_size=16)
     (path,) = (root / "data").glob("*/*.parquet")
@@ -345,11 +284,10 @@ MAKERS: dict[str, Callable[[Path], object]] = {
     "slow": with_noise(fps=10),
     "48_kHz": with_noise(sample_rate=48000),
     "six_joints": with_noise(state_size=6),
-    "five_actions": with_noise(action_size=5),
-    "24_pixels": with_noise(image_size=24),
     "deaf": with_noise(microphones=()),
     "untagged": lambda root: make_dataset(root, (5,), features=without("intervention")),
-    "uncorrected": uncorrected,
+    "uncorrected": lambda root: rollout_dataset(root, (5,), lambda step: False),
+    "act": lambda folder: (folder.mkdir(), ACTConfig(device="cpu", push_to_hub=False).save_pretrained(folder)),
     "empty": lambda root: LeRobotDataset.create("t/empty", 20, without(), root=root, use_videos=False).finalize(),
     "truncated": truncated,
     "sounds": sounds,
@@ -367,8 +305,8 @@ class Places(dict):
 
 
 @pytest.fixture(scope="module")
-def places(noise, recorded, trained, tmp_path_factory):
-    return Places(made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained)
+def places(noise, recorded, trained, finished, tmp_path_factory):
+    return Places(made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained, finished=finished)
 
 
 def rows_of(table: str) -> list:
@@ -381,12 +319,16 @@ def test_a_refusal_names_the_option_the_value_and_what_works(base, changes, said
     places["out"] = tmp_path
     command, *options = shlex.split(BASE[base].format_map(places))
     given = {option.partition("=")[0]: option for option in options}
+    environment = {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
     for change in shlex.split(changes.format_map(places)):
-        if re.match("-[a-z]", change):
-            del given[f"-{change}"]
+        name, _, value = change.partition("=")
+        if re.match("-[a-z]", name):
+            del given[f"-{name}"]
+        elif name.isupper():
+            environment[name] = value
         else:
-            given[change.partition("=")[0]] = change
-    result = commands.run(command, *given.values(), environment={"DISPLAY": "", "WAYLAND_DISPLAY": ""})
+            given[name] = change
+    result = commands.run(command, *given.values(), environment=environment)
     message = result.output[result.output.find("error: ") :]
     for text in said:
         assert re.sub(r"\{(\w+)\}", lambda name: str(places.get(name[1], name[0])), text) in message

@@ -13,6 +13,7 @@ import os
 import pkgutil
 import shutil
 import signal
+import ssl
 import subprocess
 import sys
 import threading
@@ -167,13 +168,19 @@ def _check_cards_there() -> None:
 
 def _read_options() -> None:
     """What a command takes longest for: draccus searches the sources for the help of all 2,000 options."""
+    import httpx
     from draccus.argparsing import ArgumentParser
     from lerobot.utils import import_utils
+
+    from gym_playbyear import registry
 
     sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
     from list_options import CONFIGS  # type: ignore[import-not-found]
 
-    speed_up_parsers()
+    speed_up()
+    registry.entry_points = cache(registry.entry_points)  # it reads the metadata of all distributions
+    ssl.create_default_context = cache(ssl.create_default_context)  # it reads all certificates, for every client
+    httpx.create_ssl_context()
     import_utils.register_third_party_plugins()
     for config in CONFIGS.values():
         ArgumentParser(config)
@@ -181,8 +188,12 @@ def _read_options() -> None:
     gc.freeze()
 
 
-def speed_up_parsers() -> None:
-    """What the parser of 2,000 options looks up in sources, and LeRobot in all distributions, is looked up once a process."""
+def speed_up() -> None:
+    """What the parser of 2,000 options looks up in sources, and LeRobot in all distributions, is looked up once a process.
+
+    And a column that is added to a table's features is looked at alone: datasets looks at all others again.
+    """
+    from datasets.features import features
     from draccus.wrappers import docstring, field_wrapper
     from lerobot.utils import import_utils
 
@@ -192,6 +203,12 @@ def speed_up_parsers() -> None:
     register = import_utils.register_third_party_plugins
     register_those_on = cache(lambda *path: register())
     import_utils.register_third_party_plugins = lambda: register_those_on(*sys.path)
+
+    def set_column(self: Any, name: str, feature: Any) -> None:
+        dict.__setitem__(self, name, feature)
+        self._column_requires_decoding[name] = features.require_decoding(feature)
+
+    features.Features.__setitem__ = set_column
 
 
 def _run(job: dict[str, Any]) -> None:

@@ -12,7 +12,6 @@ import random
 import re
 import socket
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -29,27 +28,20 @@ LARGE_SUFFIXES = (".parquet", ".safetensors", ".mp4", ".png")
 """Files that the Hub keeps apart from a commit's text, as its `.gitattributes` says."""
 
 _REPO = r"(?P<kind>models|datasets)/(?P<name>[^/]+/[^/]+)"
-_SLOW_S = 0.3
 
 Fault = Callable[[str, str], str | None]
 """Given method and path, what goes wrong: "unavailable" (status 503), "cut" (no answer, and nothing is done), "lost" (it is
-done, and half of the answer arrives), "late" (status 504, and it is done when the next commit comes), "slow", or
-None."""
+done, and half of the answer arrives), "late" (status 504, and it is done when the next commit comes), or None."""
 
 
 def nothing_fails(method: str, path: str) -> None:
     """All is well."""
 
 
-def everything_fails(method: str, path: str) -> str:
-    """There is no Hub."""
-    return "cut"
-
-
 def one_in(n: int, seed: int) -> Fault:
-    """One request in n fails on average, in each of the four ways alike."""
+    """One request in n fails on average, in each of three ways alike."""
     rng = random.Random(seed)
-    return lambda method, path: rng.choice(["unavailable", "cut", "lost", "slow"]) if rng.random() < 1 / n else None
+    return lambda method, path: rng.choice(["unavailable", "cut", "lost"]) if rng.random() < 1 / n else None
 
 
 def every_second(kind: str, method: str, pattern: str) -> Fault:
@@ -395,8 +387,6 @@ class _Handler(BaseHTTPRequestHandler):
             return self._hang_up()
         if fault == "unavailable":
             return self._write(Answer(status=503, data=b"<html>The Hub is busy</html>"))
-        if fault == "slow":
-            time.sleep(_SLOW_S)
         with hub.lock:
             if fault == "late":
                 hub.late.append(partial(self._answer, path))
