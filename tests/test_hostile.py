@@ -203,6 +203,7 @@ def missing_picture(root: Path) -> None:
 
 
 OUTSIDE, NO_PAGE = "outside its folder", r"No page is written.* is a link to .*--dataset\.root"
+REPAIR = "playbyear-repair --root="
 DAMAGED = r"file-000\.parquet.*playbyear-repair --root="
 ELSEWHERE = "info.json: {}|not in its folder"
 TEMPLATES = (
@@ -243,7 +244,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], dict[str, str | None]]] = {
         for name, value in TEMPLATES
     },
     "camera's name": (lambda root: rename_feature(root, FILM, "../../secret"), {"inspect": "not in its folder"}),
-    "table: more frames": (lambda root: edit_frames(root, "episode_index", lambda _: 1), {"attach": DAMAGED}),
+    "table: more frames": (lambda root: edit_frames(root, "episode_index", lambda _: 1), {"attach": REPAIR}),
     "table: no number": (lambda root: edit_frames(root, "frame_index", lambda n: n or None), {"attach": DAMAGED}),
     "link: file": (
         link("videos/more/x.mp4", "../secret.png"),

@@ -17,6 +17,7 @@ from sound_server import RATE, Player, SoundServer, started, why_not
 from support.distributions import install
 
 from lerobot_playbyear.audio.audio_files import read_audio, write_audio
+from lerobot_playbyear.audio.control_steps import HALF
 from lerobot_playbyear.audio.microphone_pictures import SessionSound, Strip, find_session, read_strip
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.microphones.card import CardRecording
@@ -175,6 +176,30 @@ def test_a_tap_is_heard_soon_after_it_was_played_and_always_as_late(server):
     assert len(late) >= 18
     assert 0 <= np.median(late) < 0.05  # the server's own latency and a chunk
     assert np.percentile(np.abs(late - np.median(late)), 90) < 0.005
+
+
+def test_a_pictures_sound_is_of_its_moment_to_5_ms():
+    """With a card that has no delay of its own; what attaching and acting take is in it."""
+    begun: list[float] = []
+
+    @register_source("timed")
+    def timed(config: MicrophoneCameraConfig, channels: int) -> PlayedMicrophone:
+        class Timed(PlayedMicrophone):
+            def _play(self) -> None:
+                begun.append(time.perf_counter())
+                super()._play()
+
+        return Timed("the clock", np.ones((RATE, channels), np.int16), config.sample_rate)
+
+    late = []
+    with listening(mic=options(source="timed")) as cameras:
+        for _ in range(60):
+            now = time.perf_counter()
+            late.append(now - begun[0] - (heard(cameras["mic"]).counter - HALF) / RATE)
+            time.sleep(max(now + TICK_S - time.perf_counter(), 0))
+    assert np.median(late) < 0.005
+    assert np.percentile(late, 90) < 0.007  # a busy machine may be late for once
+    assert min(late) > 0
 
 
 def test_microphones_of_one_card_share_its_rate(tmp_path):
