@@ -171,7 +171,7 @@ class PowerCut(BaseException):
 
 
 @pytest.mark.parametrize("moves_before", [0, 1, 3, 5])
-def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, monkeypatch, moves_before):
+def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, monkeypatch, caplog, moves_before):
     """At every move: the dataset loads before and after recovery, and recording goes on."""
     root = tmp_path / "dataset"
     write(root, [0])
@@ -195,6 +195,7 @@ def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, mo
     with writer(root) as target:
         survived = target.num_episodes
         assert survived == (1 if moves_before == 0 else 2)  # the journal is the first move, and the point of no return
+        assert ("an episode that had not been saved was removed" in caplog.text) is (survived == 1)
         write_episode(target, 2)
     assert_recorded(root, [0, 1, 2] if survived == 2 else [0, 2])
 
