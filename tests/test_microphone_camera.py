@@ -181,18 +181,7 @@ def test_steps_as_long_as_they_should_be_keep_the_samples_bit_for_bit():
     np.testing.assert_array_equal(np.concatenate(blocks), samples[8000 - SIZE - HALF : 40000 - HALF])
 
 
-@pytest.mark.parametrize(
-    ("n", "is_resampled", "is_first"),
-    [
-        (20, False, False),
-        (399, False, False),
-        (400, True, False),
-        (1600, True, False),
-        (1601, False, False),
-        (7999, False, False),
-        (8001, False, True),
-    ],
-)
+@pytest.mark.parametrize(("n", "is_resampled", "is_first"), [(399, 0, 0), (400, 1, 0), (1601, 0, 0), (8001, 0, 1)])
 def test_nothing_is_stretched_over_a_gap(n, is_resampled, is_first):
     samples, steps = sound(5), ControlStepSound(SIZE)
     steps.next(Strip(1, 20000, RATE, samples[16000:20000]))

@@ -129,33 +129,25 @@ def test_a_card_that_was_plugged_in_later_is_found_but_never_at_the_cost_of_an_o
         later.disconnect()
 
 
-@needs_server
-def test_a_channel_is_that_of_the_card_and_no_mixture_of_several(server):
-    """A sound server gives the mean of left and right to whom asks for one channel."""
-    loud = np.full((8 * RATE, 2), [1000, 3000], np.int16)
-    with Player(server.fifo("table"), 2, noise=0) as player:
-        player.play(loud, time.perf_counter())
-        with listening(mic=options(device="table")) as cameras:
-            time.sleep(0.3)
-            samples = heard(cameras["mic"]).samples
-    assert set(np.unique(samples)) <= {0, 1000}
-    assert 1000 in samples
-
-
 # Which samples
 
 
 @needs_server
-def test_two_microphones_of_one_card_share_its_stream_and_are_alike_to_the_sample(server):
-    left = np.random.default_rng(0).integers(-30000, 30000, 8 * RATE).astype(np.int16)
+def test_a_channel_is_that_of_the_card_and_two_microphones_share_its_stream_to_the_sample(server):
+    """A sound server gives the mean of left and right, here nothing, to whom asks for one channel."""
+    left = np.random.default_rng(0).integers(-30000, 30000, 20 * RATE).astype(np.int16)
     configs = {name: options(device="table", channel=i) for i, name in enumerate(("left", "right"))}
-    with Player(server.fifo("table"), 2, noise=0) as player, listening(**configs) as cameras:
-        player.play(np.stack([left, -left], axis=1), time.perf_counter() + 0.1)
-        time.sleep(0.8)
-        strips = [heard(camera) for camera in cameras.values()]
-    assert strips[0].counter == strips[1].counter
+    with Player(server.fifo("table"), 2, noise=0) as player:
+        player.play(np.stack([left, -left], axis=1), time.perf_counter())
+        with listening(left=configs["left"]) as cameras:
+            time.sleep(0.4)
+            alone = heard(cameras["left"]).samples
+        with listening(**configs) as cameras:
+            time.sleep(0.4)
+            pairs = [[heard(camera) for camera in cameras.values()] for _ in range(10)]
+    strips = next(pair for pair in pairs if pair[0].counter == pair[1].counter)  # a busy machine may be late for once
     np.testing.assert_array_equal(strips[0].samples, -strips[1].samples)
-    assert np.abs(strips[0].samples.astype(int)).mean() > 10000
+    assert min(np.abs(samples.astype(int)).mean() for samples in (alone, strips[0].samples)) > 10000
 
 
 @needs_server
