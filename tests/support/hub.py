@@ -134,11 +134,8 @@ class Repository:
                 if value["oid"] not in objects:
                     raise HubAnswerError(400, message=f"{value['path']} was never uploaded")
                 files[value["path"]] = File(value["oid"], objects[value["oid"]], is_large=True)
-            elif key == "deletedFile":
-                if files.pop(value["path"], None) is None:
-                    raise HubAnswerError(404, "EntryNotFound", "A file with this name doesn't exist")
-            else:
-                raise HubAnswerError(400, message=f"unknown line {key}")
+            elif files.pop(value["path"], None) is None:  # "deletedFile"
+                raise HubAnswerError(404, "EntryNotFound", "A file with this name doesn't exist")
         self.branches[branch] = self._add_commit(files, message)
         return self.branches[branch]
 
@@ -271,10 +268,7 @@ class HubServer:
         for wanted in request.json()["objects"]:
             entry = dict(wanted)
             if wanted["oid"] not in self.objects:
-                entry["actions"] = {
-                    "upload": {"href": f"{self.storage_url}/storage/{wanted['oid']}"},
-                    "verify": {"href": f"{self.url}/verify"},
-                }
+                entry["actions"] = {"upload": {"href": f"{self.storage_url}/storage/{wanted['oid']}"}}
             objects.append(entry)
         return Answer({"transfer": "basic", "objects": objects})
 
@@ -282,12 +276,6 @@ class HubServer:
         self.objects[oid] = request.body
         self.arrivals[oid] += 1
         return Answer()
-
-    def verify(self, request: "_Handler") -> Answer:
-        wanted = request.json()
-        if len(self.objects.get(wanted["oid"], b"")) != wanted["size"]:
-            raise HubAnswerError(404, "EntryNotFound")
-        return Answer({})
 
     def commit(self, request: "_Handler", kind: str, name: str, revision: str) -> Answer:
         lines = [json.loads(line) for line in request.body.splitlines()]
@@ -352,7 +340,6 @@ _ROUTES: list[tuple[str, str, Callable[..., Answer]]] = [
     ("GET", rf"/api/{_REPO}/tree/(?P<revision>[^/]+)", HubServer.tree),
     ("GET", rf"/api/{_REPO}(/revision/(?P<revision>[^/]+))?", HubServer.info),
     ("POST", r"/(datasets/)?(?P<name>[^/]+/[^/]+)\.git/info/lfs/objects/batch", HubServer.large_files),
-    ("POST", r"/verify", HubServer.verify),
     ("PUT", r"/storage/(?P<oid>\w+)", HubServer.store),
     ("GET HEAD", r"/storage/(?P<oid>\w+)", HubServer.fetch),
     (
