@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from dataset_factory import CAMERA, dataset_features, make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from support.recording import write
+from support.recording import everything, write
 
 from lerobot_playbyear.audio import cut_into_frames, note_episode_start, write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
@@ -56,15 +56,11 @@ def load(root: Path) -> LeRobotDataset:
     return LeRobotDataset("test/heard", root=root, video_backend="pyav")
 
 
-def contents(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
-
-
 # From a file for each episode
 
 
 def test_every_frame_gets_what_was_heard_before_it_and_all_else_stays_as_it_was(silent, tmp_path):
-    before = contents(silent)
+    before = everything(silent)
     root = attach_files(silent, tmp_path / "heard", write_sounds(tmp_path / "sound", ending="flac"))
 
     old, new = LeRobotDataset("test/silent", root=silent, video_backend="pyav"), load(root)
@@ -84,7 +80,7 @@ def test_every_frame_gets_what_was_heard_before_it_and_all_else_stays_as_it_was(
     np.testing.assert_allclose(new.meta.stats[KEY]["std"], np.concatenate(samples).std(), rtol=1e-3)
     np.testing.assert_array_equal(new.meta.stats["action"]["mean"], old.meta.stats["action"]["mean"])
     assert survey(root).is_sound
-    assert contents(silent) == before
+    assert everything(silent) == before
     assert {path.name for path in tmp_path.iterdir()} == {"heard", "sound"}
 
 

@@ -10,8 +10,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from support.recording import edit_column, edit_info
-from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, contents, load
+from support.recording import edit_column, edit_info, everything
+from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, load
 
 from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
@@ -104,7 +104,7 @@ def episodes_of(root: Path) -> list[dict]:
 
 
 def test_files_become_columns_with_the_same_samples(with_files, silent, tmp_path):
-    before = contents(with_files)
+    before = everything(with_files)
     root = attach(with_files, tmp_path / "columns")
 
     dataset = load(root)
@@ -116,7 +116,7 @@ def test_files_become_columns_with_the_same_samples(with_files, silent, tmp_path
             assert rate == RATE
             np.testing.assert_array_equal(waveform, blocks_of(heard(episode, n_channels), length)[:, channel])
     assert survey(root).is_sound
-    assert contents(with_files) == before
+    assert everything(with_files) == before
     old = LeRobotDataset("test/silent", root=silent, video_backend="pyav")
     for key, value in old[20].items():
         assert np.array_equal(np.asarray(dataset[20][key]), np.asarray(value)), key

@@ -38,33 +38,15 @@ def few_updates(monkeypatch):
     monkeypatch.setattr(gate_model, "_N_UPDATES", 5)
 
 
-class Telling(Scripted):
-    """Remembers when others decided that it acts."""
-
-    def reset(self, env):
-        super().reset(env)
-        self.told = []
-
-    def take_over(self):
-        self.told.append(self.n)
-
-
 def attempt(expert):
     """An attempt of 20 steps; the steps in which the expert acted, and the episode."""
     episode = play(*scene(), seed=5, expert=expert)
     return np.flatnonzero(episode.interventions).tolist(), episode
 
 
-def test_an_expert_that_stays_acts_from_its_first_takeover_to_the_end():
-    expert = Telling(steps=(4, 5, 9))
-    steps, episode = attempt(Staying(expert))
-    assert steps == list(range(4, len(episode)))
-    assert expert.told == [4]
-
-
 @pytest.mark.parametrize("decides", [False, True])
 def test_a_person_who_stays_is_not_asked_to_act_in_the_step_that_they_ended(decides):
-    expert = Telling(steps=(4, 5), verdicts={7: Verdict.FAILURE})  # as where a leader no longer answers
+    expert = Scripted(steps=(4, 5), verdicts={7: Verdict.FAILURE})  # as where a leader no longer answers
     expert.decides = decides
     steps, episode = attempt(Staying(expert))
     assert (len(episode), episode.verdict) == (8, Verdict.FAILURE)

@@ -38,8 +38,8 @@ class BigEnv(gym.Env):
 
 gym.register("Big-v0", entry_point=BigEnv)
 
-TAKE_ONE_AND_CLOSE = """
-import sys, time
+TAKE_ONE = """
+import multiprocessing, os, signal, sys, time
 sys.path.insert(0, {tests!r})
 from contextlib import closing
 from lerobot_playbyear.episodes.environment import EnvSpec
@@ -47,30 +47,27 @@ from lerobot_playbyear.episodes.pool import RolloutPool
 if __name__ == "__main__":
     with closing(RolloutPool(EnvSpec("test_rollout_pool:Big-v0"), num_workers=1)) as pool:
         next(pool.episodes(range(100)))
-        time.sleep({wait})
+        {then}
     print("closed")
 """
 
 
+def take_one(folder: Path, then: str) -> subprocess.CompletedProcess:
+    """What becomes of a program, which is a process of its own, that takes an episode and then does something."""
+    script = folder / "take_one.py"
+    script.write_text(TAKE_ONE.format(tests=str(Path(__file__).parent), then=then))
+    return subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=40)
+
+
 @pytest.mark.parametrize("wait", [pytest.param(0.0, marks=pytest.mark.slow), 0.06])
 def test_a_worker_that_is_sending_an_episode_does_not_keep_the_program_from_ending(tmp_path, wait):
-    script = tmp_path / "take_one.py"
-    script.write_text(TAKE_ONE_AND_CLOSE.format(tests=str(Path(__file__).parent), wait=wait))
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=40)
+    done = take_one(tmp_path, f"time.sleep({wait})")
     assert (done.stdout, done.returncode) == ("closed\n", 0), done.stderr
 
 
 def test_workers_do_not_outlive_a_parent_that_was_killed(tmp_path):
-    script = tmp_path / "die.py"
-    script.write_text(
-        TAKE_ONE_AND_CLOSE.format(tests=str(Path(__file__).parent), wait=0).replace(
-            "        time.sleep(0)",
-            "        import multiprocessing, os, signal\n"
-            "        print(*[child.pid for child in multiprocessing.active_children()], flush=True)\n"
-            "        os.kill(os.getpid(), signal.SIGKILL)",
-        )
-    )
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=40)
+    tell = "print(*[child.pid for child in multiprocessing.active_children()], flush=True)"
+    done = take_one(tmp_path, f"{tell}, os.kill(os.getpid(), signal.SIGKILL)")
     workers = [int(number) for number in done.stdout.split()]
     assert workers
     deadline = time.monotonic() + 20
