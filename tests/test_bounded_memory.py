@@ -74,7 +74,7 @@ def test_statistics_of_sound_are_those_that_lerobot_has_of_all_samples(kind, dty
     bin_width = float(np.ptp(waveform.astype(np.float64))) / 5000  # of LeRobot's histograms
     for name, value in ours.items():
         assert value.shape == (shape[1],)
-        near = 1.0 + bin_width if name.startswith("q") and dtype is np.int16 else 1e-9
+        near = (dtype is np.int16) + bin_width if name.startswith("q") else 1e-9  # ours are exact
         assert value[0] == pytest.approx(float(lerobots[name][0]), rel=1e-4, abs=near), name
 
 
