@@ -66,13 +66,11 @@ def test_windows_are_those_of_lerobot_as_bytes_and_pcm(root, episodes):
 
 
 def load(root, cache, **options):
-    return EpisodeStore.from_dataset(
-        DatasetReader("tests/noise", root), device="cpu", place="disk", cache=cache, **options
-    )
+    return in_memory(root, place="disk", cache=cache, **options)
 
 
-def in_memory(root, **options):
-    return EpisodeStore.from_dataset(DatasetReader("tests/noise", root), device="cpu", **options)
+def in_memory(root, episodes=None, **options):
+    return EpisodeStore.from_dataset(DatasetReader("tests/noise", root, episodes), device="cpu", **options)
 
 
 def assert_same(store, other):

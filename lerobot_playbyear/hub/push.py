@@ -27,7 +27,7 @@ from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries
 from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out
 from lerobot_playbyear.datasets.journal import held
 from lerobot_playbyear.datasets.markdown import word
-from lerobot_playbyear.datasets.reader import DatasetPlace, SurveyedDataset
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.hub.dataset_card import CARD, FILM, write_dataset_card
 
 METRICS_NAME = "metrics.jsonl"
@@ -74,6 +74,19 @@ class PushOptions:
 
 
 @dataclass
+class PushDatasetConfig:
+    """The dataset.
+
+    Args:
+        repo_id: Its name on the Hub, `user/name`.
+        root: Its folder. None: in LeRobot's own cache, under its name.
+    """
+
+    repo_id: str | None = None
+    root: str | None = None
+
+
+@dataclass
 class PushPolicyConfig:
     """The policy.
 
@@ -100,7 +113,7 @@ class PushConfig(PushOptions):
         preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
     """
 
-    dataset: DatasetPlace = field(default_factory=lambda: DatasetPlace(""))
+    dataset: PushDatasetConfig = field(default_factory=PushDatasetConfig)
     policy: PushPolicyConfig = field(default_factory=PushPolicyConfig)
 
 
@@ -114,9 +127,9 @@ def push(cfg: PushConfig) -> str:
         HubError: An option is missing, there is nothing to upload, or it could not be uploaded.
     """
     dataset, policy = cfg.dataset, cfg.policy
-    if (dataset == DatasetPlace("")) == (policy == PushPolicyConfig()):
+    if (dataset == PushDatasetConfig()) == (policy == PushPolicyConfig()):
         raise HubError("Give either --dataset.repo_id (and --dataset.root), or --policy.path and --policy.repo_id.")
-    if dataset.repo_id:
+    if dataset.repo_id is not None:
         url = push_dataset(dataset.repo_id, dataset.root, cfg)
         print(f"Dataset: {url}\nLoad it anywhere: playbyear-inspect --dataset.repo_id={dataset.repo_id}")
         return url
