@@ -79,7 +79,7 @@ def test_every_frame_gets_what_was_heard_before_it_and_all_else_stays_as_it_was(
     assert new.meta.stats.keys() == {*old.meta.stats, KEY}
     np.testing.assert_allclose(new.meta.stats[KEY]["std"], np.concatenate(samples).std(), rtol=1e-3)
     np.testing.assert_array_equal(new.meta.stats["action"]["mean"], old.meta.stats["action"]["mean"])
-    assert survey(root).is_sound
+    assert survey(root).is_undamaged
     assert everything(silent) == before
     assert {path.name for path in tmp_path.iterdir()} == {"heard", "sound"}
 
@@ -95,7 +95,7 @@ def test_video_is_copied_and_two_channels_become_two_microphones(tmp_path):
     for channel, key in enumerate(("observation.audio.left", "observation.audio.right")):
         waveform, _ = episode_waveform(dataset, 1, key)
         np.testing.assert_array_equal(waveform[:100], expected[round(OFFSET * RATE) - SIZE :, channel][:100])
-    assert survey(root).is_sound
+    assert survey(root).is_undamaged
 
 
 def test_sound_of_another_rate_is_resampled(silent, tmp_path):
@@ -184,7 +184,7 @@ def test_taps_land_in_the_blocks_of_their_frames_though_the_recorder_is_fast(lon
     root = attach(long, tmp_path / "heard", session=recording, microphone="gripper", clock=clock, marks=marks(*CLAPS))
     assert len(taps()) > 100
     assert share_in_their_blocks(root) >= 0.99
-    assert survey(root).is_sound
+    assert survey(root).is_undamaged
     assert "+1000 parts in a million" in capsys.readouterr().out
 
     without = attach(

@@ -115,7 +115,7 @@ def test_files_become_columns_with_the_same_samples(with_files, silent, tmp_path
             waveform, rate = episode_waveform(dataset, episode, key)
             assert rate == RATE
             np.testing.assert_array_equal(waveform, blocks_of(heard(episode, n_channels), length)[:, channel])
-    assert survey(root).is_sound
+    assert survey(root).is_undamaged
     assert everything(with_files) == before
     old = LeRobotDataset("test/silent", root=silent, video_backend="pyav")
     for key, value in old[20].items():

@@ -72,7 +72,7 @@ def test_an_environment_of_ones_own_is_recorded_and_two_recordings_merge(run, tm
     run("merge_recordings.py", "--roots", tmp_path / "one", tmp_path / "two", f"--root={merged}", "--repo_id=me/both")
 
     assert "3 episodes" in capsys.readouterr().out
-    assert survey(merged).is_sound
+    assert survey(merged).is_undamaged
     for episode, (root, its) in enumerate([("one", 0), ("one", 1), ("two", 0)]):
         waveform, rate = episode_waveform(load(merged), episode, "observation.audio.finger")
         np.testing.assert_array_equal(
@@ -102,7 +102,7 @@ def test_a_folder_of_films_becomes_a_dataset(run, tmp_path, capsys):
     assert "b.mp4: episode 1, 1.5 s" in capsys.readouterr().out
     dataset = load(root)
     assert [int(length) for length in dataset.meta.episodes["length"]] == [40, 30]
-    assert survey(root).is_sound
+    assert survey(root).is_undamaged
     for episode, flash in ((0, 20), (1, 10)):
         first = dataset.meta.episodes[episode]["dataset_from_index"]
         items = [dataset[first + i] for i in range(dataset.meta.episodes[episode]["length"])]

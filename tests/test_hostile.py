@@ -124,7 +124,7 @@ def looked(root: Path, **options: Any) -> None:
 
 def checked(root: Path) -> None:
     found = survey(root)
-    if not found.is_sound:
+    if not found.is_undamaged:
         raise ValueError(str(found))
 
 

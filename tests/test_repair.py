@@ -132,7 +132,7 @@ def repaired(root: Path, features: dict[str, Any], lost: Collection[int] = (), *
     assert report.is_done, str(report)
     assert bool(dropped(report)) == bool(lost), str(report)
     assert all(number in lost for number in dropped(report)), str(report)
-    assert survey(report.target).is_sound
+    assert survey(report.target).is_undamaged
     dataset = load(report.target)
     assert dataset.num_episodes == len(report.kept)
     assert dataset.num_frames == len(dataset.hf_dataset) == dataset.meta.episodes[-1]["dataset_to_index"]
@@ -496,7 +496,7 @@ def damage_and_repair(original: Path, features: dict[str, Any], root: Path, seed
         assert dropped(report) <= hit, story
     assert all(each.reason for each in report.survey.episodes if not each.frames), story
     target = report.target or root
-    assert survey(target).is_sound, story
+    assert survey(target).is_undamaged, story
     dataset = load(target)
     assert dataset.num_episodes == len(report.kept), story
     # A bit of sound can flip unseen where LeRobot wrote it: without checksums.

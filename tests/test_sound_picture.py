@@ -144,7 +144,7 @@ def test_every_frame_shows_the_last_seconds_and_all_else_stays(original, seen, t
     assert new.meta.stats[PICTURE]["mean"].shape == new.meta.stats[CAMERA]["mean"].shape
     pixels = np.stack([picture(new, row) for row in range(len(new))]) / 255
     np.testing.assert_allclose(new.meta.stats[PICTURE]["mean"].ravel(), pixels.mean((0, 1, 2)), atol=1e-6)
-    assert survey(seen).is_sound
+    assert survey(seen).is_undamaged
     assert [
         verdict for verdict in check_numbers(SurveyedDataset.open("t/seen", seen)) if verdict.level == "error"
     ] == []

@@ -51,8 +51,8 @@ class Method(draccus.ChoiceRegistry):
     def check(self) -> None:
         """Raise an InputError if an option is out of its range."""
 
-    def beside(self, expert: Expert) -> Expert:
-        """Who sits beside the policy: the expert, or somebody who speaks for it."""
+    def wrap(self, expert: Expert) -> Expert:
+        """The expert as this method lets it act: itself, or with its takeovers changed."""
         return expert
 
     def begin(self, loop: "Loop") -> None:
@@ -115,7 +115,7 @@ class HgDagger(Method):
 class NoHandback(Method):
     """The expert takes over as it likes and acts to the end: an attempt holds one correction (as in RaC, Hu et al., 2025)."""
 
-    def beside(self, expert: Expert) -> Expert:
+    def wrap(self, expert: Expert) -> Expert:
         return Staying(expert)
 
 
@@ -132,7 +132,7 @@ class Redo(Method):
     skips_beginnings: ClassVar[bool] = False
     shows_failures: ClassVar[bool] = True
 
-    def beside(self, expert: Expert) -> Expert:
+    def wrap(self, expert: Expert) -> Expert:
         self._expert = Showing(expert)
         return self._expert
 

@@ -62,7 +62,7 @@ class RobotGated(Method):
         self._fitted_round = -1
         self._seconds = 0.0  # that the gate took to learn
 
-    def beside(self, expert: Expert) -> Expert:
+    def wrap(self, expert: Expert) -> Expert:
         self.shows_failures = self.redo_failed and not expert.decides  # type: ignore[misc]
         self._expert = Asked(expert, self)
         return self._expert

@@ -126,7 +126,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
         expert = cfg.expert.make(env)
         stack.callback(expert.close)
         _check_expert(cfg, expert)
-        expert = method.beside(expert)
+        expert = method.wrap(expert)
     corrections = Corrections(cfg.interventions)
     stack.callback(corrections.close)
     if env is not None and cfg.env is not None:

@@ -165,8 +165,8 @@ class DurableWriter:
         """Writes the episode in progress. Returns its index.
 
         Raises:
-            DatasetWriteError: It could not be written (disk full, permissions). The dataset is as it was before, and the
-                episode is still there: call this again once the cause is gone.
+            DatasetWriteError: It could not be written (disk full, permissions), or not be moved to its place. The episodes
+                before it are whole, and it is still there: call this again once the cause is gone.
         """
         index = self.num_episodes
         if not self._frames:
@@ -327,7 +327,7 @@ def check_undamaged(root: Path) -> None:
         found = survey(root, thorough=False)
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
-    if not found.is_sound:
+    if not found.is_undamaged:
         command = f"playbyear-repair --root={shlex.quote(str(root))}"
         raise DatasetDamagedError(
             f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "

@@ -61,7 +61,7 @@ def entries_below(folder: Path) -> Iterator[Path]:
             yield from entries_below(entry)
 
 
-def take_over(source: str | Path, target: str | Path) -> None:
+def link_or_copy(source: str | Path, target: str | Path) -> None:
     """A second name for a file that nobody changes in place, or a copy where there can be none."""
     source, target = Path(source), Path(target)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -92,7 +92,7 @@ def lock_dataset(root: Path) -> FolderLock:
 
 
 @contextlib.contextmanager
-def held(root: Path) -> Iterator[bool]:
+def locked(root: Path) -> Iterator[bool]:
     """Keeps others from writing to a dataset that is read; where no lock can be made, nobody can write to it.
 
     Yields:

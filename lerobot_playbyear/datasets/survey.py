@@ -116,7 +116,7 @@ class Survey:
         return [episode for episode in self.episodes if episode.frames]
 
     @property
-    def is_sound(self) -> bool:
+    def is_undamaged(self) -> bool:
         """Whether nothing is wrong; what is odd does not count."""
         return worst(self.findings) != "error"
 
@@ -128,7 +128,7 @@ class Survey:
     def __str__(self) -> str:
         if not self.findings:
             return f"{self.root}: {len(self.episodes)} episodes, nothing wrong."
-        verdict = "nothing wrong, but" if self.is_sound else "it is damaged:"
+        verdict = "nothing wrong, but" if self.is_undamaged else "it is damaged:"
         lines = [f"{self.root}: {len(self.whole)} whole episodes; {verdict}"]
         return "\n  - ".join([*lines, *map(str, self.findings)])
 

@@ -25,7 +25,7 @@ from lerobot_playbyear.compat import card_writer
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, first_line
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below
 from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out
-from lerobot_playbyear.datasets.journal import held
+from lerobot_playbyear.datasets.journal import locked
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.hub.dataset_card import CARD, FILM, write_dataset_card
@@ -170,7 +170,7 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
     folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
     check_name("dataset.repo_id", repo_id, needs_user=True)
     options.check()
-    with held(folder) if folder.is_dir() else contextlib.nullcontext(), TemporaryDirectory() as scratch:
+    with locked(folder) if folder.is_dir() else contextlib.nullcontext(), TemporaryDirectory() as scratch:
         try:
             dataset = SurveyedDataset.open(repo_id, folder)
             check_links(folder)

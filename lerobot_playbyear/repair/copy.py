@@ -15,7 +15,14 @@ from lerobot.datasets.io_utils import write_json, write_tasks
 
 from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.features import is_depth
-from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits, take_over
+from lerobot_playbyear.datasets.files import (
+    DEFAULT_DATA_PATH,
+    EPISODES_DIR,
+    INFO_PATH,
+    entries_below,
+    fits,
+    link_or_copy,
+)
 from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_rows, write_tables
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.statistics import (
@@ -69,7 +76,7 @@ def _copy_rest(survey: Survey, target: Path) -> None:
         if path.is_file() and not _is_scratch(name, survey.info["features"]) and not fits(name, *_REMADE):
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             # Nobody changes a film in place; of a user's own files that is not known.
-            (take_over if name.parts[0] == "videos" else shutil.copy2)(path, target / name)
+            (link_or_copy if name.parts[0] == "videos" else shutil.copy2)(path, target / name)
 
 
 def _is_scratch(name: Path, features: Collection[str]) -> bool:
@@ -126,7 +133,7 @@ def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
         file = kept[0].frames.file
         is_whole = not file.is_rescued and sum(one.frames.length for one in kept) == file.n_rows
         if is_whole and all(one.stays for one in kept):
-            take_over(path, name)
+            link_or_copy(path, name)
         else:
             write_tables(name, (one.table() for one in kept), file.schema)
         for one in kept:

@@ -12,7 +12,7 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder
 from lerobot_playbyear.datasets.findings import Finding
 from lerobot_playbyear.datasets.info import check_links
-from lerobot_playbyear.datasets.journal import finish_journal, held
+from lerobot_playbyear.datasets.journal import finish_journal, locked
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
 from lerobot_playbyear.repair.footers import rescue
 
@@ -62,7 +62,7 @@ class RepairReport:
     @property
     def is_done(self) -> bool:
         """Whether there is a dataset now with which nothing is wrong."""
-        return self.survey.is_sound or (self.target is not None and not self.left)
+        return self.survey.is_undamaged or (self.target is not None and not self.left)
 
     def __str__(self) -> str:
         lines = [str(self.survey)]
@@ -132,8 +132,8 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
         raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
     real = root.absolute()
     target = Path(target) if target is not None else real.with_name(f"{real.name}_repaired")
-    with held(root) as is_held:
-        if is_held:
+    with locked(root) as is_locked:
+        if is_locked:
             finish_journal(root)
         report = look(root, like)
         if not report.survey.damage:

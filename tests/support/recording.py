@@ -45,7 +45,7 @@ def assert_recorded(root: Path, numbers: Sequence[int], features: dict[str, Any]
     known = {key: feature for key, feature in features.items() if key != FILM + "2"}
     assert not differences(dataset, dict(enumerate(numbers)), known)
     assert int(dataset.meta.stats["action"]["count"][0]) == dataset.num_frames
-    assert survey(root).is_sound
+    assert survey(root).is_undamaged
 
 
 def edit_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
