@@ -64,8 +64,8 @@ class Player:
         self.policy.reset()
         while not is_over:
             picture = np.zeros((self.height, self.width, 3), np.uint8)
-            sound = heard
-            picture[:rows] = spectrogram.draw(len(sound), lambda first, end, sound=sound: sound[first:end])[:, :, None]
+            grey = spectrogram.draw(len(heard), lambda first, end, heard=heard: heard[first:end])
+            picture[:rows] = grey[:, :, None]
             batch = {
                 "observation.state": torch.from_numpy(observation["agent_pos"]).float()[None],
                 "observation.images.front": as_batch(observation["pixels"]["front"]),

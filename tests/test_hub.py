@@ -365,7 +365,7 @@ def test_no_link_of_a_checkpoint_or_a_run_is_followed(tmp_path):
 
 def test_a_line_of_figures_that_was_cut_off_costs_no_upload(trained, tmp_path):
     run = shutil.copytree(trained.parents[2], tmp_path / "run")
-    lines = ['{"kind": "tr', '{"kind": "eval", "step": 2, "pc_success": 90.0}', '{"kind": "eval", "st']
+    lines = ['{"kind": "tr', '{"kind": "eval", "step": 2, "pc_success": 90.0}', "7", '{"kind": "eval", "st']
     (run / "metrics.jsonl").write_text("\n".join(lines))
     figures = evaluation_of(run / "checkpoints/000002/pretrained_model")
     assert figures == {"kind": "eval", "step": 2, "pc_success": 90.0}

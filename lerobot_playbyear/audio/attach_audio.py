@@ -242,12 +242,13 @@ def open_for_copy(place: DatasetPlace, may_have_audio_files: bool = False) -> Da
 
         check_links(dataset.root)  # the copy would hold what they lead to
         check_tables(dataset.root)  # LeRobot looks at no checksum
+        rows = dataset.meta.episodes
+        said = list(zip(rows["episode_index"], rows["length"], strict=True))
     except ParquetDamageError as error:
         raise AttachError(f"{error} Repair it first: playbyear-repair --root={dataset.root}") from error
     except Exception as error:  # also what the Hub's client raises
         raise AttachError(f"The dataset '{place.repo_id}' in {place.folder} cannot be opened: {error}") from error
-    rows, held = dataset.meta.episodes, [(episode.index, len(episode)) for episode in dataset.episodes]
-    said = list(zip(rows["episode_index"], rows["length"], strict=True))
+    held = [(episode.index, len(episode)) for episode in dataset.episodes]
     if held != said or [number for number, _ in said] != list(range(len(said))):
         raise AttachError(
             f"The data files do not hold episodes 0 to {len(said) - 1} in this order, as long as meta/episodes says. Repair "

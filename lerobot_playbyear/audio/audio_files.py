@@ -161,9 +161,13 @@ def _resample_odd_rates(waveform: np.ndarray, sample_rate: int, new_sample_rate:
     n_samples = -(-waveform.shape[1] * new_sample_rate // sample_rate)
     layout = f"{len(waveform)}c"
     resampler = av.AudioResampler(format="fltp", layout=layout, rate=new_sample_rate)
-    sound = av.AudioFrame.from_ndarray(np.ascontiguousarray(waveform), format="fltp", layout=layout)
-    sound.sample_rate = sample_rate
-    frames = [*resampler.resample(sound), *resampler.resample(None)]
+    frames: list[av.AudioFrame] = []
+    for first in range(0, waveform.shape[1], sample_rate):  # a frame of FFmpeg holds less than 2 GiB
+        piece = np.ascontiguousarray(waveform[:, first : first + sample_rate])
+        frame = av.AudioFrame.from_ndarray(piece, format="fltp", layout=layout)
+        frame.sample_rate, frame.pts = sample_rate, first
+        frames += resampler.resample(frame)
+    frames += resampler.resample(None)
     found = np.concatenate([frame.to_ndarray() for frame in frames], axis=1)[:, :n_samples]
     return np.pad(found, ((0, 0), (0, n_samples - found.shape[1])))
 

@@ -363,7 +363,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     lines = path.read_text().splitlines() if path.is_file() else []
     figures: list[dict[str, Any]] = []
     for line in lines:
-        with contextlib.suppress(ValueError):
+        with contextlib.suppress(ValueError, TypeError):
             figures.append(dict(json.loads(line)))
     return figures
 
