@@ -305,28 +305,6 @@ def test_a_dataset_without_sound_or_cameras_says_so(tmp_path):
     assert messages["pictures"] == "no camera"
 
 
-# Sound and motion
-
-
-def test_sound_that_was_recorded_too_early_shows_as_a_lag(tmp_path):
-    """Here in the first half of the episodes; that of the others comes with its motion."""
-    episodes, shift = clean_episodes(12), -6
-    for arrays in episodes[:6]:
-        arrays[MICROPHONE] = np.roll(arrays[MICROPHONE], shift, axis=0)
-    root = write(tmp_path / "dataset", episodes)
-
-    def told(first: int) -> dict[str, Any]:
-        dataset = InspectDatasetConfig("tests/inspected", str(root), list(range(first, first + 6)))
-        (verdict,) = [each for each in inspect(InspectConfig(dataset)) if each.check == "sound and motion"]
-        return verdict.figures
-
-    early, in_time = told(0), told(6)
-    assert (in_time["sudden_sounds"], in_time["coincide"]) == (early["sudden_sounds"], 1) == (6, 1)
-    assert in_time["by_chance"] < 0.5
-    assert early["coincide"] == 0
-    assert early["best_lag_s"] == pytest.approx(shift / FPS, abs=2 / FPS)
-
-
 # The detectors, on sound that is hard to judge
 
 

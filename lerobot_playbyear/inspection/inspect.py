@@ -15,7 +15,7 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.info import OutsideError, check_links_out
 from lerobot_playbyear.datasets.reader import DatasetPlace, SurveyedDataset
-from lerobot_playbyear.inspection.motion import check_actions, check_alignment, check_interventions, check_success
+from lerobot_playbyear.inspection.motion import check_actions, check_interventions, check_success
 from lerobot_playbyear.inspection.pictures import PictureChecks
 from lerobot_playbyear.inspection.sound import check_sound
 from lerobot_playbyear.inspection.structure import (
@@ -114,7 +114,6 @@ def check_numbers(dataset: SurveyedDataset, action_range: Sequence[float] | None
         *check_success(dataset),
         *check_sample_rates(dataset),
         *check_sound(dataset),
-        *check_alignment(dataset),
     ]
 
 

@@ -1,15 +1,7 @@
-"""Checks of what was done and what it sounded like: actions, interventions, success; sudden sounds beside motion.
+"""Checks of what was done and what it sounded like: actions, interventions, success; how much later sound comes than pictures.
 
 Sudden sounds. A sudden sound is a moment at which the level of 5 ms of sound rises more than 12 dB above its median in the
 episode, after 50 ms in which it did not. (Training's onsets, `policy/auxiliary.py`, are steps of the policy's spectrogram.)
-
-Sound and motion. A change of motion is a frame in which the second difference of `observation.state` (or the first of
-`action`, in a dataset without a state) is, in any dimension measured in that dimension's standard deviation, among the
-largest tenth of the dataset. It and a sudden sound coincide when they are at most one frame apart. Chance is the share of
-frames that are so close to a change of motion. The same count with the sound moved by up to half a second says where the
-two fit best. Contact is one reason for both, so in most datasets they coincide more often than chance would have it; a
-command that is heard later (a hand that takes time to close) shows as a lag. It is information: whether the motion must be
-heard is the task's business.
 
 Sound and picture. A contact is heard as a sudden sound, and seen as a motion that ends: the difference of a picture from
 the one before, which stood out, no longer does. A picture shows that something moved since the one before, not when, so
@@ -36,9 +28,6 @@ STEP_S = 0.005
 
 _RISE_DB = 12.0
 _QUIET_BEFORE_S = 0.05
-_LARGEST = 0.1  # share of the frames that count as changes of motion
-_SEARCH_S = 0.5
-_MIN_ONSETS = 5
 _POWER_FLOOR = 1e-12
 
 _FEWEST = 5  # contacts
@@ -134,14 +123,6 @@ def first_success(dataset: SurveyedDataset, episode: EpisodeRows) -> int | None:
     return int(frames[0]) if len(frames) else -1
 
 
-def motion_of_arm(dataset: SurveyedDataset) -> tuple[str | None, np.ndarray]:
-    """What says how the arm moved, the state or else the action, and its values (N, D); None where there is neither."""
-    key = next((key for key in ("observation.state", _ACTION) if key in dataset.numbers), None)
-    if key is None:
-        return None, np.zeros((len(dataset), 0))
-    return key, np.nan_to_num(dataset.values(key).reshape(len(dataset), -1).astype(np.float64))
-
-
 def block_levels(samples: np.ndarray, size: int) -> np.ndarray:
     """Level of every `size` samples (n,), without the mean of all, (n // size,) [dBFS]; -120 for nothing at all."""
     blocks = (samples - samples.mean(dtype=np.float64).astype(np.float32))[: len(samples) // size * size]
@@ -164,73 +145,6 @@ def sudden_sounds(samples: np.ndarray, sample_rate: float) -> np.ndarray:
     quiet_steps = round(_QUIET_BEFORE_S / STEP_S)
     recent = np.convolve(loud, np.ones(quiet_steps + 1))[: len(loud)] - loud  # loud steps just before
     return np.flatnonzero(loud & (recent == 0)) * step / sample_rate
-
-
-def check_alignment(dataset: SurveyedDataset) -> Iterator[Finding]:
-    """How often sudden sounds and changes of motion coincide, for each microphone."""
-    motion_key, values = motion_of_arm(dataset)
-    if motion_key is None:
-        return
-    motion = _motion_changes(dataset, values, order=1 if motion_key == _ACTION else 2)
-    for key in dataset.timed_microphones:
-        onsets = [_onset_frames(dataset, key, episode) for episode in dataset.episodes]
-        n_onsets = sum(len(frames) for frames in onsets)
-        if n_onsets < _MIN_ONSETS:
-            message = f"{n_onsets} sudden sounds: too few to compare them with the arm's motion"
-            yield Finding("sound and motion", "info", message, key, figures={"sudden_sounds": n_onsets})
-            continue
-        search = round(_SEARCH_S * dataset.fps)
-        shares = {shift: _coincidence(onsets, motion, shift) for shift in range(-search, search + 1)}
-        chance = float(np.mean([_near(changes).mean() for changes in motion]))
-        best = max(shares, key=lambda shift: (shares[shift], -abs(shift)))
-        message = f"{n_onsets} sudden sounds; {shares[0]:.0%} come within a frame of a change of motion ({motion_key})"
-        message += f", by chance {chance:.0%} would"
-        if best != 0 and shares[best] > shares[0]:
-            moment = "after" if best > 0 else "before"
-            message += f"; {shares[best]:.0%} come {abs(best) / dataset.fps:.3g} s {moment} one"
-        lag_s = best / dataset.fps
-        figures = {"sudden_sounds": n_onsets, "coincide": shares[0], "by_chance": chance, "best_lag_s": lag_s}
-        yield Finding("sound and motion", "info", message, key, figures=figures)
-
-
-def _onset_frames(dataset: SurveyedDataset, key: str, episode: EpisodeRows) -> np.ndarray:
-    """The frames, from the episode's start, at which a sudden sound had been heard."""
-    times = sudden_sounds(heard(dataset, key, episode), dataset.features[key]["shape"][0] * dataset.fps)
-    # Row i ends with picture i, so a sound inside row i is seen, at the earliest, in picture i.
-    return np.minimum((times * dataset.fps).astype(int), len(episode) - 1)
-
-
-def _motion_changes(dataset: SurveyedDataset, values: np.ndarray, order: int) -> list[np.ndarray]:
-    """For every episode the frames of large changes, (n,) bool."""
-    changes = []
-    for episode in dataset.episodes:
-        change = np.zeros((len(episode), values.shape[1]))
-        if len(episode) > 2:
-            change[1 : len(episode) - order + 1] = np.abs(np.diff(values[episode.rows], n=order, axis=0))
-        changes.append(change)
-    scale = np.concatenate(changes).std(axis=0) + 1e-12
-    sizes = [(change / scale).max(axis=1) for change in changes]
-    threshold = np.quantile(np.concatenate(sizes), 1 - _LARGEST)
-    return [size > threshold for size in sizes]
-
-
-def _coincidence(onsets: list[np.ndarray], motion: list[np.ndarray], shift: int) -> float:
-    """Share of the sounds that, moved `shift` frames earlier, come within a frame of a change of motion."""
-    hits = n = 0
-    for frames, changes in zip(onsets, motion, strict=True):
-        moved = frames - shift
-        inside = moved[(moved >= 0) & (moved < len(changes))]
-        hits += int(_near(changes)[inside].sum())
-        n += len(frames)
-    return hits / n
-
-
-def _near(changes: np.ndarray) -> np.ndarray:
-    """Frames at most one frame from a True one, (n,) bool."""
-    near = changes.copy()
-    near[1:] |= changes[:-1]
-    near[:-1] |= changes[1:]
-    return near
 
 
 def difference(picture: np.ndarray, before: np.ndarray) -> float:

@@ -8,7 +8,7 @@ from PIL import Image
 
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
-from lerobot_playbyear.inspection.motion import check_delay, difference, motion_of_arm
+from lerobot_playbyear.inspection.motion import check_delay, difference
 
 _BLANK_SPREAD = 2.0  # grey levels, standard deviation within a picture
 _LEVELS = np.arange(256.0)
@@ -123,9 +123,10 @@ def _moving_frames(dataset: SurveyedDataset) -> np.ndarray:
 
     Without a state the action tells; without either, all frames.
     """
-    key, values = motion_of_arm(dataset)
+    key = next((key for key in ("observation.state", "action") if key in dataset.numbers), None)
     if key is None:
         return np.ones(len(dataset), bool)
+    values = np.nan_to_num(dataset.values(key).reshape(len(dataset), -1).astype(np.float64))  # (N, D)
     change = np.abs(np.diff(values, axis=0, prepend=values[:1])) / (values.std(axis=0) + 1e-12)
     size = change.max(axis=1)  # (N,)
     moving = size > np.median(size)

@@ -1,11 +1,7 @@
 """Batch norm, and means, over the processes of one training: several of them learn what one with all their data would."""
 
-from typing import Any
-
 import torch
 from torch import Tensor, distributed, nn
-from torch.autograd.function import FunctionCtx
-from torch.nn import functional
 
 
 def n_processes() -> int:
@@ -53,51 +49,14 @@ class SharedBatchNorm2d(nn.BatchNorm2d):
         assert self.running_var is not None
         assert self.num_batches_tracked is not None
         assert self.momentum is not None
-        output, mean, variance = _Normalised.apply(input, self.weight, self.bias, self.eps)
+        values = input.float()
+        mean = mean_over_processes(values.mean(dim=(0, 2, 3)))
+        centred = values - mean[:, None, None]
+        variance = mean_over_processes(centred.square().mean(dim=(0, 2, 3)))
         with torch.no_grad():
             n_values = n_processes() * input.numel() // input.shape[1]
             self.num_batches_tracked += 1
             self.running_mean.lerp_(mean, self.momentum)
             self.running_var.lerp_(variance * n_values / (n_values - 1), self.momentum)
-        return output
-
-
-class _Normalised(torch.autograd.Function):
-    """Batch norm of all processes: torch's own passes over the values, and one exchange of statistics each way."""
-
-    @staticmethod
-    def forward(
-        ctx: FunctionCtx, input: Tensor, weight: Tensor, bias: Tensor, eps: float
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        means, variances = _gathered(torch.batch_norm_update_stats(input.float(), None, None, 0.0))  # each (W, C)
-        mean = means.mean(dim=0)
-        variance = (variances + (means - mean).square()).mean(dim=0)
-        ctx.save_for_backward(input, weight, mean, variance)
-        ctx.eps = eps  # type: ignore[attr-defined]
-        ctx.mark_non_differentiable(mean, variance)
-        return functional.batch_norm(input, mean, variance, weight, bias, eps=eps), mean, variance
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
-        input, weight, mean, variance = ctx.saved_tensors
-        _, of_weight, of_bias = torch.ops.aten.native_batch_norm_backward(
-            gradients[0], input, weight, mean, variance, None, None, False, ctx.eps, [False, True, True]
-        )
-        per_value = torch.stack([of_weight, of_bias])
-        distributed.all_reduce(per_value)
-        through_deviation, through_mean = per_value * (input.shape[1] / (n_processes() * input.numel()))
-        slope = weight * torch.rsqrt(variance + ctx.eps)
-        # What mean and variance owe to the values is a batch norm of them; what the values owe to themselves comes on top.
-        of_input = functional.batch_norm(
-            input, mean, variance, -slope * through_deviation, -slope * through_mean, eps=ctx.eps
-        )
-        of_input.addcmul_(gradients[0], slope[:, None, None].to(of_input.dtype))
-        return of_input, of_weight, of_bias, None
-
-
-def _gathered(values: tuple[Tensor, ...]) -> Tensor:
-    """Tensors of one shape, of all processes: (len(values), processes, *shape)."""
-    own = torch.stack(values)
-    everyones = [torch.empty_like(own) for _ in range(n_processes())]
-    distributed.all_gather(everyones, own)
-    return torch.stack(everyones, dim=1)
+        scale = self.weight * torch.rsqrt(variance + self.eps)
+        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(input.dtype)
