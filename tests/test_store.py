@@ -162,12 +162,15 @@ def test_a_store_that_was_killed_at_random_times_is_whole(tmp_path, n_kills):
     began = time.monotonic()
     os.waitpid(filled(root, tmp_path / "undisturbed"), 0)
     took, n_hit = time.monotonic() - began, 0
-    for _ in range(n_kills):
+    while n_hit < n_kills:
         child = filled(root, cache)
         time.sleep(draw.uniform(0.1, 0.6) * took)
         os.kill(child, signal.SIGKILL)
-        n_hit += os.WIFSIGNALED(os.waitpid(child, 0)[1])
-    assert n_hit > 0
+        if os.WIFSIGNALED(os.waitpid(child, 0)[1]):
+            n_hit += 1
+        else:  # it was done before: the first run had been slowed down
+            shutil.rmtree(cache)
+            took /= 2
     assert_same(load(root, cache, image_size=24), in_memory(root, image_size=24))
     assert not list(cache.glob("*/*.part"))
 
