@@ -1,7 +1,6 @@
 """The store hands out what LeRobot's loader would, from memory as from the disk; and runs are drawn as promised."""
 
 import errno
-import itertools
 import logging
 import os
 import random
@@ -17,6 +16,7 @@ import pytest
 import torch
 from dataset_factory import CAMERA, MICROPHONE, TASK, audio_feature, dataset_features, make_dataset
 from lerobot.datasets import LeRobotDataset
+from support.failing import fail_once
 from torch.utils.data import default_collate
 
 from lerobot_playbyear.datasets.pictures import shrink
@@ -237,15 +237,8 @@ def test_too_little_room_is_told_before_anything_is_decoded(noise, tmp_path, mon
 
 
 def test_a_disk_that_fills_up_costs_no_column_that_was_complete(noise, tmp_path, monkeypatch):
-    fsync, calls = os.fsync, itertools.count()
-
-    def full(descriptor):
-        if next(calls) == 6:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        fsync(descriptor)
-
     with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
+        fail_once(patch, os, "fsync", 6, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
         with pytest.raises(CacheError, match="became full"):
             load(noise, tmp_path)
     assert list(folders(tmp_path)[0].glob("*.npy"))
