@@ -187,8 +187,7 @@ def needs(module: str, extra: str) -> pytest.MarkDecorator:
 @needs("rerun", "viz")
 def test_an_episode_is_saved_for_reruns_viewer(recorded, commands, tmp_path):
     where = ("--repo-id=tests/demos", f"--root={recorded}", "--episode-index=1", "--num-workers=0")
-    result = commands.run("lerobot-dataset-viz", *where, "--save=1", f"--output-dir={tmp_path}")
-    assert result.status == 0, result.output[-3000:]
+    commands.succeed("lerobot-dataset-viz", *where, "--save=1", f"--output-dir={tmp_path}")
     saved = (tmp_path / "tests_demos_episode_1.rrd").read_bytes()
     assert saved.startswith(b"RRF")
     assert b"observation.images.front" in saved

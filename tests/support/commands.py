@@ -106,6 +106,12 @@ class Commands:
         done.set()
         return Result(status, self._output.read_text())
 
+    def succeed(self, *arguments: str | Path, **how: Any) -> Result:
+        """Run a command that has to end well."""
+        result = self.run(*arguments, **how)
+        assert result.status == 0, result.output[-3000:]
+        return result
+
     def snapshot(self, repo_id: str) -> Path:
         """Where LeRobot has put a dataset that it fetched."""
         (folder,) = (self._home / "lerobot" / "hub" / f"datasets--{repo_id.replace('/', '--')}" / "snapshots").iterdir()
@@ -115,18 +121,17 @@ class Commands:
         self._process.communicate()
 
 
+def python(code: str, *arguments: str, environment: Mapping[str, str] = os.environ) -> str:
+    """What a program prints that is a process of its own."""
+    command, own = [sys.executable, "-c", code, *arguments], dict(environment)
+    result = subprocess.run(command, capture_output=True, text=True, env=own, check=False)
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout
+
+
 def run_without(blocked: set[str], code: str) -> str:
     """What a program prints in a process in which some packages cannot be imported."""
-    script = _BLOCKER.format(blocked=blocked) + code
-    result = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "MUJOCO_GL": "egl"},
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    return result.stdout
+    return python(_BLOCKER.format(blocked=blocked) + code, environment={**os.environ, "MUJOCO_GL": "egl"})
 
 
 def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
