@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import torch
-from dagger_factory import SMALL, command
+from dagger_factory import dagger
 from dataset_factory import TASK, dataset_features, random_frame
 from lerobot.configs import parser
 from lerobot.configs.types import FeatureType, PolicyFeature
@@ -51,19 +51,6 @@ def base(tmp_path_factory):
     return folder
 
 
-def dagger(base, folder, *options, policy=None):
-    return command(
-        f"--policy.path={policy or base / 'policy'}",
-        "--demos.repo_id=tests/reach",
-        f"--demos.root={base / 'demos'}",
-        "--interventions.repo_id=tests/corrections",
-        f"--interventions.root={folder / 'corrections'}",
-        f"--output_dir={folder / 'out'}",
-        *SMALL,
-        *options,
-    )
-
-
 def warnings(capfd):
     return [line for line in "\n".join(capfd.readouterr()).splitlines() if "out of the policy's reach" in line]
 
@@ -106,9 +93,9 @@ def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wide
     actions[:10] = 0.9  # the policy's own: not learned
     actions[10:15, 1] = 0.14
     write(tmp_path / "corrections", actions, by_expert)
-    offline = ("--episodes=0", "--updates=1")
+    offline = ("--episodes=0", "--updates=1", "--demos.repo_id=tests/reach", f"--demos.root={base / 'demos'}")
 
-    dagger(base, tmp_path, *offline)
+    dagger(tmp_path, *offline, f"--policy.path={base / 'policy'}", env=())
     (message,) = warnings(capfd)
     assert "the corrections" in message
     assert "'lift' in 50.0 % of 10 frames" in message
@@ -120,5 +107,5 @@ def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wide
     run_in_process(train, *wider, *data, *once, f"--output_dir={tmp_path / 'wide'}")
     policy = tmp_path / "wide/checkpoints/last/pretrained_model"
     assert json.loads((policy / "config.json").read_text())["action_range"] == 1.6
-    dagger(base, tmp_path, *offline, f"--output_dir={tmp_path / 'out_wide'}", policy=policy)
+    dagger(tmp_path, *offline, f"--policy.path={policy}", f"--output_dir={tmp_path / 'out_wide'}", env=())
     assert warnings(capfd) == []

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from recording_factory import load
 from support.recording import edit_column, edit_info, everything
-from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, load
+from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach
 
 from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
@@ -117,8 +117,7 @@ def test_files_become_columns_with_the_same_samples(with_files, silent, tmp_path
             np.testing.assert_array_equal(waveform, blocks_of(heard(episode, n_channels), length)[:, channel])
     assert survey(root).is_undamaged
     assert everything(with_files) == before
-    old = LeRobotDataset("test/silent", root=silent, video_backend="pyav")
-    for key, value in old[20].items():
+    for key, value in load(silent)[20].items():
         assert np.array_equal(np.asarray(dataset[20][key]), np.asarray(value)), key
     assert not (root / "audio").exists()
     assert not [name for name in episodes_of(root)[0] if name.startswith("audio/")]

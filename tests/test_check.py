@@ -211,16 +211,3 @@ def test_a_check_that_was_stopped_goes_on_with_the_next_player_and_says_so(tmp_p
 def test_processes_side_by_side_find_what_one_finds():
     options = {"first_seed": 1000, "names": ["middle", "nudge"], "twin": True}
     assert check(GRASP, 6, jobs=2, **options) == check(GRASP, 6, **options)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"names": ["tap_dance"]}, "player='tap_dance' is not known: choose from 'expert', 'middle'"),
-        ({"learned": [{"name": "rl", "task": PICK_PLACE}]}, "'rl' is no learner's result on 'OccludedGrasp-v1'"),
-    ],
-)
-def test_what_cannot_be_checked_is_refused_before_anybody_plays(options, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        check(GRASP, 1, progress=tmp_path / "check.partial", **options)
-    assert not list(tmp_path.iterdir())

@@ -18,6 +18,7 @@ from lerobot.datasets import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from support.shared import ENV, TINY
 
+from gym_playbyear.check.report import check
 from gym_playbyear.environment import TaskEnv
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -207,6 +208,8 @@ reset | OccludedGrasp-v1, {cube_position: [0, 0.9]} | cube_position= | on the ta
 reset | OccludedPickPlace-v1, {bin_position: 0.1} | bin_position= | give x and y
 reset | TellApart-v1, {pouch_position: [.nan, 0]} | pouch_position
 reset | TellApart-v1, {contents: gravel} | contents='gravel' is not known: choose one of screws, peanuts
+check | names: [tap_dance] | player='tap_dance' is not known: choose from 'expert', 'middle'
+check | learned: [{name: rl, task: KeyBag-Easy-v1}] | 'rl' is no learner's result on 'OccludedGrasp-v1'
 # Features of a microphone that is recorded, of 80 samples at 1600 Hz and 20 frames per second
 feature | info: {} | does not say its sample rate
 feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz
@@ -239,6 +242,7 @@ ACTION = {"dtype": "float32", "shape": [4], "names": None}
 FUNCTIONS: dict[str, Callable] = {
     "policy": PlaybyearConfig,
     "task": lambda **options: TaskEnv("OccludedGrasp-v1", **options),
+    "check": lambda **options: check("OccludedGrasp-v1", 1, progress=Path("never"), **options),
     "reset": reset,
     "feature": lambda **changes: record({MICROPHONE: tuples(SOUND | changes), "action": tuples(ACTION)}),
     "action": lambda **changes: record({"action": tuples(ACTION | changes)}),

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dataset_factory import make_dataset
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from recording_factory import load
 
 from lerobot_playbyear.audio import read_audio
 from lerobot_playbyear.datasets import episode_waveform
@@ -30,10 +30,6 @@ def run(monkeypatch):
         runpy.run_path(str(EXAMPLES / name), run_name="__main__")
 
     return call
-
-
-def load(root: Path) -> LeRobotDataset:
-    return LeRobotDataset("me/example", root=root, video_backend="pyav")
 
 
 @pytest.mark.timeout(300)  # LeRobot is imported, records, trains and evaluates: a minute and a half on a busy machine

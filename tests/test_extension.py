@@ -36,7 +36,7 @@ def installed(tmp_path_factory):
         yield
 
 
-@pytest.mark.parametrize("example", ["extension", "own_microphone"])
+@pytest.mark.parametrize("example", ["extension", "own_microphone", "own_task"])
 def test_the_examples_are_short(example):
     assert longest_file(example) < 100
 
