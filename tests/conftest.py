@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from support import shared
 from support.commands import Commands, speed_up
-from support.hub import HubServer
+from support.hub import HubServer, come_here, nothing_fails
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -76,6 +76,22 @@ def hub_server():
     """The Hub that `commands` speak to, on loopback."""
     with HubServer() as server:
         yield server
+
+
+@pytest.fixture
+def hub(hub_server):
+    """The Hub, to which nothing has come yet in this test, and where nothing fails."""
+    hub_server.arrivals.clear()
+    hub_server.requests.clear()
+    yield hub_server
+    hub_server.fault = nothing_fails
+
+
+@pytest.fixture
+def here(hub, monkeypatch):
+    """The same for this process."""
+    come_here(monkeypatch, hub)
+    return hub
 
 
 @pytest.fixture(scope="session")

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 from dagger_factory import dagger
-from dataset_factory import TASK, dataset_features, random_frame
+from dataset_factory import dataset_features, make_dataset
 from lerobot.configs import parser
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from support.shared import TINY, run_in_process
 
@@ -28,14 +27,12 @@ BLIND_AND_DEAF = ("--policy.use_vision=false", "--policy.use_audio=false", "--st
 
 def write(root, actions, by_expert=None):
     """A dataset of one episode with these actions (T, 4)."""
-    dataset = LeRobotDataset.create("tests/reach", 20, FEATURES, root=root, use_videos=False)
-    rng = np.random.default_rng(0)
-    for t, action in enumerate(np.asarray(actions, np.float32)):
-        frame = {**random_frame(FEATURES, rng), "action": action, "task": TASK}
-        frame["intervention"] = np.array([by_expert is None or bool(by_expert[t])])
-        dataset.add_frame(frame)
-    dataset.save_episode()
-    dataset.finalize()
+
+    def frame_of(episode, step, frame):
+        is_corrected = np.array([by_expert is None or bool(by_expert[step])])
+        return {**frame, "action": np.asarray(actions[step], np.float32), "intervention": is_corrected}
+
+    make_dataset(root, (len(actions),), features=FEATURES, repo_id="tests/reach", frame_of=frame_of)
 
 
 @pytest.fixture(scope="module")

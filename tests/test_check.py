@@ -2,7 +2,6 @@
 
 import gc
 import json
-import sys
 import types
 from dataclasses import replace
 
@@ -10,6 +9,7 @@ import gymnasium as gym
 import mujoco
 import numpy as np
 import pytest
+from support.shared import run_in_process
 
 from gym_playbyear.check.__main__ import main
 from gym_playbyear.check.deaf import DeafTask
@@ -161,11 +161,10 @@ def test_the_check_holds_a_good_task_to_be_good_and_judges_a_learner():
     assert "every observation but sound is the same" in as_text(report)
 
 
-def test_the_check_says_who_breaks_a_limit_and_its_exit_status_is_1(tmp_path, monkeypatch, capsys):
+def test_the_check_says_who_breaks_a_limit_and_its_exit_status_is_1(tmp_path, capsys):
     """Without the time to grasp the expert fails."""
     options = [GRASP, "--episodes=2", "--seed=1000", "--no-twin", "--players", "expert", "tap_fast", "--horizon=20"]
-    monkeypatch.setattr(sys, "argv", ["check", *options, f"--output={tmp_path / 'deep' / 'check.json'}"])
-    assert main() == 1
+    assert run_in_process(main, *options, f"--output={tmp_path / 'deep' / 'check.json'}") == 1
     assert "broken: expert (expert) solves 0 %, at least 95 % was promised" in capsys.readouterr().out
     rows = json.loads((tmp_path / "deep" / "check.json").read_text())["rows"]
     assert [(row["name"], row["kind"]) for row in rows] == [("expert", "expert"), ("tap_fast", "deaf")]

@@ -17,6 +17,7 @@ from dataset_factory import MICROPHONE, dataset_features, make_dataset, rollout_
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from support.shared import ENV, TINY
+from test_attach_audio import write_sounds
 
 from gym_playbyear.check.report import check
 from gym_playbyear.environment import TaskEnv
@@ -273,18 +274,16 @@ def truncated(root: Path) -> None:
 
 def sounds(folder: Path) -> None:
     """Of `silent`: a file for each episode, at two rates, and one of the session with times of its episodes."""
-    for episode, length in enumerate((12, 17)):
-        for rate, place in ((16000, folder), (11025, folder / "odd")):
-            write_audio(place / f"{episode:03d}.wav", np.ones((round((0.25 + length / 20) * rate), 1), np.int16), rate)
+    for rate, place in ((16000, folder), (11025, folder / "odd")):
+        write_sounds(place, rate)
     write_audio(folder / "day.wav", np.zeros((16000 * 5, 1), np.int16), 16000)
-    (folder / "starts.csv").write_text("0,1\n1,2\n")
+    (folder / "starts.csv").write_text("0,1\n1,2\n2,3\n")
 
 
 MAKERS: dict[str, Callable[[Path], object]] = {
     "full": lambda folder: (folder.mkdir(), (folder / "thesis.tex").touch()),
     "file": Path.touch,
     "folder_mp4": Path.mkdir,
-    "silent": lambda root: make_dataset(root, (12, 17), features=without(MICROPHONE)),
     "slow": with_noise(fps=10),
     "48_kHz": with_noise(sample_rate=48000),
     "six_joints": with_noise(state_size=6),
@@ -309,8 +308,9 @@ class Places(dict):
 
 
 @pytest.fixture(scope="module")
-def places(noise, recorded, trained, finished, tmp_path_factory):
-    return Places(made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained, finished=finished)
+def places(noise, silent, recorded, trained, finished, tmp_path_factory):
+    made = {"noise": noise, "silent": silent, "demos": recorded, "policy": trained, "finished": finished}
+    return Places(made, made=tmp_path_factory.mktemp("made"))
 
 
 def rows_of(table: str) -> list:

@@ -4,7 +4,6 @@ nothing is counted that is not on the disk. All else that is wrong is said, with
 import contextlib
 import errno
 import itertools
-import json
 import os
 import shutil
 import subprocess
@@ -17,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 from recording_factory import FEATURES, FILM, REPO_ID, RICH_FEATURES, differences, episode_frames, load
 from support.failing import fail_once
-from support.recording import add_episode, assert_recorded, everything, write, write_episode, writer
+from support.recording import add_episode, assert_recorded, edit_info, everything, write, write_episode, writer
 
 from lerobot_playbyear.datasets import durable, episode_files, files
 from lerobot_playbyear.datasets.durable import DatasetWriteError, has_dataset
@@ -250,12 +249,8 @@ def cut(path: Path) -> None:
 
 def lead_away(name: str) -> Any:
     """A path that leads out of the dataset and back in again: it can be read, and would be written to elsewhere."""
-
-    def change(path: Path) -> None:
-        template = "../dataset/data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-        path.write_text(json.dumps({**json.loads(path.read_text()), name: template}))
-
-    return change
+    template = "../dataset/data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    return lambda path: edit_info(path.parents[1], lambda info: info.update({name: template}))
 
 
 @pytest.mark.parametrize(

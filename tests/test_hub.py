@@ -14,7 +14,6 @@ from support.hub import (
     File,
     HubServer,
     Repository,
-    come_here,
     every_second,
     git_oid,
     nothing_fails,
@@ -28,15 +27,6 @@ from lerobot_playbyear.hub.push import HubError, PushOptions, evaluation_of, pus
 
 DATASET = "tester/grasp"
 POLICY = "tester/hearing"
-
-
-@pytest.fixture
-def hub(hub_server):
-    """The server, to which nothing has come yet in this test, and where nothing fails."""
-    hub_server.arrivals.clear()
-    hub_server.requests.clear()
-    yield hub_server
-    hub_server.fault = nothing_fails
 
 
 @pytest.fixture(scope="module")
@@ -281,13 +271,6 @@ def test_checkpoints_go_up_once_although_answers_are_lost(pushed, hub, commands,
 def dataset(noise, tmp_path):
     shutil.copytree(noise, tmp_path / "set")
     return tmp_path / "set"
-
-
-@pytest.fixture
-def here(hub, monkeypatch):
-    """The Hub on loopback, for this process."""
-    come_here(monkeypatch, hub)
-    return hub
 
 
 @pytest.fixture

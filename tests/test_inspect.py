@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from support.recording import edit_column, edit_info
+from support.shared import run_in_process
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.features import audio_feature
@@ -205,12 +205,12 @@ def test_many_faults_are_errors_where_few_are_warnings(tmp_path):
 
 @pytest.mark.parametrize(("rate", "known", "said"), [(48000, 48000, "it must be (2400,)"), (float("nan"), None, "nan")])
 def test_a_sample_rate_that_does_not_fit_or_is_no_number_is_an_error_and_all_else_is_checked(
-    root, tmp_path, monkeypatch, capsys, rate, known, said
+    root, tmp_path, capsys, rate, known, said
 ):
     """What is printed and the page are valid JSON, whatever the dataset says."""
     page = tmp_path / "page.html"
     edit_info(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate=rate))
-    assert run(monkeypatch, f"--dataset.root={root}", f"--html={page}", "--json") == 1
+    assert run(f"--dataset.root={root}", f"--html={page}", "--json") == 1
     printed = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert printed["dataset"]["microphones"] == {MICROPHONE: known}
     checks = {verdict["check"]: verdict for verdict in printed["verdicts"]}
@@ -222,7 +222,7 @@ def test_a_sample_rate_that_does_not_fit_or_is_no_number_is_an_error_and_all_els
     assert json.loads(data, parse_constant=pytest.fail)["facts"]["microphones"] == {MICROPHONE: known}
 
 
-def test_statistics_of_other_data_are_an_error(root, tmp_path):
+def test_statistics_of_other_data_are_an_error(root):
     edit_info(root, lambda stats: stats["action"].update(mean=[0.5, 0.5]), "stats.json")
     verdict = found(look(root))["statistics"]
     assert verdict.level == "error"
@@ -237,7 +237,7 @@ def change(root: Path, key: str, row: int, value: Any) -> None:
     edit_column(path, key, lambda values: [*values[:row], put(values[row]), *values[row + 1 :]])
 
 
-def test_frames_that_the_metadata_does_not_know_of_are_an_error(root, tmp_path):
+def test_frames_that_the_metadata_does_not_know_of_are_an_error(root):
     (path,) = root.glob("data/*/*.parquet")
     table = pq.read_table(path)
     pq.write_table(table.filter(pc.not_equal(table["index"], LENGTH + 7)), path)
@@ -378,17 +378,14 @@ def test_silence_before_and_after_the_sound_is_no_gap():
 # The command
 
 
-def run(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["playbyear-inspect", "--dataset.repo_id=tests/inspected", *arguments])
-    with pytest.raises(SystemExit) as exit_:
-        main()
-    return int(exit_.value.code or 0)
+def run(*arguments: str) -> int:
+    return int(run_in_process(main, "--dataset.repo_id=tests/inspected", *arguments) or 0)
 
 
-def test_the_commands_status_says_whether_there_is_an_error(clean, monkeypatch, capsys):
-    assert run(monkeypatch, f"--dataset.root={clean}", "--json", "--dataset.episodes=[1]") == 0
+def test_the_commands_status_says_whether_there_is_an_error(clean, capsys):
+    assert run(f"--dataset.root={clean}", "--json", "--dataset.episodes=[1]") == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["worst"] in ("ok", "info")
     assert {"check", "level", "message", "feature", "episodes", "figures"} == set(printed["verdicts"][0])
-    assert run(monkeypatch, f"--dataset.root={clean}", "--action_range=[-0.5, 0.5]") == 1
+    assert run(f"--dataset.root={clean}", "--action_range=[-0.5, 0.5]") == 1
     assert "error    action range" in capsys.readouterr().out

@@ -5,14 +5,11 @@ import shutil
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.commands import Commands
 from support.hub import HubServer
+from test_attach_audio import write_sounds
 
-from lerobot_playbyear.audio import write_audio
-
-FPS, RATE = 20, 16000
 OFTEN = pytest.param(40, id="40", marks=[pytest.mark.slow, pytest.mark.timeout(1800)])
 
 
@@ -26,13 +23,9 @@ def damaged(noise, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def sounds(tmp_path_factory) -> Path:
+def sounds(tmp_path_factory) -> str:
     """A file of sound for each episode of `silent`."""
-    folder = tmp_path_factory.mktemp("sounds")
-    for episode, length in enumerate((12, 17, 9)):
-        sound = np.random.default_rng(episode).integers(-3000, 3000, length * RATE // FPS).astype(np.int16)
-        write_audio(folder / f"{episode:03d}.wav", sound, RATE)
-    return folder
+    return write_sounds(tmp_path_factory.mktemp("sounds"))
 
 
 def content(root: Path) -> dict[str, bytes]:
@@ -55,7 +48,7 @@ def test_a_copy_is_there_whole_or_not_at_all(name, n_kills, damaged, silent, noi
     places = [f"--dataset.root={source}", "--dataset.repo_id=tests/noise", "--output.repo_id=tests/copy"]
     options = {
         "repair": [f"--root={source}", f"--output={target}"],
-        "attach-audio": [*places, f"--output.root={target}", f"--files={sounds}/{{episode:03d}}.wav"],
+        "attach-audio": [*places, f"--output.root={target}", f"--files={sounds}"],
         "attach-spectrogram": [*places, f"--output.root={target}", "--seconds=0.8"],
     }
     command = [f"playbyear-{name}", *options[name]]

@@ -7,10 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from draccus.utils import DecodingError
-from lerobot.scripts import lerobot_eval
 from lerobot.utils.import_utils import register_third_party_plugins
 from support.distributions import install, install_example
-from support.shared import TINY, run_in_process
+from support.shared import TINY, n_evaluated, run_in_process
 
 import gym_playbyear
 from gym_playbyear.environment import TaskEnv
@@ -71,9 +70,7 @@ def test_lerobot_records_trains_and_evaluates_it_without_a_change_here(tmp_path)
     assert run_in_process(record, *ENV, *data, "--dataset.num_episodes=1", "--num_workers=0") is None
     assert run_in_process(train, *TINY, *data, "--steps=1", f"--output_dir={tmp_path / 't'}") is None
     checkpoint = tmp_path / "t/checkpoints/last/pretrained_model"
-    once = ["--env.episode_length=5", "--eval.n_episodes=1", "--eval.batch_size=1"]
-    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *once, f"--output_dir={tmp_path / 'eval'}")
-    assert '"n_episodes": 1' in (tmp_path / "eval/eval_info.json").read_text()
+    assert n_evaluated(checkpoint, tmp_path / "eval", *ENV, "--env.episode_length=5") == 1
 
 
 def test_a_broken_distribution_says_so_and_breaks_nothing_else():

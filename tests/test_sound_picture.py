@@ -5,13 +5,12 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import dataset_factory
 import draccus
 import numpy as np
 import pytest
 import torch
 import torchaudio
-from dataset_factory import CAMERA, MICROPHONE, make_dataset, random_frame
+from dataset_factory import CAMERA, MICROPHONE, make_dataset
 from draccus.utils import DecodingError
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.feature_utils import features_equal_for_merge
@@ -152,9 +151,8 @@ def test_a_copy_that_fails_is_not_there(original, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_dataset_with_nothing_but_silence_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(dataset_factory, "random_frame", lambda features, rng: random_frame(features, rng) | SILENCE)
-    make_dataset(tmp_path / "silent", (3,), image_size=16, repo_id="t/heard")
+def test_a_dataset_with_nothing_but_silence_is_refused(tmp_path):
+    make_dataset(tmp_path / "silent", (3,), image_size=16, frame_of=lambda *frame: frame[-1] | SILENCE)
     with pytest.raises(InputError, match="nothing but silence"):
         attach_spectrogram(config(tmp_path / "silent", tmp_path / "seen"))
 

@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import math
 import os
 import random
 import shutil
@@ -10,13 +11,12 @@ import threading
 import time
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import torch
 from dataset_factory import CAMERA, MICROPHONE, TASK, audio_feature, dataset_features, make_dataset
 from lerobot.datasets import LeRobotDataset
 from support.failing import fail_once
+from support.recording import edit_column
 from torch.utils.data import default_collate
 
 from lerobot_playbyear.datasets.pictures import shrink
@@ -183,13 +183,8 @@ def with_nan(tmp_path_factory):
     root = tmp_path_factory.mktemp("nan") / "noise"
     make_dataset(root, LENGTHS, features=features)
     (path,) = root.glob("data/*/*.parquet")
-    table = pq.read_table(path)
     for key in (MICROPHONE, "observation.state"):
-        field = table.schema.field(key)
-        values = np.array(table[key].to_pylist(), np.float32)
-        values[3, 2] = np.nan
-        table = table.set_column(table.column_names.index(key), field, pa.array(values.tolist(), field.type))
-    pq.write_table(table, path)
+        edit_column(path, key, lambda rows: [*rows[:3], [*rows[3][:2], math.nan, *rows[3][3:]], *rows[4:]])
     return root
 
 
@@ -284,16 +279,14 @@ def write(root, rate: int, dtype: str = "int16", hertz=HERTZ, level: float = 1.0
         "observation.state": {"dtype": "float32", "shape": (2,), "names": None},
         "action": {"dtype": "float32", "shape": (2,), "names": None},
     }
-    dataset = LeRobotDataset.create("tests/tones", FPS, features, root=root, use_videos=False)
-    for episode, length in enumerate(RATE_LENGTHS):
-        samples = (level * tone(rate, episode, hertz)).clip(-1, 32767 / 32768).reshape(length, -1)
-        samples = np.round(samples * 32768).astype(np.int16) if dtype == "int16" else samples.astype(dtype)
-        for i, block in enumerate(samples):
-            low = np.full(2, i, np.float32)
-            dataset.add_frame({MICROPHONE: block, "observation.state": low, "action": low, "task": TASK})
-        dataset.save_episode()
-    dataset.finalize()
-    return LeRobotDataset("tests/tones", root=root)
+
+    def frame_of(episode, step, frame):
+        samples = (level * tone(rate, episode, hertz)).clip(-1, 32767 / 32768).reshape(-1, rate // FPS)[step]
+        low = np.full(2, step, np.float32)
+        kept = np.round(samples * 32768).astype(np.int16) if dtype == "int16" else samples.astype(dtype)
+        return {MICROPHONE: kept, "observation.state": low, "action": low}
+
+    return make_dataset(root, RATE_LENGTHS, features=features, repo_id="tests/tones", frame_of=frame_of)
 
 
 @pytest.fixture(scope="module")
