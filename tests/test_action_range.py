@@ -7,18 +7,15 @@ import pytest
 import torch
 from dagger_factory import dagger
 from dataset_factory import dataset_features, make_dataset
-from lerobot.configs import parser
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies import make_pre_post_processors
 from support.shared import TINY, run_in_process
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.training import train as loop
+from lerobot_playbyear.scripts.commands import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-train = parser.wrap()(loop.train)
 
 FEATURES = dataset_features(image_size=16)
 FEATURES["action"]["names"] = ["pan", "lift", "elbow", "gripper"]
