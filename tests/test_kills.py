@@ -70,26 +70,23 @@ def test_a_copy_is_there_whole_or_not_at_all(name, n_kills, damaged, silent, noi
 
 
 @pytest.mark.parametrize("n_kills", [OFTEN])
-def test_an_upload_is_there_whole_or_not_at_all(n_kills, noise, tmp_path):
+def test_an_upload_is_there_whole_or_not_at_all(n_kills, noise, hub, commands):
     """Killed once, after it began: `test_hub.py`."""
     rng = random.Random(0)
-    with HubServer() as hub:
-        commands = Commands(tmp_path / "client", hub.environment())
-        push = ["playbyear-push", f"--dataset.root={noise}"]
-        commands.run("playbyear-push", "--help")
-        start = time.monotonic()
-        commands.succeed(*push, "--dataset.repo_id=tester/0")
-        seconds, whole = time.monotonic() - start, names_on(hub, "tester/0")
-        for number in range(1, n_kills + 1):
-            name = f"tester/{number}"
-            at_a_random_moment(commands, [*push, f"--dataset.repo_id={name}"], 1.2 * seconds, rng)
-            repository = hub.dataset(name)
-            assert names_on(hub, name) in (set(), whole)
-            assert not repository.tags or names_on(hub, name) == whole
-            commands.succeed(*push, f"--dataset.repo_id={name}")
-            assert names_on(hub, name) == whole
-            assert repository.resolve("v3.0") == repository.resolve("main")
-        commands.close()
+    push = ["playbyear-push", f"--dataset.root={noise}"]
+    commands.run("playbyear-push", "--help")
+    start = time.monotonic()
+    commands.succeed(*push, "--dataset.repo_id=tester/0")
+    seconds, whole = time.monotonic() - start, names_on(hub, "tester/0")
+    for number in range(1, n_kills + 1):
+        name = f"tester/{number}"
+        at_a_random_moment(commands, [*push, f"--dataset.repo_id={name}"], 1.2 * seconds, rng)
+        repository = hub.dataset(name)
+        assert names_on(hub, name) in (set(), whole)
+        assert not repository.tags or names_on(hub, name) == whole
+        commands.succeed(*push, f"--dataset.repo_id={name}")
+        assert names_on(hub, name) == whole
+        assert repository.resolve("v3.0") == repository.resolve("main")
 
 
 def names_on(hub: HubServer, name: str) -> set[str]:

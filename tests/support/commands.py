@@ -1,14 +1,16 @@
-"""Commands as they are typed, in a tenth of a second: LeRobot is imported once, and every command is a fork of that process.
+"""Commands as they are typed, in a tenth of a second: every command is a fork of a process that has LeRobot.
 
-Each command has its own arguments, environment, output and exit status. What is read while modules are imported, such as
-`HF_ENDPOINT` and `HF_HOME`, is that of the process they are forked from.
+That process is a fork of the one that runs the tests, from before the first: what tests import is imported once. Each command
+has its own arguments, environment, output and exit status. What is read while modules are imported, such as `HF_ENDPOINT` and
+`HF_HOME`, is that of the tests; `conftest.py` sets it.
 """
 
 import contextlib
 import gc
 import importlib
 import inspect
-import json
+import logging
+import multiprocessing
 import os
 import pkgutil
 import shutil
@@ -18,10 +20,12 @@ import subprocess
 import sys
 import threading
 import traceback
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,23 +57,25 @@ class Result:
 
 
 class Commands:
-    """Runs commands.
+    """Runs commands. Make it before any test has run.
 
     Args:
-        folder: Of the caches and the output.
-        environment: Besides that of this process.
+        home: Of the caches, `HF_HOME`, and the output.
     """
 
-    def __init__(self, folder: Path, environment: Mapping[str, str] | None = None) -> None:
-        self._home, self._output = folder / "home", folder / "output"
-        folder.mkdir(parents=True, exist_ok=True)
-        self._process = subprocess.Popen(
-            [sys.executable, __file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "HF_HOME": str(self._home), "OMP_NUM_THREADS": "1", **(environment or {})},
-        )
+    def __init__(self, home: Path) -> None:
+        self._home, self._output = home, home / "output"
+        self._server, theirs = multiprocessing.Pipe()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of threads: none of them is at work yet
+            self._pid = os.fork()
+        if self._pid == 0:
+            self._server.close()
+            try:
+                _serve(theirs)
+            finally:
+                os._exit(0)
+        theirs.close()
 
     def run(
         self,
@@ -82,27 +88,18 @@ class Commands:
 
         Args:
             arguments: Its name and its options.
-            fresh: Whether it begins without anything in its caches.
+            fresh: Whether it begins without anything from the Hub in its caches.
             environment: For this command alone.
             kill_when: The command is killed when this becomes true.
         """
-        if fresh:
-            shutil.rmtree(self._home, ignore_errors=True)
-        job = {
-            "arguments": [str(argument) for argument in arguments],
-            "environment": dict(environment or {}),
-            "folder": os.getcwd(),
-            "output": str(self._output),
-        }
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(job) + "\n")
-        self._process.stdin.flush()
-        pid = int(self._process.stdout.readline())
+        for name in ("hub", "lerobot") if fresh else ():
+            shutil.rmtree(self._home / name, ignore_errors=True)
+        self._server.send(([*map(str, arguments)], dict(environment or {}), os.getcwd(), self._output))
+        pid = self._server.recv()
         done = threading.Event()
         if kill_when is not None:
             threading.Thread(target=_kill, args=(pid, kill_when, done), daemon=True).start()
-        status = int(self._process.stdout.readline())
+        status = self._server.recv()
         done.set()
         return Result(status, self._output.read_text())
 
@@ -118,7 +115,8 @@ class Commands:
         return folder
 
     def close(self) -> None:
-        self._process.communicate()
+        self._server.close()
+        os.waitpid(self._pid, 0)
 
 
 def python(code: str, *arguments: str, environment: Mapping[str, str] = os.environ) -> str:
@@ -142,24 +140,29 @@ def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
             return
 
 
-def _serve() -> None:
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # whatever is printed meanwhile is no answer
+def _serve(connection: Connection) -> None:
+    logging.getLogger().handlers.clear()  # pytest's
+    prepare = cache(_prepare)
+    with contextlib.suppress(EOFError):  # the tests have ended
+        while True:
+            job = connection.recv()
+            prepare()
+            pid = os.fork()
+            if pid == 0:
+                _run(*job)
+            connection.send(pid)
+            connection.send(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+
+
+def _prepare() -> None:
     package = importlib.import_module("lerobot_playbyear")
     ours = [module.name for module in pkgutil.walk_packages(package.__path__, "lerobot_playbyear.")]
     for module in (*_IMPORTED, *ours):
         with contextlib.suppress(ImportError):  # of what needs a sound card or a window
             importlib.import_module(module)
-    if "HF_ENDPOINT" in os.environ:
-        _check_cards_there()
+    importlib.import_module("torch").set_num_threads(1)
+    _check_cards_there()
     _read_options()
-    for line in sys.stdin:
-        job = json.loads(line)
-        pid = os.fork()
-        if pid == 0:
-            _run(job)
-        print(pid, file=answers, flush=True)
-        print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), file=answers, flush=True)
 
 
 def _check_cards_there() -> None:
@@ -216,15 +219,20 @@ def speed_up() -> None:
     features.Features.__setitem__ = set_column
 
 
-def _run(job: dict[str, Any]) -> None:
+def _run(arguments: list[str], environment: dict[str, str], folder: str, output: Path) -> None:
     """Never returns."""
     status = 0
-    os.environ.update(job["environment"])
-    os.chdir(job["folder"])
-    with open(job["output"], "w") as output:
-        os.dup2(output.fileno(), 1)
-        os.dup2(output.fileno(), 2)
-    sys.argv = job["arguments"]
+    os.environ.update(environment)
+    os.chdir(folder)
+    with output.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
+    for logger in logging.root.manager.loggerDict.values():
+        for handler in getattr(logger, "handlers", ()):
+            if isinstance(handler, logging.StreamHandler):
+                handler.setStream(sys.stderr)  # it has that of the tests
+    sys.argv = arguments
     try:
         _COMMANDS[sys.argv[0]].load()()
     except SystemExit as error:
@@ -237,7 +245,3 @@ def _run(job: dict[str, Any]) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)
-
-
-if __name__ == "__main__":
-    _serve()
