@@ -21,7 +21,7 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -175,48 +175,70 @@ def _check_cards_there() -> None:
 
 
 def _read_options() -> None:
-    """What a command takes longest for: draccus searches the sources for the help of all 2,000 options."""
     import httpx
-    from draccus.argparsing import ArgumentParser
+    from draccus import argparsing
     from lerobot.utils import import_utils
-
-    from gym_playbyear import registry
 
     sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
     from list_options import CONFIGS  # type: ignore[import-not-found]
 
     speed_up()
-    registry.entry_points = cache(registry.entry_points)  # it reads the metadata of all distributions
     ssl.create_default_context = cache(ssl.create_default_context)  # it reads all certificates, for every client
     httpx.create_ssl_context()
     import_utils.register_third_party_plugins()
     for config in CONFIGS.values():
-        ArgumentParser(config)
+        argparsing.ArgumentParser(config)
     gc.collect()
     gc.freeze()
 
 
 def speed_up() -> None:
-    """What the parser of 2,000 options looks up in sources, and LeRobot in all distributions, is looked up once a process.
+    """What commands take longest for is done once a process: a parser of 2,000 options, whose help draccus searches the sources
+    for, and to look for plugins in the metadata of all distributions.
 
     And a column that is added to a table's features is looked at alone: datasets looks at all others again.
     """
     from datasets.features import features
+    from draccus import argparsing
+    from draccus.choice_types import ChoiceRegistryBase
     from draccus.wrappers import docstring, field_wrapper
     from lerobot.utils import import_utils
+
+    from gym_playbyear import registry
 
     docstring._get_class_source = cache(docstring._get_class_source.__wrapped__)  # it has room for 100 classes
     docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
     field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
-    register = import_utils.register_third_party_plugins
-    register_those_on = cache(lambda *path: register())
-    import_utils.register_third_party_plugins = lambda: register_those_on(*sys.path)
+    new_parser = cache(
+        lambda n_choices, config, exits, make=argparsing.ArgumentParser: make(config, exit_on_error=exits)
+    )
+
+    def parser_of(config_class: type, config_path: Any = None, exit_on_error: bool = True, **_: Any) -> Any:
+        known = [getattr(kind, "_choice_registry", ()) for kind in _below(ChoiceRegistryBase)]
+        parser = new_parser(sum(map(len, known)), config_class, exit_on_error)  # another one when there are more
+        parser.config_path, parser.parser.prog = config_path, Path(sys.argv[0]).name
+        return parser
+
+    argparsing.ArgumentParser = parser_of
+    for module, name in ((import_utils, "register_third_party_plugins"), (registry, "entry_points")):
+        setattr(module, name, _once_for_each_path(getattr(module, name)))
 
     def set_column(self: Any, name: str, feature: Any) -> None:
         dict.__setitem__(self, name, feature)
         self._column_requires_decoding[name] = features.require_decoding(feature)
 
     features.Features.__setitem__ = set_column
+
+
+def _below(kind: type) -> Iterator[Any]:
+    for below in kind.__subclasses__():
+        yield from (below, *_below(below))
+
+
+def _once_for_each_path(search: Callable[..., Any]) -> Callable[..., Any]:
+    """What this finds in the distributions on a path."""
+    found = cache(lambda path, **what: search(**what))
+    return lambda **what: found(tuple(sys.path), **what)
 
 
 def _run(arguments: list[str], environment: dict[str, str], folder: str, output: Path) -> None:
