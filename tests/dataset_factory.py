@@ -56,10 +56,6 @@ def random_frame(features: dict[str, dict[str, Any]], rng: np.random.Generator) 
     return frame
 
 
-def as_it_is(episode: int, step: int, frame: dict[str, Any]) -> dict[str, Any]:
-    return frame
-
-
 def make_dataset(
     root: str | Path,
     episode_lengths: tuple[int, ...] = (12, 17, 9),
@@ -68,7 +64,7 @@ def make_dataset(
     features: dict[str, dict[str, Any]] | None = None,
     repo_id: str = "tests/noise",
     robot_type: str | None = None,
-    frame_of: Callable[[int, int, dict[str, Any]], dict[str, Any]] = as_it_is,
+    frame_of: Callable[[int, int, dict[str, Any]], dict[str, Any]] = lambda episode, step, frame: frame,
     **kwargs: Any,
 ) -> LeRobotDataset:
     """Write episodes of noise to `root` and open them for reading.

@@ -14,12 +14,7 @@ from support.recording import everything, write
 
 from lerobot_playbyear.audio import cut_into_frames, note_episode_start, write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
-from lerobot_playbyear.audio.recorder_clock import (
-    CLOCK_PATH,
-    ClockError,
-    read_clock,
-    read_episode_starts,
-)
+from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts
 from lerobot_playbyear.datasets import episode_files, episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.shared import run_in_process
 
+from gym_playbyear import TASKS
 from gym_playbyear.check.__main__ import main
 from gym_playbyear.check.deaf import DeafTask
 from gym_playbyear.check.report import as_text, check, deaf_scripts, play, players
@@ -19,13 +20,7 @@ from gym_playbyear.panda import SensorNoise
 from gym_playbyear.registry import make_definition
 from gym_playbyear.terminations import Success
 
-GRASP, PICK_PLACE, POUCH, EASY, HARD = (
-    "OccludedGrasp-v1",
-    "OccludedPickPlace-v1",
-    "TellApart-v1",
-    "KeyBag-Easy-v1",
-    "KeyBag-Hard-v1",
-)
+GRASP, PICK_PLACE, POUCH, EASY, HARD = TASKS
 EXACT = SensorNoise(0, 0, 0, 0, 0, 0, differentiated=False)
 
 

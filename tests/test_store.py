@@ -15,8 +15,9 @@ import pytest
 import torch
 from dataset_factory import CAMERA, MICROPHONE, TASK, audio_feature, dataset_features, make_dataset
 from lerobot.datasets import LeRobotDataset
+from recording_factory import load as recorded_dataset
 from support.failing import fail_once
-from support.recording import edit_column
+from support.recording import edit_column, writer
 from torch.utils.data import default_collate
 
 from lerobot_playbyear.datasets.pictures import shrink
@@ -279,14 +280,15 @@ def write(root, rate: int, dtype: str = "int16", hertz=HERTZ, level: float = 1.0
         "observation.state": {"dtype": "float32", "shape": (2,), "names": None},
         "action": {"dtype": "float32", "shape": (2,), "names": None},
     }
-
-    def frame_of(episode, step, frame):
-        samples = (level * tone(rate, episode, hertz)).clip(-1, 32767 / 32768).reshape(-1, rate // FPS)[step]
-        low = np.full(2, step, np.float32)
-        kept = np.round(samples * 32768).astype(np.int16) if dtype == "int16" else samples.astype(dtype)
-        return {MICROPHONE: kept, "observation.state": low, "action": low}
-
-    return make_dataset(root, RATE_LENGTHS, features=features, repo_id="tests/tones", frame_of=frame_of)
+    with writer(root, features) as target:
+        for episode, length in enumerate(RATE_LENGTHS):
+            samples = (level * tone(rate, episode, hertz)).clip(-1, 32767 / 32768).reshape(length, -1)
+            samples = np.round(samples * 32768).astype(np.int16) if dtype == "int16" else samples.astype(dtype)
+            for i, block in enumerate(samples):
+                low = np.full(2, i, np.float32)
+                target.add_frame({MICROPHONE: block, "observation.state": low, "action": low, "task": TASK})
+            target.save_episode()
+    return recorded_dataset(root)
 
 
 @pytest.fixture(scope="module")
