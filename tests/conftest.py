@@ -3,12 +3,16 @@
 import gc
 import logging
 import os
+import tempfile
 from pathlib import Path
 
 import pytest
 from support import shared
 from support.commands import Commands, speed_up
-from support.hub import HubServer
+from support.hub import HubServer, nothing_fails
+
+HUB, HOME = HubServer(), tempfile.TemporaryDirectory(prefix="playbyear-")
+os.environ.update(HUB.environment(), HF_HOME=HOME.name)  # before anything is imported that reads it
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -71,25 +75,46 @@ def finished() -> Path:
     return finished()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="session", autouse=True)
 def hub_server():
-    """The Hub that `commands` speak to, on loopback."""
-    with HubServer() as server:
-        yield server
+    """The Hub, on loopback."""
+    with HUB:
+        yield HUB
+
+
+@pytest.fixture
+def hub(hub_server):
+    """The Hub, to which nothing has come yet in this test, and where nothing fails."""
+    hub_server.arrivals.clear()
+    hub_server.requests.clear()
+    yield hub_server
+    hub_server.fault = nothing_fails
+
+
+@pytest.fixture
+def here(hub, monkeypatch):
+    """The same for this process, which checks no cards: the client asks huggingface.co."""
+    monkeypatch.setattr("huggingface_hub.RepoCard.validate", lambda card, repo_type=None: None)
+    return hub
 
 
 @pytest.fixture(scope="session")
-def commands(hub_server, tmp_path_factory):
+def commands(request):
     """Runs commands as they are typed, each in a process of its own; see `support/commands.py`."""
-    runner = Commands(tmp_path_factory.mktemp("commands"), hub_server.environment())
-    yield runner
-    runner.close()
+    yield request.config.commands
+    request.config.commands.close()
 
 
 def pytest_collection_finish():
     """What was imported stays: the garbage collector need not look through PyTorch and LeRobot again and again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session):
+    if any("commands" in item.fixturenames for item in session.items):
+        session.config.commands = Commands(Path(HOME.name))
 
 
 class ToldAtOnce:

@@ -14,6 +14,7 @@ from lerobot.configs import parser
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from safetensors.torch import load_file
+from support.failing import PowerCut, fail_once
 from support.shared import ENV, once, recorded, trained
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -189,26 +190,10 @@ def assert_ended_alike(folder, expected):
     assert names[0] == names[1]
 
 
-class PowerCut(BaseException):
-    """Stops the run at a chosen moment, so that no clean-up of its own runs."""
-
-
-def cut_power(monkeypatch, owner, name, after):
-    """Lets `owner.name` work `after` times; the next call stops the run before it does anything."""
-    calls, real = iter(range(10**6)), getattr(owner, name)
-
-    def wrapped(*args, **kwargs):
-        if next(calls) == after:
-            raise PowerCut
-        return real(*args, **kwargs)
-
-    monkeypatch.setattr(owner, name, wrapped)
-
-
 def assert_a_power_cut_changes_nothing(folder, expected, run, after, owner=RunFolder, name="commit"):
     """A run that is stopped there, and goes on, ends as one that was not."""
     with pytest.MonkeyPatch.context() as patch:
-        cut_power(patch, owner, name, after)
+        fail_once(patch, owner, name, after)
         with pytest.raises(PowerCut):
             dagger(folder, *run)
     command("--resume=true", f"--output_dir={folder / 'out'}")

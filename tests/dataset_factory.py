@@ -63,19 +63,26 @@ def make_dataset(
     seed: int = 0,
     features: dict[str, dict[str, Any]] | None = None,
     repo_id: str = "tests/noise",
+    robot_type: str | None = None,
+    frame_of: Callable[[int, int, dict[str, Any]], dict[str, Any]] = lambda episode, step, frame: frame,
     **kwargs: Any,
 ) -> LeRobotDataset:
-    """Write episodes of noise to `root` and open them for reading; `kwargs` as for `dataset_features`."""
+    """Write episodes of noise to `root` and open them for reading.
+
+    Args:
+        frame_of: Makes the frame that is written of episode, step and a frame of noise.
+        kwargs: As for `dataset_features`, where there are no `features`.
+    """
     rng = np.random.default_rng(seed)
     features = dataset_features(fps=fps, **kwargs) if features is None else features
-    use_videos = any(feature["dtype"] == "video" for feature in features.values())
-    encoder = RGBEncoderConfig(vcodec="h264") if use_videos else None
-    dataset = LeRobotDataset.create(
-        repo_id, fps, features, root=root, use_videos=use_videos, rgb_encoder=encoder, video_backend="pyav"
-    )
-    for length in episode_lengths:
-        for _ in range(length):
-            dataset.add_frame({**random_frame(features, rng), "task": TASK})
+    options: dict[str, Any] = {"robot_type": robot_type, "use_videos": False, "video_backend": "pyav"}
+    if any(feature["dtype"] == "video" for feature in features.values()):
+        # LeRobot's default encoder does not take pictures as small as these
+        options |= {"use_videos": True, "rgb_encoder": RGBEncoderConfig(vcodec="h264")}
+    dataset = LeRobotDataset.create(repo_id, fps, features, root=root, **options)
+    for episode, length in enumerate(episode_lengths):
+        for step in range(length):
+            dataset.add_frame({**frame_of(episode, step, random_frame(features, rng)), "task": TASK})
         dataset.save_episode()
     dataset.finalize()
     return LeRobotDataset(repo_id, root=root, video_backend="pyav")
@@ -85,17 +92,12 @@ def rollout_dataset(
     root: Path, lengths: tuple[int, ...], mark: Callable[[int], bool], use_videos: bool = False, by_policy: float = 0.0
 ) -> None:
     """A dataset as `lerobot-rollout --strategy.type=dagger` writes it: observations, action and `intervention`, no more."""
+
+    def marked(episode: int, step: int, frame: dict[str, Any]) -> dict[str, Any]:
+        action = frame["action"] + np.float32(by_policy * (not mark(step)))
+        return {**frame, "action": action, "intervention": np.array([mark(step)])}
+
     features = dataset_features(image_size=16, use_videos=use_videos)
     del features["next.reward"]
-    options: dict[str, Any] = {"robot_type": "so100", "use_videos": use_videos, "video_backend": "pyav"}
-    if use_videos:  # LeRobot's default encoder does not take pictures as small as these
-        options["rgb_encoder"] = RGBEncoderConfig(vcodec="h264")
-    dataset = LeRobotDataset.create("tests/rollout_corrections", 20, features, root=root, **options)
-    rng = np.random.default_rng(0)
-    for length in lengths:
-        for step in range(length):
-            frame = {**random_frame(features, rng), "intervention": np.array([mark(step)], dtype=bool)}
-            frame["action"] = frame["action"] + np.float32(by_policy * (not mark(step)))
-            dataset.add_frame({**frame, "task": "grasp"})
-        dataset.save_episode()
-    dataset.finalize()
+    repo_id = "tests/rollout_corrections"
+    make_dataset(root, lengths, features=features, repo_id=repo_id, robot_type="so100", frame_of=marked)

@@ -5,21 +5,17 @@ import json
 import numpy as np
 import pytest
 import torch
-from dagger_factory import SMALL, command
-from dataset_factory import TASK, dataset_features, random_frame
-from lerobot.configs import parser
+from dagger_factory import dagger
+from dataset_factory import dataset_features, make_dataset
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from support.shared import TINY, run_in_process
 
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
-from lerobot_playbyear.training import train as loop
+from lerobot_playbyear.scripts.commands import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-train = parser.wrap()(loop.train)
 
 FEATURES = dataset_features(image_size=16)
 FEATURES["action"]["names"] = ["pan", "lift", "elbow", "gripper"]
@@ -28,14 +24,12 @@ BLIND_AND_DEAF = ("--policy.use_vision=false", "--policy.use_audio=false", "--st
 
 def write(root, actions, by_expert=None):
     """A dataset of one episode with these actions (T, 4)."""
-    dataset = LeRobotDataset.create("tests/reach", 20, FEATURES, root=root, use_videos=False)
-    rng = np.random.default_rng(0)
-    for t, action in enumerate(np.asarray(actions, np.float32)):
-        frame = {**random_frame(FEATURES, rng), "action": action, "task": TASK}
-        frame["intervention"] = np.array([by_expert is None or bool(by_expert[t])])
-        dataset.add_frame(frame)
-    dataset.save_episode()
-    dataset.finalize()
+
+    def frame_of(episode, step, frame):
+        is_corrected = np.array([by_expert is None or bool(by_expert[step])])
+        return {**frame, "action": np.asarray(actions[step], np.float32), "intervention": is_corrected}
+
+    make_dataset(root, (len(actions),), features=FEATURES, repo_id="tests/reach", frame_of=frame_of)
 
 
 @pytest.fixture(scope="module")
@@ -49,19 +43,6 @@ def base(tmp_path_factory):
     run_in_process(train, *TINY, *BLIND_AND_DEAF, *data, f"--output_dir={folder / 'train'}")
     (folder / "policy").symlink_to(folder / "train/checkpoints/last/pretrained_model")
     return folder
-
-
-def dagger(base, folder, *options, policy=None):
-    return command(
-        f"--policy.path={policy or base / 'policy'}",
-        "--demos.repo_id=tests/reach",
-        f"--demos.root={base / 'demos'}",
-        "--interventions.repo_id=tests/corrections",
-        f"--interventions.root={folder / 'corrections'}",
-        f"--output_dir={folder / 'out'}",
-        *SMALL,
-        *options,
-    )
 
 
 def warnings(capfd):
@@ -106,9 +87,9 @@ def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wide
     actions[:10] = 0.9  # the policy's own: not learned
     actions[10:15, 1] = 0.14
     write(tmp_path / "corrections", actions, by_expert)
-    offline = ("--episodes=0", "--updates=1")
+    offline = ("--episodes=0", "--updates=1", "--demos.repo_id=tests/reach", f"--demos.root={base / 'demos'}")
 
-    dagger(base, tmp_path, *offline)
+    dagger(tmp_path, *offline, f"--policy.path={base / 'policy'}", env=())
     (message,) = warnings(capfd)
     assert "the corrections" in message
     assert "'lift' in 50.0 % of 10 frames" in message
@@ -120,5 +101,5 @@ def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wide
     run_in_process(train, *wider, *data, *once, f"--output_dir={tmp_path / 'wide'}")
     policy = tmp_path / "wide/checkpoints/last/pretrained_model"
     assert json.loads((policy / "config.json").read_text())["action_range"] == 1.6
-    dagger(base, tmp_path, *offline, f"--output_dir={tmp_path / 'out_wide'}", policy=policy)
+    dagger(tmp_path, *offline, f"--policy.path={policy}", f"--output_dir={tmp_path / 'out_wide'}", env=())
     assert warnings(capfd) == []

@@ -9,17 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dataset_factory import CAMERA, dataset_features, make_dataset
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from recording_factory import load
 from support.recording import everything, write
 
 from lerobot_playbyear.audio import cut_into_frames, note_episode_start, write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
-from lerobot_playbyear.audio.recorder_clock import (
-    CLOCK_PATH,
-    ClockError,
-    read_clock,
-    read_episode_starts,
-)
+from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts
 from lerobot_playbyear.datasets import episode_files, episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.survey import survey
@@ -52,10 +47,6 @@ def attach_files(root: Path, target: Path, files: str, **options) -> Path:
     return attach(root, target, files=files, **{"microphone": "gripper", "offset": OFFSET, **options})
 
 
-def load(root: Path) -> LeRobotDataset:
-    return LeRobotDataset("test/heard", root=root, video_backend="pyav")
-
-
 # From a file for each episode
 
 
@@ -63,7 +54,7 @@ def test_every_frame_gets_what_was_heard_before_it_and_all_else_stays_as_it_was(
     before = everything(silent)
     root = attach_files(silent, tmp_path / "heard", write_sounds(tmp_path / "sound", ending="flac"))
 
-    old, new = LeRobotDataset("test/silent", root=silent, video_backend="pyav"), load(root)
+    old, new = load(silent), load(root)
     first, samples = round(OFFSET * RATE) - SIZE, []
     for episode, length in enumerate(LENGTHS):
         waveform, rate = episode_waveform(new, episode, KEY)

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from recording_factory import load
 from support.recording import edit_column, edit_info, everything
-from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach, load
+from test_attach_audio import FPS, LENGTHS, RATE, SIZE, attach
 
 from lerobot_playbyear.datasets import episode_waveform
 from lerobot_playbyear.datasets.errors import InputError
@@ -117,8 +117,7 @@ def test_files_become_columns_with_the_same_samples(with_files, silent, tmp_path
             np.testing.assert_array_equal(waveform, blocks_of(heard(episode, n_channels), length)[:, channel])
     assert survey(root).is_undamaged
     assert everything(with_files) == before
-    old = LeRobotDataset("test/silent", root=silent, video_backend="pyav")
-    for key, value in old[20].items():
+    for key, value in load(silent)[20].items():
         assert np.array_equal(np.asarray(dataset[20][key]), np.asarray(value)), key
     assert not (root / "audio").exists()
     assert not [name for name in episodes_of(root)[0] if name.startswith("audio/")]
@@ -199,12 +198,19 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("change", "message"), REFUSED)
-def test_what_a_stranger_says_is_checked_first(with_files, tmp_path, change, message):
+OPTIONS: list[tuple[dict, str]] = [
+    ({"sample_rate": 8010}, "--sample_rate=8010: wanted a multiple of 20"),
+    ({"microphone": "gripper"}, "--microphone=gripper is for --files .*, not for the dataset's own files"),
+    ({"files": "{episode}.wav"}, rf"'{EARS}|{TABLE}' has its sound in files.*without --files and --session"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), [*REFUSED, *OPTIONS])
+def test_what_a_stranger_says_and_options_that_do_not_fit_are_refused_first(with_files, tmp_path, change, message):
     shutil.copytree(with_files, tmp_path / "files")
-    change(tmp_path / "files")
+    options = change if isinstance(change, dict) else change(tmp_path / "files") or {}
     with pytest.raises(InputError, match=message):
-        attach(tmp_path / "files", tmp_path / "columns")
+        attach(tmp_path / "files", tmp_path / "columns", **options)
     assert [path.name for path in tmp_path.iterdir()] == ["files"]
 
 
@@ -218,16 +224,3 @@ def test_a_file_that_names_others_or_is_a_link_is_not_followed(with_files, tmp_p
     file.symlink_to(with_files / f"audio/{TABLE}/chunk-000/file-000.m4a")
     with pytest.raises(InputError, match=r"is a link to .*outside its folder"):
         attach(tmp_path / "files", tmp_path / "columns")
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sample_rate": 8010}, "--sample_rate=8010: wanted a multiple of 20"),
-        ({"microphone": "gripper"}, "--microphone=gripper is for --files .*, not for the dataset's own files"),
-        ({"files": "{episode}.wav"}, rf"'{EARS}|{TABLE}' has its sound in files.*without --files and --session"),
-    ],
-)
-def test_options_that_do_not_fit_are_told(with_files, tmp_path, options, message):
-    with pytest.raises(InputError, match=message):
-        attach(with_files, tmp_path / "x", **options)

@@ -6,14 +6,13 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
+from support.playing import STILL
 
 from gym_playbyear.environment import TaskEnv
 from gym_playbyear.registry import make_definition
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.tasks.arena import TABLE_TOP, loose_box
 from gym_playbyear.terminations import Success
-
-STAY = np.array([0, 0, 0, -1.0])
 
 
 def never(env) -> bool:
@@ -50,7 +49,7 @@ def test_loose_things_may_lie_on_each_other(bits):
     env = TaskEnv(task(*(Prop(name, body.format(name, bits), "cube", loose=True) for name in "ab")), sound="none")
     env.reset_physics(seed=0)
     for _ in range(10):
-        env.step_physics(STAY)
+        env.step_physics(STILL)
     assert env.position("b")[2] > env.position("a")[2] + 0.035
     assert env.contact_forces["a-b"] > 0.5
 
@@ -63,7 +62,7 @@ def test_a_prop_may_be_an_mjspec():
     env = pickle.loads(pickle.dumps(TaskEnv(task(Prop("ball", spec, "cube", loose=True)), sound="none")))
     env.reset_physics(seed=0)
     for _ in range(10):
-        env.step_physics(STAY)
+        env.step_physics(STILL)
     assert env.position("ball")[2] == pytest.approx(TABLE_TOP + 0.02, abs=0.002)
 
 

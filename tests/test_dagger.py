@@ -21,9 +21,9 @@ from dagger_factory import (
     weights,
 )
 from dataset_factory import rollout_dataset
-from lerobot.scripts import lerobot_eval, lerobot_train
+from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
-from support.shared import ENV, run_in_process, trained
+from support.shared import ENV, n_evaluated, run_in_process, trained
 
 from lerobot_playbyear.dagger.config import DaggerConfig
 from lerobot_playbyear.datasets.errors import PlaybyearError
@@ -120,13 +120,11 @@ def check_normalisation_is_kept(tuned):
 
 
 def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_path):
-    policy = f"--policy.path={finished / 'out/checkpoints/last/pretrained_model'}"
-    once = ("--env.episode_length=5", "--eval.n_episodes=1", "--eval.batch_size=1")
-    run_in_process(lerobot_eval.eval_main, policy, *ENV, *once, f"--output_dir={tmp_path / 'eval'}")
-    assert (tmp_path / "eval/eval_info.json").exists()
+    policy = finished / "out/checkpoints/last/pretrained_model"
+    assert n_evaluated(policy, tmp_path / "eval", *ENV, "--env.episode_length=5") == 1
     data = ("--dataset.repo_id=tests/corrections", f"--dataset.root={finished / 'corrections'}", "--num_workers=0")
     small = ("--steps=1", "--batch_size=2", "--dataset.video_backend=pyav", "--env_eval_freq=0")
-    run_in_process(lerobot_train.train, policy, *data, *small, f"--output_dir={tmp_path / 'tuned'}")
+    run_in_process(lerobot_train.train, f"--policy.path={policy}", *data, *small, f"--output_dir={tmp_path / 'tuned'}")
     assert (tmp_path / "tuned/checkpoints/000001").is_dir()
 
 

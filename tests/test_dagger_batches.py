@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_playbyear.dagger.batches import (
-    BalancedBatches,
-    JoinedBatches,
-    frames_learned_from,
-)
+from lerobot_playbyear.dagger.batches import BalancedBatches, JoinedBatches, frames_learned_from
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training import EpisodeStore
 from lerobot_playbyear.training.batches import PolicyWindows

@@ -30,6 +30,8 @@ from lerobot_playbyear.training.learner import Learner
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 RUN = (*QUICK, "--episodes=2", "--warmup_episodes=1")
+SHOWN = {"n_expert_steps": 8, "n_takeovers": 1, "n_switches": 1, "autonomy": 0.0, "person_seconds": 0.4}
+"""What an attempt of which the expert makes all 8 steps costs."""
 
 
 @pytest.fixture(autouse=True)
@@ -102,8 +104,7 @@ def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, capfd, k
     np.testing.assert_allclose(column(data, "action"), np.tile([0.2, 0.1, -0.2, -1.0], (data.num_frames, 1)))
     told = [(line["seed"], line["outcome"], line["n_frames"], line["n_expert_steps"]) for line in attempts]
     assert told[:2] == [(10000, "failed", 3, 0), (10000, "kept", 8, 8)]
-    cost = {"n_takeovers": 1, "n_switches": 1, "autonomy": 0.0, "person_seconds": 0.4}
-    assert {key: attempts[1][key] for key in cost} == cost
+    assert attempts[1].items() >= SHOWN.items()
     for after in kills:  # the try counts, and its scene is not shown yet; the demonstration is saved and does not count
         assert_a_power_cut_changes_nothing(tmp_path / f"killed{after}", tmp_path / "calm", run, after)
 
@@ -149,15 +150,7 @@ def test_what_fails_although_the_robot_may_ask_is_shown_from_its_first_step(tmp_
     attempts = metrics(tmp_path / "calm", "attempt")
     assert [line["outcome"] for line in attempts[:3]] == ["unneeded", "failed", "kept"]
     assert [line["seed"] for line in attempts[:4]] == [9998, 9999, 9999, 10000]
-    cost = {
-        "n_expert_steps": 8,
-        "n_takeovers": 1,
-        "n_switches": 1,
-        "autonomy": 0.0,
-        "person_seconds": 0.4,
-        "n_calls": 0,
-    }
-    assert {key: attempts[2][key] for key in cost} == cost
+    assert attempts[2].items() >= {**SHOWN, "n_calls": 0}.items()
     assert column(corrections(tmp_path / "calm"), "intervention")[:8].all()
     assert not attempts[0]["n_asked_steps"]
     for after in kills:

@@ -15,7 +15,6 @@ import torch
 from dagger_factory import (
     FINISHED,
     QUICK,
-    PowerCut,
     Quick,
     arguments,
     assert_a_power_cut_changes_nothing,
@@ -23,7 +22,6 @@ from dagger_factory import (
     column,
     command,
     corrections,
-    cut_power,
     dagger,
     figures,
     metrics,
@@ -33,6 +31,7 @@ from dagger_factory import (
 )
 from lerobot.configs import parser
 from safetensors.torch import load_file
+from support.failing import PowerCut, fail_once
 from support.shared import trained
 
 from lerobot_playbyear.dagger import run_folder as folder_module
@@ -67,7 +66,7 @@ def test_attempts_in_vain_count_on_after_a_resume(tmp_path, monkeypatch):
     monkeypatch.setattr(Quick, "verdict", lambda self: Verdict.FAILURE if self.n >= self.n_steps else None)
     run = (*QUICK, "--episodes=1", "--max_attempts=3")
     with monkeypatch.context() as patch:
-        cut_power(patch, folder_module.RunFolder, "commit", 3)  # the third attempt does not count
+        fail_once(patch, folder_module.RunFolder, "commit", 3)  # the third attempt does not count
         with pytest.raises(PowerCut):
             dagger(tmp_path, *run)
     for n in (3, 6):  # who goes on with a run that has given up wants others
@@ -86,14 +85,14 @@ def test_a_policys_options_stay_until_there_is_a_checkpoint(tmp_path, monkeypatc
     with monkeypatch.context() as patch:
         for name in ("_config_path_args", "_config_yaml_overrides"):  # that LeRobot keeps for the process
             patch.setattr(parser, name, {})
-        cut_power(patch, folder_module.RunFolder, "commit", 1)
+        fail_once(patch, folder_module.RunFolder, "commit", 1)
         with pytest.raises(PowerCut):
             command(f"--config_path={options}", *args)
     link.unlink()
     link.symlink_to(tmp_path)
     again = ("--resume=true", f"--output_dir={tmp_path / 'out'}")
     with monkeypatch.context() as patch:
-        cut_power(patch, folder_module.RunFolder, "commit", 1)
+        fail_once(patch, folder_module.RunFolder, "commit", 1)
         with pytest.raises(PowerCut):
             command(*again, f"--policy.path={policy}", "--policy.optimizer_weight_decay=0.125")
     command(*again)
@@ -229,8 +228,7 @@ def run_and_kill(commands, folder, n_kills, *options):
         end = time.monotonic() + rng.uniform(2.0, 12.0)
         assert commands.run(*run, kill_when=lambda end=end: time.monotonic() > end).status == -signal.SIGKILL
         assert_everything_loads(folder)
-    result = commands.run(*run)
-    assert result.status == 0, result.output[-3000:]
+    commands.succeed(*run)
 
 
 def assert_everything_loads(folder):

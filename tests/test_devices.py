@@ -15,7 +15,6 @@ import torch
 import yaml
 from accelerate.state import AcceleratorState
 from dagger_factory import QUICK, command, dagger
-from lerobot.configs import parser
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.scripts import lerobot_train
@@ -37,11 +36,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from lerobot_playbyear.policy.image_augmentation import sample
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy, RecentFrames
 from lerobot_playbyear.policy.optimization import training_dtype
-from lerobot_playbyear.training import train as loop
+from lerobot_playbyear.scripts.commands import train
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-train = parser.wrap()(loop.train)
 both_trainers = pytest.mark.parametrize(
     "script", [train, lerobot_train.train], ids=["playbyear-train", "lerobot-train"]
 )
@@ -78,20 +76,17 @@ def precision_of_its_own():
         ("cpu", "auto", False, True, "bfloat16"),
         ("cpu", "auto", False, False, "float32"),
         ("mps", "auto", False, True, "float32"),
+        ("cpu", "float16", False, True, "float32"),  # with a word
+        ("mps", "bfloat16", False, True, "float32"),
     ],
 )
 def test_the_number_format_is_what_the_device_can_and_what_was_asked_for(
-    monkeypatch, device, asked, use_amp, has_bfloat16, expected
+    monkeypatch, caplog, device, asked, use_amp, has_bfloat16, expected
 ):
     monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: has_bfloat16)
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"avx512_bf16": has_bfloat16}, raising=False)
     assert training_dtype(asked, use_amp, device) == expected
-
-
-@pytest.mark.parametrize(("device", "asked"), [("cpu", "float16"), ("mps", "bfloat16")])
-def test_a_format_that_a_device_lacks_becomes_float32_with_a_word(caplog, device, asked):
-    assert training_dtype(asked, False, device) == "float32"
-    assert f"'{device}' cannot train in {asked}" in caplog.text
+    assert (f"'{device}' cannot train in {asked}" in caplog.text) is (asked in ("float16", "bfloat16"))
 
 
 def test_a_file_keeps_what_was_asked_for_and_not_what_one_machine_made_of_it(tmp_path, monkeypatch):

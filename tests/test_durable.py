@@ -31,6 +31,7 @@ from recording_factory import (
     load,
 )
 from support.commands import run_without
+from support.failing import PowerCut, fail_once
 from support.recording import ENCODER, assert_recorded, everything, write, write_episode, writer
 
 from lerobot_playbyear.datasets import audio_feature, episode_files, journal
@@ -166,25 +167,13 @@ def test_lerobot_goes_on_with_our_dataset_and_we_with_lerobots(tmp_path):
 # Crashes
 
 
-class PowerCut(BaseException):
-    """Stops the process at a chosen moment, so that no clean-up of ours runs."""
-
-
 @pytest.mark.parametrize("moves_before", [0, 1, 3, 5])
 def test_a_crash_while_an_episode_is_moved_into_place_loses_nothing(tmp_path, monkeypatch, caplog, moves_before):
     """At every move: the dataset loads before and after recovery, and recording goes on."""
     root = tmp_path / "dataset"
     write(root, [0])
     target = writer(root)
-    moves = iter(range(100))
-    real_replace = os.replace
-
-    def replace(source, target):
-        if next(moves) == moves_before:
-            raise PowerCut
-        real_replace(source, target)
-
-    monkeypatch.setattr(journal.os, "replace", replace)
+    fail_once(monkeypatch, journal.os, "replace", moves_before)
     with pytest.raises(PowerCut):
         write_episode(target, 1)
     monkeypatch.undo()

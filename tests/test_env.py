@@ -11,15 +11,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
-from virtual_screen import MISSING, VirtualScreen, wait_for
+from support.commands import python
+from support.playing import STILL
+from virtual_screen import VirtualScreen, needs_screen, wait_for
 
 from gym_playbyear import TASKS
 
 CUBE_TASKS = tuple(task for task in TASKS if task.startswith("Occluded"))
-STAY = np.array([0, 0, 0, -1], np.float32)
-needs_screen = pytest.mark.skipif(
-    bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (Debian: apt-get install xvfb xdotool)"
-)
 
 
 def make(task: str = "OccludedGrasp-v1", **options) -> gym.Env:
@@ -113,7 +111,7 @@ def play(env: gym.Env, gate, n_steps: int) -> list[dict]:
     """The expert corrects someone who does not move; what was observed."""
     observations = []
     for _ in range(n_steps):
-        action = gate.act() if gate.wants_control(STAY) else STAY
+        action = gate.act() if gate.wants_control(STILL) else STILL
         observations.append(env.step(action)[0])
     return observations
 
@@ -141,7 +139,7 @@ def test_a_copy_of_a_running_episode_goes_on_alike_and_by_itself(copied):
 
 def test_before_reset_everything_that_needs_an_episode_says_so():
     env = make(render_mode="rgb_array").unwrapped
-    needing = {"step": (STAY,), "step_physics": (STAY,), "render": (), "scripted_expert": (), "intervention_gate": ()}
+    needing = {"step": (STILL,), "step_physics": (STILL,), "render": (), "scripted_expert": (), "intervention_gate": ()}
     for name, arguments in needing.items():
         with pytest.raises(ResetNeeded, match=r"reset\(\)"):
             getattr(env, name)(*arguments)
@@ -157,7 +155,7 @@ def test_a_closed_environment_refuses_and_opens_nothing(was_reset):
     env.close()
     env.close()
     for one in (env, copy.deepcopy(env)):
-        for name, arguments in (("step", (STAY,)), ("step_physics", (STAY,)), ("render", ())):
+        for name, arguments in (("step", (STILL,)), ("step_physics", (STILL,)), ("render", ())):
             with pytest.raises(ClosedEnvironmentError, match=r"closed.*reset\(\)"):
                 getattr(one, name)(*arguments)
     assert (env._cameras, env._people) == ({}, None)
@@ -169,22 +167,8 @@ def test_reset_opens_a_closed_environment_anew():
     env.close()
     assert_same([first], [env.reset(seed=4)[0]])
     assert env.render().shape == (480, 480, 3)
-    env.step(STAY)
+    env.step(STILL)
     env.close()
-
-
-def python(code: str, *arguments: str, **environment: str) -> str:
-    """Runs a program in a process of its own, without a screen unless one is given; what it printed."""
-    kept = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL")}
-    result = subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**kept, **environment},
-    )
-    assert result.returncode == 0, result.stderr[-2000:]
-    return result.stdout
 
 
 _BASELINES = """
@@ -195,7 +179,8 @@ runpy.run_module("gym_playbyear.check", run_name="__main__")
 
 
 def test_scripts_need_no_opengl():
-    assert "all limits hold" in python(_BASELINES, MUJOCO_GL="disable")
+    without = {key: value for key, value in os.environ.items() if not key.endswith("DISPLAY")}
+    assert "all limits hold" in python(_BASELINES, environment={**without, "MUJOCO_GL": "disable"})
 
 
 def test_an_episode_that_is_not_looked_at_is_the_same_one():
@@ -277,6 +262,6 @@ print(json.dumps([str(w.message) for w in caught]))
     "task", [task if task == "OccludedGrasp-v1" else pytest.param(task, marks=pytest.mark.slow) for task in TASKS]
 )
 def test_gymnasiums_checker_passes_with_every_way_of_rendering(screen, task):
-    printed = python(_CHECK, task, **{**screen.environment, "MUJOCO_GL": "egl"})
+    printed = python(_CHECK, task, environment={**screen.environment, "MUJOCO_GL": "egl"})
     # The state of an arm has no bounds worth naming; Gymnasium remarks on every such space.
     assert [message for message in json.loads(printed.splitlines()[-1]) if "infinity" not in message] == []

@@ -17,7 +17,9 @@ from dataset_factory import MICROPHONE, dataset_features, make_dataset, rollout_
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies.act.configuration_act import ACTConfig
 from support.shared import ENV, TINY
+from test_attach_audio import write_sounds
 
+from gym_playbyear.check.report import check
 from gym_playbyear.environment import TaskEnv
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.datasets.durable import DurableWriter
@@ -207,6 +209,8 @@ reset | OccludedGrasp-v1, {cube_position: [0, 0.9]} | cube_position= | on the ta
 reset | OccludedPickPlace-v1, {bin_position: 0.1} | bin_position= | give x and y
 reset | TellApart-v1, {pouch_position: [.nan, 0]} | pouch_position
 reset | TellApart-v1, {contents: gravel} | contents='gravel' is not known: choose one of screws, peanuts
+check | names: [tap_dance] | player='tap_dance' is not known: choose from 'expert', 'middle'
+check | learned: [{name: rl, task: KeyBag-Easy-v1}] | 'rl' is no learner's result on 'OccludedGrasp-v1'
 # Features of a microphone that is recorded, of 80 samples at 1600 Hz and 20 frames per second
 feature | info: {} | does not say its sample rate
 feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz
@@ -239,6 +243,7 @@ ACTION = {"dtype": "float32", "shape": [4], "names": None}
 FUNCTIONS: dict[str, Callable] = {
     "policy": PlaybyearConfig,
     "task": lambda **options: TaskEnv("OccludedGrasp-v1", **options),
+    "check": lambda **options: check("OccludedGrasp-v1", 1, progress=Path("never"), **options),
     "reset": reset,
     "feature": lambda **changes: record({MICROPHONE: tuples(SOUND | changes), "action": tuples(ACTION)}),
     "action": lambda **changes: record({"action": tuples(ACTION | changes)}),
@@ -269,18 +274,16 @@ def truncated(root: Path) -> None:
 
 def sounds(folder: Path) -> None:
     """Of `silent`: a file for each episode, at two rates, and one of the session with times of its episodes."""
-    for episode, length in enumerate((12, 17)):
-        for rate, place in ((16000, folder), (11025, folder / "odd")):
-            write_audio(place / f"{episode:03d}.wav", np.ones((round((0.25 + length / 20) * rate), 1), np.int16), rate)
+    for rate, place in ((16000, folder), (11025, folder / "odd")):
+        write_sounds(place, rate)
     write_audio(folder / "day.wav", np.zeros((16000 * 5, 1), np.int16), 16000)
-    (folder / "starts.csv").write_text("0,1\n1,2\n")
+    (folder / "starts.csv").write_text("0,1\n1,2\n2,3\n")
 
 
 MAKERS: dict[str, Callable[[Path], object]] = {
     "full": lambda folder: (folder.mkdir(), (folder / "thesis.tex").touch()),
     "file": Path.touch,
     "folder_mp4": Path.mkdir,
-    "silent": lambda root: make_dataset(root, (12, 17), features=without(MICROPHONE)),
     "slow": with_noise(fps=10),
     "48_kHz": with_noise(sample_rate=48000),
     "six_joints": with_noise(state_size=6),
@@ -305,8 +308,9 @@ class Places(dict):
 
 
 @pytest.fixture(scope="module")
-def places(noise, recorded, trained, finished, tmp_path_factory):
-    return Places(made=tmp_path_factory.mktemp("made"), noise=noise, demos=recorded, policy=trained, finished=finished)
+def places(noise, silent, recorded, trained, finished, tmp_path_factory):
+    made = {"noise": noise, "silent": silent, "demos": recorded, "policy": trained, "finished": finished}
+    return Places(made, made=tmp_path_factory.mktemp("made"))
 
 
 def rows_of(table: str) -> list:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from dataset_factory import make_dataset
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from recording_factory import load
 
 from lerobot_playbyear.audio import read_audio
 from lerobot_playbyear.datasets import episode_waveform
@@ -32,10 +32,6 @@ def run(monkeypatch):
     return call
 
 
-def load(root: Path) -> LeRobotDataset:
-    return LeRobotDataset("me/example", root=root, video_backend="pyav")
-
-
 @pytest.mark.timeout(300)  # LeRobot is imported, records, trains and evaluates: a minute and a half on a busy machine
 def test_the_main_job_with_lerobots_own_commands(commands, tmp_path):
     """bash says which commands the script runs, and they are run."""
@@ -49,8 +45,7 @@ def test_the_main_job_with_lerobots_own_commands(commands, tmp_path):
     subprocess.run(["bash", EXAMPLES / "by_hand.sh", tmp_path], check=True, env=environment)
 
     for line in said.read_text().splitlines():
-        result = commands.run(*json.loads(line))
-        assert result.status == 0, result.output[-3000:]
+        commands.succeed(*json.loads(line))
 
     assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
 

@@ -8,11 +8,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from lerobot.scripts import lerobot_eval, lerobot_train
+from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 from support.distributions import install_example, longest_file
 from support.policy import MICROPHONE, make_config, make_episode, make_policy, run_ending_at, step_through
-from support.shared import ENV, TINY, run_in_process
+from support.shared import ENV, TINY, n_evaluated, run_in_process
 from torch import nn
 
 from lerobot_playbyear.audio.microphone_pictures import read_strip
@@ -36,7 +36,7 @@ def installed(tmp_path_factory):
         yield
 
 
-@pytest.mark.parametrize("example", ["extension", "own_microphone"])
+@pytest.mark.parametrize("example", ["extension", "own_microphone", "own_task"])
 def test_the_examples_are_short(example):
     assert longest_file(example) < 100
 
@@ -55,9 +55,7 @@ def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, noi
     assert (saved["audio_encoder"], saved["vision_encoder"]) == ("spectrogram_gru", "resnet18")
     steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
     assert [step["registry_name"] for step in steps][-2:] == ["remove_offset", "normalizer_processor"]
-    once = ("--env.episode_length=5", "--eval.n_episodes=1", "--eval.batch_size=1")
-    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *once, f"--output_dir={tmp_path / 'eval'}")
-    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
+    assert n_evaluated(checkpoint, tmp_path / "eval", *ENV, "--env.episode_length=5") == 1
 
 
 @torch.no_grad()

@@ -4,7 +4,6 @@ nothing is counted that is not on the disk. All else that is wrong is said, with
 import contextlib
 import errno
 import itertools
-import json
 import os
 import shutil
 import subprocess
@@ -16,7 +15,8 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from recording_factory import FEATURES, FILM, REPO_ID, RICH_FEATURES, differences, episode_frames, load
-from support.recording import add_episode, assert_recorded, everything, write, write_episode, writer
+from support.failing import fail_once
+from support.recording import add_episode, assert_recorded, edit_info, everything, write, write_episode, writer
 
 from lerobot_playbyear.datasets import durable, episode_files, files
 from lerobot_playbyear.datasets.durable import DatasetWriteError, has_dataset
@@ -97,17 +97,10 @@ def test_a_save_is_repeated_wherever_it_failed(tmp_path, monkeypatch, call, step
     with writer(root, TWO_FILMS) as target:
         write_episode(target, 0)
         add_episode(target, 1)
-        failures, real = 0, getattr(os, call)
+        failures = 0
         while True:
-            calls = iter(range(10**6))
-
-            def fail_later(*args, calls=calls, after=failures, **kwargs):
-                if next(calls) == after:
-                    raise fault
-                return real(*args, **kwargs)
-
             with monkeypatch.context() as patch:
-                patch.setattr(os, call, fail_later)
+                fail_once(patch, os, call, failures, fault)
                 try:
                     index = target.save_episode()
                     break
@@ -141,12 +134,11 @@ def test_an_episode_that_failed_is_discarded(tmp_path, monkeypatch):
 def test_an_episode_that_was_published_in_vain_is_there_after_closing(tmp_path, monkeypatch):
     """The journal stood: closing makes the moves that are left."""
     root = tmp_path / "dataset"
-    real, calls = os.replace, iter(range(100))
     with writer(root) as target:
         write_episode(target, 0)
         add_episode(target, 1)
         with monkeypatch.context() as patch:
-            patch.setattr(os, "replace", lambda *args: no_room() if next(calls) == 2 else real(*args))
+            fail_once(patch, os, "replace", 2, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
             with pytest.raises(DatasetWriteError, match="Episode 1 is complete on disk"):
                 target.save_episode()
             with pytest.raises(DatasetWriteError, match="is complete on disk already"):
@@ -257,12 +249,8 @@ def cut(path: Path) -> None:
 
 def lead_away(name: str) -> Any:
     """A path that leads out of the dataset and back in again: it can be read, and would be written to elsewhere."""
-
-    def change(path: Path) -> None:
-        template = "../dataset/data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-        path.write_text(json.dumps({**json.loads(path.read_text()), name: template}))
-
-    return change
+    template = "../dataset/data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    return lambda path: edit_info(path.parents[1], lambda info: info.update({name: template}))
 
 
 @pytest.mark.parametrize(
@@ -301,18 +289,10 @@ def test_a_read_that_failed_once_costs_no_episode(root, monkeypatch, what):
     """An error of the disk, the network or for lack of memory at each read of a table in turn: it is told as such, or what is
     read is read again, and nothing is changed."""
     before, expected, told = everything(root.parent), READ_BY[what](root), []
-    real, codes = pq.ParquetFile.read_row_group, itertools.cycle((errno.ESTALE, errno.EIO, errno.ENOMEM))
-    for fails_after in itertools.count():
-        calls = itertools.count()
-
-        def read_row_group(*args, calls=calls, fails_after=fails_after, **kwargs):
-            if next(calls) == fails_after:
-                code = next(codes)
-                raise OSError(code, os.strerror(code))
-            return real(*args, **kwargs)
-
+    for fails_after, code in enumerate(itertools.cycle((errno.ESTALE, errno.EIO, errno.ENOMEM))):
         with monkeypatch.context() as patch:
-            patch.setattr(pq.ParquetFile, "read_row_group", read_row_group)
+            error = OSError(code, os.strerror(code))
+            calls = fail_once(patch, pq.ParquetFile, "read_row_group", fails_after, error)
             try:
                 assert READ_BY[what](root) == expected
             except (OSError, MemoryError, PlaybyearError) as error:

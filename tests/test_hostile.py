@@ -25,7 +25,6 @@ from dataset_factory import CAMERA, MICROPHONE, TASK, dataset_features, make_dat
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets import LeRobotDatasetMetadata
 from PIL import Image
-from support.hub import HubServer, come_here
 from support.recording import edit_column, edit_info
 
 from lerobot_playbyear.audio import write_audio
@@ -66,15 +65,6 @@ def root(made, tmp_path):
     """A copy, beside a picture of this machine."""
     Image.new("RGB", (16, 16), SECRET).save(tmp_path / "secret.png")
     return Path(shutil.copytree(made, tmp_path / "set"))
-
-
-@pytest.fixture
-def hub(monkeypatch):
-    """A Hub on loopback."""
-    with HubServer() as hub:
-        come_here(monkeypatch, hub)
-        monkeypatch.setattr("huggingface_hub.RepoCard.validate", lambda card: None)  # it asks huggingface.co
-        yield hub
 
 
 def edit_frames(root: Path, key: str, change: Callable[[Any], Any]) -> None:
@@ -266,7 +256,7 @@ HOSTILE: dict[str, tuple[Callable[[Path], object], dict[str, str | None]]] = {
 
 
 @pytest.mark.parametrize("what", HOSTILE)
-def test_a_hostile_dataset_is_refused_by_whoever_reads_it(root, hub, monkeypatch, what):
+def test_a_hostile_dataset_is_refused_by_whoever_reads_it(root, here, monkeypatch, what):
     """And nothing is uploaded, copied or written."""
     spoil, says = HOSTILE[what]
     spoil(root)
@@ -278,7 +268,7 @@ def test_a_hostile_dataset_is_refused_by_whoever_reads_it(root, hub, monkeypatch
         with pytest.raises(ERRORS.get(reader, ValueError), match=f"(?s){said}"):
             READERS[reader](root)
         assert said == OUTSIDE or not (root.parent / FILES_MADE.get(reader, "nothing")).exists()
-    assert not hub.requests
+    assert not here.requests
 
 
 def test_a_picture_in_a_file_of_the_dataset_is_read(root, tmp_path, monkeypatch):
@@ -291,12 +281,12 @@ def test_a_picture_in_a_file_of_the_dataset_is_read(root, tmp_path, monkeypatch)
     assert (next(dataset.pictures(CAMERA, dataset.episodes[0]))[0, 0] == SECRET).all()
 
 
-def test_links_in_a_circle_and_pipes_hold_nobody_up(root, hub, tmp_path):
+def test_links_in_a_circle_and_pipes_hold_nobody_up(root, here, tmp_path):
     (root / "meta/loop").symlink_to("..")
     (root / "meta/self").symlink_to("self")
     os.mkfifo(root / "meta/pipe")
     push_dataset("me/hostile", root)
-    names = hub.dataset("me/hostile").files()
+    names = here.dataset("me/hostile").files()
     assert "meta/info.json" in names
     assert not [name for name in names if "loop" in name or "self" in name or "pipe" in name]
     os.mkfifo(tmp_path / "endless.png")  # who reads it waits for ever
@@ -304,7 +294,7 @@ def test_links_in_a_circle_and_pipes_hold_nobody_up(root, hub, tmp_path):
     survey(root)
 
 
-def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, monkeypatch):
+def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, here, monkeypatch):
     listed = Path.iterdir
 
     def fail(folder):
@@ -316,7 +306,7 @@ def test_a_folder_that_cannot_be_listed_is_an_error_of_the_upload(root, hub, mon
     monkeypatch.setattr(Path, "iterdir", fail)
     with pytest.raises(HubError, match=r"Not pushed.*Permission denied"):
         push_dataset("me/noise", root)
-    assert not hub.requests
+    assert not here.requests
 
 
 def test_links_that_stay_at_home_are_read_through(root, tmp_path):
@@ -396,7 +386,7 @@ def test_the_card_of_a_dataset_shows_names_as_they_are(root):
     assert_harmless(card)
 
 
-def test_the_card_of_a_policy_shows_names_as_they_are(root, hub):
+def test_the_card_of_a_policy_shows_names_as_they_are(root, here):
     rename_task(root, EVIL)
     edit_info(root, lambda info: info.update(robot_type=EVIL))
     features = {

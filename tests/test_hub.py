@@ -14,7 +14,6 @@ from support.hub import (
     File,
     HubServer,
     Repository,
-    come_here,
     every_second,
     git_oid,
     nothing_fails,
@@ -28,15 +27,6 @@ from lerobot_playbyear.hub.push import HubError, PushOptions, evaluation_of, pus
 
 DATASET = "tester/grasp"
 POLICY = "tester/hearing"
-
-
-@pytest.fixture
-def hub(hub_server):
-    """The server, to which nothing has come yet in this test, and where nothing fails."""
-    hub_server.arrivals.clear()
-    hub_server.requests.clear()
-    yield hub_server
-    hub_server.fault = nothing_fails
 
 
 @pytest.fixture(scope="module")
@@ -54,17 +44,13 @@ def recording(commands, hub_server, tmp_path_factory):
 def pushed(commands, recording):
     """The recording's folder, after the command that was named had its Hub."""
     root, result = recording
-    assert_well(commands.run(*command_in(result)))
+    commands.succeed(*command_in(result))
     return root
 
 
 def command_in(result: Result) -> list[str]:
     """The command that a message tells to run."""
     return next(shlex.split(line) for line in result.output.splitlines() if line.startswith("  playbyear-push "))
-
-
-def assert_well(result: Result) -> None:
-    assert result.status == 0, result.output[-3000:]
 
 
 def content(root: Path) -> dict[str, bytes]:
@@ -127,7 +113,7 @@ def test_the_film_beside_the_card_has_pictures_and_sound(pushed, hub, tmp_path):
 
 def test_what_has_arrived_is_not_sent_again(pushed, hub, commands):
     commits = len(hub.dataset(DATASET).commits)
-    assert_well(commands.run("playbyear-push", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}"))
+    commands.succeed("playbyear-push", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}")
     assert not hub.arrivals
     assert len(hub.dataset(DATASET).commits) == commits
 
@@ -136,7 +122,7 @@ def test_a_file_that_the_dataset_no_longer_has_goes_from_the_hub(pushed, hub, co
     stale = File(git_oid(b"old"), b"old", is_large=False)
     hub.dataset(DATASET).files()["data/chunk-000/file-009.parquet"] = stale
     hub.dataset(DATASET).files()["notes.txt"] = stale
-    assert_well(commands.run("playbyear-push", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}"))
+    commands.succeed("playbyear-push", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}")
     assert content_on(hub) == content(pushed)
     assert "notes.txt" in hub.dataset(DATASET).files()
 
@@ -147,7 +133,7 @@ def test_an_upload_that_was_killed_goes_on(pushed, hub, commands):
     assert commands.run(*push, kill_when=lambda: len(hub.arrivals) >= 2).status < 0
     assert len(hub.arrivals) >= 2
     assert not hub.dataset("tester/killed").tags
-    assert_well(commands.run(*push))
+    commands.succeed(*push)
     assert content_on(hub, "tester/killed") == content(pushed)
     assert set(hub.arrivals.values()) == {1}
 
@@ -162,7 +148,7 @@ def test_without_a_login_the_message_says_so_at_once(pushed, hub, commands):
 
 def test_lerobot_trains_on_a_dataset_from_the_hub(pushed, hub, commands, tmp_path):
     run = (*TINY, "--steps=2", f"--output_dir={tmp_path / 'out'}")
-    assert_well(commands.run("lerobot-train", f"--dataset.repo_id={DATASET}", *run))
+    commands.succeed("lerobot-train", f"--dataset.repo_id={DATASET}", *run)
     assert content(commands.snapshot(DATASET)) == content(pushed)
     assert (tmp_path / "out" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
 
@@ -174,11 +160,11 @@ def test_our_commands_load_a_dataset_and_a_policy_from_the_hub_although_one_requ
     hub.fault = one_in(10, seed=1)
     policy = ("--policy.push_to_hub=true", f"--policy.repo_id={POLICY}")
     run = (*TINY, *policy, "--steps=2", f"--output_dir={tmp_path / 'out'}")
-    assert_well(commands.run("playbyear-train", f"--dataset.repo_id={DATASET}", *run))
+    commands.succeed("playbyear-train", f"--dataset.repo_id={DATASET}", *run)
     hub.fault = nothing_fails
     evaluation = ("--eval.n_episodes=1", "--eval.batch_size=1", "--policy.device=cpu")
     output = f"--output_dir={tmp_path / 'eval'}"
-    assert_well(commands.run("lerobot-eval", f"--policy.path={POLICY}", *ENV, *evaluation, output))
+    commands.succeed("lerobot-eval", f"--policy.path={POLICY}", *ENV, *evaluation, output)
     assert (tmp_path / "eval" / "eval_info.json").is_file()
     assert hub.faults()
 
@@ -195,7 +181,7 @@ def test_a_policy_is_safe_without_the_hub_and_says_how_to_push_it_later(pushed, 
     hub.fault = nothing_fails
     film = tmp_path / "film.mp4"
     film.write_bytes(hub.dataset(DATASET).files()["preview.mp4"].data)
-    assert_well(commands.run(*command_in(result), f"--preview={film}"))
+    commands.succeed(*command_in(result), f"--preview={film}")
     files = hub.model("tester/later").files()
     assert {"config.json", "model.safetensors", "train_config.json"} <= set(files)
     assert files["preview.mp4"].data == film.read_bytes()
@@ -214,16 +200,16 @@ def test_a_policy_is_safe_without_the_hub_and_says_how_to_push_it_later(pushed, 
 def test_a_dataset_goes_up_and_comes_back_although_one_request_in_ten_fails(pushed, hub, commands):
     hub.objects.clear()
     hub.fault = one_in(10, seed=6)
-    assert_well(commands.run("playbyear-push", "--dataset.repo_id=tester/rough", f"--dataset.root={pushed}"))
+    commands.succeed("playbyear-push", "--dataset.repo_id=tester/rough", f"--dataset.root={pushed}")
     assert content_on(hub, "tester/rough") == content(pushed)
-    assert_well(commands.run("playbyear-inspect", "--dataset.repo_id=tester/rough", "--json"))
+    commands.succeed("playbyear-inspect", "--dataset.repo_id=tester/rough", "--json")
     assert content(commands.snapshot("tester/rough")) == content(pushed)
     assert hub.faults()
 
 
 @pytest.mark.slow
 def test_a_corrected_policy_goes_up_from_dagger(trained, recorded, hub, commands, tmp_path):
-    corrected = commands.run(
+    commands.succeed(
         "playbyear-dagger",
         f"--policy.path={trained}",
         "--policy.push_to_hub=true",
@@ -236,7 +222,6 @@ def test_a_corrected_policy_goes_up_from_dagger(trained, recorded, hub, commands
         *ENV,
         *("--episodes=1", "--updates_per_episode=1", "--warmup_episodes=1", "--batch_size=2", "--eval_every=0"),
     )
-    assert_well(corrected)
     weights = (tmp_path / "dagger" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
     assert hub.model("tester/corrected").files()["model.safetensors"].data == weights
     assert "## Hearing" in hub.model("tester/corrected").files()["README.md"].data.decode()
@@ -259,7 +244,7 @@ def test_a_dataset_on_the_hub_that_claims_too_much_is_refused_before_its_data_co
 def test_a_commit_whose_answer_is_lost_happens_once(pushed, hub, commands, kind):
     hub.repositories.pop(("datasets", "tester/once"), None)
     hub.fault = every_second(kind, "POST", "/commit/")
-    assert_well(commands.run("playbyear-push", "--dataset.repo_id=tester/once", f"--dataset.root={pushed}"))
+    commands.succeed("playbyear-push", "--dataset.repo_id=tester/once", f"--dataset.root={pushed}")
     assert content_on(hub, "tester/once") == content(pushed)
     assert hub.dataset("tester/once").messages == ["initial commit", "Upload dataset"]
 
@@ -269,8 +254,9 @@ def test_checkpoints_go_up_once_although_answers_are_lost(pushed, hub, commands,
     hub.fault = every_second("lost", "POST", "/commit/|/tag/|/create")
     run = (*TINY, "--policy.push_to_hub=true", "--policy.repo_id=tester/steps", "--steps=2", "--save_freq=1")
     more = ("--save_checkpoint_to_hub=true", f"--output_dir={tmp_path / 'out'}")
-    result = commands.run("playbyear-train", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}", *run, *more)
-    assert_well(result)
+    result = commands.succeed(
+        "playbyear-train", f"--dataset.repo_id={DATASET}", f"--dataset.root={pushed}", *run, *more
+    )
     assert "was not uploaded" not in result.output
     repository = hub.model("tester/steps")
     assert repository.messages == ["initial commit", "checkpoint 000001", "checkpoint 000002", "Upload policy"]
@@ -285,13 +271,6 @@ def test_checkpoints_go_up_once_although_answers_are_lost(pushed, hub, commands,
 def dataset(noise, tmp_path):
     shutil.copytree(noise, tmp_path / "set")
     return tmp_path / "set"
-
-
-@pytest.fixture
-def here(hub, monkeypatch):
-    """The Hub on loopback, for this process."""
-    come_here(monkeypatch, hub)
-    return hub
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,11 @@ import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from support.recording import edit_column, edit_info
+from support.shared import run_in_process
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.features import audio_feature
-from lerobot_playbyear.datasets.parquet import with_values
 from lerobot_playbyear.inspection import Finding
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.inspection.sound import flat_tops, gaps, repeats
@@ -92,6 +92,12 @@ def found(verdicts: list[Finding]) -> dict[str, Finding]:
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory) -> Path:
     return write(tmp_path_factory.mktemp("clean") / "dataset", clean_episodes(EPISODES))
+
+
+@pytest.fixture
+def root(clean, tmp_path) -> Path:
+    """A copy of it, to be damaged."""
+    return Path(shutil.copytree(clean, tmp_path / "copy"))
 
 
 def test_a_sound_dataset_passes_every_check(clean, capsys):
@@ -197,21 +203,14 @@ def test_many_faults_are_errors_where_few_are_warnings(tmp_path):
     assert levels == {"drop-outs": "error", "frames that repeat": "warning", "actions used": "warning"}
 
 
-def edit(root: Path, change: Callable[[dict[str, Any]], None], name: str = "info.json") -> None:
-    path = root / "meta" / name
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 @pytest.mark.parametrize(("rate", "known", "said"), [(48000, 48000, "it must be (2400,)"), (float("nan"), None, "nan")])
 def test_a_sample_rate_that_does_not_fit_or_is_no_number_is_an_error_and_all_else_is_checked(
-    clean, tmp_path, monkeypatch, capsys, rate, known, said
+    root, tmp_path, capsys, rate, known, said
 ):
     """What is printed and the page are valid JSON, whatever the dataset says."""
-    root, page = copy(clean, tmp_path), tmp_path / "page.html"
-    edit(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate=rate))
-    assert run(monkeypatch, f"--dataset.root={root}", f"--html={page}", "--json") == 1
+    page = tmp_path / "page.html"
+    edit_info(root, lambda info: info["features"][MICROPHONE]["info"].update(sample_rate=rate))
+    assert run(f"--dataset.root={root}", f"--html={page}", "--json") == 1
     printed = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert printed["dataset"]["microphones"] == {MICROPHONE: known}
     checks = {verdict["check"]: verdict for verdict in printed["verdicts"]}
@@ -223,9 +222,8 @@ def test_a_sample_rate_that_does_not_fit_or_is_no_number_is_an_error_and_all_els
     assert json.loads(data, parse_constant=pytest.fail)["facts"]["microphones"] == {MICROPHONE: known}
 
 
-def test_statistics_of_other_data_are_an_error(clean, tmp_path):
-    root = copy(clean, tmp_path)
-    edit(root, lambda stats: stats["action"].update(mean=[0.5, 0.5]), "stats.json")
+def test_statistics_of_other_data_are_an_error(root):
+    edit_info(root, lambda stats: stats["action"].update(mean=[0.5, 0.5]), "stats.json")
     verdict = found(look(root))["statistics"]
     assert verdict.level == "error"
     assert "action (mean[0] is 0.5 there" in verdict.message
@@ -235,14 +233,11 @@ def test_statistics_of_other_data_are_an_error(clean, tmp_path):
 def change(root: Path, key: str, row: int, value: Any) -> None:
     """Another value in a column of the data; `value` may be a function of the one that is there."""
     (path,) = root.glob("data/*/*.parquet")
-    table = pq.read_table(path)
-    values = table[key].to_pylist()
-    values[row] = value(values[row]) if callable(value) else value
-    pq.write_table(with_values(table, key, values), path)
+    put = value if callable(value) else lambda _: value
+    edit_column(path, key, lambda values: [*values[:row], put(values[row]), *values[row + 1 :]])
 
 
-def test_frames_that_the_metadata_does_not_know_of_are_an_error(clean, tmp_path):
-    root = copy(clean, tmp_path)
+def test_frames_that_the_metadata_does_not_know_of_are_an_error(root):
     (path,) = root.glob("data/*/*.parquet")
     table = pq.read_table(path)
     pq.write_table(table.filter(pc.not_equal(table["index"], LENGTH + 7)), path)
@@ -250,8 +245,7 @@ def test_frames_that_the_metadata_does_not_know_of_are_an_error(clean, tmp_path)
     assert (verdict.level, list(verdict.episodes)) == ("error", [1])
 
 
-def test_nan_is_named_and_the_other_checks_go_on(clean, tmp_path):
-    root = copy(clean, tmp_path)
+def test_nan_is_named_and_the_other_checks_go_on(clean, root, tmp_path):
     change(root, "observation.state", LENGTH + 3, lambda state: [state[0], float("nan"), state[2]])
     verdicts = look(root, html=tmp_path / "page.html")
     faults = found(verdicts)
@@ -262,8 +256,7 @@ def test_nan_is_named_and_the_other_checks_go_on(clean, tmp_path):
 
 
 @pytest.mark.parametrize("keys", [["observation.state", MICROPHONE], ["action", "intervention", "next.success"]])
-def test_columns_that_lack_a_value_are_named_and_the_other_checks_go_on(clean, tmp_path, keys):
-    root = copy(clean, tmp_path)
+def test_columns_that_lack_a_value_are_named_and_the_other_checks_go_on(root, tmp_path, keys):
     for key in keys:
         change(root, key, LENGTH + 3, None)
     verdicts = look(root, html=tmp_path / "page.html")
@@ -276,8 +269,7 @@ def test_columns_that_lack_a_value_are_named_and_the_other_checks_go_on(clean, t
     assert (tmp_path / "page.html").stat().st_size > 10_000
 
 
-def test_a_damaged_picture_is_an_error_and_the_page_is_written_all_the_same(clean, tmp_path):
-    root = copy(clean, tmp_path)
+def test_a_damaged_picture_is_an_error_and_the_page_is_written_all_the_same(root, tmp_path):
     change(root, CAMERA, LENGTH + 30, lambda picture: {**picture, "bytes": picture["bytes"][:60]})
     verdict = found(look(root, html=tmp_path / "page.html"))["pictures"]
     assert (verdict.level, list(verdict.episodes)) == ("error", [1])
@@ -364,21 +356,14 @@ def test_silence_before_and_after_the_sound_is_no_gap():
 # The command
 
 
-def run(monkeypatch, *arguments: str) -> int:
-    monkeypatch.setattr(sys, "argv", ["playbyear-inspect", "--dataset.repo_id=tests/inspected", *arguments])
-    with pytest.raises(SystemExit) as exit_:
-        main()
-    return int(exit_.value.code or 0)
+def run(*arguments: str) -> int:
+    return int(run_in_process(main, "--dataset.repo_id=tests/inspected", *arguments) or 0)
 
 
-def test_the_commands_status_says_whether_there_is_an_error(clean, monkeypatch, capsys):
-    assert run(monkeypatch, f"--dataset.root={clean}", "--json", "--dataset.episodes=[1]") == 0
+def test_the_commands_status_says_whether_there_is_an_error(clean, capsys):
+    assert run(f"--dataset.root={clean}", "--json", "--dataset.episodes=[1]") == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["worst"] in ("ok", "info")
     assert {"check", "level", "message", "feature", "episodes", "figures"} == set(printed["verdicts"][0])
-    assert run(monkeypatch, f"--dataset.root={clean}", "--action_range=[-0.5, 0.5]") == 1
+    assert run(f"--dataset.root={clean}", "--action_range=[-0.5, 0.5]") == 1
     assert "error    action range" in capsys.readouterr().out
-
-
-def copy(root: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(root, tmp_path / "copy"))

@@ -21,12 +21,7 @@ from lerobot_playbyear.audio.control_steps import HALF
 from lerobot_playbyear.audio.microphone_pictures import SessionSound, Strip, find_session, read_strip
 from lerobot_playbyear.microphones.camera import MicrophoneCamera, MicrophoneCameraConfig
 from lerobot_playbyear.microphones.card import CardRecording
-from lerobot_playbyear.microphones.finding import (
-    FindMicrophonesConfig,
-    described,
-    find_microphones,
-    suggested_device,
-)
+from lerobot_playbyear.microphones.finding import FindMicrophonesConfig, described, find_microphones, suggested_device
 from lerobot_playbyear.microphones.microphone import MicrophoneError, PlayedMicrophone, register_source
 from lerobot_playbyear.microphones.portaudio import SoundCard, cards_called, find_card, sound_cards
 from lerobot_playbyear.microphones.session_file import SessionFile

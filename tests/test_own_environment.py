@@ -1,13 +1,11 @@
 """Somebody else's environment, whose microphone gives int16, through LeRobot's own evaluation."""
 
-import json
 from pathlib import Path
 
 import pytest
 import torch
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.scripts import lerobot_eval
-from support.shared import TINY, run_in_process
+from support.shared import TINY, n_evaluated, run_in_process
 
 from lerobot_playbyear.policy.processor_playbyear import Pcm16ToFloatProcessorStep
 from lerobot_playbyear.scripts.commands import record, train
@@ -23,9 +21,7 @@ def test_lerobot_eval_takes_an_environment_of_ones_own_with_int16_sound(monkeypa
     assert run_in_process(record, *ENV, *data, "--dataset.num_episodes=2", "--num_workers=0") is None
     assert run_in_process(train, *TINY, *data, "--steps=2", f"--output_dir={tmp_path / 'train'}") is None
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
-    once = ["--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={tmp_path / 'eval'}"]
-    run_in_process(lerobot_eval.main, f"--policy.path={checkpoint}", *ENV, *once)
-    assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
+    assert n_evaluated(checkpoint, tmp_path / "eval", *ENV) == 1
 
 
 def scale(sound) -> torch.Tensor:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from recording_factory import load
 
 from gym_playbyear.environment import TaskEnv
 from lerobot_env_playbyear import PlaybyearEnvConfig
@@ -23,10 +23,6 @@ def config(root: Path, num_episodes: int = 2, **options) -> RecordConfig:
     env = options.pop("env", None) or PlaybyearEnvConfig(image_size=16)
     dataset = RecordDatasetConfig("test/recorded", str(root), num_episodes, video=options.pop("video", False))
     return RecordConfig(env, dataset, num_workers=options.pop("num_workers", 0), **options)
-
-
-def load(root: Path) -> LeRobotDataset:
-    return LeRobotDataset("test/recorded", root=root, video_backend="pyav")
 
 
 def tables(root: Path) -> list[dict]:

@@ -1,6 +1,5 @@
 """`lerobot-rollout` with a microphone: policies hear in every strategy, and one without a microphone says so."""
 
-import sys
 from pathlib import Path
 
 import lerobot_operator  # noqa: F401  (LeRobot finds the arm of joints then)
@@ -61,21 +60,18 @@ def told(monkeypatch):
     return all_told
 
 
-def rollout(monkeypatch, policy, *options):
+def rollout(policy, *options):
     """`lerobot-rollout` on the arm of joints."""
     given = (f"--policy.path={policy}", "--robot.type=playbyear_joints", "--device=cpu", "--fps=20", "--task=Reach out")
-    monkeypatch.setattr(
-        sys, "argv", ["lerobot-rollout", *given, "--duration=0.5", "--return_to_initial_position=false", *options]
-    )
-    lerobot_rollout.main()
+    run_in_process(lerobot_rollout.main, *given, "--duration=0.5", "--return_to_initial_position=false", *options)
 
 
-def test_a_policy_that_hears_says_that_there_is_no_sound_and_moves_nothing(policy, told, monkeypatch):
+def test_a_policy_that_hears_says_that_there_is_no_sound_and_moves_nothing(policy, told):
     with pytest.raises(InputError, match=r"hears 'gripper'.*the cameras are front.*type: microphone"):
-        rollout(monkeypatch, policy)
+        rollout(policy)
     assert told == []
     with pytest.raises(ValueError, match="RTC inference is not supported by policy type 'playbyear'"):
-        rollout(monkeypatch, policy, "--inference.type=rtc")
+        rollout(policy, "--inference.type=rtc")
 
 
 def microphone(folder: Path) -> str:
@@ -106,13 +102,13 @@ RECORDED = {
 
 
 @pytest.mark.parametrize("strategy", ["base", *RECORDED])
-def test_a_policy_hears_on_a_robot_what_its_recording_holds(strategy, policy, told, heard, monkeypatch, tmp_path):
+def test_a_policy_hears_on_a_robot_what_its_recording_holds(strategy, policy, told, heard, tmp_path):
     root, options = tmp_path / "rollout", [f"--strategy.type={strategy}", "--duration=1.5", "--play_sounds=false"]
     if strategy in RECORDED:
         dataset = ("--dataset.repo_id=tests/rollout_heard", "--dataset.no_stamp=true", f"--dataset.root={root}")
         fixed = ("--dataset.video=false", "--dataset.push_to_hub=false", "--dataset.fps=20")
         options += [*dataset, *fixed, *RECORDED[strategy]]
-    rollout(monkeypatch, policy, microphone(tmp_path), *options)
+    rollout(policy, microphone(tmp_path), *options)
     assert len(told) >= len(heard) >= 15
     if strategy in RECORDED:
         target = attach_audio(AttachAudioConfig(DatasetPlace("tests/rollout_heard", str(root))))
@@ -123,8 +119,8 @@ def test_a_policy_hears_on_a_robot_what_its_recording_holds(strategy, policy, to
 
 
 @pytest.mark.slow
-def test_a_policy_that_does_not_hear_acts(arm_dataset, told, monkeypatch, tmp_path):
-    rollout(monkeypatch, train_on(arm_dataset, tmp_path / "train", "--policy.use_audio=false"))
+def test_a_policy_that_does_not_hear_acts(arm_dataset, told, tmp_path):
+    rollout(train_on(arm_dataset, tmp_path / "train", "--policy.use_audio=false"))
     assert 5 <= len(told) <= 11
     assert all(sorted(action) == ["elbow.pos", "gripper.pos", "shoulder.pos"] for action in told)
     assert np.isfinite([list(action.values()) for action in told]).all()

@@ -4,17 +4,13 @@ import json
 
 import pytest
 from dataset_factory import dataset_features, make_dataset
-from lerobot.configs import parser
 from lerobot.scripts import lerobot_train
 from support.shared import run_in_process
 
-from lerobot_playbyear.scripts.commands import train as train_script
-from lerobot_playbyear.training import train as loop
+from lerobot_playbyear.scripts.commands import train
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-train = parser.wrap()(loop.train)
 
 TINY = ("--policy.device=cpu", "--policy.push_to_hub=false", "--policy.audio_window_s=0.9", "--num_workers=0")
 
@@ -63,7 +59,7 @@ def test_the_preset_paper_is_the_published_recipe_to_the_letter(monkeypatch):
     seen = []
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        run_in_process(train_script, "--preset=paper", "--dataset.repo_id=tests/noise")
+        run_in_process(train, "--preset=paper", "--dataset.repo_id=tests/noise")
     (cfg,) = seen
     assert {name: getattr(cfg.policy, name) for name in PUBLISHED} == PUBLISHED
     assert (cfg.batch_size, cfg.steps) == (16, 100_000)
@@ -73,7 +69,7 @@ def test_the_preset_paper_keeps_adams_rate_constant_and_never_clips(noise, tmp_p
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}")
     small = ("--policy.image_size=16", "--policy.vision_width=4", "--policy.hidden_size=32")
     run = ("--steps=4", "--log_freq=1", f"--output_dir={tmp_path / 'out'}")
-    run_in_process(train_script, "--preset=paper", *TINY, *data, *small, *run)
+    run_in_process(train, "--preset=paper", *TINY, *data, *small, *run)
 
     lines = [json.loads(line) for line in (tmp_path / "out/metrics.jsonl").read_text().splitlines()]
     saved = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/train_config.json").read_text())

@@ -12,7 +12,7 @@ from dagger_factory import arguments, column, corrections, metrics
 from lerobot.datasets import LeRobotDataset
 from lerobot.policies import make_pre_post_processors
 from support.shared import trained
-from virtual_screen import MISSING, VirtualScreen, wait_for
+from virtual_screen import VirtualScreen, needs_screen, wait_for
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.episodes.environment import env_spec
@@ -24,12 +24,7 @@ from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 from lerobot_playbyear.teleoperation.panel import FRAME, Control
 from lerobot_playbyear.teleoperation.window import Window
 
-pytestmark = [
-    pytest.mark.usefixtures("one_thread"),
-    pytest.mark.skipif(
-        bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (Debian: apt-get install xvfb xdotool)"
-    ),
-]
+pytestmark = [pytest.mark.usefixtures("one_thread"), needs_screen]
 _TITLE = "Play it by ear"
 _MOVES = {"Right": (0, 1), "Up": (1, 1), "d": (2, -1)}  # X's names of keys: axis of the environment, sign
 

@@ -11,11 +11,7 @@ import pytest
 from gymnasium.spaces import Box
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
 from lerobot.teleoperators.gamepad import GamepadTeleopConfig
-from lerobot.teleoperators.keyboard import (
-    KeyboardEndEffectorTeleopConfig,
-    KeyboardTeleop,
-    KeyboardTeleopConfig,
-)
+from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleopConfig, KeyboardTeleop, KeyboardTeleopConfig
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger.config import DaggerConfig

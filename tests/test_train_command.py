@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 import torch
 from dataset_factory import make_dataset
-from lerobot.configs import parser
 from lerobot.scripts import lerobot_train
 from safetensors.torch import load_file
 from support import shared
 from support.shared import run_in_process
 
-from lerobot_playbyear.scripts.commands import train as train_script
-from lerobot_playbyear.training import train as loop
+from lerobot_playbyear.scripts.commands import train
 from lerobot_playbyear.training.command_line import PRESETS, RECIPES, apply_preset, preset_options
 from lerobot_playbyear.training.config import PlaybyearTrainConfig, StoreConfig
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-train = parser.wrap()(loop.train)
 
 FPS = 20
 TINY = (*shared.TINY, "--log_freq=2")
@@ -82,16 +78,6 @@ def test_a_policy_is_tuned_with_sound_of_another_rate(trained, tmp_path):
     assert tuned["sample_rate"] == sample_rate
 
 
-def test_a_resumed_run_ends_where_an_uninterrupted_one_does(trained, tmp_path):
-    half = trained / "checkpoints" / "000003"
-
-    run_in_process(train, "--resume=true", f"--config_path={config_of(half)}", f"--output_dir={tmp_path}")
-
-    resumed = weights_of(tmp_path / "checkpoints" / "last")
-    expected = weights_of(trained / "checkpoints" / "last")
-    assert all(torch.equal(resumed[key], expected[key]) for key in expected)
-
-
 def test_lerobot_train_and_playbyear_train_continue_each_other(trained, tmp_path):
     ours = trained / "checkpoints" / "last"
 
@@ -108,7 +94,7 @@ def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(
     policy = trained / "checkpoints" / "last" / "pretrained_model"
     options = ("--preset=cpu", "--steps=1", "--batch_size=2", "--policy.use_amp=false")
 
-    run_in_process(train_script, f"--policy.path={policy}", *data(noise), *options, f"--output_dir={tmp_path / 'out'}")
+    run_in_process(train, f"--policy.path={policy}", *data(noise), *options, f"--output_dir={tmp_path / 'out'}")
 
     tuned = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/config.json").read_text())
     assert (tuned["image_size"], tuned["vision_width"]) == (16, 4)
@@ -160,7 +146,7 @@ def test_presets_are_options_that_exist_and_configuration_files_as_well(name, mo
     monkeypatch.setattr(PlaybyearTrainConfig, "validate", lambda cfg: seen.append(cfg) or 1 / 0)
     for options in ((f"--preset={name}", "--policy.use_amp=false"), (f"--config_path={RECIPES / name}.json",)):
         with pytest.raises(ZeroDivisionError):
-            run_in_process(train_script, *options, *data(noise))
+            run_in_process(train, *options, *data(noise))
     by_name, by_file = seen
     assert by_name.steps == int(preset_options(name)["steps"])
     assert by_name.preset == name
@@ -171,10 +157,10 @@ def test_presets_are_options_that_exist_and_configuration_files_as_well(name, mo
 def test_a_run_from_the_disk_resumes_from_there_and_sees_shrunk_pictures(tmp_path):
     make_dataset(tmp_path / "data", (12, 17), image_size=48)
     options = (*TINY, *data(tmp_path / "data"), "--store=disk", f"--store.cache={tmp_path / 'cache'}")
-    run_in_process(train_script, *options, "--steps=2", f"--output_dir={tmp_path / 'out'}")
+    run_in_process(train, *options, "--steps=2", f"--output_dir={tmp_path / 'out'}")
     (folder,) = (path for path in (tmp_path / "cache").iterdir() if path.is_dir())
     assert np.load(folder / "0.npy", mmap_mode="r").shape == (29, 3, 16, 16)
     last = tmp_path / "out" / "checkpoints" / "last"
-    run_in_process(train_script, "--resume=true", f"--config_path={config_of(last)}", "--steps=3")
+    run_in_process(train, "--resume=true", f"--config_path={config_of(last)}", "--steps=3")
     assert step_of(last.resolve()) == 3
     assert [path for path in (tmp_path / "cache").iterdir() if path.is_dir()] == [folder]

@@ -1,18 +1,15 @@
 """How people see the tasks: the same motion with other shapes and light; physics and the policy see none of it."""
 
-import gymnasium as gym
+from functools import partial
+
 import numpy as np
 import pytest
+from support import playing
 
-from gym_playbyear.environment import TaskEnv
 from gym_playbyear.rendering import PeopleView
 
+make = partial(playing.make, render_mode="rgb_array", render_size=120)
 TASKS = ("OccludedGrasp-v1", "OccludedPickPlace-v1", "TellApart-v1", "KeyBag-Hard-v1")
-
-
-def make(task: str, **options) -> TaskEnv:
-    options = {"sound": "none", "render_mode": "rgb_array", "render_size": 120} | options
-    return gym.make(f"gym_playbyear/{task}", disable_env_checker=True, **options).unwrapped
 
 
 @pytest.mark.parametrize("task", TASKS)

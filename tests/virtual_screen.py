@@ -9,11 +9,16 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from PIL import ImageGrab
 
 _numbers = itertools.count()
 MISSING = [name for name in ("Xvfb", "xdotool") if shutil.which(name) is None]
 """What is not installed (Debian: xvfb, xdotool)."""
+
+needs_screen = pytest.mark.skipif(
+    bool(MISSING), reason=f"{' and '.join(MISSING)} not installed (Debian: apt-get install xvfb xdotool)"
+)
 
 
 class VirtualScreen:

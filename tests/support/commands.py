@@ -1,14 +1,16 @@
-"""Commands as they are typed, in a tenth of a second: LeRobot is imported once, and every command is a fork of that process.
+"""Commands as they are typed, in a tenth of a second: every command is a fork of a process that has LeRobot.
 
-Each command has its own arguments, environment, output and exit status. What is read while modules are imported, such as
-`HF_ENDPOINT` and `HF_HOME`, is that of the process they are forked from.
+That process is a fork of the one that runs the tests, from before the first: what tests import is imported once. Each command
+has its own arguments, environment, output and exit status. What is read while modules are imported, such as `HF_ENDPOINT` and
+`HF_HOME`, is that of the tests; `conftest.py` sets it.
 """
 
 import contextlib
 import gc
 import importlib
 import inspect
-import json
+import logging
+import multiprocessing
 import os
 import pkgutil
 import shutil
@@ -18,10 +20,12 @@ import subprocess
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,23 +57,25 @@ class Result:
 
 
 class Commands:
-    """Runs commands.
+    """Runs commands. Make it before any test has run.
 
     Args:
-        folder: Of the caches and the output.
-        environment: Besides that of this process.
+        home: Of the caches, `HF_HOME`, and the output.
     """
 
-    def __init__(self, folder: Path, environment: Mapping[str, str] | None = None) -> None:
-        self._home, self._output = folder / "home", folder / "output"
-        folder.mkdir(parents=True, exist_ok=True)
-        self._process = subprocess.Popen(
-            [sys.executable, __file__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "HF_HOME": str(self._home), "OMP_NUM_THREADS": "1", **(environment or {})},
-        )
+    def __init__(self, home: Path) -> None:
+        self._home, self._output = home, home / "output"
+        self._server, theirs = multiprocessing.Pipe()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of threads: none of them is at work yet
+            self._pid = os.fork()
+        if self._pid == 0:
+            self._server.close()
+            try:
+                _serve(theirs)
+            finally:
+                os._exit(0)
+        theirs.close()
 
     def run(
         self,
@@ -82,29 +88,26 @@ class Commands:
 
         Args:
             arguments: Its name and its options.
-            fresh: Whether it begins without anything in its caches.
+            fresh: Whether it begins without anything from the Hub in its caches.
             environment: For this command alone.
             kill_when: The command is killed when this becomes true.
         """
-        if fresh:
-            shutil.rmtree(self._home, ignore_errors=True)
-        job = {
-            "arguments": [str(argument) for argument in arguments],
-            "environment": dict(environment or {}),
-            "folder": os.getcwd(),
-            "output": str(self._output),
-        }
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(json.dumps(job) + "\n")
-        self._process.stdin.flush()
-        pid = int(self._process.stdout.readline())
+        for name in ("hub", "lerobot") if fresh else ():
+            shutil.rmtree(self._home / name, ignore_errors=True)
+        self._server.send(([*map(str, arguments)], dict(environment or {}), os.getcwd(), self._output))
+        pid = self._server.recv()
         done = threading.Event()
         if kill_when is not None:
             threading.Thread(target=_kill, args=(pid, kill_when, done), daemon=True).start()
-        status = int(self._process.stdout.readline())
+        status = self._server.recv()
         done.set()
         return Result(status, self._output.read_text())
+
+    def succeed(self, *arguments: str | Path, **how: Any) -> Result:
+        """Run a command that has to end well."""
+        result = self.run(*arguments, **how)
+        assert result.status == 0, result.output[-3000:]
+        return result
 
     def snapshot(self, repo_id: str) -> Path:
         """Where LeRobot has put a dataset that it fetched."""
@@ -112,21 +115,21 @@ class Commands:
         return folder
 
     def close(self) -> None:
-        self._process.communicate()
+        self._server.close()
+        os.waitpid(self._pid, 0)
+
+
+def python(code: str, *arguments: str, environment: Mapping[str, str] = os.environ) -> str:
+    """What a program prints that is a process of its own."""
+    command, own = [sys.executable, "-c", code, *arguments], dict(environment)
+    result = subprocess.run(command, capture_output=True, text=True, env=own, check=False)
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout
 
 
 def run_without(blocked: set[str], code: str) -> str:
     """What a program prints in a process in which some packages cannot be imported."""
-    script = _BLOCKER.format(blocked=blocked) + code
-    result = subprocess.run(
-        [sys.executable, "-c", script],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "MUJOCO_GL": "egl"},
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    return result.stdout
+    return python(_BLOCKER.format(blocked=blocked) + code, environment={**os.environ, "MUJOCO_GL": "egl"})
 
 
 def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
@@ -137,24 +140,29 @@ def _kill(pid: int, when: Callable[[], bool], done: threading.Event) -> None:
             return
 
 
-def _serve() -> None:
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # whatever is printed meanwhile is no answer
+def _serve(connection: Connection) -> None:
+    logging.getLogger().handlers.clear()  # pytest's
+    prepare = cache(_prepare)
+    with contextlib.suppress(EOFError):  # the tests have ended
+        while True:
+            job = connection.recv()
+            prepare()
+            pid = os.fork()
+            if pid == 0:
+                _run(*job)
+            connection.send(pid)
+            connection.send(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
+
+
+def _prepare() -> None:
     package = importlib.import_module("lerobot_playbyear")
     ours = [module.name for module in pkgutil.walk_packages(package.__path__, "lerobot_playbyear.")]
     for module in (*_IMPORTED, *ours):
         with contextlib.suppress(ImportError):  # of what needs a sound card or a window
             importlib.import_module(module)
-    if "HF_ENDPOINT" in os.environ:
-        _check_cards_there()
+    importlib.import_module("torch").set_num_threads(1)
+    _check_cards_there()
     _read_options()
-    for line in sys.stdin:
-        job = json.loads(line)
-        pid = os.fork()
-        if pid == 0:
-            _run(job)
-        print(pid, file=answers, flush=True)
-        print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), file=answers, flush=True)
 
 
 def _check_cards_there() -> None:
@@ -167,42 +175,53 @@ def _check_cards_there() -> None:
 
 
 def _read_options() -> None:
-    """What a command takes longest for: draccus searches the sources for the help of all 2,000 options."""
     import httpx
-    from draccus.argparsing import ArgumentParser
+    from draccus import argparsing
     from lerobot.utils import import_utils
-
-    from gym_playbyear import registry
 
     sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
     from list_options import CONFIGS  # type: ignore[import-not-found]
 
     speed_up()
-    registry.entry_points = cache(registry.entry_points)  # it reads the metadata of all distributions
     ssl.create_default_context = cache(ssl.create_default_context)  # it reads all certificates, for every client
     httpx.create_ssl_context()
     import_utils.register_third_party_plugins()
     for config in CONFIGS.values():
-        ArgumentParser(config)
+        argparsing.ArgumentParser(config)
     gc.collect()
     gc.freeze()
 
 
 def speed_up() -> None:
-    """What the parser of 2,000 options looks up in sources, and LeRobot in all distributions, is looked up once a process.
+    """What commands take longest for is done once a process: a parser of 2,000 options, whose help draccus searches the sources
+    for, and to look for plugins in the metadata of all distributions.
 
     And a column that is added to a table's features is looked at alone: datasets looks at all others again.
     """
     from datasets.features import features
+    from draccus import argparsing
+    from draccus.choice_types import ChoiceRegistryBase
     from draccus.wrappers import docstring, field_wrapper
     from lerobot.utils import import_utils
+
+    from gym_playbyear import registry
 
     docstring._get_class_source = cache(docstring._get_class_source.__wrapped__)  # it has room for 100 classes
     docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
     field_wrapper.inspect = SimpleNamespace(getfullargspec=cache(inspect.getfullargspec))
-    register = import_utils.register_third_party_plugins
-    register_those_on = cache(lambda *path: register())
-    import_utils.register_third_party_plugins = lambda: register_those_on(*sys.path)
+    new_parser = cache(
+        lambda n_choices, config, exits, make=argparsing.ArgumentParser: make(config, exit_on_error=exits)
+    )
+
+    def parser_of(config_class: type, config_path: Any = None, exit_on_error: bool = True, **_: Any) -> Any:
+        known = [getattr(kind, "_choice_registry", ()) for kind in _below(ChoiceRegistryBase)]
+        parser = new_parser(sum(map(len, known)), config_class, exit_on_error)  # another one when there are more
+        parser.config_path, parser.parser.prog = config_path, Path(sys.argv[0]).name
+        return parser
+
+    argparsing.ArgumentParser = parser_of
+    for module, name in ((import_utils, "register_third_party_plugins"), (registry, "entry_points")):
+        setattr(module, name, _once_for_each_path(getattr(module, name)))
 
     def set_column(self: Any, name: str, feature: Any) -> None:
         dict.__setitem__(self, name, feature)
@@ -211,15 +230,31 @@ def speed_up() -> None:
     features.Features.__setitem__ = set_column
 
 
-def _run(job: dict[str, Any]) -> None:
+def _below(kind: type) -> Iterator[Any]:
+    for below in kind.__subclasses__():
+        yield from (below, *_below(below))
+
+
+def _once_for_each_path(search: Callable[..., Any]) -> Callable[..., Any]:
+    """What this finds in the distributions on a path."""
+    found = cache(lambda path, **what: search(**what))
+    return lambda **what: found(tuple(sys.path), **what)
+
+
+def _run(arguments: list[str], environment: dict[str, str], folder: str, output: Path) -> None:
     """Never returns."""
     status = 0
-    os.environ.update(job["environment"])
-    os.chdir(job["folder"])
-    with open(job["output"], "w") as output:
-        os.dup2(output.fileno(), 1)
-        os.dup2(output.fileno(), 2)
-    sys.argv = job["arguments"]
+    os.environ.update(environment)
+    os.chdir(folder)
+    with output.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
+    for logger in logging.root.manager.loggerDict.values():
+        for handler in getattr(logger, "handlers", ()):
+            if isinstance(handler, logging.StreamHandler):
+                handler.setStream(sys.stderr)  # it has that of the tests
+    sys.argv = arguments
     try:
         _COMMANDS[sys.argv[0]].load()()
     except SystemExit as error:
@@ -232,7 +267,3 @@ def _run(job: dict[str, Any]) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(status)
-
-
-if __name__ == "__main__":
-    _serve()

@@ -50,13 +50,6 @@ def every_second(kind: str, method: str, pattern: str) -> Fault:
     return lambda asked, path: kind if asked == method and re.search(pattern, path) and next(count) % 2 == 0 else None
 
 
-def come_here(monkeypatch: Any, hub: "HubServer") -> None:
-    """Lets this process, and not only commands that are started with `HubServer.environment`, talk to a server."""
-    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.url)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_DISABLE_XET", True)
-    monkeypatch.setenv("HF_TOKEN", TOKEN)
-
-
 # What a Hub keeps
 
 

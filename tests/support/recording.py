@@ -13,6 +13,7 @@ from recording_factory import FEATURES, FILM, FPS, REPO_ID, differences, episode
 
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.survey import survey
+from lerobot_playbyear.inspection import Finding, SurveyedDataset, check_numbers
 
 ENCODER = RGBEncoderConfig(vcodec="h264", preset="ultrafast")
 
@@ -48,10 +49,15 @@ def assert_recorded(root: Path, numbers: Sequence[int], features: dict[str, Any]
     assert survey(root).is_undamaged
 
 
-def edit_info(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
-    info = json.loads((root / "meta/info.json").read_text())
+def errors_in(root: Path) -> list[Finding]:
+    """What `playbyear-inspect` finds to be wrong with a dataset."""
+    return [each for each in check_numbers(SurveyedDataset.open(REPO_ID, root)) if each.level == "error"]
+
+
+def edit_info(root: Path, change: Callable[[dict[str, Any]], object], name: str = "info.json") -> None:
+    info = json.loads((root / "meta" / name).read_text())
     change(info)
-    (root / "meta/info.json").write_text(json.dumps(info))
+    (root / "meta" / name).write_text(json.dumps(info))
 
 
 def edit_column(path: Path, column: str, change: Callable[[list], list]) -> None:

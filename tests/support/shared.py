@@ -1,5 +1,6 @@
 """What several test modules read and none changes: made once for all processes that run tests."""
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -39,6 +40,15 @@ def run_in_process(main: Callable[[], Any], *arguments: str | Path) -> Any:
             return main()
         except SystemExit as end:
             return end.code
+
+
+def n_evaluated(checkpoint: Path, folder: Path, *options: str) -> int:
+    """How many episodes `lerobot-eval` has played when it ends: one."""
+    from lerobot.scripts import lerobot_eval
+
+    given = (f"--policy.path={checkpoint}", "--eval.n_episodes=1", "--eval.batch_size=1", f"--output_dir={folder}")
+    run_in_process(lerobot_eval.main, *given, *options)
+    return json.loads((folder / "eval_info.json").read_text())["overall"]["n_episodes"]
 
 
 def once(name: str, make: Callable[[Path], Any]) -> Path:
