@@ -14,7 +14,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, first_line
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     DEFAULT_VIDEO_PATH,
@@ -116,7 +116,13 @@ def check_dataset_files(
     if not (folder / INFO_PATH).is_file():
         from lerobot.datasets import LeRobotDatasetMetadata
 
-        meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+        try:
+            meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+        except Exception as error:  # LeRobot's, the Hub's or the network's
+            raise InputError(
+                f"There is no dataset in '{folder}' (no {INFO_PATH}), and '{repo_id}' could not be had from the Hub: "
+                f"{type(error).__name__}: {first_line(error)}. Correct the name or the folder."
+            ) from error
         check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return []
     footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
@@ -249,7 +255,8 @@ def _check_templates(root: Path, info: Info) -> None:
         template = info.get(name)
         if template is None:
             continue
-        if not isinstance(template, str) or not _TEMPLATE.fullmatch(template):
+        ending = PurePath(default).suffix
+        if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or not template.endswith(ending):
             raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
         for key in keys or [""]:
             file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))

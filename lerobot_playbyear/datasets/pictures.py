@@ -16,6 +16,9 @@ from lerobot_playbyear.datasets.info import OutsideError, real_path
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
 """Of the pictures that are read; others have readers that start programs."""
 
+FILMS = {"format_whitelist": "mov,matroska"}
+"""Of FFmpeg, for the films of a dataset: what they hold decides. A playlist would have other files opened."""
+
 
 def has_shape(height: int, width: int, shape: Sequence[int]) -> bool:
     """Whether a picture has the size that a feature's shape says, (C, H, W) or (H, W, C)."""
@@ -93,7 +96,7 @@ def video_pictures(
     """
     if not times:
         return
-    with av.open(str(path)) as container:
+    with av.open(str(path), options=FILMS) as container:
         stream = container.streams.video[0]
         assert stream.time_base is not None
         _check_size(path, key, shape, stream.height, stream.width)

@@ -36,11 +36,13 @@ from lerobot_playbyear.compat import (
     update_last_checkpoint,
 )
 from lerobot_playbyear.datasets.features import number_names
+from lerobot_playbyear.datasets.files import check_no_links, entries_below
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
+from lerobot_playbyear.policy.processor_playbyear import check_steps
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.batches import dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
@@ -125,8 +127,14 @@ class Learner:
         return self.accelerator.unwrap_model(self.policy)
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
-        """Write a checkpoint where lerobot-train would, and return its folder."""
+        """Write a checkpoint where lerobot-train would, and return its folder.
+
+        Raises:
+            InputError: A link is there.
+        """
         folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
+        there = [path.relative_to(folder.parent) for path in entries_below(folder)] if folder.is_dir() else []
+        check_no_links(folder.parent, folder.name, *map(str, there))
         self.write_checkpoint(folder, cfg)
         update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
@@ -352,6 +360,8 @@ def _make_processors(
         unnormalizer = {"features": config.output_features, "norm_map": norm_map, **stats}
         kwargs["postprocessor_overrides"] = {"unnormalizer_processor": unnormalizer}
     path, revision = config.pretrained_path, getattr(config, "pretrained_revision", None)
+    if path:
+        check_steps(path, revision)
     return make_pre_post_processors(policy_cfg=config, pretrained_path=path, pretrained_revision=revision, **kwargs)
 
 
