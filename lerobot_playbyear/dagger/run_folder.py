@@ -151,8 +151,9 @@ class RunFolder:
             The state of the run, or None when a new one begins.
 
         Raises:
-            InputError: The folder holds a run and `resume` is off, or it holds something else.
+            InputError: The folder holds a run and `resume` is off, or it holds something else, or a link where the run writes.
         """
+        check_no_links(self.path, METRICS_NAME, *RUN_FOLDERS)
         is_run = (self.path / CONFIG_NAME).is_file()
         begun = {LOCK, CONFIG_NAME + PARTIAL}  # of a run that could not write even its options
         names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
@@ -170,12 +171,7 @@ class RunFolder:
         return RunState(**json.loads(state.read_text())) if state.is_file() else None
 
     def begin(self, cfg: DaggerConfig, state: RunState) -> None:
-        """Make the folder of a new run; or note the options of one that goes on, and remove what was in progress.
-
-        Raises:
-            InputError: Something that would be written into is a link, or it cannot be written.
-        """
-        check_no_links(self.path, METRICS_NAME, *RUN_FOLDERS)
+        """Make the folder of a new run; or note the options of one that goes on, and remove what was in progress."""
         with _errors_of_writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             write_atomically(self.path / CONFIG_NAME, json.dumps(cfg.options(), indent=1))

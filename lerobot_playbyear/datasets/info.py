@@ -35,6 +35,7 @@ INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_ind
 
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
+_READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
 _MOST_FPS = 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
 
@@ -58,11 +59,13 @@ def read_info(root: Path) -> dict[str, Any]:
 
     Raises:
         InfoError: A field is missing or cannot be right, or the dataset is of another version of LeRobot's format.
-        OutsideError: A template, or a feature's name that it is filled with, leads out of the folder.
+        OutsideError: A template, or a feature's name that it is filled with, leads out of the folder; or a pipe or a device
+            stands in place of a file.
         FileNotFoundError: There is none.
         OSError: It cannot be read now.
     """
     path = root / INFO_PATH
+    check_ordinary(root)
     try:
         info = json.loads(path.read_bytes())
         if not isinstance(info, dict):
@@ -78,6 +81,17 @@ def read_info(root: Path) -> dict[str, Any]:
         ) from error
     _check_templates(root, info)
     return info
+
+
+def check_ordinary(root: Path) -> None:
+    """Refuses what a reader would wait for, or read without end, in place of a dataset's files: pipes and devices.
+
+    Raises:
+        OutsideError: Naming it.
+    """
+    for path in (path for pattern in _READ for path in list_files(root, pattern)):
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
 
 
 def file_inside(root: Path, name: str | PurePath) -> Path:
@@ -113,6 +127,7 @@ def check_dataset_files(
         OSError: A file cannot be read now, which says nothing about what it holds.
     """
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    check_ordinary(folder)
     if not (folder / INFO_PATH).is_file():
         from lerobot.datasets import LeRobotDatasetMetadata
 

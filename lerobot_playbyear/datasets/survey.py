@@ -36,6 +36,8 @@ Rows = Mapping[int, Mapping[str, Any]]
 """The rows of `meta/episodes`, by their episodes' numbers."""
 
 _TIME_TOLERANCE_S = 1e-3
+_MOST_LOST = 10_000  # episodes of which rows are left without frames
+_MOST_PIECES = 20_000  # of episodes in a file: LeRobot's hold 100 MB
 
 
 class DatasetDamagedError(InputError):
@@ -157,7 +159,7 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
         if (file := _open(root, path, schema, rescue, findings)) is not None
         for frames in _read_frames(root, file, info, thorough, findings)
     ]
-    rows = _read_rows(root, findings)
+    rows = _read_rows(root, sum(frames.length for frames in found), findings)
     episodes = _find_films(root, info, _match(found, rows, info), rows, thorough)
     tasks = _read_tasks(root, episodes, rows, findings)
     findings += _judge_episodes(root, info, episodes, rows)
@@ -266,6 +268,11 @@ def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, finding
     index = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     steps = {key: np.diff(values) for key, values in index.items()}
     breaks = (steps["episode_index"] != 0) | (steps["frame_index"] != 1) | (steps["row"] != 1)
+    if breaks.sum() > _MOST_PIECES:
+        findings.append(
+            _wrong("files", f"{name}: its rows are of {breaks.sum() + 1:,} pieces of episodes, which nobody recorded")
+        )
+        return
     for start, stop in itertools.pairwise([0, *(np.flatnonzero(breaks) + 1).tolist(), len(index["row"])]):
         own = {key: values[start:stop] for key, values in index.items()}
         late = np.abs(own["timestamp"] - own["frame_index"] / info["fps"])
@@ -301,12 +308,14 @@ def _damaged_pictures(
 # Episodes
 
 
-def _read_rows(root: Path, findings: list[Finding]) -> dict[int, dict[str, Any]]:
-    """The rows of all tables of episodes, by the episode's number."""
+def _read_rows(root: Path, n_frames: int, findings: list[Finding]) -> dict[int, dict[str, Any]]:
+    """The rows of all tables of episodes, by the episode's number: no more than there are frames, unless frames are lost."""
     rows: dict[int, dict[str, Any]] = {}
     for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
         name = path.relative_to(root)
         try:
+            if (n_rows := DataFile(path).n_rows) > max(n_frames, _MOST_LOST):
+                raise ParquetDamageError(f"it has rows of {n_rows:,} episodes, and there are {n_frames:,} frames")
             found = read_table(path).to_pylist()
         except ParquetDamageError as error:
             findings.append(_wrong("rows", f"{name} cannot be read: {error}"))
