@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import threading
 from pathlib import Path
@@ -12,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from dagger_factory import FINISHED, QUICK, command, dagger, state
 from dataset_factory import make_dataset
-from support.recording import edit_info
+from support.recording import edit_column, edit_info
 from support.shared import ENV, run_in_process
 
 from lerobot_playbyear.audio import write_audio
@@ -160,6 +161,30 @@ def test_pipes_and_devices_are_not_read(noise, tmp_path, name, target):
     for read in (check_dataset_files, lambda _, root: survey(root)):
         with pytest.raises(InputError, match="no ordinary file"):
             read("a/b", root)
+
+
+@pytest.mark.parametrize("name", ["file-001.parquet", "backup.parquet", "file-000 (copy).parquet"])
+def test_a_copy_of_frames_beside_them_is_named(noise, tmp_path, name):
+    """LeRobot reads every file in `data/`: a row would be another than the one that is asked for."""
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("data/*/*.parquet")
+    shutil.copy(path, path.with_name(name))
+    said = re.escape(f"data/chunk-000/{name}")
+    with pytest.raises(InputError, match=rf"{said}' belongs to no episode"):
+        check_dataset_files("a/b", root)
+    assert re.search(rf"{said}: 38 frames belong to no episode", str(survey(root)))
+    repair(RepairConfig(root))
+    check_dataset_files("a/b", tmp_path / "noise_repaired")
+
+
+@pytest.mark.parametrize("name", ["dataset_from_index", "dataset_to_index", "length"])
+def test_rows_that_number_other_frames_are_refused(noise, tmp_path, name):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    edit_column(path, name, lambda values: values[::-1])
+    with pytest.raises(InputError, match="meta/episodes says that episode 0 has"):
+        check_dataset_files("a/b", root)
+    assert not survey(root).is_undamaged
 
 
 # What a checkpoint runs

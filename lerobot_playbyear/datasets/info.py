@@ -25,7 +25,7 @@ from lerobot_playbyear.datasets.files import (
     fits,
     list_files,
 )
-from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, read_table
 
 Info = Mapping[str, Any]
 """The fields of `meta/info.json`."""
@@ -36,6 +36,7 @@ INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_ind
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
 _READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
+_PLACES = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
 _MOST_FPS = 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
 
@@ -140,11 +141,11 @@ def check_dataset_files(
             ) from error
         check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return []
-    footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
+    footers: dict[str, dict[Path, pq.FileMetaData]] = {"data": {}, "meta": {}}
     for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, f"{EPISODES_DIR}/*/*.parquet")]:
         try:
             with open_checked(path) as file:
-                footers[path.relative_to(folder).parts[0]].append(file.metadata)
+                footers[path.relative_to(folder).parts[0]][path] = file.metadata
         except ParquetDamageError as error:
             raise InputError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
@@ -152,8 +153,45 @@ def check_dataset_files(
             ) from error
     if not footers["data"]:
         raise InputError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
-    check_claims(folder, footers["data"], sum(footer.num_rows for footer in footers["meta"]))
-    return footers["data"]
+    data = [*footers["data"].values()]
+    check_claims(folder, data, sum(footer.num_rows for footer in footers["meta"].values()))
+    _check_places(folder, footers["data"], list(footers["meta"]))
+    return data
+
+
+def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: Iterable[Path]) -> None:
+    """Refuses what LeRobot would read wrongly: it finds rows by numbers in `meta/episodes`, in all files there are.
+
+    Raises:
+        InputError: A data file belongs to no episode, or frames are counted otherwise than they are there.
+    """
+    repair = f"Repair it: playbyear-repair --root={folder}"
+    pattern = read_info(folder)["data_path"]
+    rows: list[tuple[Any, ...]] = []
+    for path in tables:
+        try:
+            table = read_table(path, list(_PLACES))
+        except ParquetDamageError as error:
+            raise InputError(f"'{path}' is damaged: {error}. {repair}") from error
+        rows += zip(*(table.column(name).to_pylist() for name in _PLACES), strict=True)
+    named = {folder / pattern.format(chunk_index=row[-2], file_index=row[-1]) for row in rows}
+    if stray := sorted(set(data) - named):
+        raise InputError(
+            f"'{stray[0]}' belongs to no episode, and LeRobot would read it all the same. If it is a copy, move it out of "
+            f"'{folder}'; otherwise: playbyear-repair --root={folder}"
+        )
+    first = 0
+    for number, (episode, length, start, stop, *_) in enumerate(sorted(rows, key=lambda row: row[0])):
+        if (episode, start, stop) != (number, first, first + length):
+            raise InputError(
+                f"meta/episodes says that episode {episode} has {length} frames, from {start} to {stop}; wanted episode "
+                f"{number} from {first} on. {repair}"
+            )
+        first = stop
+    if first != (there := sum(footer.num_rows for footer in data.values())):
+        raise InputError(
+            f"The data files of '{folder}' hold {there:,} frames, and meta/episodes counts {first:,}. {repair}"
+        )
 
 
 def check_claims(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) -> None:

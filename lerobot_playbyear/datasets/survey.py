@@ -160,10 +160,10 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
         for frames in _read_frames(root, file, info, thorough, findings)
     ]
     rows = _read_rows(root, sum(frames.length for frames in found), findings)
-    episodes = _find_films(root, info, _match(found, rows, info), rows, thorough)
+    episodes = _find_films(root, info, _match(root, found, rows, info), rows, thorough)
     tasks = _read_tasks(root, episodes, rows, findings)
     findings += _judge_episodes(root, info, episodes, rows)
-    findings += _judge_counts(root, info, episodes, n_found=sum(frames.length for frames in found))
+    findings += _judge_counts(root, info, episodes, found)
     return Survey(root, info, schema, episodes, tasks, findings)
 
 
@@ -330,7 +330,7 @@ def _read_rows(root: Path, n_frames: int, findings: list[Finding]) -> dict[int, 
     return rows
 
 
-def _match(found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
+def _match(root: Path, found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
     """Finds each episode's frames, and where its row says that its pictures are."""
     frames_of: dict[int, list[Frames]] = defaultdict(list)
     for frames in found:
@@ -340,7 +340,11 @@ def _match(found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
     for number in sorted({*frames_of, *rows}):
         said = {key: place_in_row(rows.get(number, {}), key) for key in films}
         places = {key: place for key, place in said.items() if place is not None}
-        episodes.append(replace(_choose(number, frames_of[number], rows.get(number, {})), places=places))
+        row = rows.get(number, {})
+        own = sorted(
+            frames_of[number], key=lambda frames: str(frames.file.path.relative_to(root)) != data_path(info, row)
+        )
+        episodes.append(replace(_choose(number, own, row), places=places))
     return episodes
 
 
@@ -449,14 +453,17 @@ def _judge_episodes(root: Path, info: Info, episodes: Sequence[Episode], rows: R
 # What is said of the whole dataset
 
 
-def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], n_found: int) -> Iterator[Finding]:
+def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], found: Sequence[Frames]) -> Iterator[Finding]:
     n_frames = sum(episode.frames.length for episode in episodes if episode.frames)
     is_whole = all(episode.frames for episode in episodes)
     if info["total_episodes"] != len(episodes) or (is_whole and info["total_frames"] != n_frames):
         counted = f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all"
         yield _wrong("rows", f"{counted}; there are {len(episodes)} of {n_frames}")
-    if is_whole and n_found > n_frames:
-        yield _wrong("rows", f"the data files hold {n_found - n_frames} frames that belong to no episode")
+    used = {(each.frames.file.path, each.frames.start) for each in episodes if each.frames}
+    if is_whole and (others := [each for each in found if (each.file.path, each.start) not in used]):
+        names = sorted({each.file.path.relative_to(root).as_posix() for each in others})
+        n_others = sum(each.length for each in others)
+        yield _wrong("rows", f"{', '.join(names)}: {n_others} frames belong to no episode")
     expected = 0
     for place, episode in enumerate(episodes):
         if episode.frames is None:
