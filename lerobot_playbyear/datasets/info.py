@@ -90,7 +90,7 @@ def check_ordinary(root: Path) -> None:
     Raises:
         OutsideError: Naming it.
     """
-    for path in (path for pattern in _READ for path in list_files(root, pattern)):
+    for path in (path for pattern in _READ if root.is_dir() for path in list_files(root, pattern)):
         if path.exists() and not path.is_file() and not path.is_dir():
             raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
 
