@@ -359,7 +359,11 @@ def test_a_repair_that_was_killed_leaves_the_dataset_and_no_half_copy(copy, monk
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
     assert everything(root) == before
-    assert [path.name for path in sorted(root.parent.glob("*dataset*"))] == [".dataset_repaired.partial", "dataset"]
+    assert [path.name for path in sorted(root.parent.glob("*dataset*"))] == [
+        ".dataset_repaired.lock",
+        ".dataset_repaired.partial",
+        "dataset",
+    ]
     repaired(root, FEATURES)
     assert [path.name for path in sorted(root.parent.glob("*dataset*"))] == ["dataset", "dataset_repaired"]
 

@@ -1,6 +1,7 @@
 """Sound in files: WAV, FLAC and the sound tracks of videos in, WAV and FLAC out, and how a recording meets frames."""
 
 import itertools
+import logging
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,13 @@ import av
 import numpy as np
 
 from lerobot_playbyear.datasets.features import samples_per_frame, to_pcm_s16
+
+SOUND_FORMATS = "wav,w64,flac,aiff,au,caf,mp3,ogg,aac,ac3,amr,ape,tta,wv,mov,matroska,avi,mpeg,mpegts,flv,asf"
+"""FFmpeg's names of the formats of files that hold sound themselves."""
+
+_WITHOUT_HEADER = {b"FLV": "flv", b"\x00\x00\x01\xba": "mpeg", b"G": "mpegts"}
+
+logger = logging.getLogger(__name__)
 
 HALF = 16
 """Samples before and after a moment that its interpolated value depends on."""
@@ -35,8 +43,10 @@ def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
         path: The file.
 
     Returns:
-        The samples, (n, channels) int16 PCM, and the sample rate [Hz]. Sample 0 is at the file's time 0: a sound
-        track that begins after its video begins with silence. 16-bit files come out bit for bit; others are rounded.
+        The samples, (n, channels) int16 PCM, and the sample rate [Hz]. Sample 0 is when the file's first picture is shown, or
+        without pictures its first sound heard: a sound track that begins after its video begins with silence. 16-bit files
+        come out bit for bit; others are rounded. Of a file that is cut off or damaged in the middle what comes before is read,
+        and a warning says how much that is.
 
     Raises:
         AudioFileError: The file is missing, or holds no sound that can be decoded.
@@ -45,13 +55,13 @@ def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
     return np.concatenate([samples for samples, _ in parts]), parts[0][1]
 
 
-def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarray, int]]:
+def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tuple[np.ndarray, int]]:
     """As `read_audio`, in pieces of bounded size, each with the sample rate; silence, how long it may be, is no exception.
 
     Args:
         path: The file.
-        formats: FFmpeg's names of the formats that it may have, separated by commas; empty: any. A stranger's file of some
-            formats (playlists) would have others opened.
+        formats: FFmpeg's names of the formats that it may have, separated by commas. Playlists, which would have other files
+            opened, are none of them.
 
     Raises:
         AudioFileError: The file is missing, or holds no sound that can be decoded.
@@ -61,13 +71,16 @@ def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarr
         raise AudioFileError(f"There is no sound file {path}.")
     position = rate = 0
     try:
-        with av.open(str(path), options={"format_whitelist": formats} if formats else {}) as container:
+        with _opened(path, formats) as container:
             if not container.streams.audio:
                 raise AudioFileError(f"{path} holds no sound.")
-            rate = container.streams.audio[0].rate
+            rate, begin = container.streams.audio[0].rate, _begin(container)
+            _warn_of_delay(path, container)
             for frame in container.decode(audio=0):
                 samples = _to_samples(frame)  # (n, channels)
-                start = round(frame.time * rate) if frame.time is not None else position
+                if begin is None:
+                    begin = frame.time or 0.0
+                start = round((frame.time - begin) * rate) if frame.time is not None else position
                 if position == 0 and start < 0:
                     samples, start = samples[-start:], 0
                 if start - position > (_GAP_SECONDS * rate if position else 0):
@@ -80,9 +93,48 @@ def audio_pieces(path: str | Path, formats: str = "") -> Iterator[tuple[np.ndarr
     except (av.FFmpegError, ValueError) as error:
         if isinstance(error, AudioFileError):
             raise
-        raise AudioFileError(f"The sound of {path} cannot be decoded: {error}.") from error
+        if not position or isinstance(error, OSError):
+            raise AudioFileError(f"The sound of {path} cannot be decoded: {error}.") from error
+        logger.warning(
+            "%s is damaged or cut off after %.3f s (%s): what comes later is lost.", path, position / rate, error
+        )
     if not position:
         raise AudioFileError(f"{path} holds no samples.")
+
+
+def _opened(path: Path, formats: str) -> av.container.InputContainer:
+    with path.open("rb") as file:
+        begin = file.read(4)
+    for mark, name in _WITHOUT_HEADER.items():
+        if begin.startswith(mark) and name in formats.split(","):
+            return av.open(str(path), format=name)  # with options it would look for streams where there are none yet
+    return av.open(str(path), options={"format_whitelist": formats})
+
+
+def _begin(container: av.container.InputContainer) -> float | None:
+    """When a file begins, by its own clock [s]: with its first picture, or its earliest sound; None: with the first read."""
+    streams: list[Any] = [
+        each for each in container.streams.video if not each.disposition & av.stream.Disposition.attached_pic
+    ]
+    streams = streams or ([*container.streams.audio] if len(container.streams.audio) > 1 else [])
+    starts = [
+        float(each.start_time * each.time_base) for each in streams if each.start_time is not None and each.time_base
+    ]
+    return min(starts, default=None)
+
+
+def _warn_of_delay(path: Path, container: av.container.InputContainer) -> None:
+    """Says by how much sound may come late in formats that do not say how much silence an encoder put before it."""
+    stream = container.streams.audio[0]
+    codec, kind = stream.codec_context.name, container.format.name
+    n_samples = 1024 if kind == "aac" else 1105 if codec.startswith("mp3") and kind in ("avi", "mpegts") else 0
+    if n_samples and stream.rate:
+        logger.warning(
+            "%s: this format does not say how much silence its encoder put before the sound. It may come %.0f ms late; "
+            "keep WAV or FLAC, or say it with --offset.",
+            path,
+            1000 * n_samples / stream.rate,
+        )
 
 
 def write_audio(path: str | Path, waveform: np.ndarray, sample_rate: int) -> Path:

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.features import Features
-from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, link_or_copy, list_files
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, list_files
 from lerobot_playbyear.datasets.info import read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -91,8 +91,7 @@ def write_copy(
         elif fits(name, _EPISODES):
             _write_rows(path, target / name, episodes, removed)
         elif not fits(name, INFO_PATH, STATS_PATH):
-            # Nobody changes a film in place; of a user's own files that is not known.
-            (link_or_copy if name.parts[0] == "videos" else shutil.copyfile)(path, target / name)
+            shutil.copyfile(path, target / name)  # no link: LeRobot may write into a film that is there
     known = {key: stats for key, stats in (load_stats(root) or {}).items() if key not in removed}
     write_stats({**known, **add_stats(None, episodes)}, target)
     (target / INFO_PATH).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")

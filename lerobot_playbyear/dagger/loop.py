@@ -254,6 +254,7 @@ class Loop:
             with seconds.of("checkpoint_saving"):
                 self.folder.save_checkpoint(name, lambda path: self.learner.write_checkpoint(path, self.training))
             state.checkpoint, state.step = name, self.learner.step
+            state.made = [*dict.fromkeys([*state.made, name])]
             if cfg.env is not None and is_due(state.round, cfg.eval_every):
                 state.milestones.append(name)
         total = time.perf_counter() - start

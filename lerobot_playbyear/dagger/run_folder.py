@@ -1,8 +1,8 @@
 """The output folder of a run: options, checkpoints, figures and counters that survive being killed at any moment.
 
 `dagger_state.json` is the truth: it is replaced as a whole after every attempt, and names the checkpoint that belongs to
-it. A checkpoint is written beside its place, put on the disk and renamed before the state names it; what no state names is
-removed when the run goes on.
+it. A checkpoint is written beside its place, put on the disk and renamed before the state names it. Only checkpoints that the
+state names are ever removed, and nothing is written or removed through a link.
 """
 
 import contextlib
@@ -23,12 +23,14 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import (
     PARTIAL,
     FolderLock,
+    append_line,
     check_can_be_made,
+    check_no_links,
     is_trial,
     new_folder,
     write_atomically,
 )
-from lerobot_playbyear.hub.push import METRICS_NAME, read_metrics
+from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, read_metrics
 
 STATE_NAME = "dagger_state.json"
 """File in the output folder with the counters of the run and the name of its checkpoint."""
@@ -70,6 +72,7 @@ class RunState:
             that it was of, None for the policy that the run began with. Empty before, and where that checkpoint was removed.
         checkpoint: Folder of the newest weights; None before the first update.
         milestones: Checkpoints that are kept for good.
+        made: Checkpoints that this run has written and not removed; no other folder is ever removed.
         method: What the method keeps.
         wandb_run_id: To go on with the same run there.
     """
@@ -94,6 +97,7 @@ class RunState:
     best: dict[str, Any] = field(default_factory=dict)
     checkpoint: str | None = None
     milestones: list[str] = field(default_factory=list)
+    made: list[str] = field(default_factory=list)
     method: dict[str, Any] = field(default_factory=dict)
     wandb_run_id: str | None = None
 
@@ -147,8 +151,9 @@ class RunFolder:
             The state of the run, or None when a new one begins.
 
         Raises:
-            InputError: The folder holds a run and `resume` is off, or it holds something else.
+            InputError: The folder holds a run and `resume` is off, or it holds something else, or a link where the run writes.
         """
+        check_no_links(self.path, METRICS_NAME, *RUN_FOLDERS)
         is_run = (self.path / CONFIG_NAME).is_file()
         begun = {LOCK, CONFIG_NAME + PARTIAL}  # of a run that could not write even its options
         names = {path.name for path in self.path.iterdir()} if self.path.exists() else set()
@@ -233,9 +238,9 @@ class RunFolder:
                 shutil.rmtree(place)
             os.replace(link, place)
         wanted = {*state.milestones, *named.values()}
-        for path in self.checkpoints.iterdir():
-            if path.is_dir() and not path.is_symlink() and path.name not in wanted:
-                shutil.rmtree(path, ignore_errors=True)
+        for name in [name for name in state.made if name not in wanted]:
+            shutil.rmtree(self.checkpoints / name, ignore_errors=True)  # not where it is a link
+            state.made.remove(name)
 
     def differences(self, cfg: DaggerConfig) -> list[str]:
         """What tells a run apart from the one in the folder: another task, other data, another expert or method."""
@@ -251,8 +256,8 @@ class RunFolder:
 
     def append_metrics(self, line: dict[str, Any]) -> None:
         """Add a line to the figures. It holds only once a state that knows of it was committed."""
-        with _errors_of_writing(self.path), (self.path / METRICS_NAME).open("a") as file:
-            file.write(json.dumps(line) + "\n")
+        with _errors_of_writing(self.path):
+            append_line(self.path / METRICS_NAME, json.dumps(line))
 
     def metrics(self) -> list[dict[str, Any]]:
         """All lines of the figures; none before the first."""

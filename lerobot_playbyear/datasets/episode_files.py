@@ -35,7 +35,7 @@ from lerobot_playbyear.datasets.parquet import (
     write_rows,
     write_tables,
 )
-from lerobot_playbyear.datasets.pictures import decode_picture
+from lerobot_playbyear.datasets.pictures import FILMS, decode_picture
 from lerobot_playbyear.datasets.statistics import add_stats, numeric_stats, picture_stats, stats_columns, write_stats
 
 logger = logging.getLogger(__name__)
@@ -193,7 +193,7 @@ def _stage_film(
         (folder / f"frame-{number:06d}.{'tiff' if is_depth(feature) else 'png'}").write_bytes(picture)
     encode_video_frames(folder, path, info.fps, video_encoder=encoder)
     shutil.rmtree(folder)
-    with av.open(str(path)) as container:
+    with av.open(str(path), options=FILMS) as container:
         n_frames = sum(1 for packet in container.demux(video=0) if packet.size)
     if n_frames != len(pictures):
         raise OSError(

@@ -11,6 +11,7 @@ import contextlib
 import fnmatch
 import glob
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -59,16 +60,6 @@ def entries_below(folder: Path) -> Iterator[Path]:
         yield entry
         if entry.is_dir() and not entry.is_symlink():
             yield from entries_below(entry)
-
-
-def link_or_copy(source: str | Path, target: str | Path) -> None:
-    """A second name for a file that nobody changes in place, or a copy where there can be none."""
-    source, target = Path(source), Path(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
 
 
 def fits(name: PurePath, *patterns: str) -> bool:
@@ -143,6 +134,55 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A file that is there as a whole or not at all, where others may write one of its name at the same time.
+
+    Args:
+        path: Its place; the folder is made, and what was there is replaced. A link there is replaced, not followed.
+
+    Yields:
+        Of an empty file beside it, with the same ending, to write into. Where that raises, it is removed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{PARTIAL}{path.suffix}")
+    partial.open("x").close()
+    try:
+        yield partial
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def append_line(path: Path, line: str) -> None:
+    """Writes a line at the end of a file, which is made where it is missing.
+
+    Raises:
+        OSError: It cannot be written, or is a link.
+    """
+    new = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0)
+    with os.fdopen(os.open(path, new, 0o666), "a") as file:
+        file.write(line + "\n")
+
+
+def check_no_links(folder: Path, *names: str) -> None:
+    """Whether what is written below a folder stays in it.
+
+    Args:
+        folder: Of a run; it may be a stranger's.
+        names: Of folders in it that are written into, and of files that are written in place.
+
+    Raises:
+        InputError: One of them is a link.
+    """
+    for path in (folder / name for name in names):
+        if path.is_symlink():
+            raise InputError(
+                f"'{path}' is a link to '{os.readlink(path)}', and nothing is written or removed there. Put what it leads to "
+                "in its place, or choose an --output_dir where there is room."
+            )
+
+
+@contextlib.contextmanager
 def new_folder(target: Path) -> Iterator[Path]:
     """A folder that is there as a whole, on the disk itself, or not at all: it is written beside its place, and renamed.
 
@@ -153,18 +193,23 @@ def new_folder(target: Path) -> Iterator[Path]:
         The empty folder to write into. Where that raises, it is removed.
 
     Raises:
+        FolderLockedError: Another process writes one of this name.
         OSError: It cannot be written, or something is at its place.
     """
     partial = target.absolute().with_name(f".{target.name}{PARTIAL}")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        flush_all(partial)
-        os.rename(partial, target)
-        flush(partial.parent)
-    finally:
+    lock = partial.with_suffix(".lock")
+    with FolderLock(lock, f"Another process is writing {target}: wait until it has ended, or choose another place."):
         shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        try:
+            yield partial
+            flush_all(partial)
+            os.rename(partial, target)
+            flush(partial.parent)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+            with contextlib.suppress(OSError):  # Windows removes no open file
+                lock.unlink()  # whoever gets a lock whose file is gone makes another
 
 
 class FolderLock(contextlib.ExitStack):

@@ -14,7 +14,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, first_line
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     DEFAULT_VIDEO_PATH,
@@ -25,7 +25,7 @@ from lerobot_playbyear.datasets.files import (
     fits,
     list_files,
 )
-from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, read_table
 
 Info = Mapping[str, Any]
 """The fields of `meta/info.json`."""
@@ -35,6 +35,8 @@ INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_ind
 
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
+_READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
+_PLACES = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
 _MOST_FPS = 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
 
@@ -58,11 +60,13 @@ def read_info(root: Path) -> dict[str, Any]:
 
     Raises:
         InfoError: A field is missing or cannot be right, or the dataset is of another version of LeRobot's format.
-        OutsideError: A template, or a feature's name that it is filled with, leads out of the folder.
+        OutsideError: A template, or a feature's name that it is filled with, leads out of the folder; or a pipe or a device
+            stands in place of a file.
         FileNotFoundError: There is none.
         OSError: It cannot be read now.
     """
     path = root / INFO_PATH
+    check_ordinary(root)
     try:
         info = json.loads(path.read_bytes())
         if not isinstance(info, dict):
@@ -78,6 +82,17 @@ def read_info(root: Path) -> dict[str, Any]:
         ) from error
     _check_templates(root, info)
     return info
+
+
+def check_ordinary(root: Path) -> None:
+    """Refuses what a reader would wait for, or read without end, in place of a dataset's files: pipes and devices.
+
+    Raises:
+        OutsideError: Naming it.
+    """
+    for path in (path for pattern in _READ if root.is_dir() for path in list_files(root, pattern)):
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
 
 
 def file_inside(root: Path, name: str | PurePath) -> Path:
@@ -113,17 +128,24 @@ def check_dataset_files(
         OSError: A file cannot be read now, which says nothing about what it holds.
     """
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    check_ordinary(folder)
     if not (folder / INFO_PATH).is_file():
         from lerobot.datasets import LeRobotDatasetMetadata
 
-        meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+        try:
+            meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+        except Exception as error:  # LeRobot's, the Hub's or the network's
+            raise InputError(
+                f"There is no dataset in '{folder}' (no {INFO_PATH}), and '{repo_id}' could not be had from the Hub: "
+                f"{type(error).__name__}: {first_line(error)}. Correct the name or the folder."
+            ) from error
         check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return []
-    footers: dict[str, list[pq.FileMetaData]] = {"data": [], "meta": []}
+    footers: dict[str, dict[Path, pq.FileMetaData]] = {"data": {}, "meta": {}}
     for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, f"{EPISODES_DIR}/*/*.parquet")]:
         try:
             with open_checked(path) as file:
-                footers[path.relative_to(folder).parts[0]].append(file.metadata)
+                footers[path.relative_to(folder).parts[0]][path] = file.metadata
         except ParquetDamageError as error:
             raise InputError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
@@ -131,8 +153,45 @@ def check_dataset_files(
             ) from error
     if not footers["data"]:
         raise InputError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
-    check_claims(folder, footers["data"], sum(footer.num_rows for footer in footers["meta"]))
-    return footers["data"]
+    data = [*footers["data"].values()]
+    check_claims(folder, data, sum(footer.num_rows for footer in footers["meta"].values()))
+    _check_places(folder, footers["data"], list(footers["meta"]))
+    return data
+
+
+def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: Iterable[Path]) -> None:
+    """Refuses what LeRobot would read wrongly: it finds rows by numbers in `meta/episodes`, in all files there are.
+
+    Raises:
+        InputError: A data file belongs to no episode, or frames are counted otherwise than they are there.
+    """
+    repair = f"Repair it: playbyear-repair --root={folder}"
+    pattern = read_info(folder)["data_path"]
+    rows: list[tuple[Any, ...]] = []
+    for path in tables:
+        try:
+            table = read_table(path, list(_PLACES))
+        except ParquetDamageError as error:
+            raise InputError(f"'{path}' is damaged: {error}. {repair}") from error
+        rows += zip(*(table.column(name).to_pylist() for name in _PLACES), strict=True)
+    named = {folder / pattern.format(chunk_index=row[-2], file_index=row[-1]) for row in rows}
+    if stray := sorted(set(data) - named):
+        raise InputError(
+            f"'{stray[0]}' belongs to no episode, and LeRobot would read it all the same. If it is a copy, move it out of "
+            f"'{folder}'; otherwise: playbyear-repair --root={folder}"
+        )
+    first = 0
+    for number, (episode, length, start, stop, *_) in enumerate(sorted(rows, key=lambda row: row[0])):
+        if (episode, start, stop) != (number, first, first + length):
+            raise InputError(
+                f"meta/episodes says that episode {episode} has {length} frames, from {start} to {stop}; wanted episode "
+                f"{number} from {first} on. {repair}"
+            )
+        first = stop
+    if first != (there := sum(footer.num_rows for footer in data.values())):
+        raise InputError(
+            f"The data files of '{folder}' hold {there:,} frames, and meta/episodes counts {first:,}. {repair}"
+        )
 
 
 def check_claims(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) -> None:
@@ -249,7 +308,8 @@ def _check_templates(root: Path, info: Info) -> None:
         template = info.get(name)
         if template is None:
             continue
-        if not isinstance(template, str) or not _TEMPLATE.fullmatch(template):
+        ending = PurePath(default).suffix
+        if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or not template.endswith(ending):
             raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
         for key in keys or [""]:
             file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))

@@ -10,11 +10,15 @@ import av
 import numpy as np
 from PIL import Image
 
+from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import INFO_PATH
 from lerobot_playbyear.datasets.info import OutsideError, real_path
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
 """Of the pictures that are read; others have readers that start programs."""
+
+FILMS = {"format_whitelist": "mov,matroska"}
+"""Of FFmpeg, for the films of a dataset: what they hold decides. A playlist would have other files opened."""
 
 
 def has_shape(height: int, width: int, shape: Sequence[int]) -> bool:
@@ -33,7 +37,7 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
 
     Raises:
         OutsideError: `path` leads out of the folder.
-        ValueError: The picture is missing, or has another size than the feature says.
+        ValueError: The picture is missing, has another size than the feature says, or more than 8 bits a value.
         OSError: It is no picture.
     """
     if row is None:
@@ -45,6 +49,14 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
             "not read. Record it again, or ask who made the dataset for one with its pictures."
         )
     image = Image.open(root / name if data is None else io.BytesIO(data), formats=PICTURE_FORMATS)
+    if image.mode.startswith(("I", "F")) and not is_depth(feature):
+        mode = image.mode
+        image.close()
+        raise ValueError(
+            f"'{key}': a picture of mode {mode}, with more than 8 bits a value, as depth cameras give it, would be seen as "
+            f"white; wanted 8 bits. Leave the camera out: lerobot-edit-dataset --repo_id=<name> --root={root} "
+            f"--operation.type=remove_feature --operation.feature_names=\"['{key}']\""
+        )
     if not has_shape(image.height, image.width, feature["shape"]):
         size = f"{image.width} x {image.height}"
         image.close()
@@ -93,7 +105,7 @@ def video_pictures(
     """
     if not times:
         return
-    with av.open(str(path)) as container:
+    with av.open(str(path), options=FILMS) as container:
         stream = container.streams.video[0]
         assert stream.time_base is not None
         _check_size(path, key, shape, stream.height, stream.width)

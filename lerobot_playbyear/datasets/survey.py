@@ -36,6 +36,8 @@ Rows = Mapping[int, Mapping[str, Any]]
 """The rows of `meta/episodes`, by their episodes' numbers."""
 
 _TIME_TOLERANCE_S = 1e-3
+_MOST_LOST = 10_000  # episodes of which rows are left without frames
+_MOST_PIECES = 20_000  # of episodes in a file: LeRobot's hold 100 MB
 
 
 class DatasetDamagedError(InputError):
@@ -157,11 +159,11 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
         if (file := _open(root, path, schema, rescue, findings)) is not None
         for frames in _read_frames(root, file, info, thorough, findings)
     ]
-    rows = _read_rows(root, findings)
-    episodes = _find_films(root, info, _match(found, rows, info), rows, thorough)
+    rows = _read_rows(root, sum(frames.length for frames in found), findings)
+    episodes = _find_films(root, info, _match(root, found, rows, info), rows, thorough)
     tasks = _read_tasks(root, episodes, rows, findings)
     findings += _judge_episodes(root, info, episodes, rows)
-    findings += _judge_counts(root, info, episodes, n_found=sum(frames.length for frames in found))
+    findings += _judge_counts(root, info, episodes, found)
     return Survey(root, info, schema, episodes, tasks, findings)
 
 
@@ -266,6 +268,11 @@ def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, finding
     index = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     steps = {key: np.diff(values) for key, values in index.items()}
     breaks = (steps["episode_index"] != 0) | (steps["frame_index"] != 1) | (steps["row"] != 1)
+    if breaks.sum() > _MOST_PIECES:
+        findings.append(
+            _wrong("files", f"{name}: its rows are of {breaks.sum() + 1:,} pieces of episodes, which nobody recorded")
+        )
+        return
     for start, stop in itertools.pairwise([0, *(np.flatnonzero(breaks) + 1).tolist(), len(index["row"])]):
         own = {key: values[start:stop] for key, values in index.items()}
         late = np.abs(own["timestamp"] - own["frame_index"] / info["fps"])
@@ -301,12 +308,14 @@ def _damaged_pictures(
 # Episodes
 
 
-def _read_rows(root: Path, findings: list[Finding]) -> dict[int, dict[str, Any]]:
-    """The rows of all tables of episodes, by the episode's number."""
+def _read_rows(root: Path, n_frames: int, findings: list[Finding]) -> dict[int, dict[str, Any]]:
+    """The rows of all tables of episodes, by the episode's number: no more than there are frames, unless frames are lost."""
     rows: dict[int, dict[str, Any]] = {}
     for path in list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
         name = path.relative_to(root)
         try:
+            if (n_rows := DataFile(path).n_rows) > max(n_frames, _MOST_LOST):
+                raise ParquetDamageError(f"it has rows of {n_rows:,} episodes, and there are {n_frames:,} frames")
             found = read_table(path).to_pylist()
         except ParquetDamageError as error:
             findings.append(_wrong("rows", f"{name} cannot be read: {error}"))
@@ -321,7 +330,7 @@ def _read_rows(root: Path, findings: list[Finding]) -> dict[int, dict[str, Any]]
     return rows
 
 
-def _match(found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
+def _match(root: Path, found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
     """Finds each episode's frames, and where its row says that its pictures are."""
     frames_of: dict[int, list[Frames]] = defaultdict(list)
     for frames in found:
@@ -331,7 +340,11 @@ def _match(found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
     for number in sorted({*frames_of, *rows}):
         said = {key: place_in_row(rows.get(number, {}), key) for key in films}
         places = {key: place for key, place in said.items() if place is not None}
-        episodes.append(replace(_choose(number, frames_of[number], rows.get(number, {})), places=places))
+        row = rows.get(number, {})
+        own = sorted(
+            frames_of[number], key=lambda frames: str(frames.file.path.relative_to(root)) != data_path(info, row)
+        )
+        episodes.append(replace(_choose(number, own, row), places=places))
     return episodes
 
 
@@ -440,14 +453,17 @@ def _judge_episodes(root: Path, info: Info, episodes: Sequence[Episode], rows: R
 # What is said of the whole dataset
 
 
-def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], n_found: int) -> Iterator[Finding]:
+def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], found: Sequence[Frames]) -> Iterator[Finding]:
     n_frames = sum(episode.frames.length for episode in episodes if episode.frames)
     is_whole = all(episode.frames for episode in episodes)
     if info["total_episodes"] != len(episodes) or (is_whole and info["total_frames"] != n_frames):
         counted = f"{INFO_PATH} counts {info['total_episodes']} episodes of {info['total_frames']} frames in all"
         yield _wrong("rows", f"{counted}; there are {len(episodes)} of {n_frames}")
-    if is_whole and n_found > n_frames:
-        yield _wrong("rows", f"the data files hold {n_found - n_frames} frames that belong to no episode")
+    used = {(each.frames.file.path, each.frames.start) for each in episodes if each.frames}
+    if is_whole and (others := [each for each in found if (each.file.path, each.start) not in used]):
+        names = sorted({each.file.path.relative_to(root).as_posix() for each in others})
+        n_others = sum(each.length for each in others)
+        yield _wrong("rows", f"{', '.join(names)}: {n_others} frames belong to no episode")
     expected = 0
     for place, episode in enumerate(episodes):
         if episode.frames is None:

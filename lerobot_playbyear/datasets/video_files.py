@@ -16,6 +16,7 @@ import numpy as np
 
 from lerobot_playbyear.datasets.files import is_listed, naming
 from lerobot_playbyear.datasets.info import Info, file_inside
+from lerobot_playbyear.datasets.pictures import FILMS
 
 TOLERANCE_S = 1e-4
 """How far a picture's time may be from its frame's; LeRobot's own."""
@@ -155,7 +156,7 @@ def picture_times(path: Path) -> np.ndarray:
     times: list[float] = []
     with _Remembering(path) as file:
         try:
-            with av.open(file, "r") as container:
+            with av.open(file, "r", options=FILMS) as container:
                 for packet in container.demux(container.streams.video[0]):
                     pictures: list[Any] = []
                     with contextlib.suppress(av.FFmpegError):  # what it held is missing from the times

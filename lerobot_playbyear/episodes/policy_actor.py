@@ -16,6 +16,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.play import Observation
+from lerobot_playbyear.policy.processor_playbyear import check_steps
 
 
 class PolicyActor:
@@ -65,7 +66,11 @@ def load_policy_actor(policy_cfg: PreTrainedConfig, env_cfg: EnvConfig) -> Polic
     Args:
         policy_cfg: Its configuration, with `pretrained_path`.
         env_cfg: Where it shall act.
+
+    Raises:
+        InputError: Its processors have steps that nobody registered.
     """
+    check_steps(str(policy_cfg.pretrained_path))
     policy = make_policy(cfg=policy_cfg, env_cfg=env_cfg)
     device = torch.device(str(policy.config.device))
     preprocessor, postprocessor = make_pre_post_processors(

@@ -1,6 +1,5 @@
 """Films with sound: pictures of an episode above the spectrogram of what was heard, and the sound itself."""
 
-import os
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from lerobot_playbyear.audio.audio_files import resample
+from lerobot_playbyear.datasets.files import new_file
 
 _AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 _STRIP_HEIGHT = 120  # pixels
@@ -178,32 +178,25 @@ def write_film(
     Returns:
         The path. The file is there only when it is complete.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-    n_channels = min(sound.shape[1], 2)
-    try:
-        with av.open(str(partial), "w", options={"movflags": "+faststart"}) as film:
-            audio = _add_audio_stream(film, sample_rate, n_channels) if n_channels else None
-            video = None
-            for index, picture in enumerate(frames):
-                height, width = (size - size % 2 for size in picture.shape[:2])
-                picture = picture[:height, :width]
-                if video is None:
-                    video = _add_video_stream(film, fps, height, width, x264_options or {})
-                film.mux(video.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
-                if audio is not None:
-                    first, end = (round(i * sample_rate / fps) for i in (index, index + 1))
-                    if first < len(sound):
-                        film.mux(audio.encode(_audio_frame(sound[first:end][:, :2], sample_rate, first)))
+    path, n_channels = Path(path), min(sound.shape[1], 2)
+    with new_file(path) as partial, av.open(str(partial), "w", options={"movflags": "+faststart"}) as film:
+        audio = _add_audio_stream(film, sample_rate, n_channels) if n_channels else None
+        video = None
+        for index, picture in enumerate(frames):
+            height, width = (size - size % 2 for size in picture.shape[:2])
+            picture = picture[:height, :width]
             if video is None:
-                raise ValueError("A film needs at least one frame.")
-            for stream in (video, audio):
-                if stream is not None:
-                    film.mux(stream.encode(None))
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+                video = _add_video_stream(film, fps, height, width, x264_options or {})
+            film.mux(video.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+            if audio is not None:
+                first, end = (round(i * sample_rate / fps) for i in (index, index + 1))
+                if first < len(sound):
+                    film.mux(audio.encode(_audio_frame(sound[first:end][:, :2], sample_rate, first)))
+        if video is None:
+            raise ValueError("A film needs at least one frame.")
+        for stream in (video, audio):
+            if stream is not None:
+                film.mux(stream.encode(None))
     return path
 
 

@@ -33,12 +33,18 @@ from lerobot_playbyear.hub.dataset_card import CARD, FILM, write_dataset_card
 METRICS_NAME = "metrics.jsonl"
 """File in the output folder of a training with one JSON object per line."""
 
+RUN_FOLDERS = ("checkpoints", "eval", "wandb")
+"""What is written into in a run's folder."""
+
 _WAITS_S = (1, 2, 5)  # between the tries of a step
 _PASSING = (408, 409, 412, 425, 429)  # besides all from 500; 412: a newer commit came before this one
 
 _CONTENT = ("data/", "meta/", "videos/")
 _LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratch; what is made anew; what is the Hub's
-_POLICY_FILES = ("*.safetensors", "*.json", "*.yaml")  # as LeRobot uploads them
+_POLICY_FILES = (  # that saving makes
+    *("config.json", "train_config.json", "model*.safetensors", "model.safetensors.index.json"),
+    *("policy_preprocessor*", "policy_postprocessor*", "adapter_config.json", "adapter_model.safetensors"),
+)
 _NO_RESULTS = "_No evaluation results have been provided for this policy yet._"  # LeRobot's template
 
 logger = logging.getLogger(__name__)

@@ -4,11 +4,11 @@ Of every episode it has a film, and beside it sound as pictures, curves, spans a
 """
 
 import base64
+import contextlib
 import hashlib
 import html
 import io
 import json
-import os
 import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,6 +22,7 @@ import numpy as np
 from PIL import Image
 
 from lerobot_playbyear.datasets.features import number_names
+from lerobot_playbyear.datasets.files import new_file
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 from lerobot_playbyear.film.dataset_film import encode, tile
@@ -45,7 +46,7 @@ _PREVIEW_COLUMNS = 60
 _PREVIEW_RANGE_DB = 45.0
 
 
-class PageWriter:
+class PageWriter(contextlib.ExitStack):
     """Adds one episode after another to a page; the file is there only when it is complete.
 
     Args:
@@ -58,23 +59,15 @@ class PageWriter:
     """
 
     def __init__(self, path: Path, dataset: SurveyedDataset, picture_height: int = 240) -> None:
+        super().__init__()
         self.path = path
         self._dataset = dataset
         self._data = EpisodeData(dataset)
         self._picture_height = picture_height
         self._index: list[dict[str, Any]] = []
-        self._partial = path.with_name(f".{path.name}.partial")
-        path.parent.mkdir(parents=True, exist_ok=True)
         before, self._after = _skeleton(dataset.repo_id).split(_EPISODES_HERE)
-        self._file = self._partial.open("w", encoding="utf-8")
+        self._file = self.enter_context(self.enter_context(new_file(path)).open("w", encoding="utf-8"))
         self._file.write(before)
-
-    def __enter__(self) -> "PageWriter":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._file.close()
-        self._partial.unlink(missing_ok=True)
 
     def add(self, episode: EpisodeRows, pictures: Mapping[str, Iterator[np.ndarray]]) -> None:
         """Writes an episode.
@@ -116,8 +109,6 @@ class PageWriter:
         }
         self._write("application/json", "dataset", [_json(whole)])
         self._file.write(self._after)
-        self._file.close()
-        os.replace(self._partial, self.path)
         return self.path
 
     def _write(self, kind: str, name: str, parts: Iterable[str]) -> None:

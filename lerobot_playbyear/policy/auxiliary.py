@@ -24,10 +24,10 @@ def make_auxiliary(config: PlaybyearConfig) -> "AuxiliaryHeads | None":
 
 
 def weights_of(config: PlaybyearConfig) -> dict[str, float]:
-    """The weight of each kind of loss. A policy leaves out what needs more ears than it has: all take the same preset."""
+    """The weight of each kind of loss. A policy leaves out what it has not ears, or a body, enough for: all take one preset."""
     n_ears = len(config.audio_keys) if config.use_audio else 0
-    needs = {"onset": 1, "balance": 2, "way": 1}
-    return {kind: getattr(config, f"auxiliary_{kind}") if n_ears >= least else 0.0 for kind, least in needs.items()}
+    can = {"onset": n_ears >= 1, "balance": n_ears >= 2, "way": n_ears >= 1 and bool(config.low_dimensional_keys)}
+    return {kind: getattr(config, f"auxiliary_{kind}") if is_able else 0.0 for kind, is_able in can.items()}
 
 
 class AuxiliaryHeads(nn.Module):
@@ -65,7 +65,8 @@ class AuxiliaryHeads(nn.Module):
             By kind the errors (B, K), and their weights (B, K): 0 where there was nothing to predict.
         """
         # How loud each frame is at each microphone, (B, n_audio_frames, M) [10 dB]
-        levels = torch.stack([torch.log10(wave.square().mean(dim=2) + POWER_FLOOR) for wave in waves], dim=2)
+        sounds = [wave - wave.mean(dim=(1, 2), keepdim=True) for wave in waves]  # what is constant is not loud
+        levels = torch.stack([torch.log10(sound.square().mean(dim=2) + POWER_FLOOR) for sound in sounds], dim=2)
         losses = {"onset": self._onset, "balance": self._balance, "way": self._way}
         return {kind: losses[kind](levels, felt, encodings, outputs) for kind in self.heads}
 

@@ -127,7 +127,8 @@ def _power_below(highest_hz: float, tilt: Tensor) -> Tensor:
 
 
 def noise_floor(wave: Tensor) -> Tensor:
-    """(B, samples) -> (B, 1), root mean square of each item's quieter parts."""
+    """(B, samples) -> (B, 1), root mean square of each item's quieter parts, without what is constant in it."""
+    wave = wave - wave.mean(dim=1, keepdim=True)  # what a cheap sound card's converter adds is no sound
     blocks = wave[:, : wave.shape[1] // 16 * 16].unflatten(1, (16, -1))
     levels = blocks.square().mean(dim=2).sqrt().sort(dim=1).values  # (B, 16)
     return levels[:, 3:4].lerp(levels[:, 4:5], 0.75)  # the first quartile; torch's own asks the host
@@ -161,7 +162,7 @@ class RecordedNoise:
             if wave is None:
                 raise InputError(f"{option}: the files last more than {_MOST_SECONDS // 3600} hours: take some out.")
             seconds += len(wave) / rate
-            wave = resample(wave, rate, sample_rate)
+            wave = resample(wave - wave.mean(), rate, sample_rate)
             level = float(np.sqrt(np.mean(np.square(wave))))
             if level < _SILENCE:
                 raise InputError(f"{option}: {path} is silent: take it out of the folder.")

@@ -21,7 +21,6 @@ from lerobot_playbyear.datasets.files import (
     INFO_PATH,
     entries_below,
     fits,
-    link_or_copy,
 )
 from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_rows, write_tables
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
@@ -45,7 +44,7 @@ def write_copy(survey: Survey, target: Path) -> None:
 
     Args:
         survey: Of the damaged one.
-        target: An empty folder; where the file system allows, it shares the films and unchanged files of frames.
+        target: An empty folder.
 
     Raises:
         ValueError: A picture or a film lies outside the dataset's folder, or a picture has another size than its feature.
@@ -75,8 +74,7 @@ def _copy_rest(survey: Survey, target: Path) -> None:
         name = path.relative_to(survey.root)
         if path.is_file() and not _is_scratch(name, survey.info["features"]) and not fits(name, *_REMADE):
             (target / name).parent.mkdir(parents=True, exist_ok=True)
-            # Nobody changes a film in place; of a user's own files that is not known.
-            (link_or_copy if name.parts[0] == "videos" else shutil.copy2)(path, target / name)
+            shutil.copy2(path, target / name)  # no link: LeRobot may write into a film that is there
 
 
 def _is_scratch(name: Path, features: Collection[str]) -> bool:
@@ -133,7 +131,8 @@ def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
         file = kept[0].frames.file
         is_whole = not file.is_rescued and sum(one.frames.length for one in kept) == file.n_rows
         if is_whole and all(one.stays for one in kept):
-            link_or_copy(path, name)
+            name.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(path, name)
         else:
             write_tables(name, (one.table() for one in kept), file.schema)
         for one in kept:

@@ -36,11 +36,13 @@ from lerobot_playbyear.compat import (
     update_last_checkpoint,
 )
 from lerobot_playbyear.datasets.features import number_names
+from lerobot_playbyear.datasets.files import INFO_PATH, check_no_links, entries_below
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
+from lerobot_playbyear.policy.processor_playbyear import check_steps
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.batches import dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
@@ -125,8 +127,14 @@ class Learner:
         return self.accelerator.unwrap_model(self.policy)
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
-        """Write a checkpoint where lerobot-train would, and return its folder."""
+        """Write a checkpoint where lerobot-train would, and return its folder.
+
+        Raises:
+            InputError: A link is there.
+        """
         folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
+        there = [path.relative_to(folder.parent) for path in entries_below(folder)] if folder.is_dir() else []
+        check_no_links(folder.parent, folder.name, *map(str, there))
         self.write_checkpoint(folder, cfg)
         update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
@@ -242,6 +250,8 @@ def make_learner(
     keep_freed_memory()
     check_dataset_suits(cfg.policy, meta, cfg.rename_map)
     policy = make_policy(cfg=cfg.policy, ds_meta=meta, rename_map=cfg.rename_map)
+    if cfg.policy.auxiliary_way and not cfg.policy.low_dimensional_keys:
+        logging.info("--policy.auxiliary_way is left out: the policy observes nothing that moves with the hand")
     assert isinstance(policy, PlaybyearPolicy)
     if keep_normalization:
         policy.keep_normalization()
@@ -322,6 +332,15 @@ def check_dataset_suits(
         ValueError: Naming what was seen, what is wanted, and what to do.
     """
     policy.check_frame_rate(meta)
+    for key, feature in meta.features.items():
+        remedy = f"Leave it out: lerobot-edit-dataset --operation.type=remove_feature --operation.feature_names=\"['{key}']\""
+        if feature["dtype"] == "bool" and key.startswith(f"{OBS_STR}."):
+            raise ValueError(f"'{key}' has dtype bool, which LeRobot cannot normalise; wanted float32. {remedy}.")
+        if feature["dtype"] in ("image", "video") and len(feature.get("names") or ()) != len(feature["shape"]):
+            raise ValueError(
+                f"'{key}' has names {feature.get('names')}; wanted what its dimensions are, such as "
+                f"['height', 'width', 'channels'], in {INFO_PATH}. Correct it there. Or: {remedy}."
+            )
     missing = [key for key in dataset_names(policy, rename_map).values() if key not in meta.features]
     if missing:
         seen = [key for key in meta.features if key.startswith(OBS_STR)]
@@ -352,6 +371,8 @@ def _make_processors(
         unnormalizer = {"features": config.output_features, "norm_map": norm_map, **stats}
         kwargs["postprocessor_overrides"] = {"unnormalizer_processor": unnormalizer}
     path, revision = config.pretrained_path, getattr(config, "pretrained_revision", None)
+    if path:
+        check_steps(path, revision)
     return make_pre_post_processors(policy_cfg=config, pretrained_path=path, pretrained_revision=revision, **kwargs)
 
 

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_playbyear.compat import WandBLogger, metrics_tracker
+from lerobot_playbyear.datasets.files import append_line
 from lerobot_playbyear.hub.push import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 from lerobot_playbyear.training.learner import Learner
@@ -112,9 +113,8 @@ class Report(Progress):
         numbers = ", ".join(f"{key} {value:.4g}" for key, value in figures.items())
         logging.info(text or f"{kind} at step {self._counter.step}: {numbers}")
         elapsed = round(time.perf_counter() - self._began, 2)
-        with self._path.open("a") as file:
-            line = {"kind": kind, "step": self._counter.step, "elapsed_s": elapsed, **figures}
-            file.write(json.dumps(line) + "\n")
+        line = {"kind": kind, "step": self._counter.step, "elapsed_s": elapsed, **figures}
+        append_line(self._path, json.dumps(line))
         self._to_wandb(kind, figures)
 
     def saved(self, checkpoint: Path) -> None:

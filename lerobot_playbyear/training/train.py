@@ -17,10 +17,10 @@ from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
 
 from lerobot_playbyear.datasets.errors import errors_of_input
-from lerobot_playbyear.datasets.files import check_can_be_made
+from lerobot_playbyear.datasets.files import check_can_be_made, check_no_links
 from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.reader import DatasetReader
-from lerobot_playbyear.hub.push import PushOptions, check_upload, push_policy
+from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, PushOptions, check_upload, push_policy
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import (
     Batch,
@@ -123,6 +123,7 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
     output = cfg.output_dir or _OUTPUTS
     check_can_be_made(Path(str(output)), f"--output_dir={output}")
     cfg.validate()
+    check_no_links(Path(str(cfg.output_dir)), METRICS_NAME, *RUN_FOLDERS)
     check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     if cfg.policy is None:
         raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")

@@ -1,0 +1,293 @@
+"""What strangers send writes, removes, reads and runs nothing outside its own folder."""
+
+import json
+import os
+import re
+import shutil
+import threading
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from dagger_factory import FINISHED, QUICK, command, dagger, state
+from dataset_factory import make_dataset
+from support.recording import edit_column, edit_info
+from support.shared import ENV, run_in_process
+
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import FolderLockedError, new_file, new_folder, write_atomically
+from lerobot_playbyear.datasets.info import check_dataset_files
+from lerobot_playbyear.datasets.pictures import video_pictures
+from lerobot_playbyear.datasets.survey import survey
+from lerobot_playbyear.datasets.video_files import picture_times
+from lerobot_playbyear.hub.push import PushOptions, push_policy
+from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
+from lerobot_playbyear.repair.repair import RepairConfig, repair
+from lerobot_playbyear.scripts.commands import train, video
+
+SECRET = "what nobody else may read or change"
+
+
+@pytest.fixture
+def secret(tmp_path):
+    """A file of this machine."""
+    path = tmp_path / "home/.bashrc"
+    path.parent.mkdir()
+    path.write_text(SECRET)
+    yield path
+    assert path.read_text() == SECRET
+    assert [each.name for each in path.parent.iterdir()] == [".bashrc"]
+
+
+def film(path: Path, size: int = 16) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=20)
+        stream.width = stream.height = size
+        for _ in range(5):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.zeros((size, size, 3), np.uint8), "rgb24")))
+        container.mux(stream.encode(None))
+
+
+# Links
+
+
+@pytest.mark.parametrize("name", [".page.html.partial", "page.html"])
+def test_a_page_is_written_through_no_link(noise, tmp_path, secret, name):
+    (tmp_path / name).symlink_to(secret)
+    inspect(InspectConfig(InspectDatasetConfig("a/b", str(noise)), html=tmp_path / "page.html"))
+    assert "<html" in (tmp_path / "page.html").read_text()
+
+
+@pytest.mark.parametrize("make", [write_atomically, lambda path, text: _write(path, text)])
+@pytest.mark.parametrize("name", ["info.json.partial", "info.json"])
+def test_a_file_is_written_through_no_link(tmp_path, secret, make, name):
+    (tmp_path / name).symlink_to(secret)
+    make(tmp_path / "info.json", "new")
+    assert (tmp_path / "info.json").read_text() == "new"
+    assert not (tmp_path / "info.json").is_symlink()
+
+
+def _write(path: Path, text: str) -> None:
+    with new_file(path) as partial:
+        partial.write_text(text)
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "metrics.jsonl", "eval"])
+def test_a_run_goes_on_through_no_link(finished, tmp_path, secret, name):
+    """Neither `playbyear-dagger`, which removes checkpoints that it no longer needs, nor `playbyear-train`."""
+    run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
+    if (run / name).is_dir():
+        shutil.rmtree(run / name)
+    (run / name).unlink(missing_ok=True)
+    (run / name).symlink_to(secret.parent if name != "metrics.jsonl" else secret)
+    with pytest.raises(InputError, match=f"{name}' is a link to .*nothing is written or removed"):
+        command("--resume=true", f"--output_dir={run}")
+
+
+@pytest.mark.parametrize("name", ["checkpoints/000004", "checkpoints/000004/pretrained_model", "metrics.jsonl"])
+def test_training_writes_through_no_link(recorded, trained, tmp_path, secret, name):
+    run = Path(shutil.copytree(trained.parents[2], tmp_path / "run", symlinks=True))
+    (run / name).unlink(missing_ok=True)
+    (run / name).parent.mkdir(exist_ok=True)
+    (run / name).symlink_to(secret.parent if name != "metrics.jsonl" else secret)
+    config = run / "checkpoints/000002/pretrained_model/train_config.json"
+    saved = json.loads(config.read_text())
+    config.write_text(json.dumps({**saved, "output_dir": str(run)}))
+    said = run_in_process(train, "--resume=true", f"--config_path={config}", "--steps=4")
+    assert f"{Path(name).name}' is a link to" in str(said)
+
+
+def test_dagger_removes_only_checkpoints_of_its_own(tmp_path):
+    dagger(tmp_path, *QUICK, *FINISHED, "--episodes=2")
+    first = state(tmp_path)["checkpoint"]
+    checkpoints = tmp_path / "out/checkpoints"
+    for name in ("holiday_pictures", "000000"):
+        (checkpoints / name).mkdir()
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=3")
+    last = state(tmp_path)["checkpoint"]
+    assert last != first
+    names = {path.name for path in checkpoints.iterdir()}
+    assert names == {"holiday_pictures", "000000", "last", "best", *state(tmp_path)["made"]}
+    assert last in names
+
+
+# Files that lead to others
+
+
+@pytest.mark.parametrize("kind", ["hls", "concat"])
+def test_a_playlist_is_no_film(tmp_path, secret, kind):
+    other, path = tmp_path / "other.mp4", tmp_path / "file-000.mp4"
+    film(other)
+    lists = {
+        "hls": f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\n{other}\n#EXT-X-ENDLIST\n",
+        "concat": f"ffconcat version 1.0\nfile {other}\n",
+    }
+    path.write_text(lists[kind])
+    for read in (picture_times, lambda path: list(video_pictures(path, [0.0], 0.1))):
+        with pytest.raises(av.FFmpegError):
+            read(path)
+    assert len(picture_times(other)) == 5
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("video_path", "videos/{video_key}/{file_index}.m3u8"),
+        ("video_path", "videos/{video_key}/{file_index}"),
+        ("data_path", "data/{file_index}.csv"),
+    ],
+)
+def test_the_files_of_a_dataset_end_as_lerobots_do(noise, tmp_path, name, value):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    edit_info(root, lambda info: info.update({name: value}))
+    with pytest.raises(InputError, match=f"{name} is"):
+        check_dataset_files("a/b", root)
+
+
+@pytest.mark.parametrize("name", ["meta/stats.json", "meta/info.json", "meta/episodes/chunk-000/file-009.parquet"])
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero"])
+def test_pipes_and_devices_are_not_read(noise, tmp_path, name, target):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (root / name).unlink(missing_ok=True)
+    if target == "pipe":
+        os.mkfifo(root / name)
+    else:
+        (root / name).symlink_to(target)
+    for read in (check_dataset_files, lambda _, root: survey(root)):
+        with pytest.raises(InputError, match="no ordinary file"):
+            read("a/b", root)
+
+
+@pytest.mark.parametrize("name", ["file-001.parquet", "backup.parquet", "file-000 (copy).parquet"])
+def test_a_copy_of_frames_beside_them_is_named(noise, tmp_path, name):
+    """LeRobot reads every file in `data/`: a row would be another than the one that is asked for."""
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("data/*/*.parquet")
+    shutil.copy(path, path.with_name(name))
+    said = re.escape(f"data/chunk-000/{name}")
+    with pytest.raises(InputError, match=rf"{said}' belongs to no episode"):
+        check_dataset_files("a/b", root)
+    assert re.search(rf"{said}: 38 frames belong to no episode", str(survey(root)))
+    repair(RepairConfig(root))
+    check_dataset_files("a/b", tmp_path / "noise_repaired")
+
+
+@pytest.mark.parametrize("name", ["dataset_from_index", "dataset_to_index", "length"])
+def test_rows_that_number_other_frames_are_refused(noise, tmp_path, name):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    edit_column(path, name, lambda values: values[::-1])
+    with pytest.raises(InputError, match="meta/episodes says that episode 0 has"):
+        check_dataset_files("a/b", root)
+    assert not survey(root).is_undamaged
+
+
+# What a checkpoint runs
+
+
+@pytest.mark.parametrize("file", ["policy_preprocessor.json", "policy_postprocessor.json"])
+def test_a_checkpoint_names_no_class_to_call(recorded, trained, tmp_path, file):
+    checkpoint, ran = Path(shutil.copytree(trained, tmp_path / "policy")), tmp_path / "ran"
+    saved = json.loads((checkpoint / file).read_text())
+    saved["steps"].insert(0, {"class": "subprocess.Popen", "config": {"args": ["touch", str(ran)]}})
+    (checkpoint / file).write_text(json.dumps(saved))
+    data = ("--dataset.repo_id=tests/demos", f"--dataset.root={recorded}", "--steps=1")
+    resumed = (f"--policy.path={checkpoint}", "--policy.push_to_hub=false", f"--output_dir={tmp_path / 'out'}")
+    filmed = (*ENV, f"--policy.path={checkpoint}", f"--output={tmp_path / 'film.mp4'}")
+    for said in (run_in_process(train, *data, *resumed, "--num_workers=0"), run_in_process(video, *filmed)):
+        assert "not registered by any package but names a class" in str(said)
+    assert not ran.exists()
+
+
+def test_what_is_no_part_of_a_checkpoint_is_not_uploaded(trained, tmp_path, here):
+    checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))
+    for name in ("notes.json", "notes.yaml", "secret.safetensors"):
+        (checkpoint / name).write_text(SECRET)
+    push_policy(checkpoint, "me/policy", PushOptions())
+    names = set(here.model("me/policy").files())
+    assert {"config.json", "model.safetensors", "policy_preprocessor.json", "train_config.json"} <= names
+    assert not [name for name in names if "notes" in name or "secret" in name]
+
+
+# Two at once, and copies
+
+
+def test_two_commands_do_not_write_one_output(tmp_path):
+    target = tmp_path / "out"
+    with new_folder(target) as first:
+        (first / "data").write_text("first")
+        with pytest.raises(FolderLockedError, match=f"Another process is writing {target}"), new_folder(target):
+            pass
+        assert (first / "data").read_text() == "first"
+    assert (target / "data").read_text() == "first"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_many_that_want_one_output_make_it_once(tmp_path):
+    made, start = [], threading.Barrier(4)
+
+    def write(number: int) -> None:
+        start.wait()
+        try:
+            with new_folder(tmp_path / "out") as folder:
+                for name in range(20):
+                    (folder / str(name)).write_text(str(number))
+            made.append(number)
+        except (OSError, FolderLockedError):  # the others come at the same time, or later
+            pass
+
+    for _ in range(10):
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        made.clear()
+        threads = [threading.Thread(target=write, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(made) == 1
+        assert {path.read_text() for path in (tmp_path / "out").iterdir()} == {str(made[0])}
+        assert len(list((tmp_path / "out").iterdir())) == 20
+
+
+def test_a_copy_shares_no_file_with_its_original(tmp_path):
+    """LeRobot may write into a film that is there: where its folder for new ones is on another disk."""
+    root = tmp_path / "set"
+    make_dataset(root, (6, 5), use_videos=True, image_size=16)
+    for episode in range(2):
+        write_audio(tmp_path / f"{episode}.wav", np.zeros(16000, np.int16), 16000)
+    places = DatasetPlace("a/b", str(root)), DatasetPlace("a/c", str(tmp_path / "copy"))
+    attach_audio(AttachAudioConfig(*places, files=str(tmp_path / "{episode}.wav"), microphone="new"))
+    (root / "meta/stats.json").unlink()
+    repair(RepairConfig(root))
+    originals = {path.stat().st_ino for path in root.rglob("*") if path.is_file()}
+    for copy in (tmp_path / "copy", tmp_path / "set_repaired"):
+        assert list(copy.rglob("*.mp4"))
+        assert not [path for path in copy.rglob("*") if path.stat().st_ino in originals]
+
+
+# Small files that ask for everything
+
+
+def test_small_tables_of_many_rows_take_no_memory(noise, tmp_path):
+    """Half a million equal rows of episodes fill a megabyte, and 4 GiB once they are read."""
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    table = pq.read_table(path).slice(0, 1)
+    pq.write_table(table.take([0] * 500_000), path)
+    assert path.stat().st_size < 3e6
+    found = survey(root)
+    assert "rows of 500,000 episodes, and there are 38 frames" in str(found)
+    assert found.whole
+
+
+def test_a_small_file_of_many_pieces_takes_no_time(noise, tmp_path):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path, columns=None).slice(0, 1)
+    pq.write_table(table.take([0] * 800_000), path)
+    assert "800,000 pieces of episodes" in str(survey(root))
