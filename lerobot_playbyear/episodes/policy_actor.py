@@ -14,9 +14,9 @@ from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_proces
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION
 
+from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.play import Observation
-from lerobot_playbyear.policy.processor_playbyear import check_steps
 
 
 class PolicyActor:

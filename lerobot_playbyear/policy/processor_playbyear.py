@@ -1,13 +1,10 @@
 """What happens to observations and actions around the network: LeRobot's own steps, and two of ours for sound."""
 
-import json
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from huggingface_hub import hf_hub_download
 from lerobot.processor import (
     PolicyAction,
     PolicyProcessorPipeline,
@@ -16,7 +13,6 @@ from lerobot.processor import (
     make_default_policy_processor_steps,
     make_policy_processor_pipelines,
 )
-from lerobot.utils.constants import POLICY_POSTPROCESSOR_DEFAULT_NAME, POLICY_PREPROCESSOR_DEFAULT_NAME
 from torch import Tensor
 
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
@@ -60,34 +56,6 @@ def make_playbyear_pre_post_processors(
         input_steps=[steps.rename_observations, steps.add_batch_dim, steps.to_device, *heard, steps.normalize],
         output_steps=[steps.unnormalize, steps.to_cpu],
     )
-
-
-def check_steps(path: str | Path, revision: str | None = None) -> None:
-    """Refuses a checkpoint whose processors name a class that is to be imported and called, as any program could be.
-
-    Args:
-        path: Its folder, or its name on the Hub.
-        revision: On the Hub.
-
-    Raises:
-        InputError: One of its steps is not named as packages register them.
-    """
-    for name in (f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json", f"{POLICY_POSTPROCESSOR_DEFAULT_NAME}.json"):
-        file = Path(path) / name
-        if not Path(path).is_dir():
-            file = Path(hf_hub_download(str(path), name, revision=revision))
-        if not file.is_file():
-            continue  # LeRobot says so
-        try:
-            steps = json.loads(file.read_bytes())["steps"]
-            strange = [step for step in steps if "class" in step or not isinstance(step["registry_name"], str)]
-        except (ValueError, LookupError, TypeError) as error:
-            raise InputError(f"{file} is no processor of LeRobot's: {type(error).__name__}: {error}.") from error
-        if strange:
-            raise InputError(
-                f"{file} has the step {strange[0]}, which is not registered by any package but names a class to import; "
-                "nothing was loaded. Ask who made the checkpoint for steps with a registry_name."
-            )
 
 
 def _microphone_step(name: str) -> ProcessorStep:

@@ -35,6 +35,7 @@ from lerobot_playbyear.compat import (
     save_checkpoint,
     update_last_checkpoint,
 )
+from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import number_names
 from lerobot_playbyear.datasets.files import INFO_PATH, check_no_links, entries_below
 from lerobot_playbyear.hub.push import push_checkpoint
@@ -42,7 +43,6 @@ from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
-from lerobot_playbyear.policy.processor_playbyear import check_steps
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.batches import dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig

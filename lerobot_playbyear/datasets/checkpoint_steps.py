@@ -1,0 +1,39 @@
+"""What a checkpoint may have done before and after its network: it may be a stranger's, and LeRobot calls what it names."""
+
+import json
+from pathlib import Path
+
+from huggingface_hub import hf_hub_download
+
+from lerobot_playbyear.datasets.errors import InputError
+
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+"""LeRobot's names of the files."""
+
+
+def check_steps(path: str | Path, revision: str | None = None) -> None:
+    """Refuses a checkpoint whose processors name a class that is to be imported and called, as any program could be.
+
+    Args:
+        path: Its folder, or its name on the Hub.
+        revision: On the Hub.
+
+    Raises:
+        InputError: One of its steps is not named as packages register them.
+    """
+    for name in PROCESSORS:
+        file = Path(path) / name
+        if not Path(path).is_dir():
+            file = Path(hf_hub_download(str(path), name, revision=revision))
+        if not file.is_file():
+            continue  # LeRobot says so
+        try:
+            steps = json.loads(file.read_bytes())["steps"]
+            strange = [step for step in steps if "class" in step or not isinstance(step["registry_name"], str)]
+        except (ValueError, LookupError, TypeError) as error:
+            raise InputError(f"{file} is no processor of LeRobot's: {type(error).__name__}: {error}.") from error
+        if strange:
+            raise InputError(
+                f"{file} has the step {strange[0]}, which is not registered by any package but names a class to import; "
+                "nothing was loaded. Ask who made the checkpoint for steps with a registry_name."
+            )
