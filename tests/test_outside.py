@@ -278,7 +278,8 @@ def test_small_tables_of_many_rows_take_no_memory(noise, tmp_path):
     root = Path(shutil.copytree(noise, tmp_path / "noise"))
     (path,) = root.glob("meta/episodes/*/*.parquet")
     table = pq.read_table(path).slice(0, 1)
-    pq.write_table(table.take([0] * 500_000), path)
+    small = table.select([name for name in table.column_names if not name.startswith("stats/")])
+    pq.write_table(small.take([0] * 500_000), path)
     assert path.stat().st_size < 3e6
     found = survey(root)
     assert "rows of 500,000 episodes, and there are 38 frames" in str(found)
