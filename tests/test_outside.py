@@ -29,6 +29,8 @@ from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetCo
 from lerobot_playbyear.repair.repair import RepairConfig, repair
 from lerobot_playbyear.scripts.commands import train, video
 
+pytestmark = pytest.mark.usefixtures("one_thread")
+
 SECRET = "what nobody else may read or change"
 
 
@@ -114,6 +116,21 @@ def test_dagger_removes_only_checkpoints_of_its_own(tmp_path):
     names = {path.name for path in checkpoints.iterdir()}
     assert names == {"holiday_pictures", "000000", "last", "best", *state(tmp_path)["made"]}
     assert last in names
+
+
+@pytest.mark.parametrize("field", ["made", "milestones", "checkpoint", "best"])
+@pytest.mark.parametrize("name", ["../../../home", "{home}", "..", ""])
+def test_a_runs_state_names_no_folder_elsewhere(finished, tmp_path, secret, field, name):
+    """Or else the folder that it says was made by the run would be removed."""
+    run, name = (
+        Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out",
+        name.format(home=secret.parent),
+    )
+    saved = json.loads((run / "dagger_state.json").read_text())
+    saved[field] = {"made": [name], "milestones": [name], "checkpoint": name, "best": {"checkpoint": name}}[field]
+    (run / "dagger_state.json").write_text(json.dumps(saved))
+    with pytest.raises(InputError, match="names the checkpoint"):
+        command("--resume=true", f"--output_dir={run}")
 
 
 # Files that lead to others
@@ -289,6 +306,7 @@ def test_small_tables_of_many_rows_take_no_memory(noise, tmp_path):
 def test_a_small_file_of_many_pieces_takes_no_time(noise, tmp_path):
     root = Path(shutil.copytree(noise, tmp_path / "noise"))
     (path,) = root.glob("data/*/*.parquet")
-    table = pq.read_table(path, columns=None).slice(0, 1)
-    pq.write_table(table.take([0] * 800_000), path)
-    assert "800,000 pieces of episodes" in str(survey(root))
+    table = pq.read_table(path).slice(0, 1)
+    pq.write_table(table.take([0] * 30_000), path)
+    assert path.stat().st_size < 3e6
+    assert "30,000 pieces of episodes" in str(survey(root))

@@ -107,8 +107,9 @@ def _opened(path: Path, formats: str) -> av.container.InputContainer:
         begin = file.read(4)
     for mark, name in _WITHOUT_HEADER.items():
         if begin.startswith(mark) and name in formats.split(","):
-            return av.open(str(path), format=name)  # with options it would look for streams where there are none yet
-    return av.open(str(path), options={"format_whitelist": formats})
+            return av.open(str(path), format=name)  # with options PyAV 15.1 ends in a segmentation fault
+    others = ",".join(name for name in formats.split(",") if name not in _WITHOUT_HEADER.values())
+    return av.open(str(path), options={"format_whitelist": others})
 
 
 def _begin(container: av.container.InputContainer) -> float | None:

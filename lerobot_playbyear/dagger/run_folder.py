@@ -9,6 +9,7 @@ import contextlib
 import json
 import logging
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
@@ -40,6 +41,8 @@ BEST_LINK = "best"
 
 LOCK = ".lock"
 """File in the output folder while a run is at work."""
+
+_NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a checkpoint's folder: one that leads nowhere else
 
 _SAME_RUN = (
     *("demos", "interventions", "env", "expert", "method", "skip_s", "new_weights", "seed"),
@@ -167,8 +170,16 @@ class RunFolder:
             raise InputError(
                 f"--output_dir={self.path} holds a run already: go on with it with --resume=true, or choose another."
             )
-        state = self.path / STATE_NAME
-        return RunState(**json.loads(state.read_text())) if state.is_file() else None
+        path = self.path / STATE_NAME
+        if not path.is_file():
+            return None
+        state = RunState(**json.loads(path.read_text()))
+        said = [*state.made, *state.milestones, state.checkpoint, state.best.get("checkpoint")]
+        if strange := [name for name in said if name is not None and not _NAME.fullmatch(name)]:
+            raise InputError(
+                f"{path} names the checkpoint {strange[0]!r}; wanted names of folders in '{self.checkpoints}'."
+            )
+        return state
 
     def begin(self, cfg: DaggerConfig, state: RunState) -> None:
         """Make the folder of a new run; or note the options of one that goes on, and remove what was in progress."""

@@ -1,9 +1,11 @@
 """What a checkpoint may have done before and after its network: it may be a stranger's, and LeRobot calls what it names."""
 
+import contextlib
 import json
 from pathlib import Path
 
 from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import EntryNotFoundError
 
 from lerobot_playbyear.datasets.errors import InputError
 
@@ -24,7 +26,8 @@ def check_steps(path: str | Path, revision: str | None = None) -> None:
     for name in PROCESSORS:
         file = Path(path) / name
         if not Path(path).is_dir():
-            file = Path(hf_hub_download(str(path), name, revision=revision))
+            with contextlib.suppress(EntryNotFoundError):
+                file = Path(hf_hub_download(str(path), name, revision=revision))
         if not file.is_file():
             continue  # LeRobot says so
         try:

@@ -15,13 +15,7 @@ from lerobot.datasets.io_utils import write_json, write_tasks
 
 from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.features import is_depth
-from lerobot_playbyear.datasets.files import (
-    DEFAULT_DATA_PATH,
-    EPISODES_DIR,
-    INFO_PATH,
-    entries_below,
-    fits,
-)
+from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits
 from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_rows, write_tables
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.statistics import (

@@ -37,7 +37,7 @@ from lerobot_playbyear.compat import (
 )
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import number_names
-from lerobot_playbyear.datasets.files import INFO_PATH, check_no_links, entries_below
+from lerobot_playbyear.datasets.files import INFO_PATH
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
@@ -127,14 +127,8 @@ class Learner:
         return self.accelerator.unwrap_model(self.policy)
 
     def save(self, cfg: PlaybyearTrainConfig) -> Path:
-        """Write a checkpoint where lerobot-train would, and return its folder.
-
-        Raises:
-            InputError: A link is there.
-        """
+        """Write a checkpoint where lerobot-train would, and return its folder."""
         folder = get_step_checkpoint_dir(Path(str(cfg.output_dir)), cfg.steps, self.step)
-        there = [path.relative_to(folder.parent) for path in entries_below(folder)] if folder.is_dir() else []
-        check_no_links(folder.parent, folder.name, *map(str, there))
         self.write_checkpoint(folder, cfg)
         update_last_checkpoint(folder)
         if cfg.save_checkpoint_to_hub and cfg.policy and cfg.policy.repo_id:
@@ -249,6 +243,8 @@ def make_learner(
     assert isinstance(cfg.policy, PlaybyearConfig)
     keep_freed_memory()
     check_dataset_suits(cfg.policy, meta, cfg.rename_map)
+    if cfg.policy.pretrained_path:
+        check_steps(cfg.policy.pretrained_path, getattr(cfg.policy, "pretrained_revision", None))
     policy = make_policy(cfg=cfg.policy, ds_meta=meta, rename_map=cfg.rename_map)
     if cfg.policy.auxiliary_way and not cfg.policy.low_dimensional_keys:
         logging.info("--policy.auxiliary_way is left out: the policy observes nothing that moves with the hand")
@@ -371,8 +367,6 @@ def _make_processors(
         unnormalizer = {"features": config.output_features, "norm_map": norm_map, **stats}
         kwargs["postprocessor_overrides"] = {"unnormalizer_processor": unnormalizer}
     path, revision = config.pretrained_path, getattr(config, "pretrained_revision", None)
-    if path:
-        check_steps(path, revision)
     return make_pre_post_processors(policy_cfg=config, pretrained_path=path, pretrained_revision=revision, **kwargs)
 
 

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import torch
 from lerobot.datasets import make_train_eval_datasets
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
 
 from lerobot_playbyear.datasets.errors import errors_of_input
-from lerobot_playbyear.datasets.files import check_can_be_made, check_no_links
+from lerobot_playbyear.datasets.files import check_can_be_made, check_no_links, entries_below
 from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, PushOptions, check_upload, push_policy
@@ -123,7 +123,7 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
     output = cfg.output_dir or _OUTPUTS
     check_can_be_made(Path(str(output)), f"--output_dir={output}")
     cfg.validate()
-    check_no_links(Path(str(cfg.output_dir)), METRICS_NAME, *RUN_FOLDERS)
+    _check_links(Path(str(cfg.output_dir)))
     check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     if cfg.policy is None:
         raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
@@ -134,6 +134,18 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
         )
     if cfg.policy.push_to_hub:
         check_upload("policy.repo_id", str(cfg.policy.repo_id))
+
+
+def _check_links(run: Path) -> None:
+    """Whether all that a run writes stays in its folder: what resumes may be a stranger's.
+
+    Raises:
+        InputError: A link stands there, other than LeRobot's own to the last checkpoint.
+    """
+    check_no_links(run, METRICS_NAME, *RUN_FOLDERS)
+    folder = run / CHECKPOINTS_DIR
+    there = [path for path in entries_below(folder) if path != folder / LAST_CHECKPOINT_LINK] if folder.is_dir() else []
+    check_no_links(run, *(str(path.relative_to(run)) for path in there))
 
 
 def _loss_of(
