@@ -251,10 +251,37 @@ def test_after_a_repair_the_times_are_those_of_the_same_episodes(tmp_path, monke
     assert read_episode_starts(target) == {0: STARTS[0], 1: STARTS[2]}
 
 
-def test_a_table_of_times_may_come_from_a_spreadsheet(tmp_path):
-    for text in ("0,1.5\n1,20\n", "Episode;Start\n0;1.5\n\n1;20\n", "episode\tstart\tremark\n0\t1.5\t\n1\t20\tgood\n"):
-        (tmp_path / "times.csv").write_text(text)
-        assert read_clock(tmp_path / "times.csv") == {0: 1.5, 1: 20.0}
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16-le", "utf-16-be", "utf-16", "cp1252"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0,1.5\n1,20\n",
+        "Episode;Start\r\n0;1.5\r\n\r\n1;20\r\n",
+        "episode\tstart\tremark\n0\t1.5\t\n1\t20\tgood\n",
+        "Épisode;Début (s)\n0;1,5\n1;20\n",
+        "0\t1,5\n1\t20,0\n",
+        'épisode,début\n0,"1,5"\n1,"20"\n',
+        "sep=;\r\nEpisode;Start, in s\r\n0;1,5\r\n1;20,000\r\n",
+        "SEP=,\n0,1.5\n1,20\n",
+        "sep=\t\nepisode\tstart; s\n0\t1,5\n1\t20\n",
+    ],
+)
+def test_a_table_of_times_may_come_from_a_spreadsheet(tmp_path, text, encoding):
+    (tmp_path / "times.csv").write_bytes(text.encode(encoding))
+    assert read_clock(tmp_path / "times.csv") == {0: 1.5, 1: 20.0}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-be"])
+def test_times_in_json_may_have_any_order_of_bytes(tmp_path, encoding):
+    (tmp_path / "times.json").write_bytes('{"0": 1.5, "1": 20}'.encode(encoding))
+    assert read_clock(tmp_path / "times.json") == {0: 1.5, 1: 20.0}
+
+
+@pytest.mark.parametrize("text", ["0;1.754,5\n", "0;1,754,000\n", "\0\0\0", "0,1\0,5\n"])
+def test_marks_between_thousands_and_zeros_are_no_times(tmp_path, text):
+    (tmp_path / "times.csv").write_text(text)
+    with pytest.raises(ClockError, match="wanted"):
+        read_clock(tmp_path / "times.csv")
 
 
 def test_no_start_is_noted_through_a_link_or_without_a_meaning(tmp_path):

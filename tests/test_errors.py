@@ -125,7 +125,7 @@ train | --dataset.image_transforms.enable=true | --dataset.image_transforms.enab
 train | --dataset.root={slow} | 10 frames per second | configured for 20 | --policy.fps=10
 train | --dataset.root={deaf} | observation.audio | --policy.use_audio=false
 train | --policy.sample_rate=48001 | sample_rate / fps = 48001 / 20
-train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be at least 1, got 0
+train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be at least 1 and at most 1,000, got 0
 train | --policy.audio_window_s=0.5 | audio_window_s | too few for 4 convolutions
 train | --policy.audio_encoder=nobody | --policy.audio_encoder=nobody | spectrogram_cnn | lerobot_policy_
 train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={out}/no | no such folder

@@ -3,6 +3,7 @@
 import math
 import shutil
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -175,11 +176,44 @@ def test_a_folder_that_cannot_be_used_is_refused_with_what_to_do(recordings, tmp
     secret = write_audio(tmp_path / "elsewhere" / "secret.flac", tone(300, RATE)[:, None], RATE)
     (tmp_path / "noise").mkdir()
     (tmp_path / "noise" / "a.wav").write_text(f"ffconcat version 1.0\nfile '{secret}'\n")  # FFmpeg would open it
-    with pytest.raises(InputError, match=r"a\.wav.*cannot be decoded.*take it out of the folder"):
+    with pytest.raises(InputError, match=r"holds no .wav or .flac file with sound"):
         RecordedNoise(tmp_path / "noise", RATE)
     write_audio(tmp_path / "noise" / "a.wav", np.zeros((RATE, 1)), RATE)
     with pytest.raises(InputError, match=r"a\.wav is silent"):
         RecordedNoise(tmp_path / "noise", RATE)
+
+
+def test_files_that_hold_no_sound_are_left_out_of_a_folder_and_told(recordings, caplog):
+    """And others are read as what they are, whatever their names say."""
+    head = b"RIFF\x24\0\0\0WAVEfmt \x10\0\0\0\1\0\1\0"
+    pcm = b"\2\0\x10\0data"
+    nothing = {
+        "._low.wav": b"\0\5\x16\7\0\2\0\0Mac OS X        " + bytes(4000),  # beside every file on a Mac's USB stick
+        "notes.wav": b"the tone is in low.wav\n",
+        "list.wav": b"ffconcat version 1.0\nfile 'low.wav'\n",
+        "empty.wav": b"",
+        "no_samples.wav": head + b"\x80\x3e\0\0\0\x7d\0\0" + pcm + bytes(4),
+        "no_rate.wav": head + bytes(8) + pcm + b"\4\0\0\0" + bytes(4),
+        "odd_codec.wav": head[:-4] + b"\x99\x99\1\0" + b"\x80\x3e\0\0\0\x7d\0\0" + pcm + b"\4\0\0\0" + bytes(4),
+        "cut.flac": b"fLaC\0\0\0",
+    }
+    for name, content in nothing.items():
+        (recordings / name).write_bytes(content)
+    sound = write_audio(recordings / "mid.flac", tone(1000, RATE)[:, None], RATE)
+    sound.rename(recordings / "mid.wav")
+    with av.open(str(recordings / "aiff.wav"), "w", format="aiff") as file:
+        stream = file.add_stream("pcm_s16be", rate=RATE, layout="mono")
+        block = (32000 * tone(2000, RATE)).astype(np.int16)[None]
+        frame = av.AudioFrame.from_ndarray(block, format="s16", layout="mono")
+        frame.sample_rate = RATE
+        file.mux(stream.encode(frame))
+    torch.manual_seed(0)
+    found = RecordedNoise(recordings, RATE)
+    assert set(pitch_of(found.excerpts(200, 4000)).tolist()) == {500.0, 1000.0, 1500.0, 2000.0}
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == len(nothing)
+    for name in nothing:
+        assert any(name in line and "left out" in line for line in said), name
 
 
 def test_training_reads_the_folder_and_acting_does_not(recordings, tmp_path):

@@ -1,6 +1,7 @@
 """The moment of a sound in a file is that of the file, whatever its format says about clocks and encoders."""
 
 import logging
+import struct
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,48 @@ def test_what_is_left_of_a_file_that_was_cut_off_is_read(tmp_path, caplog, name)
     assert (rest[: len(rest) - 4096] == whole[: len(rest) - 4096]).all()
     path.write_bytes(path.read_bytes()[:40])
     with pytest.raises(AudioFileError):
+        read_audio(path)
+
+
+def wav(
+    path: Path, samples: np.ndarray, tag: int, n_bits: int, valid: int | None = None, form: bytes = b"RIFF"
+) -> Path:
+    """One channel; with `valid` as an extensible WAV, with a chunk of other things before its format, as recorders write it."""
+    size = samples.itemsize
+    head = struct.pack("<HHIIHH", tag if valid is None else 0xFFFE, 1, 16000, 16000 * size, size, n_bits)
+    if valid is not None:
+        head += struct.pack("<HHIH", 22, valid, 4, tag) + bytes.fromhex("000000001000800000aa00389b71")
+    chunks = {b"bext": b"fmt " * 150 + b"!", b"fmt ": head, b"data": samples.tobytes()}
+    body = b"".join(name + struct.pack("<I", len(each)) + each + bytes(len(each) % 2) for name, each in chunks.items())
+    path.write_bytes(form + struct.pack("<I", 4 + len(body)) + b"WAVE" + body)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("dtype", "tag", "n_bits", "valid"),
+    [
+        ("<i4", 1, 32, 24),
+        ("<i4", 1, 24, 24),
+        ("<i4", 1, 24, None),
+        ("<i4", 1, 32, 20),
+        ("<i4", 1, 32, 16),
+        ("<i2", 1, 16, 12),
+        ("<i2", 1, 16, 8),
+        ("<f4", 3, 32, 24),
+        ("<f8", 3, 64, 53),
+    ],
+)
+def test_samples_with_room_for_more_bits_than_they_hold_are_read_as_they_are(tmp_path, dtype, tag, n_bits, valid):
+    sound = np.random.default_rng(0).integers(-9000, 9000, 1001)
+    full = {"i": 2 ** (8 * np.dtype(dtype).itemsize - 16), "f": 1 / 32768}[dtype[1]]
+    samples, rate = read_audio(wav(tmp_path / "sound.wav", (sound * full).astype(dtype), tag, n_bits, valid))
+    assert rate == 16000
+    assert np.abs(samples[:, 0] - sound).max() <= (dtype[1] == "f")
+
+
+def test_a_wav_file_that_ffmpeg_misreads_is_refused(tmp_path):
+    path = wav(tmp_path / "sound.wav", np.zeros(100, ">i2"), 1, 16, form=b"RIFX")
+    with pytest.raises(AudioFileError, match=r"big-endian numbers \(RIFX\)"):
         read_audio(path)
 
 

@@ -4,6 +4,7 @@ import warnings
 
 from gymnasium.envs import registration
 
+from gym_playbyear import opengl  # noqa: F401  (first: whether MuJoCo can be imported)
 from gym_playbyear.registry import Registry
 
 __version__ = "0.1.0"

@@ -10,13 +10,10 @@ import mujoco
 import mujoco.viewer
 import numpy as np
 
+from gym_playbyear.opengl import GLUnavailableError, no_context
 from gym_playbyear.scene import PEOPLE_CAMERA, compose
 from gym_playbyear.task import Task
 from gym_playbyear.visuals import add_visuals
-
-
-class GLUnavailableError(RuntimeError):
-    """No OpenGL library could be loaded for off-screen rendering."""
 
 
 class SceneRenderer:
@@ -31,10 +28,7 @@ class SceneRenderer:
         try:
             self._renderer = mujoco.Renderer(model, height=size, width=size)
         except Exception as error:
-            raise GLUnavailableError(
-                f"No OpenGL context could be made for rendering (MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}): {error}. "
-                "Install Mesa's EGL (Debian: apt-get install libegl1 libgl1-mesa-dri) and set MUJOCO_GL=egl."
-            ) from error
+            raise no_context(error) from error
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._option = mujoco.MjvOption()

@@ -20,6 +20,8 @@ RESPONSES: dict[str, tuple[str, float | tuple[float, float], float]] = {
 """Frequency responses: kind of a Butterworth filter of the first order, its corner frequencies [Hz], and how often what it
 lets through is added to the sound; 0 puts it in the sound's place."""
 
+_MOST_HZ = 10**6  # of a recording
+
 
 class Room:
     """A room where a recording plays, and a microphone of another frequency response.
@@ -79,8 +81,10 @@ def _recording(path: str, sample_rate: int) -> np.ndarray:
         raise OptionError("room_noise", path, "there is no such file, give a WAV file")
     try:
         rate, samples = wavfile.read(path)
-    except (ValueError, EOFError) as error:
-        raise OptionError("room_noise", path, f"it cannot be read as a WAV file ({error})") from error
+        if not 0 < rate <= _MOST_HZ:
+            raise ValueError(f"it has {rate} samples per second, wanted 1 to {_MOST_HZ}")
+    except Exception as error:  # SciPy trusts what a file's head says, and divides and unpacks whatever it is
+        raise OptionError("room_noise", path, f"it cannot be read as a WAV file ({error}), give another") from error
     wave = samples.astype(np.float64).reshape(len(samples), -1).mean(axis=1)
     wave -= wave.mean() if len(wave) else 0.0  # nobody hears it, and the level must not count it
     divisor = gcd(rate, sample_rate)

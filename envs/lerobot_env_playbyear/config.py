@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import torch
@@ -17,11 +17,10 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE, OBS_STR
 
-from gym_playbyear import register_tasks
-from gym_playbyear.environment import TaskEnv
-from gym_playbyear.registry import OptionError, PluginError, make_definition
-from gym_playbyear.task import Task
 from lerobot_env_playbyear.attempts import AttemptsFile
+
+if TYPE_CHECKING:
+    from gym_playbyear.task import Task
 
 SPECTROGRAM = "lerobot_env_playbyear.spectrogram"
 """Group of entry points, by which another distribution brings pictures of sound: a module with `pictures_for` and
@@ -174,7 +173,7 @@ class PlaybyearEnvConfig(EnvConfig):
             DecodingError: `task` is none that `gym_playbyear` registers.
         """
         self._check()
-        register_tasks()  # those of distributions that were installed since gym_playbyear was imported
+        _tasks().register_tasks()  # those of distributions that were installed since gym_playbyear was imported
         make: Callable[[], gym.Env] = partial(
             gym.make,
             f"{self.package_name}:{self.gym_id}",
@@ -203,8 +202,8 @@ class PlaybyearEnvConfig(EnvConfig):
             return None
         return {"noise": self.room_noise, "noise_level": self.room_noise_level, "response": self.microphone_response}
 
-    def _definition(self) -> Task:
-        return self._asked(lambda: make_definition(self.task or "", self.task_options))
+    def _definition(self) -> "Task":
+        return self._asked(lambda: _tasks().registry.make_definition(self.task or "", self.task_options))
 
     def _spectrograms(self) -> Any:
         """What makes pictures of sound; of another distribution."""
@@ -241,18 +240,35 @@ class PlaybyearEnvConfig(EnvConfig):
                 raise self._error(name, f"--env.sound={self.sound} has no sound for it; leave one of them out")
         if self.room_noise is None and self.room_noise_level != 1.0:
             raise self._error("room_noise_level", "no noise plays in the room; name a WAV file with --env.room_noise")
-        self._asked(lambda: TaskEnv(self.task or "", **self.gym_kwargs))  # whose messages tell what works
+        self._asked(
+            lambda: _tasks().environment.TaskEnv(self.task or "", **self.gym_kwargs)
+        )  # whose messages tell what works
 
     def _asked[T](self, what: Callable[[], T]) -> T:
         """What the tasks answer; their complaint names the option of this configuration."""
+        known = _tasks().registry
         try:
             return what()
-        except OptionError as error:
+        except known.OptionError as error:
             name = _OPTIONS.get(error.option, error.option)
             raise self._error(name if hasattr(self, name) else "task_options", error.wanted) from error
-        except PluginError as error:
+        except known.PluginError as error:
             raise self._error("task", str(error).rstrip(".")) from error
 
     def _error(self, name: str, what_to_do: str) -> DecodingError:
         # Not a ValueError: draccus hides a ValueError of __post_init__ behind a traceback, and prints this as one line.
         return DecodingError(("env", name), f"{getattr(self, name)!r} does not work: {what_to_do}.")
+
+
+def _tasks() -> Any:
+    """`gym_playbyear`, imported when it is asked for: LeRobot keeps to itself why a package cannot be imported, and goes on
+    without its `--env.type`.
+
+    Raises:
+        DecodingError: MuJoCo cannot draw as `MUJOCO_GL` says.
+    """
+    try:
+        import gym_playbyear.environment
+    except RuntimeError as error:
+        raise DecodingError(("env", "type"), f"'playbyear' does not work: {error}") from error
+    return gym_playbyear

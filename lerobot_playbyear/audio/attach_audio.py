@@ -19,7 +19,7 @@ from tqdm import tqdm
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, cut_into_frames, read_audio
 from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_tracks
 from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder, scratch_folder
 from lerobot_playbyear.datasets.findings import name_episodes
@@ -183,7 +183,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
             added = _read([source], cfg, dataset, scratch)
         write_new_dataset(dataset.root, target, added, removed, notes)
     heard = [f"{key} at {added[key].feature['info']['sample_rate']} Hz" for key in audio_keys(added)]
-    print(f"\nDataset: {target} ({len(dataset.episodes)} episodes with {', '.join(heard)})")
+    print(printable(f"\nDataset: {target} ({len(dataset.episodes)} episodes with {', '.join(heard)})"))
     return target
 
 

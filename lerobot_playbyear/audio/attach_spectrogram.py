@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.attach_audio import AttachError, open_for_copy, output_folder, write_new_dataset
 from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture, picture_feature
-from lerobot_playbyear.datasets.errors import errors_of_input
+from lerobot_playbyear.datasets.errors import errors_of_input, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
 from lerobot_playbyear.datasets.pictures import encode_picture
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader, EpisodeRows
@@ -76,10 +76,8 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
         fitted = [_with_levels(dataset, plan, cfg) for plan in _plan(cfg, dataset)]
         write_new_dataset(dataset.root, target, {how.feature: _column(dataset, how) for how in fitted})
     for how in fitted:
-        print(
-            f"{how.feature}: the last {how.seconds:.2f} s of '{how.microphone}', {how.width} x {how.height}, "
-            f"{how.low_db:g} to {how.high_db:g} dB"
-        )
+        told = f"{how.feature}: the last {how.seconds:.2f} s of '{how.microphone}', {how.width} x {how.height}, "
+        print(printable(f"{told}{how.low_db:g} to {how.high_db:g} dB"))
     print(f"\nDataset: {target} ({len(dataset.episodes)} episodes). To roll out with it: --env.spectrogram={target}")
     return target
 

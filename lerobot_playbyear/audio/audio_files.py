@@ -1,8 +1,11 @@
 """Sound in files: WAV, FLAC and the sound tracks of videos in, WAV and FLAC out, and how a recording meets frames."""
 
+import contextlib
+import io
 import itertools
 import logging
 import math
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +25,12 @@ logger = logging.getLogger(__name__)
 HALF = 16
 """Samples before and after a moment that its interpolated value depends on."""
 
+_NUMBERS = (1, 3)  # what a WAV file calls integers and floats; its "extensible" form says it further on
+_EXTENSIBLE = 0xFFFE
+_MOST_CHUNKS = 64  # of a WAV file before the one that says how its samples are written
 _GAP_SECONDS = 0.02  # between two packets of a sound track; smaller ones are rounding
 _SILENCE_AT_ONCE = 2**14  # samples
+_MOST_HZ = 10**7  # of sound, also of bats'
 _CODECS = {".wav": "pcm_s16le", ".flac": "flac"}
 _BLOCK = 4096  # samples that are encoded at once
 _FILTER_WIDTH, _ROLLOFF = 64, 0.9475937167399596  # of the resampler
@@ -74,7 +81,14 @@ def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tup
         with _opened(path, formats) as container:
             if not container.streams.audio:
                 raise AudioFileError(f"{path} holds no sound.")
-            rate, begin = container.streams.audio[0].rate, _begin(container)
+            sound: Any = container.streams.audio[0]
+            if sound.codec_context is None:
+                raise AudioFileError(
+                    f"{path} holds sound of a coding that FFmpeg does not know: convert it to WAV or FLAC."
+                )
+            rate, begin = sound.rate, _begin(container)
+            if not 0 < rate <= _MOST_HZ:
+                raise AudioFileError(f"{path} says that it has {rate} samples per second; wanted 1 to {_MOST_HZ:,}.")
             _warn_of_delay(path, container)
             for frame in container.decode(audio=0):
                 samples = _to_samples(frame)  # (n, channels)
@@ -90,7 +104,7 @@ def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tup
                         yield silence, rate
                 position += len(samples)
                 yield samples, rate
-    except (av.FFmpegError, ValueError) as error:
+    except (av.FFmpegError, ValueError, OSError) as error:
         if isinstance(error, AudioFileError):
             raise
         if not position or isinstance(error, OSError):
@@ -102,14 +116,73 @@ def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tup
         raise AudioFileError(f"{path} holds no samples.")
 
 
-def _opened(path: Path, formats: str) -> av.container.InputContainer:
-    with path.open("rb") as file:
+@contextlib.contextmanager
+def _opened(path: Path, formats: str) -> Iterator[av.container.InputContainer]:
+    with _WholeSamples(path) as file:
         begin = file.read(4)
-    for mark, name in _WITHOUT_HEADER.items():
-        if begin.startswith(mark) and name in formats.split(","):
-            return av.open(str(path), format=name)  # with options PyAV 15.1 ends in a segmentation fault
-    others = ",".join(name for name in formats.split(",") if name not in _WITHOUT_HEADER.values())
-    return av.open(str(path), options={"format_whitelist": others})
+        file.seek(0)
+        source = file if file.room else str(path)
+        found = [
+            name for mark, name in _WITHOUT_HEADER.items() if begin.startswith(mark) and name in formats.split(",")
+        ]
+        if found:
+            opened = av.open(source, format=found[0])  # with options PyAV 15.1 ends in a segmentation fault
+        else:
+            others = ",".join(name for name in formats.split(",") if name not in _WITHOUT_HEADER.values())
+            opened = av.open(source, options={"format_whitelist": others})
+        with opened:
+            yield opened
+
+
+class _WholeSamples(io.FileIO):
+    """A file; of a WAV file whose samples have room for more bits than they hold, such as 24 in 32, one that says the room.
+
+    What they hold stands in the upper bits. FFmpeg goes by the number of bits: it takes 24 in 32 for Cool Edit's floats,
+    and 16 in 32 for two samples.
+    """
+
+    def __init__(self, path: Path):
+        super().__init__(path)
+        self._places: list[int] = []  # of numbers of bits
+        self.room = b""
+        """What a number of bits is to be; nothing: as it is."""
+        with contextlib.suppress(struct.error):
+            self._look()
+        self.seek(0)
+
+    def _look(self) -> None:
+        form, _, kind = struct.unpack("<4sI4s", self.read(12))
+        if form == b"RIFX" and kind == b"WAVE":
+            raise AudioFileError(
+                f"{self.name} is a WAV file of big-endian numbers (RIFX), which FFmpeg misreads: convert it."
+            )
+        if form not in (b"RIFF", b"RF64") or kind != b"WAVE":
+            return
+        for _ in range(_MOST_CHUNKS):
+            name, size = struct.unpack("<4sI", self.read(8))
+            if name == b"fmt ":
+                break
+            self.seek(size + size % 2, io.SEEK_CUR)
+        else:
+            return
+        place = self.tell()
+        tag, n_channels, _, _, n_bytes, n_bits = struct.unpack("<HHIIHH", self.read(16))
+        held = [n_bits]
+        if tag == _EXTENSIBLE:
+            _, valid, _, tag = struct.unpack("<HHIH", self.read(10))
+            held.append(valid or n_bits)
+        room = 8 * n_bytes // max(n_channels, 1)
+        if tag in _NUMBERS and max(held) <= room and -(-min(held) // 8) * 8 < room:
+            self.room, self._places = struct.pack("<H", room), [place + 14, place + 18][: len(held)]
+
+    def read(self, size: int = -1, /) -> bytes:
+        begin = self.tell()
+        found = bytearray(super().read(size))
+        for place in self._places:
+            for i, byte in enumerate(self.room, place - begin):
+                if 0 <= i < len(found):
+                    found[i] = byte
+        return bytes(found)
 
 
 def _begin(container: av.container.InputContainer) -> float | None:

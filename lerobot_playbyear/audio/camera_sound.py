@@ -24,6 +24,7 @@ from lerobot_playbyear.audio.microphone_pictures import (
     read_timecode,
 )
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
+from lerobot_playbyear.datasets.errors import printable
 from lerobot_playbyear.datasets.features import INTERVENTION, IS_FIRST, IS_FIRST_FEATURE, MICROPHONE, Features
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.datasets.findings import name_episodes
@@ -104,15 +105,18 @@ class _MicrophoneReader:
 
     def read(self) -> tuple[Columns, list[np.ndarray]]:
         """The sound of all episodes, and which of their frames are the first ones, (n,) bool."""
+        reading = f"Reading {printable(self._key)}"
         is_first = [
             self._read_episode(number, self._dataset.pictures(self._key, episode))
-            for number, episode in enumerate(tqdm(self._dataset.episodes, desc=f"Reading {self._key}", unit="episode"))
+            for number, episode in enumerate(tqdm(self._dataset.episodes, desc=reading, unit="episode"))
         ]
         raise_all([f"{self._key}, {name_episodes(episodes)}: {error}" for error, episodes in self._errors.items()])
         self._check_pace()
         for session, (start, stop) in self._taken.items():
             file = self._files[session]
-            print(f"{self._key}: {start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s of {file.path}")
+            print(
+                f"{printable(self._key)}: {start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s of {file.path}"
+            )
         return self._sound.columns(self._rate, self._dataset.fps), is_first
 
     def _read_episode(self, episode: int, pictures: Iterator[np.ndarray]) -> np.ndarray:

@@ -99,7 +99,8 @@ def read_clock(path: str | Path) -> dict[int, float]:
 
     Args:
         path: JSON, as `CLOCK_PATH` or `{"0": 12.5}`, or a list in the order of the episodes. Any other name: a table
-            (CSV) with two columns, episode and seconds, and perhaps a line of names above.
+            (CSV) with two columns, episode and seconds, and perhaps a line of names above, as spreadsheets of any language
+            save it: with a mark of the byte order or `sep=` first, in UTF-16, with decimal commas.
 
     Raises:
         ClockError: It holds something else.
@@ -111,7 +112,7 @@ def read_clock(path: str | Path) -> dict[int, float]:
 
 def _from_json(path: Path) -> dict[int, float]:
     try:
-        content: Any = json.loads(path.read_text())
+        content: Any = json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:
         raise ClockError(f"{path} is no JSON ({error}); {_WANTED}.") from error
     if isinstance(content, Mapping) and _EPISODES in content:
@@ -125,9 +126,10 @@ def _from_json(path: Path) -> dict[int, float]:
 
 def _from_table(path: Path) -> dict[int, float]:
     try:
-        text = path.read_text()
-        separator = next((mark for mark in "\t;" if mark in text), ",")
-        table = csv.reader(text.splitlines(), delimiter=separator)
+        rows = _text(path.read_bytes()).splitlines()
+        said = rows.pop(0)[4:5] if rows and rows[0].lower().startswith("sep=") else ""
+        separator = said or next((mark for mark in "\t;" if any(mark in row for row in rows)), ",")
+        table = csv.reader(rows, delimiter=separator)
         lines = [line for line in table if any(cell.strip() for cell in line)]
     except (ValueError, csv.Error) as error:
         raise ClockError(f"{path} is no table ({error}); wanted lines such as 0,12.5.") from error
@@ -137,6 +139,14 @@ def _from_table(path: Path) -> dict[int, float]:
     if short:
         raise ClockError(f"{path}: a line is {','.join(short[0])!r}; wanted episode and seconds, such as 0,12.5.")
     return _numbered(path, [(line[0], line[1]) for line in lines])
+
+
+def _text(data: bytes) -> str:
+    """Of a spreadsheet's file: UTF-8, or UTF-16 in either order, with or without its mark, or what Windows had before."""
+    try:
+        return data.decode(json.detect_encoding(data))
+    except UnicodeDecodeError:
+        return data.decode("latin-1")  # an accent in a column's name
 
 
 def _numbered(path: Path, pairs: list[tuple[Any, Any]]) -> dict[int, float]:
@@ -155,7 +165,7 @@ def _seconds(value: Any, of: str) -> float:
     try:
         if isinstance(value, bool):
             raise TypeError
-        seconds = float(value)
+        seconds = float(value.replace(",", ".") if isinstance(value, str) else value)
     except (TypeError, ValueError, OverflowError):
         seconds = math.nan
     if not math.isfinite(seconds):

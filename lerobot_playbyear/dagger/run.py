@@ -20,7 +20,7 @@ from lerobot_playbyear.dagger.corrections import Corrections
 from lerobot_playbyear.dagger.loop import Loop, Scene
 from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.dagger.run_folder import BEST_LINK, RunFolder, RunState
-from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input, printable
 from lerobot_playbyear.datasets.features import Features, differences
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.episodes.environment import env_facts, env_spec
@@ -214,7 +214,7 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
     is_better = state.success is not None and state.best and state.best["success"] > state.success
     if is_better and state.best["seeds"] == [cfg.seed, cfg.eval.n_episodes]:
         best = folder.checkpoints / BEST_LINK / PRETRAINED_MODEL_DIR if state.best["checkpoint"] else state.policy_path
-        print(f"Best:        {state.best['success']:.1f} % of them: {best}")
+        print(f"Best:        {state.best['success']:.1f} % of them: {printable(best)}")
         print("             The best of several evaluations looks better than it is: evaluate it on other seeds, too.")
     more = "episodes" if cfg.is_online else "updates"
     go_on = f"Go on:       playbyear-dagger --resume=true --output_dir={folder.path} --{more}=..."
@@ -226,7 +226,7 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
     if cfg.env is not None:
         env = f" --env.type={cfg.env.type} --env.task={shlex.quote(str(cfg.env.task))}"
     print(f"Policy:      {policy}")
-    print(f"Evaluate:    lerobot-eval --policy.path={policy}{env}")
+    print(f"Evaluate:    lerobot-eval --policy.path={policy}{printable(env)}")
     print(go_on)
 
 

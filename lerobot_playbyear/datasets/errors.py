@@ -24,6 +24,11 @@ def first_line(error: BaseException) -> str:
     return next((line.strip().rstrip(".") for line in str(error).splitlines() if line.strip()), type(error).__name__)
 
 
+def printable(text: object, kept: str = "\n\t") -> str:
+    """For a terminal: what would command it, in a name of a stranger's, is shown as an escape, but for what is kept."""
+    return "".join(letter if letter.isprintable() or letter in kept else repr(letter)[1:-1] for letter in str(text))
+
+
 @contextmanager
 def errors_of_input(*more: type[Exception]) -> Iterator[None]:
     """For the time in which options and data are read: what is raised of some kinds says what is wrong with them.

@@ -37,7 +37,7 @@ _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
 _READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
 _PLACES = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
-_MOST_FPS = 1000
+_LEAST_FPS, _MOST_FPS = 0.01, 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
 
 
@@ -276,8 +276,8 @@ def _check_fields(info: Info) -> None:
         if not _is_count(info.get(name)):
             raise ValueError(f"{name} is {info.get(name)!r}; wanted a whole number")
     fps = info.get("fps")
-    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= _MOST_FPS:
-        raise ValueError(f"fps is {fps!r}; wanted a number above 0, and at most {_MOST_FPS:,}")
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not _LEAST_FPS <= fps <= _MOST_FPS:
+        raise ValueError(f"fps is {fps!r}; wanted a number from {_LEAST_FPS} to {_MOST_FPS:,}")
     features = info.get("features")
     if not isinstance(features, dict):
         raise ValueError(f"features is {features!r}; wanted a dtype and a shape for each")

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.info import OutsideError, check_links_out
 from lerobot_playbyear.datasets.reader import DatasetPlace, SurveyedDataset
@@ -92,7 +92,7 @@ def inspect(cfg: InspectConfig) -> list[Finding]:
         return findings
     print(as_text(dataset, findings, colour=sys.stdout.isatty()))
     if cfg.html is not None:
-        print(f"Page: {cfg.html} ({cfg.html.stat().st_size / 1e6:.1f} MB). Open it in a browser.")
+        print(f"Page: {printable(cfg.html)} ({cfg.html.stat().st_size / 1e6:.1f} MB). Open it in a browser.")
     return findings
 
 
@@ -166,18 +166,18 @@ def as_text(dataset: SurveyedDataset, findings: Sequence[Finding], colour: bool 
     known = facts(dataset)
     name_width = max(len(finding.check) for finding in findings)
     lines = [
-        _printable(f"{known['repo_id']} in {known['root']}"),
+        _line(f"{known['repo_id']} in {known['root']}"),
         f"{known['episodes']} episodes, {known['frames']:,} frames, {known['seconds']:,.1f} s at {known['fps']} Hz; "
-        f"cameras: {_printable(_names(dataset.cameras))}; microphones: {_printable(_names(dataset.microphones))}",
+        f"cameras: {_line(_names(dataset.cameras))}; microphones: {_line(_names(dataset.microphones))}",
         "",
     ]
     for finding in findings:
         level = f"\033[{_COLOURS[finding.level]}m{finding.level:<7}\033[0m" if colour else f"{finding.level:<7}"
         feature = f"{finding.feature}: " if finding.feature else ""
-        lines.append(f"{level}  {finding.check:<{name_width}}  {_printable(feature + str(finding))}")
+        lines.append(f"{level}  {finding.check:<{name_width}}  {_line(feature + str(finding))}")
     lines += ["", summary(findings)]
     if dataset.survey.damage:
-        lines.append(f"A repaired copy: playbyear-repair --root={known['root']}")
+        lines.append(f"A repaired copy: playbyear-repair --root={_line(known['root'])}")
     return "\n".join(lines)
 
 
@@ -192,6 +192,5 @@ def _names(keys: Sequence[str]) -> str:
     return ", ".join(key.split(".", 2)[-1] for key in keys) or "none"
 
 
-def _printable(text: str) -> str:
-    """Without the characters that command a terminal; names and messages may be a stranger's."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+def _line(text: object) -> str:
+    return printable(text, kept="")

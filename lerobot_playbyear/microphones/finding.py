@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_playbyear.audio.audio_files import write_audio
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.microphones.microphone import MicrophoneError
 from lerobot_playbyear.microphones.portaudio import (
     PortAudioMicrophone,
@@ -63,13 +63,13 @@ def find_microphones(cfg: FindMicrophonesConfig) -> None:
     n_heard = 0
     for card in cards:
         rates = accepted_rates(card)
-        print("\n".join(described(card, rates, cards)), flush=True)
+        print(printable("\n".join(described(card, rates, cards))), flush=True)
         if not cfg.list:
             try:
                 print(f"  {_listen(card, suggested_rate(card, rates), cfg)}\n", flush=True)
                 n_heard += 1
             except MicrophoneError as error:
-                print(f"  {error}\n", flush=True)
+                print(f"  {printable(error)}\n", flush=True)
     if not cfg.list and n_heard == 0:
         raise MicrophoneError("None of these sound cards can be opened. Close other programs that use them.")
 

@@ -19,7 +19,18 @@ from lerobot_playbyear.policy.optimization import DTYPES, PlaybyearSchedulerConf
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
 
-_AT_LEAST_1 = ("fps", "n_frame_stack", "n_memory_steps", "n_supervised_steps", "vision_width", "image_size")
+_SIZES = {
+    "fps": 1000,
+    "n_frame_stack": 100,
+    "n_memory_steps": 10_000,
+    "n_supervised_steps": 10_000,
+    "n_frequency_bins": 100_000,
+    "image_size": 4096,
+    "vision_width": 1024,
+    "hidden_size": 16_384,
+    "embedding_size": 16_384,
+}
+"""From 1 to this: beyond it a configuration is damaged, or asks for all memory."""
 _AT_LEAST_0 = (
     *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
     *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
@@ -275,9 +286,9 @@ class PlaybyearConfig(PreTrainedConfig):
         Raises:
             ValueError: Names the option.
         """
-        for name in _AT_LEAST_1:
-            if getattr(self, name) < 1:
-                raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
+        for name, most in _SIZES.items():
+            if not 1 <= getattr(self, name) <= most:
+                raise ValueError(f"--policy.{name} must be at least 1 and at most {most:,}, got {getattr(self, name)}.")
         for name in _AT_LEAST_0:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"--policy.{name} must be at least 0 (none) and finite, got {getattr(self, name)}.")

@@ -1,5 +1,6 @@
 """The policy `playbyear`: what LeRobot calls. What it computes is in `networks.py`."""
 
+import logging
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -10,16 +11,20 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.device_utils import resolve_safetensors_device
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lerobot_playbyear.compat import card_writer
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.batch_norm import is_first_process, mean_over_processes, share_batch_norm
 from lerobot_playbyear.policy.card import with_hearing, write_card
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.cpu_inference import act_by_folded_copies, prepare_to_act
 from lerobot_playbyear.policy.networks import PlaybyearNetwork, newest
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, to_float_wave
+
+logger = logging.getLogger(__name__)
 
 
 class PlaybyearPolicy(PreTrainedPolicy):
@@ -70,18 +75,34 @@ class PlaybyearPolicy(PreTrainedPolicy):
 
     @classmethod
     def _load_as_safetensor(cls, model: Any, model_file: str, map_location: str, strict: bool) -> Any:
-        """Loads a checkpoint. LeRobot's own leaves weights that it lacks at random; here that is an error."""
+        """Loads a checkpoint. LeRobot's own leaves weights that it lacks at random; here that is an error.
+
+        Raises:
+            InputError: The file cannot be read, does not fit, or holds what is not finite.
+        """
         hint = "Use the configuration, with the sizes and the inputs, that the checkpoint was trained with."
         try:
             weights = load_file(model_file, device=resolve_safetensors_device(map_location))
+        except (SafetensorError, OSError) as error:
+            raise InputError(f"{model_file} is missing or damaged: {error}. Give another checkpoint.") from error
+        endless = sorted(name for name, value in weights.items() if not value.isfinite().all())
+        if endless:
+            raise InputError(
+                f"{model_file} holds numbers that are infinite or none (NaN), in {endless[:3]}, of {len(endless)}: its training "
+                "went wrong. Give an earlier checkpoint."
+            )
+        try:
             missing, unexpected = model.load_state_dict(weights, strict=False)
         except RuntimeError as error:
-            raise ValueError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
+            raise InputError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
+        told = (
+            f"it lacks {sorted(missing)[:3]} and has {sorted(unexpected)[:3]} too many, of {len(missing)} and "
+            f"{len(unexpected)}. {hint}"
+        )
         if missing or (strict and unexpected):
-            raise ValueError(
-                f"{model_file} does not fit the policy: it lacks {sorted(missing)[:3]} and has {sorted(unexpected)[:3]} "
-                f"too many, of {len(missing)} and {len(unexpected)}. {hint}"
-            )
+            raise InputError(f"{model_file} does not fit the policy: {told}")
+        if unexpected:
+            logger.warning("%s does not fit the policy in all: %s What is too many is left out.", model_file, told)
         return model
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> Any:

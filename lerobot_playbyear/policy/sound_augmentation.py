@@ -1,6 +1,7 @@
 """What training does to sound, so that the policy bears other rooms and other microphones: noise that is drawn, recordings of
 rooms, radios and tools, and another microphone's response."""
 
+import logging
 import math
 from pathlib import Path
 
@@ -22,11 +23,12 @@ _HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
 _RECORDED_SHARE = 0.75  # of the items that get recorded noise
 _RECORDED_FAINTEST_DB = 0.0  # of it, relative to an item's noise floor, unless the loudest is fainter
 _ENDINGS = (".wav", ".flac")  # of files with recorded noise
-_FORMATS = "wav,w64,flac"
 _MOST_SECONDS = 7200  # of all recordings
 _SILENCE = 1e-5  # root mean square
 _LEAKAGE = 8  # bins above the highest one that is kept, whose noise still reaches it
 _COLOUR_POINTS = 6  # of a microphone's response, evenly spaced in octaves
+
+logger = logging.getLogger(__name__)
 
 
 class SoundAugmentation(nn.Module):
@@ -138,11 +140,12 @@ class RecordedNoise:
     """The recordings of a folder and its subfolders, in memory, all equally loud.
 
     Args:
-        folder: Of WAV and FLAC files, at most two hours in all; several channels become their mean.
+        folder: Of WAV and FLAC files, at most two hours in all; several channels become their mean. Files of such a name that
+            hold no sound, as a Mac leaves beside others, are left out, and a line of the log says so.
         sample_rate: Of the sound that they are mixed into [Hz].
 
     Raises:
-        InputError: There are none, or one of them cannot be used; the message says which.
+        InputError: There are none, or one of them is silent; the message says which.
     """
 
     def __init__(self, folder: str | Path, sample_rate: int):
@@ -150,15 +153,14 @@ class RecordedNoise:
         if not folder.is_dir():
             raise InputError(f"{option}: there is no such folder; wanted one with WAV or FLAC files, or null.")
         files = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _ENDINGS and path.is_file())
-        if not files:
-            raise InputError(f"{option}: the folder holds no {' or '.join(_ENDINGS)} file: put some noise into it.")
         self._recordings: list[Tensor] = []
         seconds = 0.0
         for path in files:
             try:
                 wave, rate = _mean_of_channels(path, _MOST_SECONDS - seconds)
             except AudioFileError as error:
-                raise InputError(f"{option}: {error} Mend the file, or take it out of the folder.") from error
+                logger.warning("%s: %s It is left out: mend the file, or take it out of the folder.", option, error)
+                continue
             if wave is None:
                 raise InputError(f"{option}: the files last more than {_MOST_SECONDS // 3600} hours: take some out.")
             seconds += len(wave) / rate
@@ -167,6 +169,10 @@ class RecordedNoise:
             if level < _SILENCE:
                 raise InputError(f"{option}: {path} is silent: take it out of the folder.")
             self._recordings.append(torch.from_numpy(wave / level).half())
+        if not self._recordings:
+            raise InputError(
+                f"{option}: the folder holds no {' or '.join(_ENDINGS)} file with sound: put some noise into it."
+            )
 
     def __len__(self) -> int:
         return len(self._recordings)
@@ -190,7 +196,7 @@ def _mean_of_channels(path: Path, most_seconds: float) -> tuple[np.ndarray | Non
     """A file's sound, (n,) float32, and its sample rate; None if it is longer than that."""
     parts: list[np.ndarray] = []
     n_samples, rate = 0, 1
-    for piece, rate in audio_pieces(path, _FORMATS):
+    for piece, rate in audio_pieces(path):
         n_samples += len(piece)
         if n_samples > most_seconds * rate:
             return None, rate

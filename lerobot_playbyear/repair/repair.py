@@ -8,7 +8,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder
 from lerobot_playbyear.datasets.findings import Finding
 from lerobot_playbyear.datasets.info import check_links
@@ -92,7 +92,7 @@ def repair(cfg: RepairConfig) -> RepairReport:
         MemoryError: There is not enough of it.
     """
     report = look(cfg.root, cfg.like) if cfg.dry_run else repair_dataset(cfg.root, cfg.output, cfg.like)
-    print(report)
+    print(printable(report))
     return report
 
 

@@ -6,12 +6,15 @@ import functools
 import inspect
 import io
 import json
+import logging
+import os
 import sys
 from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from lerobot_playbyear.datasets.errors import printable
 from lerobot_playbyear.training.command_line import given_options
 
 HELP = Path(__file__).with_name("help")
@@ -37,6 +40,7 @@ def command(
     def decorate(work: Callable[[], object]) -> Callable[[], None]:
         @functools.wraps(work)
         def run() -> None:
+            _prepare_console()
             sys.argv[1:] = [f"{option}=true" if option == flag else option for option in sys.argv[1:]]
             answer_at_once(f"playbyear-{work.__name__.replace('_', '-')}")
             from draccus.utils import ParsingError
@@ -47,15 +51,31 @@ def command(
             try:
                 work()
             except ParsingError as error:
-                sys.exit(f"error: {_reason(error)}")
+                sys.exit(f"error: {printable(_reason(error))}")
             except (PlaybyearError, MemoryError, *said) as error:
-                sys.exit(f"error: {str(error) or 'there is not enough memory'}")
+                sys.exit(f"error: {printable(error) or 'there is not enough memory'}")
             except KeyboardInterrupt:
                 sys.exit(interrupted)
 
         return run
 
     return decorate
+
+
+def _prepare_console() -> None:
+    """A letter that the terminal lacks, and in the log what would command it, are shown as escapes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    logging.setLogRecordFactory(_PrintableRecord)
+    os.environ.setdefault("NO_COLOR", "1")  # LeRobot's colours are such commands, too
+
+
+class _PrintableRecord(logging.LogRecord):
+    """A line of the log; what it says may be a stranger's."""
+
+    def getMessage(self) -> str:  # noqa: N802  (as logging has it)
+        return printable(super().getMessage())
 
 
 def _reason(error: BaseException) -> BaseException:

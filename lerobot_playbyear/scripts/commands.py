@@ -3,6 +3,7 @@
 import logging
 import sys
 
+from lerobot_playbyear.datasets.errors import printable
 from lerobot_playbyear.scripts.command import check_local_dataset, command, run_alone, run_with_lerobot
 
 
@@ -66,7 +67,7 @@ def inspect() -> None:
     try:
         findings = run_alone(inspect)
     except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         sys.exit(2)
     sys.exit(worst(findings) == "error")
 
@@ -79,7 +80,7 @@ def repair() -> None:
         report = run_alone(repair)
     except (OSError, MemoryError) as error:
         sys.exit(
-            f"error: {str(error) or 'there is not enough memory'}\n"
+            f"error: {printable(error) or 'there is not enough memory'}\n"
             "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
         )
     sys.exit(0 if report.is_done else 1)

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_playbyear.compat import WandBLogger, metrics_tracker
+from lerobot_playbyear.datasets.errors import printable
 from lerobot_playbyear.datasets.files import append_line
 from lerobot_playbyear.hub.push import METRICS_NAME
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
@@ -139,7 +140,7 @@ def print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
         policy = folder / "checkpoints" / "last" / "pretrained_model"
         env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."
         print(f"Policy:     {policy}")
-        print(f"Evaluate:   lerobot-eval --policy.path={policy}{env}")
+        print(f"Evaluate:   lerobot-eval --policy.path={policy}{printable(env)}")
         print(f"Go on:      playbyear-train --resume=true --config_path={policy / 'train_config.json'} --steps=...")
 
 

@@ -45,7 +45,12 @@ class Blocker:
 
 sys.meta_path.insert(0, Blocker())
 """
-_IMPORTED = ("lerobot.scripts.lerobot_train", "lerobot.scripts.lerobot_eval", "lerobot_env_playbyear")
+_IMPORTED = (
+    "lerobot.scripts.lerobot_train",
+    "lerobot.scripts.lerobot_eval",
+    "lerobot_env_playbyear",
+    "gym_playbyear.environment",
+)
 
 
 @dataclass
