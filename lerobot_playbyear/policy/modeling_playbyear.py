@@ -88,8 +88,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
         endless = sorted(name for name, value in weights.items() if not value.isfinite().all())
         if endless:
             raise InputError(
-                f"{model_file} holds numbers that are infinite or none (NaN), in {endless[:3]}, of {len(endless)}: its training "
-                "went wrong. Give an earlier checkpoint."
+                f"{model_file} holds numbers that are infinite or none (NaN), in {endless[:3]}, of {len(endless)}. Its "
+                "training went wrong: give an earlier checkpoint."
             )
         try:
             missing, unexpected = model.load_state_dict(weights, strict=False)
