@@ -47,6 +47,8 @@ def random_frame(features: dict[str, dict[str, Any]], rng: np.random.Generator) 
             frame[key] = rng.integers(0, 256, shape, dtype=np.uint8)
         elif dtype == "bool":
             frame[key] = rng.random(shape) < 0.5
+        elif dtype == "string":
+            frame[key] = "a word"
         elif dtype == "int16":
             frame[key] = rng.normal(0, 300, shape).astype(np.int16)
         else:

@@ -76,7 +76,7 @@ def test_what_can_be_told_from_options_and_files_is_told_before_lerobot_is_impor
         calls += [("playbyear-inspect", DATA, root), ("playbyear-push", DATA, root)]
         calls.append(("playbyear-attach-audio", DATA, root, *output))
     repair, train, *of_datasets = answers(*calls)
-    assert "/no/such holds no LeRobotDataset" in repair
+    assert "There is no LeRobotDataset in '/no/such': it does not exist" in repair
     assert "exit: error: --preset=tpu is not known" in train
     for inspect, push, attach in batched(of_datasets, 3):
         assert "exit: 2" in inspect

@@ -62,7 +62,7 @@ train | cpu | 'cpu' is no option
 train | -dataset.repo_id | --dataset.repo_id is needed
 # Places
 record | --dataset.root={noise} | {noise} already holds a dataset | --resume=true
-record | --dataset.root={full} --resume=true | {full} is not empty and holds no dataset
+record | --dataset.root={full} --resume=true | There is no LeRobotDataset in '{full}': | it holds thesis.tex
 record | --dataset.root={file}/new | Cannot write | {file}
 record | --dataset.root={truncated} --resume=true | {truncated} | damaged | playbyear-repair --root={truncated}
 record | --dataset.root={noise} --resume=true | {noise} does not fit | seed is absent there | choose another root
@@ -73,8 +73,8 @@ dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagge
 dagger | --interventions.root={demos} | --demos and --interventions are the same dataset | of their own
 dagger | --interventions.root={out}/dagger | --output_dir={out}/dagger lies in the folder of --interventions
 attach-audio | --output.root={noise} | {noise} | is there already
-attach-audio | --dataset.root={out}/no | There is no dataset in {out}/no
-inspect | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no' | Check --dataset.root
+attach-audio | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no': it does not exist
+inspect | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no': it does not exist | Correct
 inspect | --html={file}/page.html | The page cannot be written | {file}
 repair | --like={full} | --like={full} holds no LeRobotDataset | the same settings
 push policy | --policy.path={noise} | there is no checkpoint with config.json | {noise}
@@ -125,7 +125,7 @@ train | --dataset.image_transforms.enable=true | --dataset.image_transforms.enab
 train | --dataset.root={slow} | 10 frames per second | configured for 20 | --policy.fps=10
 train | --dataset.root={deaf} | observation.audio | --policy.use_audio=false
 train | --policy.sample_rate=48001 | sample_rate / fps = 48001 / 20
-train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be at least 1 and at most 1,000, got 0
+train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be above 0 and at most 1000, got 0
 train | --policy.audio_window_s=0.5 | audio_window_s | too few for 4 convolutions
 train | --policy.audio_encoder=nobody | --policy.audio_encoder=nobody | spectrogram_cnn | lerobot_policy_
 train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
@@ -189,7 +189,7 @@ find-microphones | --seconds=0 | seconds=0
 CALLS = """
 # The policy's configuration
 policy | dtype: half | --policy.dtype must be one of auto, float32, bfloat16, float16, got 'half'
-policy | action_range: 0.0 | --policy.action_range must be above 0 and finite, got 0
+policy | action_range: 0.0 | --policy.action_range must be above 0 and at most 1000, got 0
 policy | audio_noise_files: here | audio_noise_files=here | how loud | --policy.audio_noise_db=24
 policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (none) and finite, got -1.0
 policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4

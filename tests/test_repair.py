@@ -160,7 +160,7 @@ def test_a_sound_dataset_is_left_alone(copy):
 def test_a_recording_that_lerobot_could_not_finish_is_whole_again(copy, originals):
     """And goes on, in the copy; what was killed is not continued."""
     root = copy("killed")
-    with pytest.raises(DatasetDamagedError, match=r"(?s)cannot be read.*playbyear-repair --root="):
+    with pytest.raises(DatasetDamagedError, match=r"(?s)no meta/episodes.*playbyear-repair --root="):
         write(root, [N_EPISODES], RICH_FEATURES)
     report = repaired(root, RICH_FEATURES)
     assert "no valid end" in str(report)
@@ -419,13 +419,13 @@ def test_what_is_no_whole_dataset_is_named_as_such(copy, tmp_path):
     with pytest.raises(DatasetDamagedError, match="No whole episode is left"):
         repair_dataset(root)
     for name, content, error in (
-        ("demo.hdf5", b"\x89HDF", "holds no LeRobotDataset"),
+        ("demo.hdf5", b"\x89HDF", "There is no LeRobotDataset"),
         ("meta/info.json", b'{"robot": "arm"}', "info.json is damaged"),
         ("data/chunk-000/file-000.parquet", b"PAR1", "info.json is missing.*--like"),
     ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(DatasetDamagedError, match=error):
+        with pytest.raises(InputError, match=error):
             repair_dataset(tmp_path)
         (tmp_path / name).unlink()
 

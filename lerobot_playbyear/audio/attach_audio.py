@@ -23,9 +23,11 @@ from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder, scratch_folder
 from lerobot_playbyear.datasets.findings import name_episodes
-from lerobot_playbyear.datasets.info import check_links
+from lerobot_playbyear.datasets.frame_rate import divides, exact_rate, nearest_sample_rate
+from lerobot_playbyear.datasets.info import check_links, nothing_in
 from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
+from lerobot_playbyear.datasets.remedies import repair_command
 
 if TYPE_CHECKING:
     from lerobot_playbyear.audio.dataset_copy import Columns
@@ -137,7 +139,7 @@ class PutAside:
             np.save(self._folder / f"{key}-{len(self._stats[key])}.npy", blocks[..., channel])
             self._stats[key].append(sound_stats(blocks[..., channel]))
 
-    def columns(self, sample_rate: int, fps: int) -> "Columns":
+    def columns(self, sample_rate: int, fps: float) -> "Columns":
         """All that was added, as columns of a copy."""
         from lerobot_playbyear.audio.dataset_copy import AddedColumn
 
@@ -207,7 +209,7 @@ def write_new_dataset(
         with new_folder(target) as unfinished:
             write_copy(root, unfinished, added, removed, notes)
     except ParquetDamageError as error:
-        raise AttachError(f"{error} Repair it first: playbyear-repair --root={root}") from error
+        raise AttachError(f"{error} Repair it first: {repair_command(root)}") from error
 
 
 def output_folder(place: DatasetPlace) -> Path:
@@ -235,7 +237,7 @@ def open_for_copy(place: DatasetPlace, may_have_audio_files: bool = False) -> Da
         AttachError: There is none, or it is not so.
     """
     if place.root is not None and not (Path(place.root) / INFO_PATH).is_file():
-        raise AttachError(f"There is no dataset in {place.root}: it has no {INFO_PATH}. Correct --dataset.root.")
+        raise AttachError(f"{nothing_in(Path(place.root))}. Correct --dataset.root.")
     try:
         dataset = DatasetReader(place.repo_id, place.root, may_have_audio_files=may_have_audio_files)
         from lerobot_playbyear.audio.dataset_copy import check_tables
@@ -245,14 +247,16 @@ def open_for_copy(place: DatasetPlace, may_have_audio_files: bool = False) -> Da
         rows = dataset.meta.episodes
         said = list(zip(rows["episode_index"], rows["length"], strict=True))
     except ParquetDamageError as error:
-        raise AttachError(f"{error} Repair it first: playbyear-repair --root={dataset.root}") from error
+        raise AttachError(f"{error} Repair it first: {repair_command(dataset.root)}") from error
+    except InputError as error:
+        raise AttachError(str(error)) from error
     except Exception as error:  # also what the Hub's client raises
         raise AttachError(f"The dataset '{place.repo_id}' in {place.folder} cannot be opened: {error}") from error
     held = [(episode.index, len(episode)) for episode in dataset.episodes]
     if held != said or [number for number, _ in said] != list(range(len(said))):
         raise AttachError(
             f"The data files do not hold episodes 0 to {len(said) - 1} in this order, as long as meta/episodes says. Repair "
-            f"the dataset first: playbyear-repair --root={dataset.root}"
+            f"the dataset first: {repair_command(dataset.root)}"
         )
     return dataset
 
@@ -337,8 +341,11 @@ def _read(sources: list[Source], cfg: AttachAudioConfig, dataset: DatasetReader,
         AttachError: Naming every episode whose sound is missing, too short or of another kind.
     """
     fps = dataset.fps
-    if cfg.sample_rate is not None and (cfg.sample_rate <= 0 or cfg.sample_rate % fps):
-        raise AttachError(f"--sample_rate={cfg.sample_rate}: wanted a multiple of {fps} frames per second.")
+    if cfg.sample_rate is not None and not divides(fps, cfg.sample_rate):
+        raise AttachError(
+            f"--sample_rate={cfg.sample_rate}: wanted a multiple of {exact_rate(fps).numerator} Hz, such as "
+            f"{nearest_sample_rate(cfg.sample_rate, fps)}, since the dataset has {fps} frames per second."
+        )
     errors: list[str] = []
     found: list[tuple[PutAside, dict[int, int]]] = []  # and the episode in which each rate comes first
     for source in sources:
@@ -360,19 +367,21 @@ def _read(sources: list[Source], cfg: AttachAudioConfig, dataset: DatasetReader,
     return {key: column for sound, rates in found for key, column in sound.columns(next(iter(rates)), fps).items()}
 
 
-def _new_rate(cfg: AttachAudioConfig, own_rate: int, fps: int, is_own: bool = False) -> int:
+def _new_rate(cfg: AttachAudioConfig, own_rate: int, fps: float, is_own: bool = False) -> int:
     """The rate that sound of the rate `own_rate` is to have [Hz].
 
     Raises:
         AudioFileError: The frame rate does not divide it.
     """
-    rate, nearest = cfg.sample_rate or own_rate, max(1, round(own_rate / fps)) * fps
-    if rate % fps and not is_own:
+    rate, nearest = cfg.sample_rate or own_rate, nearest_sample_rate(own_rate, fps)
+    if divides(fps, rate):
+        return rate
+    if not is_own:
         raise AudioFileError(
-            f"it has {own_rate} samples per second, which is no multiple of {fps} frames per second. "
-            f"Resample it, for example with --sample_rate={nearest}."
+            f"it has {own_rate} samples per second, which is no multiple of {exact_rate(fps).numerator} Hz, and the dataset "
+            f"{fps} frames per second. Resample it, for example with --sample_rate={nearest}."
         )
-    return nearest if rate % fps else rate
+    return nearest
 
 
 def _files(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], _: Path) -> Source:

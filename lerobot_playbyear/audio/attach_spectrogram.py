@@ -123,7 +123,7 @@ def _size(cfg: AttachSpectrogramConfig, features: dict) -> tuple[int, int]:
     return height, width
 
 
-def _columns_per_frame(cfg: AttachSpectrogramConfig, width: int, fps: int) -> int:
+def _columns_per_frame(cfg: AttachSpectrogramConfig, width: int, fps: float) -> int:
     if not 0 < cfg.seconds * fps <= width + 1e-6:
         raise AttachError(
             f"--seconds={cfg.seconds:g}: wanted above 0 and at most {width / fps:.2f}, since each frame takes one of {width} "

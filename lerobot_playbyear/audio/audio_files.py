@@ -331,7 +331,7 @@ def interpolate(samples: np.ndarray, places: np.ndarray) -> np.ndarray:
 def cut_into_frames(
     waveform: np.ndarray,
     sample_rate: int,
-    fps: int,
+    fps: float,
     n_frames: int,
     offset: float = 0.0,
     pad: bool = False,
@@ -350,7 +350,7 @@ def cut_into_frames(
         n_frames: The episode's length.
         offset: Where in the file the episode's first frame was taken [s]; negative if the file begins after it.
         pad: Fill what the file lacks at its beginning and its end with silence.
-        new_sample_rate: What the blocks shall have [Hz], a multiple of `fps`. None: `sample_rate`.
+        new_sample_rate: What the blocks shall have [Hz], which `fps` divides. None: `sample_rate`.
         speed: Seconds of the file in a second of the frames' clock, in which `offset` is given; 1.001: the recorder's
             clock is 0.1 % fast.
 

@@ -25,10 +25,19 @@ from lerobot_playbyear.audio.microphone_pictures import (
 )
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.errors import printable
-from lerobot_playbyear.datasets.features import INTERVENTION, IS_FIRST, IS_FIRST_FEATURE, MICROPHONE, Features
+from lerobot_playbyear.datasets.features import (
+    INTERVENTION,
+    IS_FIRST,
+    IS_FIRST_FEATURE,
+    MICROPHONE,
+    Features,
+    samples_per_frame,
+)
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
 from lerobot_playbyear.datasets.findings import name_episodes
+from lerobot_playbyear.datasets.frame_rate import nearest_sample_rate
 from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.datasets.remedies import without_episodes
 from lerobot_playbyear.datasets.statistics import numeric_stats
 
 
@@ -149,10 +158,10 @@ class _MicrophoneReader:
 
     def _sound_of(self, frame: _Frame) -> tuple[np.ndarray, bool]:
         strip = frame.strip or self._from_file(frame)
-        rate = round(strip.sample_rate / self._dataset.fps) * self._dataset.fps
+        rate = nearest_sample_rate(strip.sample_rate, self._dataset.fps)
         if self._steps is None:
             self._rate, self._source_rate = rate, strip.sample_rate
-            self._steps = ControlStepSound(rate // self._dataset.fps)
+            self._steps = ControlStepSound(samples_per_frame(rate, self._dataset.fps))
         if strip.sample_rate != self._source_rate:
             raise ValueError(
                 f"it has {strip.sample_rate} samples per second, and those before {self._source_rate}: all "
@@ -216,7 +225,9 @@ class _MicrophoneReader:
             try:
                 check_pace(own, rate, fps, f"episode {episode}", is_live=True)
             except ValueError as error:
-                logging.warning("%s: %s. Remove that episode with lerobot-edit-dataset.", self._key, error)
+                logging.warning(
+                    "%s: %s. To leave it out: %s", self._key, error, without_episodes(self._dataset.root, [episode])
+                )
 
 
 def _read_frame(picture: np.ndarray) -> _Frame | None:

@@ -83,9 +83,7 @@ def read_tracks(dataset: DatasetReader, start_time_s: float | None = None) -> li
     """
     with errors_of_input():
         info = read_info(dataset.root)
-        fps, features = info["fps"], info["features"]
-        if fps % 1:
-            raise InputError(f"{dataset.root / INFO_PATH}: fps is {fps!r}; wanted a whole number. Correct it.")
+        features = info["features"]
         template = info.get("audio_path") or DEFAULT_AUDIO_PATH
         if not isinstance(template, str) or not _TEMPLATE.fullmatch(template) or "{file_index" not in template:
             raise InputError(

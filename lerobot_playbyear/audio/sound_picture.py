@@ -9,6 +9,7 @@ same samples give the same picture, whichever process makes it. Environments nee
 """
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
@@ -18,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, samples_per_frame
 from lerobot_playbyear.datasets.files import INFO_PATH
+from lerobot_playbyear.datasets.frame_rate import divides
 
 PICTURE_PREFIX = "observation.images."
 """What the key of every picture starts with, those of cameras as well."""
@@ -62,7 +64,7 @@ class SoundPicture:
     microphone: str
     feature: str
     sample_rate: int
-    fps: int
+    fps: float
     height: int
     width: int
     columns_per_frame: int
@@ -74,7 +76,7 @@ class SoundPicture:
     def __post_init__(self) -> None:
         if self.layout != _LAYOUT:
             raise self._error("layout", f"{_LAYOUT}, which this version makes")
-        for name in ("sample_rate", "fps", "height", "width", "columns_per_frame"):
+        for name in ("sample_rate", "height", "width", "columns_per_frame"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise self._error(name, "a whole number above 0")
@@ -84,7 +86,9 @@ class SoundPicture:
         for name in ("height", "width"):
             if getattr(self, name) > _LARGEST:
                 raise self._error(name, f"at most {_LARGEST} pixels")
-        if self.sample_rate % self.fps or self.columns_per_frame > self.samples_per_frame:
+        if isinstance(self.fps, bool) or not isinstance(self.fps, int | float) or not 0 < self.fps < math.inf:
+            raise self._error("fps", "a number above 0")
+        if not divides(self.fps, self.sample_rate) or self.columns_per_frame > self.samples_per_frame:
             raise self._error("columns_per_frame", "at most sample_rate / fps: more seconds, or a smaller width")
         if not FLOOR_DB <= self.low_db < self.high_db:
             raise self._error("low_db", f"at least {FLOOR_DB:g}, and below high_db={self.high_db}")
@@ -99,7 +103,7 @@ class SoundPicture:
 
     @property
     def samples_per_frame(self) -> int:
-        return self.sample_rate // self.fps
+        return samples_per_frame(self.sample_rate, self.fps)
 
     @property
     def seconds(self) -> float:

@@ -321,7 +321,7 @@ def _check_dataset(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata, rename
             )
 
 
-def _check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, own: Features, fps: int, what: str) -> None:
+def _check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, own: Features, fps: float, what: str) -> None:
     """Refuse what cannot share a batch with the demonstrations.
 
     Args:

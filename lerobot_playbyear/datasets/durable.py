@@ -9,7 +9,6 @@ schema, statistics and video, and then moves them into place, so that the datase
 import contextlib
 import logging
 import os
-import shlex
 import shutil
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -34,8 +33,10 @@ from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
 from lerobot_playbyear.datasets.features import Features, check_features, check_frame, differences, is_depth
 from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, list_files
 from lerobot_playbyear.datasets.free_memory import available_memory
+from lerobot_playbyear.datasets.info import check_parts, nothing_in
 from lerobot_playbyear.datasets.journal import JOURNAL, SCRATCH, finish_journal, lock_dataset, publish, remove_staged
 from lerobot_playbyear.datasets.pictures import encode_picture
+from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, survey
 
 logger = logging.getLogger(__name__)
@@ -300,7 +301,7 @@ def check_root(root: Path, *, resume: bool) -> None:
         if not resume:
             raise FileExistsError(f"{root} already holds a dataset. Append with --resume=true, or choose another root.")
     elif root.is_dir() and any(path.name != SCRATCH.name for path in root.iterdir()):
-        raise FileExistsError(f"{root} is not empty and holds no dataset. Choose another root.")
+        raise FileExistsError(f"{nothing_in(root)}. Choose another root, or an empty one.")
 
 
 def has_dataset(root: Path) -> bool:
@@ -328,7 +329,11 @@ def check_undamaged(root: Path) -> None:
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
     if not found.is_undamaged:
-        command = f"playbyear-repair --root={shlex.quote(str(root))}"
+        try:
+            check_parts(root)
+        except InputError as error:
+            raise DatasetDamagedError(str(error)) from error
+        command = repair_command(root)
         raise DatasetDamagedError(
             f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "
             f"again, more closely, and `{command}` writes a copy with the episodes that are whole."

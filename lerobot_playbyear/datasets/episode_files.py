@@ -26,6 +26,7 @@ from lerobot.datasets.video_utils import encode_video_frames, get_video_duration
 from lerobot.utils.constants import DEFAULT_FEATURES
 
 from lerobot_playbyear.datasets.features import Features, is_depth
+from lerobot_playbyear.datasets.frame_rate import exact_rate
 from lerobot_playbyear.datasets.journal import STAGING, remove_staged
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -191,7 +192,7 @@ def _stage_film(
     folder.mkdir()
     for number, picture in enumerate(pictures):
         (folder / f"frame-{number:06d}.{'tiff' if is_depth(feature) else 'png'}").write_bytes(picture)
-    encode_video_frames(folder, path, info.fps, video_encoder=encoder)
+    encode_video_frames(folder, path, exact_rate(info.fps), video_encoder=encoder)  # type: ignore[arg-type]
     shutil.rmtree(folder)
     with av.open(str(path), options=FILMS) as container:
         n_frames = sum(1 for packet in container.demux(video=0) if packet.size)

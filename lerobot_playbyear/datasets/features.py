@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
+from lerobot_playbyear.datasets.frame_rate import divides, exact_rate, nearest_sample_rate
 from lerobot_playbyear.datasets.parquet import column_to_numpy
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ _DTYPES = ("int16", "float32", "float64")
 _MOST_SAMPLES_PER_S = 1_000_000
 
 
-def samples_per_frame(sample_rate: int, fps: int, key: str = AUDIO_PREFIX + "<microphone>") -> int:
+def samples_per_frame(sample_rate: int, fps: float, key: str = AUDIO_PREFIX + "<microphone>") -> int:
     """The number of samples between two frames.
 
     Args:
@@ -55,21 +56,22 @@ def samples_per_frame(sample_rate: int, fps: int, key: str = AUDIO_PREFIX + "<mi
     Raises:
         ValueError: If the frame rate does not divide the sample rate.
     """
-    if sample_rate <= 0 or fps <= 0 or sample_rate % fps:
-        nearest = max(1, round(sample_rate / fps)) * fps if fps > 0 else sample_rate
+    if fps <= 0:
+        raise ValueError(f"'{key}': fps is {fps}; wanted a number above 0.")
+    if not divides(fps, sample_rate):
         raise ValueError(
             f"'{key}': a frame must hold a whole number of samples, but sample_rate / fps = {sample_rate} / {fps} "
-            f"is not a positive integer. Choose a sample rate that is a multiple of {fps} Hz, for example "
-            f"{nearest} Hz, and resample the recording to it."
+            f"is not a positive integer. Choose a sample rate that is a multiple of {exact_rate(fps).numerator} Hz, for "
+            f"example {nearest_sample_rate(sample_rate, fps)} Hz, and resample the recording to it."
         )
-    return int(sample_rate // fps)
+    return int(sample_rate / exact_rate(fps))
 
 
-def audio_feature(sample_rate: int, fps: int) -> dict[str, Any]:
+def audio_feature(sample_rate: int, fps: float) -> dict[str, Any]:
     """The feature of one microphone for `LeRobotDataset.create(features=...)`: int16 PCM of shape (S,).
 
     Args:
-        sample_rate: Samples per second [Hz]; a multiple of `fps`.
+        sample_rate: Samples per second [Hz], which `fps` divides.
         fps: Frames per second of the dataset [Hz].
 
     Raises:
@@ -90,7 +92,7 @@ def is_depth(feature: Mapping[str, Any]) -> bool:
     return bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
 
 
-def check_audio_features(features: Features, fps: int) -> dict[str, int]:
+def check_audio_features(features: Features, fps: float) -> dict[str, int]:
     """Check every microphone of a dataset against the contract.
 
     Args:
@@ -106,7 +108,7 @@ def check_audio_features(features: Features, fps: int) -> dict[str, int]:
     return {key: _check_one(key, features[key], fps) for key in audio_keys(features)}
 
 
-def _check_one(key: str, feature: Mapping[str, Any], fps: int) -> int:
+def _check_one(key: str, feature: Mapping[str, Any], fps: float) -> int:
     if feature["dtype"] == AUDIO_DTYPE:
         raise ValueError(
             f"'{key}' has its sound in files (dtype 'audio'); wanted a column. Make one: playbyear-attach-audio, "
@@ -227,7 +229,7 @@ def number_names(feature: Mapping[str, Any] | None) -> list[str] | None:
     return names if feature is not None and len(names) == feature["shape"][0] else None
 
 
-def check_features(features: Features, fps: int) -> None:
+def check_features(features: Features, fps: float) -> None:
     """Whether a dataset of these features can be written.
 
     Args:

@@ -4,6 +4,7 @@ Files that it names lie in its folder. A feature claims no more values a row tha
 or uploads a dataset reads it through this module. LeRobot, which takes seconds to import, is not needed for that.
 """
 
+import glob
 import json
 import math
 import os
@@ -23,9 +24,12 @@ from lerobot_playbyear.datasets.files import (
     INFO_PATH,
     entries_below,
     fits,
+    is_listed,
     list_files,
 )
+from lerobot_playbyear.datasets.frame_rate import frame_rate
 from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, read_table
+from lerobot_playbyear.datasets.remedies import convert_command, repair_command
 
 Info = Mapping[str, Any]
 """The fields of `meta/info.json`."""
@@ -36,6 +40,7 @@ INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_ind
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
 _READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
+_MOST_NAMED = 4  # files of a folder
 _PLACES = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
 _LEAST_FPS, _MOST_FPS = 0.01, 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
@@ -56,7 +61,8 @@ def read_info(root: Path) -> dict[str, Any]:
         root: The dataset's folder.
 
     Returns:
-        All its fields. What LeRobot relies on is there and of the right kind; no template leads out of the folder.
+        All its fields. What LeRobot relies on is there and of the right kind; no template leads out of the folder. A frame
+        rate that is whole is an int.
 
     Raises:
         InfoError: A field is missing or cannot be right, or the dataset is of another version of LeRobot's format.
@@ -77,11 +83,11 @@ def read_info(root: Path) -> dict[str, Any]:
         raise
     except (ValueError, RecursionError) as error:
         raise InfoError(
-            f"{path} is damaged: {error}. Put it back from a copy, or let it be made anew: playbyear-repair --root={root} "
+            f"{path} is damaged: {error}. Put it back from a copy, or let it be made anew: {repair_command(root)} "
             "--like=<folder of a dataset that was recorded with the same settings>."
         ) from error
     _check_templates(root, info)
-    return info
+    return {**info, "fps": frame_rate(info["fps"])}
 
 
 def check_ordinary(root: Path) -> None:
@@ -130,14 +136,16 @@ def check_dataset_files(
     folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
     check_ordinary(folder)
     if not (folder / INFO_PATH).is_file():
+        if list_folder(folder):  # LeRobot fetches into no folder that holds other files
+            raise InputError(f"{nothing_in(folder)}. Correct the folder.")
         from lerobot.datasets import LeRobotDatasetMetadata
 
         try:
             meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
         except Exception as error:  # LeRobot's, the Hub's or the network's
             raise InputError(
-                f"There is no dataset in '{folder}' (no {INFO_PATH}), and '{repo_id}' could not be had from the Hub: "
-                f"{type(error).__name__}: {first_line(error)}. Correct the name or the folder."
+                f"{nothing_in(folder)}, and '{repo_id}' could not be had from the Hub: {type(error).__name__}: "
+                f"{first_line(error)}. Correct the name or the folder."
             ) from error
         check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return []
@@ -149,10 +157,9 @@ def check_dataset_files(
         except ParquetDamageError as error:
             raise InputError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
-                f"killed, its episodes can be saved: playbyear-repair --root={folder}"
+                f"killed, its episodes can be saved: {repair_command(folder)}"
             ) from error
-    if not footers["data"]:
-        raise InputError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
+    check_parts(folder)
     data = [*footers["data"].values()]
     check_claims(folder, data, sum(footer.num_rows for footer in footers["meta"].values()))
     _check_places(folder, footers["data"], list(footers["meta"]))
@@ -165,20 +172,28 @@ def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: It
     Raises:
         InputError: A data file belongs to no episode, or frames are counted otherwise than they are there.
     """
-    repair = f"Repair it: playbyear-repair --root={folder}"
-    pattern = read_info(folder)["data_path"]
+    repair, info = f"Repair it: {repair_command(folder)}", read_info(folder)
+    films = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    names = {key: [f"videos/{key}/{name}" for name in ("chunk_index", "file_index")] for key in films}
     rows: list[tuple[Any, ...]] = []
+    used: set[Path] = set()
     for path in tables:
         try:
-            table = read_table(path, list(_PLACES))
+            table = read_table(path, [*_PLACES, *(name for own in names.values() for name in own)])
+            for key, own in names.items():
+                for chunk, file in set(zip(*(table.column(name).to_pylist() for name in own), strict=True)):
+                    name = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
+                    used.add(folder / name)
         except ParquetDamageError as error:
             raise InputError(f"'{path}' is damaged: {error}. {repair}") from error
         rows += zip(*(table.column(name).to_pylist() for name in _PLACES), strict=True)
-    named = {folder / pattern.format(chunk_index=row[-2], file_index=row[-1]) for row in rows}
+    named = {folder / info["data_path"].format(chunk_index=row[-2], file_index=row[-1]) for row in rows}
+    if lost := [*sorted(named - set(data)), *(path for path in sorted(used) if not path.is_file())]:
+        raise InputError(f"'{lost[0]}' is missing, where meta/episodes says that episodes are. {repair}")
     if stray := sorted(set(data) - named):
         raise InputError(
             f"'{stray[0]}' belongs to no episode, and LeRobot would read it all the same. If it is a copy, move it out of "
-            f"'{folder}'; otherwise: playbyear-repair --root={folder}"
+            f"'{folder}'; otherwise: {repair_command(folder)}"
         )
     first = 0
     for number, (episode, length, start, stop, *_) in enumerate(sorted(rows, key=lambda row: row[0])):
@@ -192,6 +207,77 @@ def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: It
         raise InputError(
             f"The data files of '{folder}' hold {there:,} frames, and meta/episodes counts {first:,}. {repair}"
         )
+
+
+def nothing_in(root: Path) -> str:
+    """Says why a folder holds no dataset, and what is there instead; without a full stop."""
+    if not root.exists():
+        problem = "it does not exist"
+    elif not root.is_dir():
+        problem = "it is no folder"
+    else:
+        names, below = list_folder(root), list_files(root, f"*/{INFO_PATH}")
+        more = ", ..." if len(names) > _MOST_NAMED else ""
+        held = (
+            f"there is one in '{below[0].parents[1]}'" if below else f"it holds {', '.join(names[:_MOST_NAMED])}{more}"
+        )
+        problem = f"it has no {INFO_PATH}; {held}" if names else "it is empty"
+    return f"There is no LeRobotDataset in '{root}': {problem}"
+
+
+def check_there(root: Path) -> None:
+    """Refuses a folder that holds nothing of a dataset.
+
+    Raises:
+        InputError: Saying what it holds.
+    """
+    if not (root.is_dir() and (is_listed(root, INFO_PATH) or list_files(root, "data/*/*.parquet"))):
+        raise InputError(f"{nothing_in(root)}. Correct the folder.")
+
+
+def list_folder(root: Path) -> list[str]:
+    """The names in a folder, in order, but hidden ones; none where it is no folder."""
+    return sorted(each.name for each in root.iterdir() if not each.name.startswith(".")) if root.is_dir() else []
+
+
+def check_parts(root: Path, can_be_repaired: bool = False) -> None:
+    """Refuses a dataset of which a whole part is missing: frames, films of a camera, or the table of episodes.
+
+    Args:
+        root: The dataset's folder.
+        can_be_repaired: Whether a table of episodes that is missing is no reason.
+
+    Raises:
+        InputError: Naming what is missing, and what to do.
+        Exception: As `read_info`.
+    """
+    info = read_info(root)
+    if not list_files(root, "data/*/*.parquet"):
+        raise InputError(
+            f"The dataset in '{root}' is empty: no episode was saved, for it has no data/*/*.parquet, and {INFO_PATH} counts "
+            f"{info['total_episodes']} episodes. Record at least one, or put them back from a copy."
+        )
+    if not can_be_repaired and not list_files(root, f"{EPISODES_DIR}/*/*.parquet"):
+        raise InputError(
+            f"The dataset in '{root}' has no {EPISODES_DIR}/*/*.parquet, which says where its episodes are. It can be made "
+            f"from the frames: {repair_command(root)}"
+        )
+    for key, feature in info["features"].items():
+        if feature["dtype"] != "video":
+            continue
+        pattern = PurePath(info["video_path"].format(video_key=key, chunk_index=0, file_index=0))
+        if not list_files(root, f"{glob.escape(str(pattern.parent.parent))}/*/*{pattern.suffix}"):
+            films = [path for path in entries_below(root) if path.suffix == pattern.suffix]
+            films.sort(key=lambda path: key not in path.parts)
+            remedy = (
+                f"There are films in '{films[0].parent}': if they are these, move them there"
+                if films
+                else "Put them back"
+            )
+            raise InputError(
+                f"The dataset in '{root}' has no films of '{key}', which {INFO_PATH} says to be in '{root / pattern.parent}'. "
+                f"{remedy}, or correct video_path."
+            )
 
 
 def check_claims(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) -> None:
@@ -219,7 +305,7 @@ def check_claims(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int
     if total > _TOLERANCE * max(n_episodes, 1):
         raise InfoError(
             f"{root / INFO_PATH}: total_episodes is {total:,}, but meta/episodes has {n_episodes:,}. "
-            f"Repair it: playbyear-repair --root={root}"
+            f"Repair it: {repair_command(root)}"
         )
 
 
@@ -263,8 +349,7 @@ def _check_version(root: Path, version: Any) -> None:
         raise ValueError(f"codebase_version is {version!r}; wanted 'v3.0'")
     if int(found[1]) < 3:
         raise InfoError(
-            f"{root} is a dataset of LeRobot's older format {version}; wanted v3.0. Convert it with "
-            "`python -m lerobot.scripts.convert_dataset_v21_to_v30`."
+            f"{root} is a dataset of LeRobot's older format {version}; wanted v3.0. Convert it: {convert_command(root)}"
         )
     if int(found[1]) > 3:
         raise InfoError(f"{root} was written by a newer LeRobot (format {version}); wanted v3.0. Update lerobot.")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import INFO_PATH, FolderLock, entries_below, flush, flush_all, write_atomically
+from lerobot_playbyear.datasets.remedies import repair_command
 
 SCRATCH = Path("images")
 STAGING = SCRATCH / ".staging"
@@ -57,7 +58,7 @@ def finish_journal(root: Path) -> None:
         return
     names = _staged_files(root)
     if journal.is_symlink() or not journal.is_file():
-        remedy = f"If nothing is being recorded there, delete it and run `playbyear-repair --root={root}`"
+        remedy = f"If nothing is being recorded there, delete it and run `{repair_command(root)}`"
         raise _error(journal, "is no ordinary file", remedy)
     for name in names:
         target = root / name

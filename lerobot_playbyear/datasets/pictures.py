@@ -13,6 +13,7 @@ from PIL import Image
 from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import INFO_PATH
 from lerobot_playbyear.datasets.info import OutsideError, real_path
+from lerobot_playbyear.datasets.remedies import repair_command, without_feature
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
 """Of the pictures that are read; others have readers that start programs."""
@@ -41,7 +42,7 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
         OSError: It is no picture.
     """
     if row is None:
-        raise ValueError(f"'{key}': a picture is missing. Repair the dataset: playbyear-repair --root={root}")
+        raise ValueError(f"'{key}': a picture is missing. Repair the dataset: {repair_command(root)}")
     data, name = row["bytes"], row["path"]
     if data is None and (name is None or not real_path(root / name).is_relative_to(root.resolve())):
         raise OutsideError(
@@ -54,8 +55,7 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
         image.close()
         raise ValueError(
             f"'{key}': a picture of mode {mode}, with more than 8 bits a value, as depth cameras give it, would be seen as "
-            f"white; wanted 8 bits. Leave the camera out: lerobot-edit-dataset --repo_id=<name> --root={root} "
-            f"--operation.type=remove_feature --operation.feature_names=\"['{key}']\""
+            f"white; wanted 8 bits. Leave the camera out: {without_feature(root, key)}"
         )
     if not has_shape(image.height, image.width, feature["shape"]):
         size = f"{image.width} x {image.height}"

@@ -22,9 +22,18 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.findings import name_episodes
-from lerobot_playbyear.datasets.info import INDEX_COLUMNS, check_claims, check_dataset_files, file_inside
+from lerobot_playbyear.datasets.frame_rate import frame_rate
+from lerobot_playbyear.datasets.info import (
+    INDEX_COLUMNS,
+    check_claims,
+    check_dataset_files,
+    check_parts,
+    file_inside,
+    nothing_in,
+)
 from lerobot_playbyear.datasets.parquet import DataFile, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
+from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.survey import Survey, survey
 from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
 
@@ -92,7 +101,7 @@ class EpisodeReader:
     """
 
     def __init__(
-        self, repo_id: str, root: Path, fps: int, features: Features, files: list[DataFile], tasks: Mapping[int, str]
+        self, repo_id: str, root: Path, fps: float, features: Features, files: list[DataFile], tasks: Mapping[int, str]
     ) -> None:
         self.repo_id, self.root, self.fps, self.features, self.tasks = repo_id, root, fps, features, tasks
         self.episodes: list[EpisodeRows] = []
@@ -238,7 +247,7 @@ class DatasetReader(EpisodeReader):
         folder = Path(meta.root)
         files = [DataFile(path) for path in list_files(folder, "data/*/*.parquet")]
         tasks = {} if meta.tasks is None else dict(enumerate(meta.tasks.index.astype(str)))
-        super().__init__(meta.repo_id, folder, int(meta.fps), meta.features, files, tasks)
+        super().__init__(meta.repo_id, folder, frame_rate(meta.fps), meta.features, files, tasks)
         if not may_have_audio_files:
             check_audio_features(
                 {key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps
@@ -277,7 +286,7 @@ class SurveyedDataset(EpisodeReader):
         files = {each.frames.file.path: each.frames.file for each in found.whole if each.frames}
         self.survey, self.info = found, found.info
         super().__init__(
-            repo_id, found.root, int(self.info["fps"]), self.info["features"], list(files.values()), found.tasks
+            repo_id, found.root, self.info["fps"], self.info["features"], list(files.values()), found.tasks
         )
         self.chosen = None if episodes is None else set(episodes)
         self._places = {each.number: each.places for each in found.whole}
@@ -301,11 +310,11 @@ class SurveyedDataset(EpisodeReader):
         """
         folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
         if root is not None and not (folder / INFO_PATH).is_file():
-            problem = "it does not exist" if not folder.exists() else f"it has no {INFO_PATH}"
-            raise InputError(f"There is no LeRobotDataset in '{folder}': {problem}. Check --dataset.root.")
+            raise InputError(f"{nothing_in(folder)}. Correct the folder.")
         if not (folder / INFO_PATH).is_file():
             folder = _fetch(repo_id, folder, episodes)
         try:
+            check_parts(folder)
             found = survey(folder, thorough=False)
             dataset = cls(repo_id, found, episodes)
             check_claims(folder, [file.footer for file in dataset.files], len(found.episodes))
@@ -316,7 +325,7 @@ class SurveyedDataset(EpisodeReader):
             said, more = "; ".join(map(str, found.damage[:_LISTED])), len(found.damage) - _LISTED
             raise InputError(
                 f"The dataset in '{folder}' cannot be opened: {said}{f'; and {more} more' if more > 0 else ''}. "
-                f"Repair it: playbyear-repair --root={folder}"
+                f"Repair it: {repair_command(folder)}"
             )
         if not dataset.episodes:
             raise InputError(f"The dataset in '{folder}' is empty: no episode was saved. Record at least one.")

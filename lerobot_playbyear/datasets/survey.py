@@ -22,9 +22,10 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
-from lerobot_playbyear.datasets.info import INDEX_COLUMNS, Info, InfoError, read_info
+from lerobot_playbyear.datasets.info import INDEX_COLUMNS, Info, InfoError, check_there, read_info
 from lerobot_playbyear.datasets.parquet import DataFile, ParquetDamageError, column_to_numpy, parsing, read_table
 from lerobot_playbyear.datasets.pictures import open_picture
+from lerobot_playbyear.datasets.remedies import repair_command, task_command
 from lerobot_playbyear.datasets.video_files import Place, find_places, place_in_row
 
 TASKS_PATH, STATS_PATH = "meta/tasks.parquet", "meta/stats.json"
@@ -146,7 +147,8 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
         like: A dataset that was recorded with the same settings. Its frame rate and features are believed.
 
     Raises:
-        DatasetDamagedError: It is no dataset, or nothing says what its columns are.
+        InputError: It is no dataset.
+        DatasetDamagedError: Nothing says what its columns are.
         OSError: Something cannot be read now.
         MemoryError: There is no room for something.
     """
@@ -172,11 +174,9 @@ def _wrong(check: str, said: str, episodes: Sequence[int] = (), remedy: str = ""
 
 
 def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[str, Any]:
-    has_data = root.is_dir() and bool(list_files(root, "data/*/*.parquet"))
-    if not has_data and not (root.is_dir() and is_listed(root, INFO_PATH)):
-        raise DatasetDamagedError(f"{root} holds no LeRobotDataset: it has no {INFO_PATH}, and no data.")
+    check_there(root)
     known = None if like is None else read_info(like)
-    remedy = f"Put it back from a copy, or: playbyear-repair --root={root} --like=<folder of a dataset with the same settings>"
+    remedy = f"Put it back from a copy, or: {repair_command(root)} --like=<folder of a dataset with the same settings>"
     try:
         if not is_listed(root, INFO_PATH):
             raise InfoError(f"{root / INFO_PATH} is missing. {remedy}.")
@@ -225,7 +225,8 @@ def _open(root: Path, path: Path, schema: pa.Schema, rescue: Rescue | None, find
         findings.append(_wrong("files", f"{name} cannot be read ({error})"))
         return None
     if problem := _difference(file.schema, schema):
-        remedy = f"Correct the features in {INFO_PATH}, or take those of a dataset like it: playbyear-repair --like"
+        like = f"{repair_command(root)} --like=<folder of a dataset with the same settings>"
+        remedy = f"Correct the features in {INFO_PATH}, or: {like}"
         findings.append(_wrong("files", f"{name}: {problem}", remedy=remedy))
         return None
     return file
@@ -513,7 +514,7 @@ def _read_tasks(root: Path, episodes: Sequence[Episode], rows: Rows, findings: l
         if text != known.get(task, text) and not problem:
             others = name_episodes(numbers)
             message = f"{TASKS_PATH}: task {task} reads {known[task]!r}; the rows of {others} say {text!r}"
-            remedy = "If nobody renamed it, lerobot-edit-dataset with --operation.type=modify_tasks sets the right one"
+            remedy = f"If nobody renamed it, give them the right one: {task_command(root, numbers, text)}"
             findings.append(Finding("tasks", "warning", message, episodes=numbers, remedy=remedy))
     return known
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from lerobot_playbyear.datasets.errors import PlaybyearError
+from lerobot_playbyear.datasets.frame_rate import frame_rate
 
 if TYPE_CHECKING:  # a process that plays scripts imports nothing of LeRobot
     from lerobot.envs import EnvConfig
@@ -77,10 +78,15 @@ def env_facts(env: gym.Env) -> EnvFacts:
         raise RolloutError(f"The observation space must be a Dict, but it is {env.observation_space}.")
     if not isinstance(env.action_space, gym.spaces.Box):
         raise RolloutError(f"The action space must be a Box, but it is {env.action_space}.")
+    fps = frame_rate(env.metadata.get("render_fps") or 0)
+    if not isinstance(fps, int):
+        raise RolloutError(
+            f"metadata['render_fps'] is {fps}; wanted a whole number of steps per second, such as {round(fps)}."
+        )
     return EnvFacts(
         observation_space=env.observation_space,
         action_space=env.action_space,
-        fps=int(env.metadata.get("render_fps", 0)),
+        fps=fps,
         has_expert=callable(getattr(env.unwrapped, "scripted_expert", None)),
         state_names=getattr(env.unwrapped, "state_names", None),
         action_names=getattr(env.unwrapped, "action_names", None),

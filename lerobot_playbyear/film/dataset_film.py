@@ -1,6 +1,7 @@
 """An episode of a dataset as a film with sound, in the formats that every browser plays: H.264 and AAC."""
 
 import itertools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
@@ -51,7 +52,7 @@ def encode(
     path: Path,
     pictures: Iterator[np.ndarray],
     n_pictures: int,
-    fps: int,
+    fps: float,
     sound: Sequence[np.ndarray],
     gain: float,
     most_bytes: int = 2**28,
@@ -70,7 +71,7 @@ def encode(
     """
     samples, sample_rate = film_sound(blocks_of(sound, n_pictures), fps, gain)
     # Key frames every second, so that stepping backwards is quick.
-    options = {"crf": "23", "g": str(fps)}
+    options = {"crf": "23", "g": str(math.ceil(fps))}
     bit_rate = max(round(8 * most_bytes * fps / n_pictures) - _SOUND_BIT_RATE, _LOWEST_BIT_RATE)
     if bit_rate < _LIMITED_BIT_RATE:
         options |= {"maxrate": str(bit_rate), "bufsize": str(2 * bit_rate)}

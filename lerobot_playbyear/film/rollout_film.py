@@ -107,7 +107,7 @@ def _env_of_lerobot(env_cfg: EnvConfig) -> gym.Env:
     return env.env if isinstance(env, FreezeAfterEpisodeEnd) else env  # that one ends with its first episode
 
 
-def write_episode_film(episode: Episode, path: Path, fps: int) -> None:
+def write_episode_film(episode: Episode, path: Path, fps: float) -> None:
     """Writes a film with the policy's camera in a corner, the spectrogram below, and the sound as loud as it can be.
 
     Args:

@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 
 from lerobot_playbyear.audio.audio_files import resample
 from lerobot_playbyear.datasets.files import new_file
+from lerobot_playbyear.datasets.frame_rate import exact_rate, sample_rate_of
 
 _AAC_RATES = (8000, 11025, 12000, 16000, 22050, 24000, 32000, 44100, 48000)
 _STRIP_HEIGHT = 120  # pixels
@@ -44,7 +45,7 @@ def episode_sound(blocks: np.ndarray) -> np.ndarray:
     return shifted.reshape(blocks.shape[0] * blocks.shape[1], blocks.shape[2])
 
 
-def film_sound(blocks: np.ndarray, fps: int, gain: float | None = None) -> tuple[np.ndarray, int]:
+def film_sound(blocks: np.ndarray, fps: float, gain: float | None = None) -> tuple[np.ndarray, int]:
     """The sound of an episode, in time with its pictures, amplified, and at a sample rate that AAC has.
 
     Args:
@@ -55,7 +56,7 @@ def film_sound(blocks: np.ndarray, fps: int, gain: float | None = None) -> tuple
     Returns:
         (n, n_microphones) int16, and the sample rate [Hz].
     """
-    samples, sample_rate = amplify(episode_sound(blocks), gain), blocks.shape[1] * fps
+    samples, sample_rate = amplify(episode_sound(blocks), gain), sample_rate_of(blocks.shape[1], fps)
     rate = next((rate for rate in _AAC_RATES if rate >= sample_rate), _AAC_RATES[-1])
     return (resample(samples, sample_rate, rate) if samples.size else samples), rate
 
@@ -159,7 +160,7 @@ def compose(
 def write_film(
     path: str | Path,
     frames: Iterable[np.ndarray],
-    fps: int,
+    fps: float,
     sound: np.ndarray,
     sample_rate: int,
     x264_options: Mapping[str, str] | None = None,
@@ -200,8 +201,8 @@ def write_film(
     return path
 
 
-def _add_video_stream(film, fps: int, height: int, width: int, x264_options: Mapping[str, str]):
-    stream = film.add_stream("libx264", rate=fps)
+def _add_video_stream(film, fps: float, height: int, width: int, x264_options: Mapping[str, str]):
+    stream = film.add_stream("libx264", rate=exact_rate(fps))
     stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
     stream.options = {"crf": "20", "preset": "veryfast", **x264_options}
     return stream

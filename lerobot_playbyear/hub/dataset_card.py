@@ -164,7 +164,7 @@ def film_preview(dataset: SurveyedDataset, path: Path) -> str:
     """Films the first episode with success, or without any the first, for at most 30 seconds. Returns what it shows."""
     solved = [each for each in dataset.episodes if first_success(dataset, each) not in (None, -1)]
     episode = (solved or dataset.episodes)[0]
-    shown = replace(episode, stop=min(episode.stop, episode.start + _LONGEST_S * dataset.fps))
+    shown = replace(episode, stop=min(episode.stop, episode.start + round(_LONGEST_S * dataset.fps)))
     microphones, n_frames = dataset.timed_microphones, len(shown)
     blocks = blocks_of([heard(dataset, key, shown) for key in microphones[:2]], n_frames)
     sound, sample_rate = film_sound(blocks, dataset.fps)

@@ -24,7 +24,7 @@ from huggingface_hub.utils import validate_repo_id
 from lerobot_playbyear.compat import card_writer
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, first_line
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below
-from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out
+from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out, check_there
 from lerobot_playbyear.datasets.journal import locked
 from lerobot_playbyear.datasets.markdown import word
 from lerobot_playbyear.datasets.reader import SurveyedDataset
@@ -176,7 +176,11 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
     folder, options = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id, options or PushOptions()
     check_name("dataset.repo_id", repo_id, needs_user=True)
     options.check()
-    with locked(folder) if folder.is_dir() else contextlib.nullcontext(), TemporaryDirectory() as scratch:
+    try:
+        check_there(folder)
+    except InputError as error:
+        raise HubError(f"Not pushed. {error}") from error
+    with locked(folder), TemporaryDirectory() as scratch:
         try:
             dataset = SurveyedDataset.open(repo_id, folder)
             check_links(folder)

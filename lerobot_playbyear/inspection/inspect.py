@@ -15,6 +15,7 @@ from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.info import OutsideError, check_links_out
 from lerobot_playbyear.datasets.reader import DatasetPlace, SurveyedDataset
+from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.inspection.motion import check_actions, check_interventions, check_success
 from lerobot_playbyear.inspection.pictures import PictureChecks
 from lerobot_playbyear.inspection.sound import check_sound
@@ -177,7 +178,7 @@ def as_text(dataset: SurveyedDataset, findings: Sequence[Finding], colour: bool 
         lines.append(f"{level}  {finding.check:<{name_width}}  {_line(feature + str(finding))}")
     lines += ["", summary(findings)]
     if dataset.survey.damage:
-        lines.append(f"A repaired copy: playbyear-repair --root={_line(known['root'])}")
+        lines.append(f"A repaired copy: {_line(repair_command(dataset.root))}")
     return "\n".join(lines)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from lerobot_playbyear.datasets.features import INTERVENTION
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
+from lerobot_playbyear.datasets.frame_rate import sample_rate_of
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 from lerobot_playbyear.inspection.sound import FULL_SCALE, heard, runs
 
@@ -162,7 +163,7 @@ def check_delay(dataset: SurveyedDataset, motion: Mapping[str, Sequence[Sequence
         motion: Of each camera and episode how much every picture differs from the one before (`difference`).
     """
     for key in dataset.timed_microphones:
-        rate = dataset.features[key]["shape"][0] * dataset.fps
+        rate = sample_rate_of(dataset.features[key]["shape"][0], dataset.fps)
         # Row i ends with picture i: the first row was heard before the first picture.
         onsets = (sudden_sounds(heard(dataset, key, episode), rate) for episode in dataset.episodes)
         sounds = [_apart(times) + STEP_S / 2 - 1 / dataset.fps for times in onsets]
@@ -178,7 +179,7 @@ def _apart(times_s: np.ndarray) -> np.ndarray:
     return times_s[np.diff(times_s, prepend=-np.inf) > _QUIET_S]
 
 
-def _motion_ends(motion: np.ndarray, fps: int) -> np.ndarray:
+def _motion_ends(motion: np.ndarray, fps: float) -> np.ndarray:
     """Between which times motions end, (k, 2) [s]."""
     floor = float(np.median(motion)) if len(motion) else 0.0
     peak = float(np.sort(motion)[-5:].mean()) if len(motion) else 0.0  # a single disturbed picture does not set it

@@ -24,6 +24,7 @@ from PIL import Image
 from lerobot_playbyear.datasets.features import number_names
 from lerobot_playbyear.datasets.files import new_file
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
+from lerobot_playbyear.datasets.frame_rate import sample_rate_of
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 from lerobot_playbyear.film.dataset_film import encode, tile
 from lerobot_playbyear.film.video import TOP_FREQUENCY, WINDOW_S, gain_of, spectra
@@ -240,7 +241,7 @@ class EpisodeData:
 
     def _measure(self, key: str) -> Microphone:
         dataset = self._dataset
-        rate = dataset.features[key]["shape"][0] * dataset.fps
+        rate = sample_rate_of(dataset.features[key]["shape"][0], dataset.fps)
         episodes = dataset.episodes[:: max(len(dataset.episodes) // _SAMPLED_EPISODES, 1)]
         levels = np.concatenate([_levels(heard(dataset, key, episode), rate)[0] for episode in episodes])
         peak = max(float(np.abs(heard(dataset, key, each)).max()) for each in dataset.episodes) / FULL_SCALE

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lerobot_playbyear.datasets.findings import Finding, Level, name_episodes
+from lerobot_playbyear.datasets.frame_rate import sample_rate_of
 from lerobot_playbyear.datasets.parquet import stretches
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 
@@ -137,7 +138,7 @@ def repeats(samples: np.ndarray, samples_per_frame: int) -> list[tuple[int, int]
 
 def _check_microphone(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
     samples_per_frame = dataset.features[key]["shape"][0]
-    sample_rate = float(samples_per_frame * dataset.fps)
+    sample_rate = float(sample_rate_of(samples_per_frame, dataset.fps))
     dead, quiet, offset = [], [], []
     cut, lost, repeated = (_Spans(key, sample_rate, len(dataset) * samples_per_frame) for _ in range(3))
     levels, peak, worst_offset = [], 0.0, 0.0

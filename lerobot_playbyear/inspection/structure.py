@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 
 from lerobot_playbyear.datasets.findings import Finding, name_episodes
+from lerobot_playbyear.datasets.frame_rate import sample_rate_of
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
+from lerobot_playbyear.datasets.remedies import recompute_command
 from lerobot_playbyear.datasets.survey import STATS_PATH
 
 _LENGTH_FACTOR = 4.0  # an episode this much longer or shorter than the median is named
-_STATS_TOLERANCE = 0.02  # of a value's range; LeRobot sums statistics in float32, episode by episode
+_STATS_TOLERANCE, _STD_TOLERANCE = 0.02, 0.05  # of a value's range, and of its standard deviation
+_ROUNDING = 2.0**-23  # for each number in a sum: LeRobot sums values and their squares in float32, episode by episode
 
 
 def check_survey(dataset: SurveyedDataset) -> Iterator[Finding]:
@@ -61,7 +64,7 @@ def check_sample_rates(dataset: SurveyedDataset) -> Iterator[Finding]:
         yield Finding("sound", "info", "no sound: no key starts with observation.audio.")
     for key in dataset.timed_microphones:
         block = dataset.features[key]["shape"][0]
-        rate = block * dataset.fps
+        rate = sample_rate_of(block, dataset.fps)
         message = f"{rate:,} Hz / {dataset.fps} Hz = {block} samples per frame"
         yield Finding("sample rate", "ok", message, key, figures={"sample_rate": rate, "samples_per_frame": block})
 
@@ -97,7 +100,7 @@ def check_statistics(dataset: SurveyedDataset) -> Iterator[Finding]:
         n_compared += 1
         if difference:
             wrong.append(f"{key} ({difference})")
-    remedy = "Recompute: lerobot-edit-dataset --operation.type recompute_stats"
+    remedy = f"Recompute them: {recompute_command(dataset.root)}"
     if wrong:
         yield Finding("statistics", "error", f"meta/stats.json does not fit the data: {'; '.join(wrong)}. {remedy}")
     if missing:
@@ -145,10 +148,14 @@ def _stats_difference(dataset: SurveyedDataset, key: str, own: Mapping[str, Any]
     for name, value in stored.items():
         value = value[:1] if (value == value[0]).all() else value
         compared = found if value.size == size else _of_all_elements(found)
-        actual, scale = compared[name], compared["max"] - compared["min"]
-        off = np.abs(value - actual) > _STATS_TOLERANCE * scale + 1e-6 * (1 + np.abs(actual))
-        if off.any():
-            element = int(np.flatnonzero(off)[0])
+        actual, rounding = compared[name], _ROUNDING * max(8, *map(len, dataset.episodes))
+        squares = np.square(compared["mean"]) + np.square(compared["std"])
+        tolerance = _STATS_TOLERANCE * (compared["max"] - compared["min"]) + rounding * np.sqrt(squares)
+        if name == "std":  # a small difference of two large numbers
+            tolerance = _STD_TOLERANCE * actual + np.sqrt(np.square(actual) + rounding * squares) - actual
+        fits = np.abs(value - actual) <= tolerance + 1e-6 * (1 + np.abs(actual))  # false where it is NaN
+        if not fits.all():
+            element = int(np.flatnonzero(~fits)[0])
             return f"{name}[{element}] is {value[element]:.4g} there, {actual[element]:.4g} in the data"
     return None
 

@@ -9,6 +9,7 @@ import pandas as pd
 from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_playbyear.datasets.frame_rate import frame_rate
 from lerobot_playbyear.datasets.markdown import code, plain, repository_name, word
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 
@@ -92,7 +93,7 @@ def _facts(meta: Any) -> SimpleNamespace:
         repo_id=repository_name(meta.repo_id) or word(meta.repo_id),
         total_episodes=int(meta.total_episodes),
         total_frames=int(meta.total_frames),
-        fps=int(meta.fps),
+        fps=frame_rate(meta.fps),
         tasks=pd.DataFrame(index=texts),
         robot_type=word(meta.robot_type) if meta.robot_type else None,
         camera_keys=[plain(key) for key in meta.camera_keys],

@@ -13,14 +13,14 @@ from lerobot.utils.constants import OBS_STATE
 
 from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
 from lerobot_playbyear.compat import encode_choice
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX, MICROPHONE
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, MICROPHONE, samples_per_frame
+from lerobot_playbyear.datasets.frame_rate import divides, frame_rate
 from lerobot_playbyear.policy.optimization import DTYPES, PlaybyearSchedulerConfig, training_dtype
 
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
 
 _SIZES = {
-    "fps": 1000,
     "n_frame_stack": 100,
     "n_memory_steps": 10_000,
     "n_supervised_steps": 10_000,
@@ -31,6 +31,8 @@ _SIZES = {
     "embedding_size": 16_384,
 }
 """From 1 to this: beyond it a configuration is damaged, or asks for all memory."""
+
+_LARGEST = 1000  # frames per second, and range of actions
 _AT_LEAST_0 = (
     *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
     *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
@@ -112,7 +114,7 @@ class PlaybyearConfig(PreTrainedConfig):
     """
 
     # Inputs
-    fps: int = 20
+    fps: float = 20
     sample_rate: int | None = None
     use_vision: bool = True
     use_audio: bool = True
@@ -175,6 +177,7 @@ class PlaybyearConfig(PreTrainedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_options()
+        self.fps = frame_rate(self.fps)  # an option or JSON may have 20.0
         self._asked_dtype = self.dtype
         self.dtype = training_dtype(self.dtype, self.use_amp, str(self.device))  # LeRobot reads this, and not use_amp
 
@@ -292,8 +295,9 @@ class PlaybyearConfig(PreTrainedConfig):
         for name in _AT_LEAST_0:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"--policy.{name} must be at least 0 (none) and finite, got {getattr(self, name)}.")
-        if not 0 < self.action_range < math.inf:
-            raise ValueError(f"--policy.action_range must be above 0 and finite, got {self.action_range}.")
+        for name in ("fps", "action_range"):
+            if not 0 < getattr(self, name) <= _LARGEST:
+                raise ValueError(f"--policy.{name} must be above 0 and at most {_LARGEST}, got {getattr(self, name)}.")
         if self.memory_displacement_gain and not self.low_dimensional_gain:
             raise ValueError(
                 f"--policy.memory_displacement_gain={self.memory_displacement_gain} compares low-dimensional observations, and "
@@ -376,8 +380,8 @@ class PlaybyearConfig(PreTrainedConfig):
         """Raises a ValueError if a dataset has another one than the policy."""
         if meta.fps != self.fps:
             raise ValueError(
-                f"The dataset '{meta.repo_id}' has {meta.fps} frames per second, and the policy is configured for {self.fps}: "
-                f"give --policy.fps={meta.fps}, or a dataset recorded at {self.fps}."
+                f"The dataset '{meta.repo_id}' has {frame_rate(meta.fps)} frames per second, and the policy is configured for "
+                f"{self.fps}: give --policy.fps={frame_rate(meta.fps)}, or a dataset recorded at {self.fps}."
             )
 
     def check_dataset(self, meta: "LeRobotDatasetMetadata") -> None:
@@ -421,14 +425,15 @@ def _no_microphone_in(features: Iterable[str]) -> str:
     )
 
 
-def _check_samples(key: str, samples: int, sample_rate: int, fps: int) -> None:
-    if sample_rate % fps:
+def _check_samples(key: str, samples: int, sample_rate: int, fps: float) -> None:
+    if not divides(fps, sample_rate):
         raise ValueError(
             f"sample_rate {sample_rate} / fps {fps} is not an integer: {key} cannot hold whole frames. Set "
             "--policy.fps to the dataset's."
         )
-    if samples * fps != sample_rate:
+    if samples != samples_per_frame(sample_rate, fps):
+        wanted = frame_rate(sample_rate / samples)
         raise ValueError(
-            f"{key} has {samples} samples per frame, which at {sample_rate} Hz means {sample_rate / samples:g} frames per "
-            f"second, but the policy is configured for fps={fps}: set --policy.fps={sample_rate / samples:g}."
+            f"{key} has {samples} samples per frame, which at {sample_rate} Hz means {wanted} frames per "
+            f"second, but the policy is configured for fps={fps}: set --policy.fps={wanted}."
         )

@@ -19,7 +19,8 @@ from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
 from lerobot_playbyear.audio.microphone_pictures import Strip, read_strip
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import AUDIO_PREFIX
+from lerobot_playbyear.datasets.features import AUDIO_PREFIX, samples_per_frame
+from lerobot_playbyear.datasets.frame_rate import nearest_sample_rate
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import SoundStep
 
@@ -83,7 +84,7 @@ class MicrophonePicturesToAudioStep(SoundStep):
 
     microphones: list[str] = field(default_factory=list)
     sample_rate: int = 16000
-    fps: int = 20
+    fps: float = 20
 
     def __post_init__(self) -> None:
         self.reset()
@@ -136,10 +137,10 @@ class MicrophonePicturesToAudioStep(SoundStep):
 
     def _column_rate(self, sample_rate: int) -> int:
         """The rate that a microphone's sound has in a dataset [Hz]."""
-        return round(sample_rate / self.fps) * self.fps
+        return nearest_sample_rate(sample_rate, self.fps)
 
     def _block(self, key: str, number: int, strip: Strip) -> np.ndarray:
-        sound = self._sounds.setdefault((key, number), ControlStepSound(self.sample_rate // self.fps))
+        sound = self._sounds.setdefault((key, number), ControlStepSound(samples_per_frame(self.sample_rate, self.fps)))
         block, _ = sound.next(strip)
         if number == 0 and key == self.microphones[0] and sound.n_heard is not None:
             self._watch_pace(sound.n_heard, strip.sample_rate)

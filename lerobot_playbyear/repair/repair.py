@@ -11,8 +11,8 @@ from pathlib import Path
 from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder
 from lerobot_playbyear.datasets.findings import Finding
-from lerobot_playbyear.datasets.info import check_links
-from lerobot_playbyear.datasets.journal import finish_journal, locked
+from lerobot_playbyear.datasets.info import check_links, check_parts, check_there
+from lerobot_playbyear.datasets.journal import JOURNAL, finish_journal, locked
 from lerobot_playbyear.datasets.survey import DatasetDamagedError, Survey, survey
 from lerobot_playbyear.repair.footers import rescue
 
@@ -98,11 +98,13 @@ def repair(cfg: RepairConfig) -> RepairReport:
 
 def look(root: Path, like: Path | None = None) -> RepairReport:
     """What a repair would keep. Arguments and errors as for `repair_dataset`."""
-    if not root.is_dir():
-        raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
+    check_there(root)
     if like is not None and not (like / INFO_PATH).is_file():
         raise InputError(f"--like={like} holds no LeRobotDataset: no {INFO_PATH}. Give one with the same settings.")
-    return RepairReport(survey(root, rescue=rescue, like=like))
+    report = RepairReport(survey(root, rescue=rescue, like=like))
+    if report.survey.damage and not report.kept and like is None:
+        check_parts(root, can_be_repaired=True)
+    return report
 
 
 def repair_dataset(root: str | Path, target: str | Path | None = None, like: Path | None = None) -> RepairReport:
@@ -121,15 +123,15 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
         What was found, and where the copy is; without damage that a copy can put right, there is none.
 
     Raises:
-        DatasetDamagedError: It is no dataset, or no episode in it is whole.
+        DatasetDamagedError: No episode in it is whole.
         OutsideError: A link leads out of its folder: the copy would hold what it leads to.
-        InputError: The copy's folder is there already, or cannot be made.
+        InputError: It is no dataset, or the copy's folder is there already, or cannot be made.
         OSError: Something cannot be read now, or the copy cannot be written.
         MemoryError: There is no room for something.
     """
     root = Path(root)
-    if not root.is_dir():
-        raise InputError(f"--root={root} holds no LeRobotDataset: it is no folder.")
+    if not (root / JOURNAL).exists():
+        check_there(root)  # before anything is written there, if only a lock
     real = root.absolute()
     target = Path(target) if target is not None else real.with_name(f"{real.name}_repaired")
     with locked(root) as is_locked:

@@ -196,13 +196,13 @@ def check_local_dataset(repo_id: str, root: str | None) -> None:
 
     Args:
         repo_id: The dataset's name.
-        root: Its folder; None: in LeRobot's cache. Where there is none, nothing is looked at.
+        root: Its folder; None: in LeRobot's cache. An empty one is left to LeRobot, which asks the Hub.
 
     Raises:
-        InputError: A file is damaged, or leads out of the folder.
+        InputError: A file is damaged, or leads out of the folder, or the folder holds something else.
     """
-    from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH
-    from lerobot_playbyear.datasets.info import check_dataset_files
+    from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
+    from lerobot_playbyear.datasets.info import check_dataset_files, list_folder
 
-    if (Path(root or HF_LEROBOT_HOME / repo_id) / INFO_PATH).is_file():
+    if list_folder(Path(root or HF_LEROBOT_HOME / repo_id)):
         check_dataset_files(repo_id, root)

@@ -36,8 +36,9 @@ from lerobot_playbyear.compat import (
     update_last_checkpoint,
 )
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
-from lerobot_playbyear.datasets.features import number_names
+from lerobot_playbyear.datasets.features import is_depth, number_names
 from lerobot_playbyear.datasets.files import INFO_PATH
+from lerobot_playbyear.datasets.remedies import without_feature
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
@@ -328,22 +329,36 @@ def check_dataset_suits(
         ValueError: Naming what was seen, what is wanted, and what to do.
     """
     policy.check_frame_rate(meta)
+    used = dataset_names(policy, rename_map).values()  # none of a new policy, which takes all
     for key, feature in meta.features.items():
-        remedy = f"Leave it out: lerobot-edit-dataset --operation.type=remove_feature --operation.feature_names=\"['{key}']\""
-        if feature["dtype"] == "bool" and key.startswith(f"{OBS_STR}."):
-            raise ValueError(f"'{key}' has dtype bool, which LeRobot cannot normalise; wanted float32. {remedy}.")
-        if feature["dtype"] in ("image", "video") and len(feature.get("names") or ()) != len(feature["shape"]):
-            raise ValueError(
-                f"'{key}' has names {feature.get('names')}; wanted what its dimensions are, such as "
-                f"['height', 'width', 'channels'], in {INFO_PATH}. Correct it there. Or: {remedy}."
-            )
-    missing = [key for key in dataset_names(policy, rename_map).values() if key not in meta.features]
+        if problem := _why_not(key, feature, key in used or not used, policy.use_vision):
+            raise ValueError(f"'{key}' {problem}. Leave it out: {without_feature(Path(meta.root), key)}")
+    missing = [key for key in used if key not in meta.features]
     if missing:
         seen = [key for key in meta.features if key.startswith(OBS_STR)]
         raise ValueError(
             f"The dataset '{meta.repo_id}' lacks {missing}, which the policy needs; its observations are {seen}. "
             "Use a dataset with these keys, or map its names with --rename_map."
         )
+
+
+def _why_not(key: str, feature: Mapping[str, Any], is_used: bool, is_seen: bool) -> str:
+    """What of a feature a policy cannot learn from; empty where nothing."""
+    dtype, shape = feature["dtype"], tuple(feature["shape"])
+    if dtype in ("image", "video"):
+        if len(feature.get("names") or ()) != len(shape):  # LeRobot reads those of all cameras
+            names = "['height', 'width', 'channels']"
+            return f"has names {feature.get('names')}; wanted what its dimensions are, such as {names}, in {INFO_PATH}"
+        if is_used and is_seen and is_depth(feature):
+            return "holds distances of a depth camera; wanted colours"
+        if is_used and is_seen and 3 not in (shape[0], shape[-1]):
+            return f"has shape {shape}; wanted three channels, (H, W, 3)"
+    elif is_used and key.startswith(f"{OBS_STR}."):
+        if dtype in ("bool", "string", "language"):
+            return f"has dtype {dtype}, which LeRobot cannot normalise; wanted float32"
+        if len(shape) != 1:
+            return f"has shape {shape}; wanted one dimension"
+    return ""
 
 
 def _make_processors(

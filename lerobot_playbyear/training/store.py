@@ -25,6 +25,7 @@ from lerobot_playbyear.datasets.info import INDEX_COLUMNS
 from lerobot_playbyear.datasets.parquet import episode_bounds
 from lerobot_playbyear.datasets.pictures import kept_shape, shrink
 from lerobot_playbyear.datasets.reader import DatasetReader, check_finite
+from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.training.frame_cache import cached_columns, dataset_identity
 
 PLACES = ("memory", "disk", "auto")
@@ -64,7 +65,7 @@ class EpisodeStore:
         columns: Mapping[str, Tensor],
         starts: Sequence[int],
         ends: Sequence[int],
-        fps: int,
+        fps: float,
         tasks: Sequence[str] = ("",),
         device: str | torch.device = "cpu",
         image_size: int | None = None,
@@ -138,7 +139,7 @@ class EpisodeStore:
                 _check_memory(n_bytes, device)
                 # One by one, so that a copy on another device never doubles the whole dataset.
                 columns = {key: _gathered(pieces(key), len(reader)).to(device) for key in features}
-        starts, ends = _episodes(columns, reader.repo_id)
+        starts, ends = _episodes(columns, reader)
         return cls(
             columns, starts, ends, reader.fps, list(reader.meta.tasks.index), columns["index"].device, image_size
         )
@@ -306,7 +307,7 @@ def choose_place(
     return "memory" if n_bytes <= _MEMORY_SHARE * available_memory() else "disk"
 
 
-def features_at(features: Mapping[str, Any], sample_rates: Mapping[str, int], fps: int) -> dict[str, Any]:
+def features_at(features: Mapping[str, Any], sample_rates: Mapping[str, int], fps: float) -> dict[str, Any]:
     """A dataset's features, its microphones at other sample rates.
 
     Args:
@@ -394,7 +395,7 @@ def _select_features(reader: DatasetReader, keys: Iterable[str] | None) -> dict[
         if key not in features:
             raise ValueError(f"The dataset '{reader.repo_id}' has no '{key}'; it has {sorted(features)}.")
         if key in others:
-            raise ValueError(f"'{key}' ({features[key]['dtype']}) cannot be kept in memory: use lerobot-train for it.")
+            raise ValueError(f"'{key}' ({features[key]['dtype']}) cannot be kept in memory: leave it out of the keys.")
     return {key: features[key] for key in keys}
 
 
@@ -428,14 +429,14 @@ def _check_memory(n_bytes: int, device: torch.device) -> None:
         )
 
 
-def _episodes(columns: Mapping[str, Tensor], repo_id: str) -> tuple[list[int], list[int]]:
+def _episodes(columns: Mapping[str, Tensor], reader: DatasetReader) -> tuple[list[int], list[int]]:
     starts, ends = episode_bounds(columns["episode_index"].cpu().numpy())
     frame_index = columns["frame_index"].cpu()
     for start, end in zip(starts, ends, strict=True):
         if not torch.equal(frame_index[start:end], torch.arange(end - start)):
             raise ValueError(
-                f"Episode {int(columns['episode_index'][start])} of '{repo_id}' is incomplete: its {end - start} rows "
-                f"are not frames 0 to {end - start - 1}. Remove it with lerobot-edit-dataset, or record it again."
+                f"Episode {int(columns['episode_index'][start])} of '{reader.repo_id}' is incomplete: its {end - start} rows "
+                f"are not frames 0 to {end - start - 1}. Copy what is whole: {repair_command(reader.root)}"
             )
     if IS_FIRST in columns and columns[IS_FIRST].dtype == torch.bool:
         # LeRobot's rollout resets the policy after a pause: no window reaches back beyond it.
