@@ -21,7 +21,7 @@ from gym_playbyear import register_tasks
 from gym_playbyear.environment import TaskEnv
 from gym_playbyear.registry import OptionError, PluginError, make_definition
 from gym_playbyear.task import Task
-from lerobot_env_playbyear.attempts import AttemptsFile
+from lerobot_env_playbyear.attempts import AttemptsFile, holds_attempts
 
 SPECTROGRAM = "lerobot_env_playbyear.spectrogram"
 """Group of entry points, by which another distribution brings pictures of sound: a module with `pictures_for` and
@@ -236,6 +236,8 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("visualization_width", "the picture is square: give both sides the same")
         if self.attempts_file is not None and Path(self.attempts_file).is_dir():
             raise self._error("attempts_file", "it is a folder, give a file in it, such as attempts.jsonl")
+        if self.attempts_file is not None and not holds_attempts(Path(self.attempts_file)):
+            raise self._error("attempts_file", "it holds something else than attempts, give another file")
         for name in ("room_noise", "microphone_response", "spectrogram"):
             if self.sound != "waveform" and getattr(self, name) not in (None, "flat"):
                 raise self._error(name, f"--env.sound={self.sound} has no sound for it; leave one of them out")

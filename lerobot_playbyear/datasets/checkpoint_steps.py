@@ -1,13 +1,13 @@
 """What a checkpoint may have done before and after its network: it may be a stranger's, and LeRobot calls what it names."""
 
 import contextlib
-import json
 from pathlib import Path
 
 from huggingface_hub import hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError
 
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import parse_json
 
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 """LeRobot's names of the files."""
@@ -31,7 +31,7 @@ def check_steps(path: str | Path, revision: str | None = None) -> None:
         if not file.is_file():
             continue  # LeRobot says so
         try:
-            steps = json.loads(file.read_bytes())["steps"]
+            steps = parse_json(file.read_bytes())["steps"]
             strange = [step for step in steps if "class" in step or not isinstance(step["registry_name"], str)]
         except (ValueError, LookupError, TypeError) as error:
             raise InputError(f"{file} is no processor of LeRobot's: {type(error).__name__}: {error}.") from error

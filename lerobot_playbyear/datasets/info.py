@@ -4,7 +4,6 @@ Files that it names lie in its folder. A feature claims no more values a row tha
 or uploads a dataset reads it through this module. LeRobot, which takes seconds to import, is not needed for that.
 """
 
-import json
 import math
 import os
 import re
@@ -12,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.errors import InputError, first_line
@@ -24,18 +24,22 @@ from lerobot_playbyear.datasets.files import (
     entries_below,
     fits,
     list_files,
+    parse_json,
 )
-from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, read_table
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, check_room, open_checked, read_table
 
 Info = Mapping[str, Any]
 """The fields of `meta/info.json`."""
+
+STATS_PATH = "meta/stats.json"
 
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """That every dataset of LeRobot's has."""
 
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
-_READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
+_DATA, _EPISODES, _TABLES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "meta/*.parquet"
+_READ = (INFO_PATH, "meta/*.json", _TABLES, _EPISODES, _DATA, "videos/*/*/*")
 _PLACES = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
 _MOST_FPS = 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
@@ -68,20 +72,43 @@ def read_info(root: Path) -> dict[str, Any]:
     path = root / INFO_PATH
     check_ordinary(root)
     try:
-        info = json.loads(path.read_bytes())
+        info = parse_json(path.read_bytes())
         if not isinstance(info, dict):
             raise ValueError("it holds no fields")
         _check_version(root, info.get("codebase_version"))
         _check_fields(info)
     except InfoError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InfoError(
             f"{path} is damaged: {error}. Put it back from a copy, or let it be made anew: playbyear-repair --root={root} "
             "--like=<folder of a dataset that was recorded with the same settings>."
         ) from error
     _check_templates(root, info)
     return info
+
+
+def parse_stats(data: bytes) -> dict[str, dict[str, Any]]:
+    """What `meta/stats.json` says: of each feature its statistics, numbers or lists of them.
+
+    Raises:
+        ValueError: It says something else.
+    """
+    stats = parse_json(data)
+    if not isinstance(stats, dict):
+        raise ValueError("it holds no features")
+    for key, own in stats.items():
+        if not isinstance(own, dict) or not all(map(are_numbers, own.values())):
+            raise ValueError(f"the entries of {key} are no numbers")
+    return stats
+
+
+def are_numbers(value: Any) -> bool:
+    """Whether a statistic is one: a number, or a list of them."""
+    try:
+        return np.array(value).dtype.kind in "fiub"
+    except ValueError:  # lists of different lengths
+        return False
 
 
 def check_ordinary(root: Path) -> None:
@@ -91,20 +118,30 @@ def check_ordinary(root: Path) -> None:
         OutsideError: Naming it.
     """
     for path in (path for pattern in _READ if root.is_dir() for path in list_files(root, pattern)):
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
+        ordinary(path)
+
+
+def ordinary(path: Path) -> Path:
+    """A path that is to be opened.
+
+    Raises:
+        OutsideError: A pipe or a device is there, or a link leads to one.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
+    return path
 
 
 def file_inside(root: Path, name: str | PurePath) -> Path:
     """A file that a dataset names.
 
     Raises:
-        OutsideError: The name leads out of the folder.
+        OutsideError: The name leads out of the folder, or to a pipe or a device.
     """
     windows = PureWindowsPath(name)
     if windows.anchor or PurePath(name).is_absolute() or ".." in (*windows.parts, *PurePath(name).parts):
         raise OutsideError(f"The dataset in '{root}' names the file '{name}', which is not in its folder.")
-    return root / name
+    return ordinary(root / name)
 
 
 def check_dataset_files(
@@ -141,21 +178,31 @@ def check_dataset_files(
             ) from error
         check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return []
-    footers: dict[str, dict[Path, pq.FileMetaData]] = {"data": {}, "meta": {}}
-    for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, f"{EPISODES_DIR}/*/*.parquet")]:
+    footers: dict[str, dict[Path, pq.FileMetaData]] = {_DATA: {}, _EPISODES: {}, _TABLES: {}}
+    named = [(kind, path) for kind in footers for path in list_files(folder, kind)]
+    for kind, path in named:
         try:
             with open_checked(path) as file:
-                footers[path.relative_to(folder).parts[0]][path] = file.metadata
+                footers[kind][path] = file.metadata
         except ParquetDamageError as error:
             raise InputError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
                 f"killed, its episodes can be saved: playbyear-repair --root={folder}"
             ) from error
-    if not footers["data"]:
+        for group in [None] if kind == _TABLES else range(footers[kind][path].num_row_groups):
+            check_room(path, footers[kind][path], group)
+    if not footers[_DATA]:
         raise InputError(f"The dataset '{repo_id}' in '{folder}' is empty: no episode was saved. Record at least one.")
-    data = [*footers["data"].values()]
-    check_claims(folder, data, sum(footer.num_rows for footer in footers["meta"].values()))
-    _check_places(folder, footers["data"], list(footers["meta"]))
+    try:
+        if (folder / STATS_PATH).is_file():
+            parse_stats((folder / STATS_PATH).read_bytes())
+    except ValueError as error:
+        raise InputError(
+            f"'{folder / STATS_PATH}' cannot be read: {error}. Repair it: playbyear-repair --root={folder}"
+        ) from error
+    data = [*footers[_DATA].values()]
+    check_claims(folder, data, sum(footer.num_rows for footer in footers[_EPISODES].values()))
+    _check_places(folder, footers[_DATA], list(footers[_EPISODES]))
     return data
 
 
@@ -275,6 +322,8 @@ def _check_fields(info: Info) -> None:
     for name in ("total_episodes", "total_frames", "chunks_size"):
         if not _is_count(info.get(name)):
             raise ValueError(f"{name} is {info.get(name)!r}; wanted a whole number")
+    if info["chunks_size"] == 0:
+        raise ValueError("chunks_size is 0; wanted 1 or more, such as 1000")
     fps = info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= _MOST_FPS:
         raise ValueError(f"fps is {fps!r}; wanted a number above 0, and at most {_MOST_FPS:,}")
