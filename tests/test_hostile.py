@@ -465,6 +465,18 @@ def test_claims_that_ask_for_gigabytes_get_none(root, kind):
         assert grown_by(lambda reader=reader: read(reader)) < 150
 
 
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells a peak anew")
+def test_large_pictures_are_decoded_one_at_a_time(tmp_path):
+    """Black ones of 12 million pixels fill 40 kB, and 36 MB each once they are read."""
+    root, size = tmp_path / "set", 3464
+    make_dataset(root, (8,), image_size=16, microphones=())
+    picture(data=encoded(Image.new("RGB", (size, size)), "PNG"))(root)
+    edit_info(root, lambda info: info["features"][CAMERA].update(shape=[size, size, 3]))
+    dataset = SurveyedDataset("a/b", survey(root, thorough=False))
+    pictures = dataset.pictures(CAMERA, dataset.episodes[0])
+    assert grown_by(lambda: next(pictures)) < 220  # all of them: 350
+
+
 def test_a_rate_without_a_common_divisor_takes_no_gigabytes():
     rate = 44_101
     blocks = np.ones((2, rate, 2), np.int16)

@@ -344,7 +344,15 @@ def test_no_link_of_a_checkpoint_or_a_run_is_followed(tmp_path):
 
 def test_a_line_of_figures_that_was_cut_off_costs_no_upload(trained, tmp_path):
     run = shutil.copytree(trained.parents[2], tmp_path / "run")
-    lines = ['{"kind": "tr', '{"kind": "eval", "step": 2, "pc_success": 90.0}', "7", '{"kind": "eval", "st']
+    lines = ['{"kind": "tr', '{"kind": "eval", "step": 2, "pc_success": 90.0}', "7", '{"kind": "eval", "st', "[" * 9999]
     (run / "metrics.jsonl").write_text("\n".join(lines))
     figures = evaluation_of(run / "checkpoints/000002/pretrained_model")
     assert figures == {"kind": "eval", "step": 2, "pc_success": 90.0}
+
+
+@pytest.mark.parametrize(("step", "success"), [("<b>", 90), (2, "<b>"), (2, None), ([2], 90)])
+def test_figures_that_are_no_numbers_are_on_no_card(trained, tmp_path, step, success):
+    run = shutil.copytree(trained.parents[2], tmp_path / "run")
+    (run / "metrics.jsonl").write_text(json.dumps({"kind": "eval", "step": step, "pc_success": success}))
+    (run / "checkpoints/000002/training_state/training_step.json").write_text(json.dumps({"step": step}))
+    assert evaluation_of(run / "checkpoints/000002/pretrained_model") is None

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import av
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from dagger_factory import FINISHED, QUICK, command, dagger, state
-from dataset_factory import make_dataset
+from dataset_factory import CAMERA, make_dataset
 from support.recording import edit_column, edit_info
 from support.shared import ENV, run_in_process
 
@@ -22,11 +23,13 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import FolderLockedError, new_file, new_folder, write_atomically
 from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.pictures import video_pictures
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.datasets.video_files import picture_times
 from lerobot_playbyear.hub.push import PushOptions, push_policy
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.repair.repair import RepairConfig, repair
+from lerobot_playbyear.scripts.commands import dagger as dagger_command
 from lerobot_playbyear.scripts.commands import train, video
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -133,6 +136,43 @@ def test_a_runs_state_names_no_folder_elsewhere(finished, tmp_path, secret, fiel
         command("--resume=true", f"--output_dir={run}")
 
 
+@pytest.mark.parametrize("file", ["train_config.json", "playbyear_train_config.json"])
+def test_training_goes_on_in_its_own_folder(trained, tmp_path, file):
+    """Also where the folder was moved since."""
+    run = Path(shutil.copytree(trained.parents[2], tmp_path / "run", symlinks=True))
+    config = run / "checkpoints/000002/pretrained_model/train_config.json"
+    config.write_text(json.dumps({**json.loads(config.read_text()), "output_dir": str(run)}))
+    options = json.loads(config.with_name(file).read_text())
+    config.with_name(file).write_text(json.dumps({**options, "output_dir": str(tmp_path / "home")}))
+    said = run_in_process(train, "--resume=true", f"--config_path={config}", "--steps=3")
+    assert not (tmp_path / "home").exists()
+    if file == "train_config.json":
+        assert f"is another folder. Give --output_dir={run} to go on there" in said
+    else:  # where only options of ours are read
+        assert (run / "checkpoints/000003").is_dir()
+
+
+@pytest.mark.parametrize("text", [SECRET, "[1]", '{"a": 1}\n', "[" * 9999])
+def test_attempts_are_appended_to_no_other_file(finished, tmp_path, text):
+    """Which the options of a stranger's run may name."""
+    run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
+    (tmp_path / "other").write_text(text)
+    saved = json.loads((run / "dagger_config.json").read_text())
+    saved["env"]["attempts_file"] = str(tmp_path / "other")
+    (run / "dagger_config.json").write_text(json.dumps(saved))
+    said = run_in_process(dagger_command, "--resume=true", f"--output_dir={run}", "--episodes=4")
+    assert "it holds something else than attempts" in said
+    assert (tmp_path / "other").read_text() == text
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"evil": 1}', "[" * 9999, '{"policy_path": "x", "made": "000002"}'])
+def test_a_damaged_state_of_a_run_is_named(finished, tmp_path, text):
+    run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
+    (run / "dagger_state.json").write_text(text)
+    with pytest.raises(InputError, match=r"dagger_state\.json is damaged"):
+        command("--resume=true", f"--output_dir={run}")
+
+
 # Files that lead to others
 
 
@@ -180,6 +220,30 @@ def test_pipes_and_devices_are_not_read(noise, tmp_path, name, target):
             read("a/b", root)
 
 
+@pytest.mark.parametrize("target", ["pipe", "/dev/zero"])
+@pytest.mark.parametrize("kind", ["picture", "film"])
+def test_pictures_are_read_from_no_pipe_or_device(tmp_path, kind, target):
+    root = tmp_path / "set"
+    make_dataset(root, (6, 5), use_videos=kind == "film", image_size=16)
+    name = f"seen/{CAMERA}/0.mp4" if kind == "film" else "seen/0.png"
+    edit_info(root, lambda info: info.update(video_path="seen/{video_key}/{file_index}.mp4"))
+    if kind == "picture":
+        (path,) = root.glob("data/*/*.parquet")
+        edit_column(path, CAMERA, lambda values: [{"bytes": None, "path": name} for _ in values])
+    (root / name).parent.mkdir(parents=True)
+    if target == "pipe":
+        os.mkfifo(root / name)
+    else:
+        (root / name).symlink_to(target)
+    with pytest.raises(InputError, match=r"no ordinary file|outside its folder"):
+        _look(root)
+
+
+def _look(root: Path) -> None:
+    dataset = SurveyedDataset("a/b", survey(root))
+    list(dataset.pictures(CAMERA, dataset.episodes[0]))
+
+
 @pytest.mark.parametrize("name", ["file-001.parquet", "backup.parquet", "file-000 (copy).parquet"])
 def test_a_copy_of_frames_beside_them_is_named(noise, tmp_path, name):
     """LeRobot reads every file in `data/`: a row would be another than the one that is asked for."""
@@ -202,6 +266,18 @@ def test_rows_that_number_other_frames_are_refused(noise, tmp_path, name):
     with pytest.raises(InputError, match="meta/episodes says that episode 0 has"):
         check_dataset_files("a/b", root)
     assert not survey(root).is_undamaged
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", "5", "{", "[" * 9999, '{"action": 5}', '{"action": {"min": "x"}}', '{"action": {"min": {}}}']
+)
+def test_statistics_that_are_none_are_named(noise, tmp_path, text):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (root / "meta/stats.json").write_text(text)
+    with pytest.raises(InputError, match=r"stats\.json' cannot be read: .*playbyear-repair"):
+        check_dataset_files("a/b", root)
+    findings = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
+    assert [each.check for each in findings if each.level == "error"] == ["statistics"]
 
 
 # What a checkpoint runs
@@ -310,3 +386,33 @@ def test_a_small_file_of_many_pieces_takes_no_time(noise, tmp_path):
     pq.write_table(table.take([0] * 30_000), path)
     assert path.stat().st_size < 3e6
     assert "30,000 pieces of episodes" in str(survey(root))
+
+
+def test_a_small_table_of_many_tasks_takes_no_memory_that_is_not_there(noise, tmp_path, monkeypatch):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    path = root / "meta/tasks.parquet"
+    pq.write_table(pq.read_table(path).take(np.zeros(2_000_000, int)), path)
+    assert path.stat().st_size < 1e6
+    monkeypatch.setattr("lerobot_playbyear.datasets.parquet.available_memory", lambda: 2**26)
+    for read in (check_dataset_files, lambda _, root: survey(root)):
+        with pytest.raises(MemoryError, match="values in one piece"):
+            read("a/b", root)
+
+
+@pytest.mark.parametrize("part", ["meta/episodes", "data"])
+def test_long_lists_of_equal_numbers_take_no_memory_that_is_not_there(noise, tmp_path, monkeypatch, part):
+    """Twenty million zeros fill a few kilobytes."""
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob(f"{part}/*/*.parquet")
+    table = pq.read_table(path).replace_schema_metadata({})
+    name = next(name for name in table.column_names if "action" in name)
+    length = 20_000_000 // len(table)
+    zeros = pa.ListArray.from_arrays(
+        np.arange(len(table) + 1) * length, pa.array(np.zeros(len(table) * length, np.float32))
+    )
+    pq.write_table(table.set_column(table.column_names.index(name), name, zeros), path, compression="zstd")
+    assert path.stat().st_size < 1e6
+    monkeypatch.setattr("lerobot_playbyear.datasets.parquet.available_memory", lambda: 2**26)
+    for read in (check_dataset_files, lambda _, root: survey(root)):
+        with pytest.raises(MemoryError, match="values in one piece"):
+            read("a/b", root)

@@ -8,7 +8,22 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+_MOST_BYTES = 2**16  # of a line
 _PLAIN = "biufU"  # NumPy's kinds of truth values, numbers and texts: what JSON has, too
+
+
+def holds_attempts(path: Path) -> bool:
+    """Whether attempts may be appended to a file, which a stranger's options may name: it holds some, or nothing."""
+    if not path.exists():
+        return True
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        line = file.readline(_MOST_BYTES)
+    try:
+        return not line or "steps" in dict(json.loads(line))
+    except (ValueError, TypeError, RecursionError):
+        return False
 
 
 class AttemptsFile(gym.Wrapper):

@@ -17,7 +17,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE, OBS_STR
 
-from lerobot_env_playbyear.attempts import AttemptsFile
+from lerobot_env_playbyear.attempts import AttemptsFile, holds_attempts
 
 if TYPE_CHECKING:
     from gym_playbyear.task import Task
@@ -235,6 +235,8 @@ class PlaybyearEnvConfig(EnvConfig):
             raise self._error("visualization_width", "the picture is square: give both sides the same")
         if self.attempts_file is not None and Path(self.attempts_file).is_dir():
             raise self._error("attempts_file", "it is a folder, give a file in it, such as attempts.jsonl")
+        if self.attempts_file is not None and not holds_attempts(Path(self.attempts_file)):
+            raise self._error("attempts_file", "it holds something else than attempts, give another file")
         for name in ("room_noise", "microphone_response", "spectrogram"):
             if self.sound != "waveform" and getattr(self, name) not in (None, "flat"):
                 raise self._error(name, f"--env.sound={self.sound} has no sound for it; leave one of them out")

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.features import Features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, list_files
-from lerobot_playbyear.datasets.info import read_info
+from lerobot_playbyear.datasets.info import STATS_PATH, read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
     ParquetDamageError,
@@ -29,7 +29,6 @@ from lerobot_playbyear.datasets.parquet import (
     write_tables,
 )
 from lerobot_playbyear.datasets.statistics import add_stats, with_stats, write_stats
-from lerobot_playbyear.datasets.survey import STATS_PATH
 
 _SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
 _DATA, _EPISODES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet"

@@ -7,7 +7,6 @@ be a stranger's, and is checked here.
 """
 
 import itertools
-import json
 import math
 import re
 from dataclasses import dataclass, replace
@@ -16,8 +15,8 @@ from typing import Any
 
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, AUDIO_PREFIX
-from lerobot_playbyear.datasets.files import INFO_PATH
-from lerobot_playbyear.datasets.info import file_inside, read_info
+from lerobot_playbyear.datasets.files import INFO_PATH, parse_json
+from lerobot_playbyear.datasets.info import file_inside, ordinary, read_info
 from lerobot_playbyear.datasets.reader import DatasetReader
 
 AUDIO_FOLDER = "audio"
@@ -65,7 +64,7 @@ class AudioTrack:
 def has_audio_files(root: Path) -> bool:
     """Whether a dataset has sound in files beside the frames; also False where its features cannot be read."""
     try:
-        features = json.loads((root / INFO_PATH).read_text())["features"]
+        features = parse_json(ordinary(root / INFO_PATH).read_text())["features"]
         return any(feature.get("dtype") == AUDIO_DTYPE for feature in features.values())
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return False

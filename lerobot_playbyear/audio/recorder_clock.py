@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import write_atomically
+from lerobot_playbyear.datasets.files import parse_json, write_atomically
 
 CLOCK_PATH = "meta/playbyear_clock.json"
 """Where in a dataset's folder its episodes' times stand."""
@@ -112,8 +112,8 @@ def read_clock(path: str | Path) -> dict[int, float]:
 
 def _from_json(path: Path) -> dict[int, float]:
     try:
-        content: Any = json.loads(path.read_bytes())
-    except (ValueError, RecursionError) as error:
+        content: Any = parse_json(path.read_bytes())
+    except ValueError as error:
         raise ClockError(f"{path} is no JSON ({error}); {_WANTED}.") from error
     if isinstance(content, Mapping) and _EPISODES in content:
         content = content[_EPISODES]

@@ -8,7 +8,6 @@ Here is numpy alone, in double precision and without matrix products, whose sums
 same samples give the same picture, whichever process makes it. Environments need neither torch nor LeRobot for it.
 """
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
@@ -20,7 +19,7 @@ import numpy as np
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, samples_per_frame
-from lerobot_playbyear.datasets.files import INFO_PATH
+from lerobot_playbyear.datasets.files import INFO_PATH, parse_json
 from lerobot_playbyear.datasets.frame_rate import divides
 
 PICTURE_PREFIX = "observation.images."
@@ -310,7 +309,7 @@ def read_pictures(path: str | Path) -> list[SoundPicture]:
     path = Path(path)
     file = path / INFO_PATH if path.is_dir() else path
     try:
-        features = json.loads(file.read_text())["features"]
+        features = parse_json(file.read_text())["features"]
         pictures = pictures_of(features)
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         if isinstance(error, InputError):

@@ -16,11 +16,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import draccus
+from draccus.utils import ParsingError
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from safetensors import SafetensorError
 
 from lerobot_playbyear.dagger.config import CONFIG_NAME, DaggerConfig
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, first_line
 from lerobot_playbyear.datasets.files import (
     PARTIAL,
     FolderLock,
@@ -29,6 +31,7 @@ from lerobot_playbyear.datasets.files import (
     check_no_links,
     is_trial,
     new_folder,
+    parse_json,
     write_atomically,
 )
 from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, read_metrics
@@ -154,7 +157,8 @@ class RunFolder:
             The state of the run, or None when a new one begins.
 
         Raises:
-            InputError: The folder holds a run and `resume` is off, or it holds something else, or a link where the run writes.
+            InputError: The folder holds a run and `resume` is off, or it holds something else, or a link where the run writes;
+                or its state is damaged.
         """
         check_no_links(self.path, METRICS_NAME, *RUN_FOLDERS)
         is_run = (self.path / CONFIG_NAME).is_file()
@@ -173,9 +177,15 @@ class RunFolder:
         path = self.path / STATE_NAME
         if not path.is_file():
             return None
-        state = RunState(**json.loads(path.read_text()))
+        try:
+            state = draccus.decode(RunState, parse_json(path.read_bytes()))
+        except (ValueError, ParsingError) as error:
+            raise InputError(
+                f"{path} is damaged: {first_line(error)}. Put it back from a copy, or begin another run with the corrections "
+                "that are there, in another --output_dir."
+            ) from error
         said = [*state.made, *state.milestones, state.checkpoint, state.best.get("checkpoint")]
-        if strange := [name for name in said if name is not None and not _NAME.fullmatch(name)]:
+        if strange := [name for name in said if name is not None and not _NAME.fullmatch(str(name))]:
             raise InputError(
                 f"{path} names the checkpoint {strange[0]!r}; wanted names of folders in '{self.checkpoints}'."
             )
@@ -280,8 +290,12 @@ class RunFolder:
         if not path.is_file():
             return
         done = {"attempt": state.attempts, "round": state.round, "eval": state.evaluated_round}
-        lines = ((line, line["attempt" if line["kind"] == "attempt" else "round"]) for line in self.metrics())
-        kept = [json.dumps(line) + "\n" for line, number in lines if number <= done[line["kind"]]]
+        lines = ((line, line.get("attempt" if line.get("kind") == "attempt" else "round")) for line in self.metrics())
+        kept = [
+            json.dumps(line) + "\n"
+            for line, number in lines
+            if isinstance(number, int) and number <= done.get(str(line.get("kind")), -1)
+        ]
         with _errors_of_writing(self.path):
             write_atomically(path, "".join(kept))
 

@@ -1,7 +1,6 @@
 """What a checkpoint may have done before and after its network: it may be a stranger's, and LeRobot calls what it names."""
 
 import contextlib
-import json
 from pathlib import Path, PurePath
 
 from huggingface_hub import hf_hub_download
@@ -9,6 +8,7 @@ from huggingface_hub.errors import EntryNotFoundError
 from safetensors import SafetensorError, safe_open
 
 from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import parse_json
 
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 """LeRobot's names of the files."""
@@ -33,7 +33,7 @@ def check_steps(path: str | Path, revision: str | None = None) -> None:
         if not file.is_file():
             continue  # LeRobot says so
         try:
-            steps = json.loads(file.read_bytes())["steps"]
+            steps = parse_json(file.read_bytes())["steps"]
             strange = [step for step in steps if "class" in step or not isinstance(step["registry_name"], str)]
             states = [step["state_file"] for step in steps if "state_file" in step]
         except (ValueError, LookupError, TypeError) as error:

@@ -10,12 +10,14 @@ with them take seconds to import; a test compares them.
 import contextlib
 import fnmatch
 import glob
+import json
 import os
 import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path, PurePath
+from typing import Any
 
 from filelock import FileLock, Timeout
 from huggingface_hub.constants import HF_HOME
@@ -86,6 +88,18 @@ def read_listed(root: Path, name: str) -> bytes | None:
         return None
     with naming(root / name):
         return (root / name).read_bytes()
+
+
+def parse_json(data: str | bytes) -> Any:
+    """What JSON says.
+
+    Raises:
+        ValueError: It is none, or a stranger's, in which one thing lies in another without end.
+    """
+    try:
+        return json.loads(data)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
 
 @contextlib.contextmanager

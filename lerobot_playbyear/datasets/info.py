@@ -5,7 +5,6 @@ or uploads a dataset reads it through this module. LeRobot, which takes seconds 
 """
 
 import glob
-import json
 import math
 import os
 import re
@@ -13,6 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
+import numpy as np
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.errors import InputError, first_line
@@ -26,20 +26,24 @@ from lerobot_playbyear.datasets.files import (
     fits,
     is_listed,
     list_files,
+    parse_json,
 )
 from lerobot_playbyear.datasets.frame_rate import frame_rate
-from lerobot_playbyear.datasets.parquet import ParquetDamageError, open_checked, read_table
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, check_room, open_checked, read_table
 from lerobot_playbyear.datasets.remedies import convert_command, repair_command
 
 Info = Mapping[str, Any]
 """The fields of `meta/info.json`."""
+
+STATS_PATH = "meta/stats.json"
 
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """That every dataset of LeRobot's has."""
 
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
-_READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
+_DATA, _EPISODES, _TABLES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "meta/*.parquet"
+_READ = (INFO_PATH, "meta/*.json", _TABLES, _EPISODES, _DATA, "videos/*/*/*")
 _MOST_NAMED = 4  # files of a folder
 _PLACES = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
 _LEAST_FPS, _MOST_FPS = 0.01, 1000
@@ -74,20 +78,43 @@ def read_info(root: Path) -> dict[str, Any]:
     path = root / INFO_PATH
     check_ordinary(root)
     try:
-        info = json.loads(path.read_bytes())
+        info = parse_json(path.read_bytes())
         if not isinstance(info, dict):
             raise ValueError("it holds no fields")
         _check_version(root, info.get("codebase_version"))
         _check_fields(info)
     except InfoError:
         raise
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise InfoError(
             f"{path} is damaged: {error}. Put it back from a copy, or let it be made anew: {repair_command(root)} "
             "--like=<folder of a dataset that was recorded with the same settings>."
         ) from error
     _check_templates(root, info)
     return {**info, "fps": frame_rate(info["fps"])}
+
+
+def parse_stats(data: bytes) -> dict[str, dict[str, Any]]:
+    """What `meta/stats.json` says: of each feature its statistics, numbers or lists of them.
+
+    Raises:
+        ValueError: It says something else.
+    """
+    stats = parse_json(data)
+    if not isinstance(stats, dict):
+        raise ValueError("it holds no features")
+    for key, own in stats.items():
+        if not isinstance(own, dict) or not all(map(are_numbers, own.values())):
+            raise ValueError(f"the entries of {key} are no numbers")
+    return stats
+
+
+def are_numbers(value: Any) -> bool:
+    """Whether a statistic is one: a number, or a list of them."""
+    try:
+        return np.array(value).dtype.kind in "fiub"
+    except ValueError:  # lists of different lengths
+        return False
 
 
 def check_ordinary(root: Path) -> None:
@@ -97,20 +124,30 @@ def check_ordinary(root: Path) -> None:
         OutsideError: Naming it.
     """
     for path in (path for pattern in _READ if root.is_dir() for path in list_files(root, pattern)):
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
+        ordinary(path)
+
+
+def ordinary(path: Path) -> Path:
+    """A path that is to be opened.
+
+    Raises:
+        OutsideError: A pipe or a device is there, or a link leads to one.
+    """
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
+    return path
 
 
 def file_inside(root: Path, name: str | PurePath) -> Path:
     """A file that a dataset names.
 
     Raises:
-        OutsideError: The name leads out of the folder.
+        OutsideError: The name leads out of the folder, or to a pipe or a device.
     """
     windows = PureWindowsPath(name)
     if windows.anchor or PurePath(name).is_absolute() or ".." in (*windows.parts, *PurePath(name).parts):
         raise OutsideError(f"The dataset in '{root}' names the file '{name}', which is not in its folder.")
-    return root / name
+    return ordinary(root / name)
 
 
 def check_dataset_files(
@@ -149,20 +186,30 @@ def check_dataset_files(
             ) from error
         check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
         return []
-    footers: dict[str, dict[Path, pq.FileMetaData]] = {"data": {}, "meta": {}}
-    for path in [*list_files(folder, "data/*/*.parquet"), *list_files(folder, f"{EPISODES_DIR}/*/*.parquet")]:
+    footers: dict[str, dict[Path, pq.FileMetaData]] = {_DATA: {}, _EPISODES: {}, _TABLES: {}}
+    named = [(kind, path) for kind in footers for path in list_files(folder, kind)]
+    for kind, path in named:
         try:
             with open_checked(path) as file:
-                footers[path.relative_to(folder).parts[0]][path] = file.metadata
+                footers[kind][path] = file.metadata
         except ParquetDamageError as error:
             raise InputError(
                 f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
                 f"killed, its episodes can be saved: {repair_command(folder)}"
             ) from error
+        for group in [None] if kind == _TABLES else range(footers[kind][path].num_row_groups):
+            check_room(path, footers[kind][path], group)
     check_parts(folder)
-    data = [*footers["data"].values()]
-    check_claims(folder, data, sum(footer.num_rows for footer in footers["meta"].values()))
-    _check_places(folder, footers["data"], list(footers["meta"]))
+    try:
+        if (folder / STATS_PATH).is_file():
+            parse_stats((folder / STATS_PATH).read_bytes())
+    except ValueError as error:
+        raise InputError(
+            f"'{folder / STATS_PATH}' cannot be read: {error}. Repair it: {repair_command(folder)}"
+        ) from error
+    data = [*footers[_DATA].values()]
+    check_claims(folder, data, sum(footer.num_rows for footer in footers[_EPISODES].values()))
+    _check_places(folder, footers[_DATA], list(footers[_EPISODES]))
     return data
 
 
@@ -360,6 +407,8 @@ def _check_fields(info: Info) -> None:
     for name in ("total_episodes", "total_frames", "chunks_size"):
         if not _is_count(info.get(name)):
             raise ValueError(f"{name} is {info.get(name)!r}; wanted a whole number")
+    if info["chunks_size"] == 0:
+        raise ValueError("chunks_size is 0; wanted 1 or more, such as 1000")
     fps = info.get("fps")
     if isinstance(fps, bool) or not isinstance(fps, int | float) or not _LEAST_FPS <= fps <= _MOST_FPS:
         raise ValueError(f"fps is {fps!r}; wanted a number from {_LEAST_FPS} to {_MOST_FPS:,}")

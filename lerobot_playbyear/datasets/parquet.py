@@ -17,6 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.errors import first_line
+from lerobot_playbyear.datasets.free_memory import available_memory
 
 
 class ParquetDamageError(ValueError):
@@ -27,6 +28,7 @@ PIECE_BYTES = 2**26
 """Of the rows that are in memory together, about: more is read and written in parts."""
 
 _BUFFER_BYTES = 2**20
+_COLUMN_BYTES, _OBJECT_BYTES = 4, 20  # of a number, in a column and as Python has it, about
 _IMPOSSIBLE_BYTES = 2**40  # more memory than any part of a file takes
 _PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
 
@@ -73,6 +75,27 @@ def open_checked(path: Path, footer: pq.FileMetaData | None = None) -> pq.Parque
                     raise ParquetDamageError("it does not begin as a parquet file does")
         return pq.ParquetFile(
             path, metadata=footer, page_checksum_verification=True, pre_buffer=False, buffer_size=_BUFFER_BYTES
+        )
+
+
+def check_room(path: Path, footer: pq.FileMetaData, group: int | None = None) -> None:
+    """Whether the values of a file fit into memory: equal ones take next to no room in it.
+
+    Args:
+        path: The file, for the message.
+        footer: Its footer.
+        group: Only this row group, as columns; None: all, as objects of Python.
+
+    Raises:
+        MemoryError: They do not.
+    """
+    groups = map(footer.row_group, range(footer.num_row_groups) if group is None else [group])
+    n_values = sum(own.column(i).num_values for own in groups for i in range(own.num_columns))
+    wanted = n_values * (_OBJECT_BYTES if group is None else _COLUMN_BYTES)
+    if wanted > PIECE_BYTES and 2 * wanted > (free := available_memory()):
+        raise MemoryError(
+            f"'{path}' holds {n_values:,} values in one piece, which take {wanted / 2**30:.1f} GiB of memory, and "
+            f"{free / 2**30:.1f} GiB are free. Use a machine with more, or ask who made the dataset."
         )
 
 
@@ -150,6 +173,7 @@ class DataFile:
 
     def _read_group(self, file: pq.ParquetFile, group: int, columns: list[str] | None) -> pa.Table | ParquetDamageError:
         """A row group of the opened file, or what is wrong with it. Raises as `row_groups`."""
+        check_room(self.path, self.footer, group)
         try:
             with parsing(self.path):
                 table = file.read_row_group(group, columns=columns, use_threads=False)
@@ -165,8 +189,11 @@ def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     Raises:
         ParquetDamageError: A part of it is damaged.
         OSError: It cannot be read now.
+        MemoryError: There is no room for it.
     """
     with open_checked(path) as file, parsing(path):
+        if columns is None:
+            check_room(path, file.metadata)
         table = file.read(columns=columns, use_threads=False)
         table.validate(full=True)
     return table

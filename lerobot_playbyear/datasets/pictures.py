@@ -12,7 +12,7 @@ from PIL import Image
 
 from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import INFO_PATH
-from lerobot_playbyear.datasets.info import OutsideError, real_path
+from lerobot_playbyear.datasets.info import OutsideError, ordinary, real_path
 from lerobot_playbyear.datasets.remedies import repair_command, without_feature
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
@@ -37,7 +37,7 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
         feature: Its feature.
 
     Raises:
-        OutsideError: `path` leads out of the folder.
+        OutsideError: `path` leads out of the folder, or to a pipe.
         ValueError: The picture is missing, has another size than the feature says, or more than 8 bits a value.
         OSError: It is no picture.
     """
@@ -49,7 +49,7 @@ def open_picture(row: Mapping[str, Any] | None, root: Path, key: str, feature: M
             f"'{key}': a picture is not in the dataset but in the file {name!r}, outside its folder '{root}', and is "
             "not read. Record it again, or ask who made the dataset for one with its pictures."
         )
-    image = Image.open(root / name if data is None else io.BytesIO(data), formats=PICTURE_FORMATS)
+    image = Image.open(ordinary(root / str(name)) if data is None else io.BytesIO(data), formats=PICTURE_FORMATS)
     if image.mode.startswith(("I", "F")) and not is_depth(feature):
         mode = image.mode
         image.close()

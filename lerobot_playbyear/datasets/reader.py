@@ -7,6 +7,7 @@ numpy arrays through Arrow. An episode is the unit of memory for sound and numbe
 inspection and uploads. What is read is not judged: NaN is data, for `playbyear-inspect` reports it and training refuses it.
 """
 
+import math
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -31,7 +32,7 @@ from lerobot_playbyear.datasets.info import (
     file_inside,
     nothing_in,
 )
-from lerobot_playbyear.datasets.parquet import DataFile, column_to_numpy, episode_bounds
+from lerobot_playbyear.datasets.parquet import PIECE_BYTES, DataFile, column_to_numpy, episode_bounds
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.survey import Survey, survey
@@ -40,7 +41,7 @@ from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
 if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-_PICTURES_AT_ONCE = 64  # that are decoded ahead
+_PICTURES_AT_ONCE = 64  # that are decoded ahead; fewer of large ones
 _LISTED = 3  # findings
 
 
@@ -173,10 +174,11 @@ class EpisodeReader:
                 pixels = np.asarray(image.convert("L" if 1 in (feature["shape"][0], feature["shape"][-1]) else "RGB"))
             return pixels[..., None] if pixels.ndim == 2 else pixels
 
+        at_once = max(min(_PICTURES_AT_ONCE, PIECE_BYTES // max(math.prod(feature["shape"]), 1)), 1)
         with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
             for column in self._columns(key, episode.start + first, episode.stop):
-                for start in range(0, len(column), _PICTURES_AT_ONCE):
-                    yield from pool.map(decode, column.slice(start, _PICTURES_AT_ONCE).to_pylist())
+                for start in range(0, len(column), at_once):
+                    yield from pool.map(decode, column.slice(start, at_once).to_pylist())
 
     def task(self, episode: EpisodeRows) -> str:
         """The episode's task in words; empty if it has none."""

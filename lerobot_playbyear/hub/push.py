@@ -23,7 +23,7 @@ from huggingface_hub.utils import validate_repo_id
 
 from lerobot_playbyear.compat import card_writer
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, first_line
-from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below
+from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, entries_below, parse_json
 from lerobot_playbyear.datasets.info import OutsideError, check_links, check_links_out, check_there
 from lerobot_playbyear.datasets.journal import locked
 from lerobot_playbyear.datasets.markdown import word
@@ -266,7 +266,7 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
     def upload() -> str:
         repository = _create(repo_id, "model", options.private)
         config.repo_id = repository.repo_id  # with the user's name, for the card
-        files = {file.name: file for pattern in _POLICY_FILES for file in folder.glob(pattern)}
+        files = {file.name: file for pattern in _POLICY_FILES for file in folder.glob(pattern) if file.is_file()}
         card = _patiently(lambda: _policy_card(policy, folder))
         if options.preview is not None:
             files[FILM] = options.preview
@@ -362,8 +362,14 @@ def evaluation_of(checkpoint: Path) -> dict[str, float] | None:
     state = folder.parent / "training_state" / "training_step.json"
     if not state.is_file():
         return None
-    step, lines = json.loads(state.read_text())["step"], read_metrics(folder.parent.parent.parent)
-    found = [line for line in lines if line.get("kind") == "eval" and line.get("step") == step and "pc_success" in line]
+    try:
+        step = int(parse_json(state.read_bytes())["step"])
+    except (ValueError, TypeError, LookupError, OverflowError):
+        return None
+    evaluations = [line for line in read_metrics(folder.parent.parent.parent) if line.get("kind") == "eval"]
+    found = [
+        line for line in evaluations if line.get("step") == step and isinstance(line.get("pc_success"), int | float)
+    ]
     return found[-1] if found else None
 
 
@@ -374,7 +380,7 @@ def read_metrics(run: Path) -> list[dict[str, Any]]:
     figures: list[dict[str, Any]] = []
     for line in lines:
         with contextlib.suppress(ValueError, TypeError):
-            figures.append(dict(json.loads(line)))
+            figures.append(dict(parse_json(line)))
     return figures
 
 

@@ -1,6 +1,5 @@
 """Checks of a dataset's shape: what the survey found, lengths, sample rates, numbers and their statistics."""
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -9,9 +8,9 @@ import numpy as np
 
 from lerobot_playbyear.datasets.findings import Finding, name_episodes
 from lerobot_playbyear.datasets.frame_rate import sample_rate_of
+from lerobot_playbyear.datasets.info import STATS_PATH, parse_stats
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
 from lerobot_playbyear.datasets.remedies import recompute_command
-from lerobot_playbyear.datasets.survey import STATS_PATH
 
 _LENGTH_FACTOR = 4.0  # an episode this much longer or shorter than the median is named
 _STATS_TOLERANCE, _STD_TOLERANCE = 0.02, 0.05  # of a value's range, and of its standard deviation
@@ -121,7 +120,7 @@ def _rows(dataset: SurveyedDataset, key: str, episode: EpisodeRows) -> np.ndarra
 def _stored_stats(dataset: SurveyedDataset) -> dict[str, dict[str, Any]]:
     """Empty where they cannot be read, which the survey says."""
     try:
-        return json.loads((dataset.root / STATS_PATH).read_bytes())
+        return parse_stats((dataset.root / STATS_PATH).read_bytes())
     except (OSError, ValueError):
         return {}
 

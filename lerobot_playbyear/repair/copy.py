@@ -16,6 +16,7 @@ from lerobot.datasets.io_utils import write_json, write_tasks
 from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits
+from lerobot_playbyear.datasets.info import STATS_PATH
 from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_rows, write_tables
 from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
 from lerobot_playbyear.datasets.statistics import (
@@ -27,7 +28,7 @@ from lerobot_playbyear.datasets.statistics import (
     stats_columns,
     write_stats,
 )
-from lerobot_playbyear.datasets.survey import STATS_PATH, TASKS_PATH, Episode, Frames, Survey, unknown_task
+from lerobot_playbyear.datasets.survey import TASKS_PATH, Episode, Frames, Survey, unknown_task
 from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
 
 _REMADE = (INFO_PATH, STATS_PATH, TASKS_PATH, "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet")

@@ -10,6 +10,9 @@ from lerobot.configs import parser
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.utils.utils import flatten_dict
 
+from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.files import parse_json
+
 OWN_CONFIG_NAME = "playbyear_train_config.json"
 """File beside `train_config.json` that holds the options which lerobot-train does not know."""
 
@@ -99,8 +102,11 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
         path = Path(pretrained_name_or_path)
         own = (path if path.is_dir() else path.parent) / OWN_CONFIG_NAME
         if own.is_file():
-            content = json.loads(own.read_text())
-            saved = flatten_dict(content, sep=".").items()
+            try:
+                content = dict(parse_json(own.read_bytes()))
+            except (ValueError, TypeError) as error:
+                raise InputError(f"{own} is damaged: {error}. Put it back from a copy, or remove it.") from error
+            saved = flatten_dict({name: content.get(name) for name in _OWN_FIELDS}, sep=".").items()
             missing = {k: v for k, v in saved if v is not None and parser.parse_arg(k, cli_args) is None}
             given = [f"--{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in missing.items()]
             cli_args = given + cli_args

@@ -11,12 +11,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
+from lerobot.configs import parser
 from lerobot.datasets import make_train_eval_datasets
 from lerobot.utils.constants import ACTION, CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
 
-from lerobot_playbyear.datasets.errors import errors_of_input
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.files import check_can_be_made, check_no_links, entries_below
 from lerobot_playbyear.datasets.info import check_dataset_files
 from lerobot_playbyear.datasets.reader import DatasetReader
@@ -123,6 +124,7 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
     output = cfg.output_dir or _OUTPUTS
     check_can_be_made(Path(str(output)), f"--output_dir={output}")
     cfg.validate()
+    _check_place(cfg)
     _check_links(Path(str(cfg.output_dir)))
     check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     if cfg.policy is None:
@@ -134,6 +136,22 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
         )
     if cfg.policy.push_to_hub:
         check_upload("policy.repo_id", str(cfg.policy.repo_id))
+
+
+def _check_place(cfg: PlaybyearTrainConfig) -> None:
+    """Whether a run goes on in its own folder, also where that was moved, or a stranger wrote its options.
+
+    Raises:
+        InputError: Its options name another one, and the command line none.
+    """
+    if not cfg.resume or cfg.checkpoint_path is None or parser.parse_arg("output_dir") is not None:
+        return
+    run = cfg.checkpoint_path.parent.parent
+    if run.resolve() != Path(str(cfg.output_dir)).resolve():
+        raise InputError(
+            f"The options of the run in '{run}' say --output_dir={cfg.output_dir}, which is another folder. Give "
+            f"--output_dir={run} to go on there."
+        )
 
 
 def _check_links(run: Path) -> None:
