@@ -6,7 +6,7 @@ export MUJOCO_GL=${MUJOCO_GL:-egl}
 folder=${1:-outputs/by_hand}
 
 playbyear-record --env.type=playbyear --env.task=OccludedGrasp-v1 \
-  --dataset.repo_id=me/occluded --dataset.root="$folder/dataset" --dataset.num_episodes=2 --seed=0 --resume=true
+  --dataset.repo_id=me/occluded --dataset.root="$folder/dataset" --dataset.num_episodes=2 --seed=0
 
 lerobot-train --policy.type=playbyear --policy.push_to_hub=false --policy.device=cpu \
   --policy.image_size=48 --policy.vision_width=8 \

@@ -14,8 +14,8 @@ lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true --polic
 
 playbyear-attach-audio --dataset.repo_id=me/rollout_corrections --dataset.root="$folder/corrections"
 
-playbyear-dagger --episodes=0 --updates="${UPDATES:-1000}" --policy.path="$POLICY" --output_dir="$folder/dagger" \
-  --demos.repo_id=me/demos_with_sound --demos.root="$DEMOS" \
+playbyear-dagger --num_episodes=0 --steps="${UPDATES:-1000}" --policy.path="$POLICY" --output_dir="$folder/dagger" \
+  --dataset.repo_id=me/demos_with_sound --dataset.root="$DEMOS" \
   --interventions.repo_id=me/rollout_corrections_with_sound --interventions.root="$folder/corrections_with_sound"
 
 lerobot-rollout --policy.path="$folder/dagger/checkpoints/last/pretrained_model" "${ROBOT[@]}" --fps="$fps" --duration="${ACT_S:-60}"

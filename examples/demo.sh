@@ -21,16 +21,20 @@ step() { printf '\n\033[1m== %s\033[0m\n' "$*"; }
 run() { printf '$ %s\n' "$*"; commands+=("$*"); "$@"; }
 
 step "1/5 Record $EPISODES demonstrations"
-run playbyear-record --env.type=playbyear --env.task="$TASK" \
-  --dataset.repo_id=demo/occluded --dataset.root="$dataset" --dataset.num_episodes="$EPISODES" \
-  --seed=0 --resume=true --dataset.push_to_hub=false
+recorded=$(python -c 'import json, sys; print(json.load(open(sys.argv[1]))["total_episodes"])' "$dataset/meta/info.json" 2>/dev/null || echo 0)
+if [ "$recorded" -ge "$EPISODES" ]; then
+  echo "$dataset holds them."
+else
+  run playbyear-record --env.type=playbyear --env.task="$TASK" \
+    --dataset.repo_id=demo/occluded --dataset.root="$dataset" --dataset.num_episodes=$((EPISODES - recorded)) --seed=0 --resume=true
+fi
 
 step "2/5 Train"
 if [ -e "$checkpoint" ]; then
   echo "Using the policy in $checkpoint; remove $train to train anew."
 else
   rm -rf "$train"
-  run playbyear-train --preset=cpu --policy.type=playbyear --policy.push_to_hub=false \
+  run playbyear-train --preset=cpu \
     --dataset.repo_id=demo/occluded --dataset.root="$dataset" --output_dir="$train" \
     --steps="$STEPS" --save_freq="$STEPS" --wandb.enable=false
 fi

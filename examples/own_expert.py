@@ -120,13 +120,13 @@ def main() -> None:
 
     sys.argv[1:] = [
         f"--policy.path={folder / 'train/checkpoints/last/pretrained_model'}",
-        "--demos.repo_id=me/demos",
-        f"--demos.root={folder / 'demos'}",
+        "--dataset.repo_id=me/demos",
+        f"--dataset.root={folder / 'demos'}",
         "--interventions.repo_id=me/corrections",
         f"--interventions.root={folder / 'corrections'}",
         "--env.type=own_car",
         "--expert.type=momentum",
-        f"--episodes={args.episodes}",
+        f"--num_episodes={args.episodes}",
         f"--updates_per_episode={args.updates}",
         "--warmup_episodes=1",
         "--batch_size=8",

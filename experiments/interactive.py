@@ -168,7 +168,7 @@ class Study:
         command = [
             "playbyear-dagger",
             f"--policy.path={policy}",
-            *options_of(self.demonstrations, "demos"),
+            *options_of(self.demonstrations),
             *options_of(self.corrections, "interventions"),
             f"--batch_size={BATCH_SIZE}",
             f"--seed={self.job.training_seed}",
@@ -181,11 +181,11 @@ class Study:
         return folder
 
     def _attempts(self, policy: Path, name: str, task: str, kept: int, updates_per_episode: int) -> Path:
-        """Attempts at a task until the dataset holds so many. Returns the run's folder."""
+        """Attempts at a task until the run has kept so many. Returns its folder."""
         environment = ["--env.type=playbyear", f"--env.task={task}", *METHODS[self.options.method]]
         if task != self.job.task:  # the policy hears by the microphones that it knows
             environment.append(f"--env.microphones={json.dumps(PlaybyearEnvConfig(task=self.job.task).microphones)}")
-        how = (f"--episodes={kept}", f"--updates_per_episode={updates_per_episode}", "--max_attempts=200")
+        how = (f"--num_episodes={kept}", f"--updates_per_episode={updates_per_episode}", "--max_attempts=200")
         folder = self._dagger(policy, name, *environment, *how)
         if folder not in self.folders:
             self.folders.append(folder)
@@ -194,12 +194,14 @@ class Study:
     def _collect(self, policy: Path, number: int, kept: int) -> None:
         """Attempts of a policy that stays as it is."""
         course = {**(COURSES[self.options.course] if number == 1 else {}), self.job.task: kept}
+        before = self.options.kept * (number - 1) // self.options.rounds
         for task, n in course.items():
-            self._attempts(policy, f"collect{number}-{task}", task, n, 0)
+            self._attempts(policy, f"collect{number}-{task}", task, n - before, 0)
+            before = n
 
     def _learn_anew(self, number: int, updates: int) -> Path:
         """A policy that learns everything; the first one gives its options and its normalisation. Returns its checkpoint."""
-        learned = (f"--updates={updates}", "--updates_per_episode=500", "--episodes=0")
+        learned = (f"--steps={updates}", "--updates_per_episode=500", "--num_episodes=0")
         weights = METHODS[self.options.method] if self.options.method in WEIGHING else ()
         name = f"learn{number}{self._grown(updates)}"
         folder = self._dagger(self.job.checkpoint, name, *learned, "--new_weights=true", *weights)
@@ -217,9 +219,10 @@ class Study:
             The checkpoint, and the updates of its weights; those of the first policy where none were made.
         """
         per_episode = self.options.updates * self.options.rounds // self.options.kept
-        policy, updates = self.job.checkpoint, self.job.steps
+        policy, updates, before = self.job.checkpoint, self.job.steps, 0
         for task, n in {**COURSES[self.options.course], self.job.task: kept}.items():
-            folder = self._attempts(policy, f"online-{task}", task, n, per_episode)
+            folder = self._attempts(policy, f"online-{task}", task, n - before, per_episode)
+            before = n
             state = load(folder / "dagger_state.json")
             if state["checkpoint"] is not None:
                 policy, updates = newest(folder), updates + state["step"]

@@ -232,12 +232,16 @@ def record(task: str, n_episodes: int, root: Path | None = None, *environment: s
         environment: Further options of the environment, `--env.image_size=48`.
     """
     root = root or dataset_root(task)
+    info = root / "meta" / "info.json"
+    missing = n_episodes - (load(info)["total_episodes"] if info.is_file() else 0)
+    if missing <= 0:
+        return
     command = [
         "playbyear-record",
         "--env.type=playbyear",
         f"--env.task={task}",
         *options_of(root),
-        f"--dataset.num_episodes={n_episodes}",
+        f"--dataset.num_episodes={missing}",
         f"--seed={DEMONSTRATION_SEED}",
         "--resume=true",
         *environment,

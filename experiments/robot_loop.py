@@ -167,8 +167,8 @@ class Loop:
             take_sound_away(heard, kind)
         output = self.fresh(self.own / (f"dagger_{kind}" if kind else "dagger"))
         command = [
-            *("playbyear-dagger", "--episodes=0", f"--updates={self.args.updates}"),
-            *(f"--policy.path={self.checkpoint}", "--demos.repo_id=me/heard", f"--demos.root={self.attached}"),
+            *("playbyear-dagger", "--num_episodes=0", f"--steps={self.args.updates}"),
+            *(f"--policy.path={self.checkpoint}", "--dataset.repo_id=me/heard", f"--dataset.root={self.attached}"),
             *("--interventions.repo_id=me/corrections", f"--interventions.root={heard}"),
             f"--output_dir={output}",
         ]

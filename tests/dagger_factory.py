@@ -32,7 +32,7 @@ QUICK = ("--expert.type=test_quick", "--env.episode_length=12")
 """Attempts of a few steps, of which every third is not worth keeping."""
 
 SMALL = ("--updates_per_episode=2", "--warmup_episodes=1", "--batch_size=4", "--eval_every=0")
-FINISHED = ("--episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1", "--eval.batch_size=1")
+FINISHED = ("--num_episodes=3", "--warmup_episodes=2", "--eval_every=2", "--eval.n_episodes=1", "--eval.batch_size=1")
 """A run of three kept attempts with an evaluation before, after the second round, and at the end."""
 
 
@@ -77,8 +77,8 @@ def arguments(folder: Path, *options: str, env: tuple[str, ...] = ENV) -> list[s
     """The command line of a small run in `folder`; later options win."""
     given = [
         f"--policy.path={trained()}",
-        "--demos.repo_id=tests/demos",
-        f"--demos.root={recorded()}",
+        "--dataset.repo_id=tests/demos",
+        f"--dataset.root={recorded()}",
         "--interventions.repo_id=tests/corrections",
         f"--interventions.root={folder / 'corrections'}",
         f"--output_dir={folder / 'out'}",

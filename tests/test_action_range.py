@@ -87,7 +87,7 @@ def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wide
     actions[:10] = 0.9  # the policy's own: not learned
     actions[10:15, 1] = 0.14
     write(tmp_path / "corrections", actions, by_expert)
-    offline = ("--episodes=0", "--updates=1", "--demos.repo_id=tests/reach", f"--demos.root={base / 'demos'}")
+    offline = ("--num_episodes=0", "--steps=1", "--dataset.repo_id=tests/reach", f"--dataset.root={base / 'demos'}")
 
     dagger(tmp_path, *offline, f"--policy.path={base / 'policy'}", env=())
     (message,) = warnings(capfd)

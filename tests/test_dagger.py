@@ -130,7 +130,7 @@ def test_lerobots_commands_take_the_checkpoint_and_the_dataset(finished, tmp_pat
 
 def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
     cfg = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), learning_rate=1.0, warmup_updates=4)
-    cfg.episodes, cfg.warmup_episodes, cfg.updates_per_episode = 7, 3, 10
+    cfg.num_episodes, cfg.warmup_episodes, cfg.updates_per_episode = 7, 3, 10
     rounds = [[cfg.rate(10 * done + number, number, 10) for number in range(10)] for done in range(6)]
     first, second, last = rounds[0], rounds[1], rounds[4]
     assert cfg.total_updates() == 50
@@ -139,9 +139,10 @@ def test_the_rate_rises_once_and_falls_in_every_round_and_over_the_run():
     assert [rates[0] for rates in rounds] == pytest.approx([0.25, 0.82, 0.64, 0.46, 0.28, 0.1])
     assert rounds[5][0] < last[0]
     recorded = DaggerConfig(DatasetPlace("a/b"), DatasetPlace("c/d"), learning_rate=1.0, warmup_updates=0)
-    recorded.episodes, recorded.updates = 0, 50  # from recorded corrections it falls once
+    recorded.num_episodes, recorded.steps = 0, 50  # from recorded corrections it falls once
     assert [recorded.rate(step, step % 10, 10) for step in (0, 25, 49)] == pytest.approx([1.0, 0.5, 0.001], abs=1e-3)
-    appended = [cfg.rate(10 * done, 0, 10, n_before=5) for done in range(3)]  # two rounds
+    cfg.num_episodes = 2
+    appended = [cfg.rate(10 * done, 0, 10, n_before=5) for done in range(3)]
     assert appended == pytest.approx([0.25, 0.55, 0.1])
     cfg.anneal = False
     assert cfg.rate(17, 7, 10) == 1
@@ -172,7 +173,7 @@ def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_
     verdicts = {11: Verdict.SUCCESS, 12: Verdict.SUCCESS, 14: Verdict.DISCARD, 17: Verdict.SUCCESS}
     attempts_end(monkeypatch, {10, 12, 13, 14, 17}, verdicts)
     evaluation = ("--seed=15", "--eval.n_episodes=2", "--eval.batch_size=2")
-    dagger(tmp_path, *QUICK, "--episode_seed=10", "--episodes=2", *evaluation)
+    dagger(tmp_path, *QUICK, "--episode_seed=10", "--num_episodes=2", *evaluation)
 
     assert seeds(tmp_path) == [12, 17]
     counts = {key: state(tmp_path)[key] for key in ("attempts", "kept", "failed", "unneeded", "discarded")}
@@ -185,7 +186,7 @@ def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_
 
 def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, monkeypatch, capfd):
     attempts_end(monkeypatch, {10}, dict.fromkeys(range(10, 14), Verdict.SUCCESS))
-    out = dagger(tmp_path, *QUICK, "--episode_seed=10", "--episodes=5", "--max_attempts=3")
+    out = dagger(tmp_path, *QUICK, "--episode_seed=10", "--num_episodes=5", "--max_attempts=3")
     assert "needed no help in 3 attempts in a row" in "".join(capfd.readouterr())
     assert seeds(tmp_path) == [10]
     assert (out / "checkpoints/last/pretrained_model/model.safetensors").is_file()
@@ -193,7 +194,7 @@ def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, monkeypatch, capfd):
 
 def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
     shutil.copytree(finished / "corrections", tmp_path / "corrections")
-    dagger(tmp_path, *QUICK, "--episodes=4")
+    dagger(tmp_path, *QUICK, "--num_episodes=1")
     before, after = seeds(finished), seeds(tmp_path)
     assert after[:3] == before
     assert len(after) == 4
@@ -206,9 +207,9 @@ def test_the_interventions_of_another_run_are_appended_to(finished, tmp_path):
 def test_without_an_environment_it_learns_from_what_is_there_but_for_the_beginning_of_corrections(
     finished, tmp_path, capfd
 ):
-    corrected = ("--episodes=0", f"--interventions.root={finished / 'corrections'}")
+    corrected = ("--num_episodes=0", f"--interventions.root={finished / 'corrections'}")
     for options, n in (((), 3), (("--skip_s=0",), 9)):  # three corrections of 3 frames, a memory of 2
-        out = dagger(tmp_path / str(n), *corrected, "--updates=5", *options, env=())
+        out = dagger(tmp_path / str(n), *corrected, "--steps=5", *options, env=())
         said = capfd.readouterr()
         assert "No correction is longer" not in said.err
         assert f"Corrections: {n} of 9 frames that the expert chose are learned from" in said.out
@@ -224,7 +225,7 @@ def test_it_learns_from_what_lerobots_rollout_recorded_and_nothing_of_what_the_p
     for by_policy in (0.0, 5.0):
         folder = tmp_path / str(by_policy)
         rollout_dataset(folder / "rollout", (20, 14), lambda step: 5 <= step < 12, use_videos=True, by_policy=by_policy)
-        recorded = ("--episodes=0", "--updates=2", f"--interventions.root={folder / 'rollout'}")
+        recorded = ("--num_episodes=0", "--steps=2", f"--interventions.root={folder / 'rollout'}")
         dagger(folder, *recorded, env=())
         assert metrics(folder, "round")[-1]["loss_interventions"] > 0
         learned.append(weights(folder))

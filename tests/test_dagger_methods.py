@@ -29,7 +29,7 @@ from lerobot_playbyear.training.learner import Learner
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-RUN = (*QUICK, "--episodes=2", "--warmup_episodes=1")
+RUN = (*QUICK, "--num_episodes=2", "--warmup_episodes=1")
 SHOWN = {"n_expert_steps": 8, "n_takeovers": 1, "n_switches": 1, "autonomy": 0.0, "person_seconds": 0.4}
 """What an attempt of which the expert makes all 8 steps costs."""
 
@@ -111,7 +111,7 @@ def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, capfd, k
 
 def test_what_a_policy_solves_alone_is_not_shown_and_what_it_fails_at_unseen_is(tmp_path, monkeypatch):
     monkeypatch.setattr(Quick, "wants_control", lambda self, *_: setattr(self, "n", self.n + 1) is not None)
-    seeds = ("--episodes=1", "--max_attempts=2", "--episode_seed=9998")  # those that 3 divides end as failures
+    seeds = ("--num_episodes=1", "--max_attempts=2", "--episode_seed=9998")  # those that 3 divides end as failures
     with pytest.raises(PlaybyearError, match="2 of 3 attempts in a row failed"):
         dagger(tmp_path, *QUICK, "--method.type=redo", *seeds)
     told = [(line["outcome"], line["n_expert_steps"]) for line in metrics(tmp_path, "attempt")]
@@ -124,7 +124,7 @@ ALONE = (*GATED, "--method.redo_failed=false")
 
 
 def test_a_robot_asks_once_its_first_attempts_are_made_and_leaves_the_rest_to_the_expert(tmp_path):
-    dagger(tmp_path, *QUICK, *ALONE, "--episodes=2", "--max_attempts=30")
+    dagger(tmp_path, *QUICK, *ALONE, "--num_episodes=2", "--max_attempts=30")
     attempts = metrics(tmp_path, "attempt")
     assert [line["n_asked_steps"] for line in attempts[:2]] == [0, 0]
     asked = [line for line in attempts if line["n_calls"]]
@@ -145,7 +145,7 @@ def succeeds_from_the_first_step_on(expert):
 def test_what_fails_although_the_robot_may_ask_is_shown_from_its_first_step(tmp_path, monkeypatch, kills):
     """Of two attempts that the policy makes alone one fails, and is made good; a run that is killed on the way ends alike."""
     monkeypatch.setattr(Quick, "take_over", succeeds_from_the_first_step_on)
-    run = (*QUICK, *GATED, "--episodes=2", "--warmup_episodes=1", "--episode_seed=9998")
+    run = (*QUICK, *GATED, "--num_episodes=2", "--warmup_episodes=1", "--episode_seed=9998")
     dagger(tmp_path / "calm", *run)
     attempts = metrics(tmp_path / "calm", "attempt")
     assert [line["outcome"] for line in attempts[:3]] == ["unneeded", "failed", "kept"]
@@ -167,7 +167,7 @@ def test_new_weights_forget_the_policy_and_keep_its_normalisation(tmp_path, monk
         return update(parts, *args)
 
     monkeypatch.setattr(Learner, "update", look)
-    offline = ("--episodes=0", "--updates=1", f"--interventions.root={tmp_path / 'corrections'}")
+    offline = ("--num_episodes=0", "--steps=1", f"--interventions.root={tmp_path / 'corrections'}")
     for name, options in (("old", ()), ("new", ("--new_weights=true",)), ("again", ("--new_weights=true",))):
         dagger(tmp_path, *offline, *options, f"--output_dir={tmp_path / name}", env=())
     old, new, again = seen

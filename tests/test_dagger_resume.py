@@ -64,7 +64,7 @@ def test_wherever_it_stops_it_ends_alike(finished, tmp_path, owner, name, after)
 
 def test_attempts_in_vain_count_on_after_a_resume(tmp_path, monkeypatch):
     monkeypatch.setattr(Quick, "verdict", lambda self: Verdict.FAILURE if self.n >= self.n_steps else None)
-    run = (*QUICK, "--episodes=1", "--max_attempts=3")
+    run = (*QUICK, "--num_episodes=1", "--max_attempts=3")
     with monkeypatch.context() as patch:
         fail_once(patch, folder_module.RunFolder, "commit", 3)  # the third attempt does not count
         with pytest.raises(PowerCut):
@@ -103,8 +103,8 @@ def test_a_policys_options_stay_until_there_is_a_checkpoint(tmp_path, monkeypatc
 
 
 def test_more_episodes_go_on_with_a_finished_run_that_asked_for_it(finished, tmp_path):
-    dagger(tmp_path, *RUN, "--episodes=2", "--resume=true")  # where there is none yet
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=3")
+    dagger(tmp_path, *RUN, "--num_episodes=2", "--resume=true")  # where there is none yet
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=3")
     assert seeds(tmp_path) == seeds(finished)
     ours, theirs = weights(tmp_path), weights(finished)
     assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
@@ -126,17 +126,17 @@ def test_only_one_run_works_in_a_folder(tmp_path):
 
 def test_resuming_another_run_names_the_differences(finished, tmp_path):
     shutil.copytree(finished / "out", tmp_path / "out", symlinks=True)
-    changed = ("--env.task=OccludedPickPlace-v1", "--demos.repo_id=other/demos", "--expert.n_steps=9")
-    more = ("--episode_seed=5", "--policy.path=elsewhere", "--episodes=0", "--updates=5")
+    changed = ("--env.task=OccludedPickPlace-v1", "--dataset.repo_id=other/demos", "--expert.n_steps=9")
+    more = ("--episode_seed=5", "--policy.path=elsewhere", "--num_episodes=0", "--steps=5")
     with pytest.raises(PlaybyearError, match="holds another run: ") as refused:
         dagger(tmp_path, "--resume=true", *QUICK, *changed, *more)
     for difference in (
         r"--env was .*OccludedGrasp-v1.* and is .*OccludedPickPlace-v1",
-        r"--demos was .*tests/demos.* and is .*other/demos",
+        r"--dataset was .*tests/demos.* and is .*other/demos",
         r"--expert was .*'n_steps': 8.* and is .*'n_steps': 9",
         "--episode_seed was 10000 and is 5",
         "--policy.path was .*pretrained_model and is elsewhere",
-        "--episodes was 3 and is 0",
+        "--num_episodes was 3 and is 0",
     ):
         assert re.search(difference, str(refused.value))
 
@@ -147,7 +147,7 @@ def test_a_dataset_that_something_else_changed_is_refused(finished, tmp_path):
     state["kept"] = state["round"] = 5
     (tmp_path / "out/dagger_state.json").write_text(json.dumps(state))
     with pytest.raises(PlaybyearError, match="holds 3 attempts, and this run knows of 5"):
-        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=8")
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=8")
 
 
 # `checkpoints/best`: the weights of the best evaluation, which are kept until a better one comes
@@ -185,30 +185,30 @@ def test_the_best_evaluation_keeps_its_weights(tmp_path, gives, monkeypatch, cap
     with monkeypatch.context() as patch:
         patch.setattr(folder_module.RunFolder, "clean", cut_after_the_best)
         with pytest.raises(PowerCut):
-            dagger(tmp_path, *EVALUATED, "--episodes=3")  # evaluated after 0, 2 and 3 attempts
+            dagger(tmp_path, *EVALUATED, "--num_episodes=3")  # evaluated after 0, 2 and 3 attempts
     third = (checkpoints / state(tmp_path)["checkpoint"]).resolve()
     gives += [20, 50]
-    best, last = go_on("--episodes=5")
+    best, last = go_on("--num_episodes=5")
     assert (best, last.name) == (third, state(tmp_path)["checkpoint"])
     assert (best / "pretrained_model/model.safetensors").is_file()  # though it is no milestone
     assert best != last
     assert f"Best:        60.0 % of them: {checkpoints / 'best/pretrained_model'}" in capfd.readouterr().out
 
     gives += [60, 50]  # of equal ones the last
-    best, last = go_on("--episodes=7")
+    best, last = go_on("--num_episodes=7")
     assert best not in (third, last)
     assert not third.exists()
     shutil.rmtree(best)  # to make room
     gives += [40]
     capfd.readouterr()
-    best, last = go_on("--episodes=8")
+    best, last = go_on("--num_episodes=8")
     assert best == last
     assert "Best:" not in capfd.readouterr().out
 
 
 def test_the_policy_that_a_run_began_with_may_be_the_best_and_other_episodes_are_evaluated(tmp_path, gives, capfd):
     gives += [30, 20]
-    dagger(tmp_path, *EVALUATED, "--episodes=1")
+    dagger(tmp_path, *EVALUATED, "--num_episodes=1")
     assert not (tmp_path / "out/checkpoints/best").is_symlink()
     assert f"Best:        30.0 % of them: {state(tmp_path)['policy_path']}" in capfd.readouterr().out
     gives += [40]
@@ -264,7 +264,7 @@ def test_killed_twenty_times_it_ends_complete_and_alike(commands, tmp_path):
         "--eval.n_episodes=2",
         "--warmup_episodes=2",
         "--updates_per_episode=20",
-        "--episodes=8",  # of which each takes some attempts: no machine has ended before the twentieth kill
+        "--num_episodes=8",  # of which each takes some attempts: no machine has ended before the twentieth kill
         "--env.episode_length=200",  # in less the expert rescues nobody
         "--max_attempts=1000",  # attempts in vain count on after each kill
     )
@@ -293,13 +293,13 @@ def test_a_full_disk_is_reported_and_harms_nothing(tmp_path):
     """It has no room for a checkpoint; `test_failed_saves.py` has the episodes."""
     message = r"Cannot write to .*out.*What was saved before is complete.*--resume=true"
     run = (*RUN, "--env.episode_length=70", "--expert.n_steps=60")
-    dagger(tmp_path, *run, "--episodes=2")
+    dagger(tmp_path, *run, "--num_episodes=2")
     before = weights(tmp_path), seeds(tmp_path)
     with small_disk(300_000), pytest.raises(PlaybyearError, match=message):
-        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=4")
+        command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=4")
     assert seeds(tmp_path)[:2] == before[1]
     assert all(torch.equal(weights(tmp_path)[key], before[0][key]) for key in before[0])
     assert not list((tmp_path / "out/checkpoints").glob("*.partial"))
 
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=3")
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=3")
     assert_complete(tmp_path, 3)

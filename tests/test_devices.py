@@ -237,8 +237,8 @@ def test_a_training_saves_resumes_and_acts(device, script, dtype, noise, tmp_pat
 
 @on_devices
 def test_hg_dagger_saves_and_goes_on(device, tmp_path):
-    dagger(tmp_path, *QUICK, "--episodes=1", f"--policy.device={device}")
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=2")
+    dagger(tmp_path, *QUICK, "--num_episodes=1", f"--policy.device={device}")
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=2")
 
     last = load_file(tmp_path / "out/checkpoints/last" / MODEL)
     assert all(value.isfinite().all() for value in last.values())

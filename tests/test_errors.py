@@ -32,11 +32,11 @@ BASE = {
     "--output_dir={out}/train",
     "train act": "playbyear-train --policy.type=act --policy.push_to_hub=false --dataset.repo_id=t/noise "
     "--dataset.root={noise} --output_dir={out}/train",
-    "dagger": f"playbyear-dagger {' '.join(ENV)} --policy.path={{policy}} --demos.repo_id=tests/demos "
-    "--demos.root={demos} --interventions.repo_id=t/corrections --interventions.root={out}/corrections --eval_every=0 "
+    "dagger": f"playbyear-dagger {' '.join(ENV)} --policy.path={{policy}} --dataset.repo_id=tests/demos "
+    "--dataset.root={demos} --interventions.repo_id=t/corrections --interventions.root={out}/corrections --eval_every=0 "
     "--batch_size=4 --warmup_episodes=1 --updates_per_episode=2 --output_dir={out}/dagger",
-    "learn": "playbyear-dagger --policy.path={policy} --demos.repo_id=tests/demos --demos.root={demos} "
-    "--interventions.repo_id=t/corrections --interventions.root={demos} --episodes=0 --updates=2 --batch_size=4 "
+    "learn": "playbyear-dagger --policy.path={policy} --dataset.repo_id=tests/demos --dataset.root={demos} "
+    "--interventions.repo_id=t/corrections --interventions.root={demos} --num_episodes=0 --steps=2 --batch_size=4 "
     "--output_dir={out}/dagger",
     "attach-audio": "playbyear-attach-audio --dataset.repo_id=t/silent --dataset.root={silent} --output.repo_id=t/heard "
     "--output.root={out}/heard --files={sounds}/{{episode:03d}}.wav --microphone=gripper --offset=0.25",
@@ -60,6 +60,10 @@ train | --steps=many | steps | 'many' into an int
 train | --steps | --steps needs a value
 train | cpu | 'cpu' is no option
 train | -dataset.repo_id | --dataset.repo_id is needed
+record | --robot.type=so101_follower | lerobot-record --robot.type=so101_follower | type: microphone | playbyear-attach-audio
+record | --robot.port=/dev/ttyUSB7 --robot.type=koch_follower | --robot.type=koch_follower --robot.port=/dev/ttyUSB7
+dagger | --teleop.type=so100_leader | lerobot-rollout --strategy.type=dagger | --teleop.type=so100_leader | --expert.teleop.type
+video | --robot.type=so101_follower | lerobot-rollout --robot.type=so101_follower
 # Places
 record | --dataset.root={noise} | {noise} already holds a dataset | --resume=true
 record | --dataset.root={full} --resume=true | There is no LeRobotDataset in '{full}': | it holds thesis.tex
@@ -70,7 +74,7 @@ train | --output_dir={full} | {full} already exists | resume
 train | --output_dir={file}/run | --output_dir={file}/run cannot be written: Not a directory | wanted
 train | --dataset.root={truncated} | file-000.parquet' is truncated | playbyear-repair --root={truncated}
 dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagger
-dagger | --interventions.root={demos} | --demos and --interventions are the same dataset | of their own
+dagger | --interventions.root={demos} | --dataset and --interventions are the same dataset | of their own
 dagger | --interventions.root={out}/dagger | --output_dir={out}/dagger lies in the folder of --interventions
 attach-audio | --output.root={noise} | {noise} | is there already
 attach-audio | --dataset.root={out}/no | There is no LeRobotDataset in '{out}/no': it does not exist
@@ -108,6 +112,7 @@ record | '--env.task_options={{colour: blue}}' | {'colour': 'blue'} | OccludedGr
 record | --env.spectrogram={noise} | {noise} | names no pictures of sound
 # Recording
 record | --dataset.num_episodes=0 | --dataset.num_episodes=0: give at least 1
+record | --dataset.fps=30 | --dataset.fps=30, but the environment runs at 20 | leave it out
 record | --seed=-1 | --seed=-1: give 0 or more
 record | --dataset.rgb_encoder.vcodec=h264 | --dataset.rgb_encoder | give --dataset.video=true
 record | --expert.type=test | --expert.type | test | scripted
@@ -130,11 +135,11 @@ train | --policy.audio_window_s=0.5 | audio_window_s | too few for 4 convolution
 train | --policy.audio_encoder=nobody | --policy.audio_encoder=nobody | spectrogram_cnn | lerobot_policy_
 train | --policy.audio_noise_db=18 --policy.audio_noise_files={out}/no | files={out}/no | no such folder
 # Corrections
-dagger | -env.type -env.task -env.image_size | give --env.type and --env.task, or --episodes=0 --updates=N
+dagger | -env.type -env.task -env.image_size | give --env.type and --env.task, or --num_episodes=0 --steps=N
 dagger | -policy.path | HG-DAgger improves a trained policy: give | --policy.path
 dagger | --batch_size=5 | --batch_size=5 must be even
-dagger | --updates=5 | --updates is for --episodes=0
-dagger | --episodes=0 | give --updates
+dagger | --steps=5 | --steps is for --num_episodes=0
+dagger | --num_episodes=0 | give --steps
 dagger | --eval_every=1 --eval.n_episodes=0 | --eval.n_episodes=0: give at least 1, or --eval_every=0
 dagger | --new_weights=true | --new_weights=true: a policy that knows nothing cannot be corrected
 dagger | --method.type=redo --skip_s=1 | --skip_s=1 | --method.type=redo the expert chooses every frame
@@ -142,14 +147,13 @@ dagger | --method.type=robot_gated --method.intervention_share=1.5 | interventio
 dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
 dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --policy.path
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
-dagger | --demos.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
-dagger | --demos.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)
+dagger | --dataset.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
+dagger | --dataset.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)
 dagger | --policy.path={act} | the type 'act' | --policy.type=playbyear | lerobot-rollout
 dagger | WORLD_SIZE=2 | 2 processes were started, and playbyear-dagger works in one
 dagger | --env.task=TellApart-v1 --method.type=no_handback | TellApart-v1 | no_handback needs one | --method.type=redo
 dagger | --env.task=TellApart-v1 --method.type=redo --expert.person=true | `intervention_gate()` | own_expert.py
 dagger | --output_dir={finished}/out | {finished}/out holds a run already | --resume=true
-dagger | --interventions.root={finished}/corrections --episodes=1 | holds 3 attempts already, and --episodes=1
 learn | --method.type=redo --interventions.root={finished}/corrections | frames that the policy chose | another --method.type
 learn | --interventions.root={untagged} | wanted 'intervention', bool (1,), and there is no such feature
 learn | --interventions.root={uncorrected} | None of the 5 frames | has 'intervention' set

@@ -97,7 +97,7 @@ def test_the_card_says_what_is_in_the_dataset(pushed, hub):
     assert "`observation.images.front`: 16 x 16 x 3, image" in card
     assert "`observation.audio.gripper`: 16,000 Hz, 800 samples a frame, int16" in card
     assert f"{hub.url}/datasets/{DATASET}/resolve/main/preview.mp4" in card
-    assert "playbyear-train --policy.type=playbyear --policy.fps=20" in card
+    assert f"playbyear-train --preset=cpu --dataset.repo_id={DATASET} --output_dir=" in card
 
 
 def test_the_film_beside_the_card_has_pictures_and_sound(pushed, hub, tmp_path):
@@ -214,13 +214,13 @@ def test_a_corrected_policy_goes_up_from_dagger(trained, recorded, hub, commands
         f"--policy.path={trained}",
         "--policy.push_to_hub=true",
         "--policy.repo_id=tester/corrected",
-        "--demos.repo_id=tests/demos",
-        f"--demos.root={recorded}",
+        "--dataset.repo_id=tests/demos",
+        f"--dataset.root={recorded}",
         "--interventions.repo_id=tester/corrections",
         f"--interventions.root={tmp_path / 'corrections'}",
         f"--output_dir={tmp_path / 'dagger'}",
         *ENV,
-        *("--episodes=1", "--updates_per_episode=1", "--warmup_episodes=1", "--batch_size=2", "--eval_every=0"),
+        *("--num_episodes=1", "--updates_per_episode=1", "--warmup_episodes=1", "--batch_size=2", "--eval_every=0"),
     )
     weights = (tmp_path / "dagger" / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").read_bytes()
     assert hub.model("tester/corrected").files()["model.safetensors"].data == weights

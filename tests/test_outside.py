@@ -108,12 +108,12 @@ def test_training_writes_through_no_link(recorded, trained, tmp_path, secret, na
 
 
 def test_dagger_removes_only_checkpoints_of_its_own(tmp_path):
-    dagger(tmp_path, *QUICK, *FINISHED, "--episodes=2")
+    dagger(tmp_path, *QUICK, *FINISHED, "--num_episodes=2")
     first = state(tmp_path)["checkpoint"]
     checkpoints = tmp_path / "out/checkpoints"
     for name in ("holiday_pictures", "000000"):
         (checkpoints / name).mkdir()
-    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--episodes=3")
+    command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=3")
     last = state(tmp_path)["checkpoint"]
     assert last != first
     names = {path.name for path in checkpoints.iterdir()}

@@ -106,11 +106,11 @@ class Remembering(PolicyActor):
 
 def test_an_override_is_recorded_on_exactly_the_held_frames_and_the_arm_moves_as_the_keys_say(screen):
     env_cfg = env_config(episode_length=36)
-    held = {"space": (6, 30), "Right": (7, 13), "Up": (15, 21), "d": (23, 28)}
+    held = {"Tab": (6, 30), "Right": (7, 13), "Up": (15, 21), "d": (23, 28)}
     shown = {3: Control.POLICY, 18: Control.PERSON, 34: Control.POLICY}
     env = Person(env_spec(env_cfg).make(), screen, held, shown)
     actor = Remembering(env_cfg)
-    env.expert = TeleopExpertConfig(begin_paused=False, play_sound=False).make(env)
+    env.expert = TeleopExpertConfig(begin_paused=False, takeover="hold", play_sound=False).make(env)
     try:
         screen.focus(screen.window(_TITLE))
         episode = play(env, actor, seed=5, expert=env.expert)
@@ -151,12 +151,14 @@ def person_corrects(screen, process, log):
 
     wait_for_state(Control.PAUSED, timeout_s=300)
     screen.focus(screen.window(_TITLE))
-    screen.press("p")
+    screen.press("space")
     wait_for_state(Control.POLICY)
-    screen.hold("Right", "space")  # the override inside the movement: what it lets through has both keys
+    screen.hold("Right")
+    screen.press("Tab")
     wait_for_state(Control.PERSON)
     threading.Event().wait(0.7)
-    screen.let_go("space", "Right")
+    screen.press("Tab")
+    screen.let_go("Right")
     wait_for_state(Control.POLICY)
     screen.press("s")
 
@@ -165,7 +167,7 @@ def person_corrects(screen, process, log):
 @pytest.mark.timeout(500)
 def test_playbyear_dagger_learns_from_a_person_at_lerobots_keyboard(screen, tmp_path):
     kind = "keyboard_ee" if find_spec("pynput") else "keyboard_window"
-    options = ("--expert.type=teleop", f"--expert.teleop.type={kind}", "--episodes=1", "--env.episode_length=2000")
+    options = ("--expert.type=teleop", f"--expert.teleop.type={kind}", "--num_episodes=1", "--env.episode_length=2000")
     program = "from lerobot_playbyear.scripts.commands import dagger; dagger()"
     command = [sys.executable, "-c", program, *arguments(tmp_path, *options)]
     log = tmp_path / "log.txt"
@@ -204,7 +206,7 @@ def demonstrate(screen):
     screen.focus(screen.window(_TITLE))
     for ending in ("r", "s"):
         wait_for(lambda: state_shown(screen) is Control.PAUSED, 60)
-        screen.press("p")
+        screen.press("space")
         wait_for(lambda: state_shown(screen) is Control.PERSON)
         screen.hold("Up")
         threading.Event().wait(0.6)

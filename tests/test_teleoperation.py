@@ -4,11 +4,14 @@ import copy
 import json
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import draccus
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
+from lerobot.rollout.configs import DAggerKeyboardConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
 from lerobot.teleoperators.gamepad import GamepadTeleopConfig
 from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleopConfig, KeyboardTeleop, KeyboardTeleopConfig
@@ -27,8 +30,13 @@ from lerobot_playbyear.teleoperation.config import TeleopExpertConfig, connect_t
 from lerobot_playbyear.teleoperation.controls import (
     CLOSE,
     DELTAS,
+    KEYS,
+    MOVES,
     OPEN,
+    OVERRIDE,
+    PAUSE,
     STAY,
+    TAKEN,
     ActionMapping,
     Controls,
     KeyboardWindowTeleop,
@@ -188,6 +196,21 @@ def test_what_is_typed_into_other_windows_moves_nothing():
     assert (wish.overrides, wish.verdict, wish.action["delta_x"]) == (True, Verdict.SUCCESS, 1)
 
 
+def test_the_keys_are_lerobots_and_the_page_and_the_panel_say_what_they_do():
+    lerobots = DAggerKeyboardConfig()
+    assert (lerobots.pause_resume, lerobots.correction) == (PAUSE, OVERRIDE)
+    letters = {name.strip().lower() for label in KEYS for name in label.split(",")}
+    arrows = {"up", "down", "left", "right"}
+    names = {"escape": "esc", **dict.fromkeys(arrows, "arrows")}
+    assert {names.get(name, name) for name in (*TAKEN, *MOVES, OVERRIDE)} == letters
+    page = (Path(__file__).parents[1] / "docs/teleoperation.md").read_text()
+    for label, meaning in KEYS.items():
+        assert f"| {label} | {meaning} |" in page
+    window = Screenless()
+    make_person(make_env(), window)
+    assert dict(window.shown[-1][0].keys) == KEYS
+
+
 # The expert in an environment
 
 
@@ -262,7 +285,7 @@ def play(script, teleop=None, env=None, beside=lambda person: person, **how):
 @pytest.mark.parametrize(("takeover", "begin", "end"), [("hold", holding, letting_go), ("toggle", tapping, tapping)])
 def test_the_person_acts_on_exactly_the_steps_in_which_the_key_is_held(takeover, begin, end):
     """Or between two presses."""
-    presses = {4: holding("right"), 5: begin("space"), 12: end("space"), 15: letting_go("right")}
+    presses = {4: holding("right"), 5: begin("tab"), 12: end("tab"), 15: letting_go("right")}
     attempt, window = play(presses, takeover=takeover)
     flags = attempt.interventions
     assert np.flatnonzero(flags).tolist() == list(range(5, 12))
@@ -289,28 +312,50 @@ def test_a_teleoperators_events_take_over_with_its_own_action_and_end_the_attemp
 
 
 def test_a_pause_stops_the_simulation_and_nothing_else():
-    held = {5: holding("space", "right"), 12: letting_go("space")}
+    held = {4: holding("right"), 5: tapping("tab"), 12: tapping("tab")}
     without, _ = play(held)
-    paused, window = play({**held, 8: tapping("p"), "paused": tapping("p")})
+    paused, window = play({**held, 8: tapping("space"), "paused": tapping("space")})
     assert window.n_pauses == 3
     np.testing.assert_array_equal(paused.actions, without.actions)
     last = [attempt.observations[-1]["agent_pos"] for attempt in (paused, without)]
     np.testing.assert_array_equal(*last)
 
 
+def test_in_a_pause_the_key_that_takes_over_goes_on_with_the_person():
+    attempt, window = play({8: tapping("space"), "paused": tapping("tab")})
+    assert window.n_pauses == 3
+    assert np.flatnonzero(attempt.interventions).tolist() == list(range(8, 30))
+
+
+@pytest.mark.parametrize("solved", [False, True])
+def test_an_attempt_that_is_ended_counts_as_the_environment_judges(solved):
+    class Judging(gym.Wrapper):
+        def step(self, action):
+            *rest, info = super().step(action)
+            return *rest, {**info, "is_success": solved}
+
+    attempt, _ = play({4: tapping("enter")}, env=Judging(make_env()))
+    assert (len(attempt), attempt.success) == (5, solved)
+
+
 @pytest.mark.parametrize(
     ("name", "verdict", "outcome"),
-    [("s", Verdict.SUCCESS, "kept"), ("q", Verdict.FAILURE, "failed"), ("r", Verdict.DISCARD, "discarded")],
+    [
+        ("s", Verdict.SUCCESS, "kept"),
+        ("f", Verdict.FAILURE, "failed"),
+        ("enter", Verdict.ENDED, "failed"),
+        ("r", Verdict.DISCARD, "discarded"),
+    ],
 )
 def test_an_attempt_ends_when_the_person_says_so(name, verdict, outcome):
-    attempt, _ = play({5: holding("space", "up"), 9: tapping(name)})
+    attempt, _ = play({5: holding("tab", "up"), 9: tapping(name)})
     assert (attempt.verdict, Method().outcome(attempt), len(attempt)) == (verdict, outcome, 10)
     assert attempt.success == (verdict is Verdict.SUCCESS)
 
 
 def test_the_gripper_key_closes_and_opens_it_with_the_cool_down_between():
     presses = {3: tapping("g"), 20: tapping("g"), 45: tapping("g"), 50: tapping("g")}
-    attempt, window = play({0: holding("space"), **presses}, env=make_env(52))
+    attempt, window = play({0: tapping("tab"), **presses}, env=make_env(52))
     commands = attempt.actions[:, 3]
     assert (np.flatnonzero(np.diff(commands)) + 1).tolist() == [3, 45]
     assert commands[:3].tolist() == [-1] * 3
@@ -334,7 +379,7 @@ def test_a_demonstration_is_the_persons_from_start_to_end():
 def test_what_was_pressed_before_an_attempt_is_not_meant_for_it():
     env, window = make_env(), Screenless()
     expert = make_person(env, window)
-    press(window.keys, "s", "g", "p", "right", "space")
+    press(window.keys, "s", "g", "enter", "right", "space", "tab")
     attempt = play_episode(env, Nobody(), seed=3, expert=expert)
     assert (attempt.verdict, len(attempt), attempt.intervention_share) == (None, 30, 0)
     press(window.keys, "escape")
@@ -374,7 +419,7 @@ class Asking:
 def test_the_robot_calls_and_a_person_who_came_is_called_no_more(monkeypatch):
     rings = []
     monkeypatch.setattr(Speaker, "ring", lambda speaker: rings.append(True))
-    held = {7: holding("space"), 13: letting_go("space")}
+    held = {7: tapping("tab"), 13: tapping("tab")}
     attempt, window = play(held, beside=lambda person: Asked(person, Asking()))
     shown = [status.control for status, picture in window.shown if picture is not None]
     assert np.flatnonzero(attempt.interventions).tolist() == list(range(7, 13))

@@ -64,7 +64,7 @@ class BalancedBatches:
         if not weights.any():
             raise InputError(
                 f"None of the {len(attempts)} frames of the intervention dataset has '{INTERVENTION}' set: there is "
-                "nothing to learn from an expert. Give a dataset of corrections, or collect some with --episodes."
+                "nothing to learn from an expert. Give a dataset of corrections, or collect some with --num_episodes."
             )
         self._attempts, self._from_attempts = attempts, RunSampler(weights, self._seed + 1)
 

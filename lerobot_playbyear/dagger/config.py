@@ -37,7 +37,7 @@ class DaggerConfig:
     """Options of `playbyear-dagger`.
 
     Attributes:
-        demos: Demonstrations, which half of each batch comes from: those that the policy was trained on.
+        dataset: Demonstrations, which half of each batch comes from: those that the policy was trained on.
         interventions: Where attempts with corrections are kept; created, or appended to.
         policy: What is improved, `--policy.path`; its normalisation stays as it is. `--policy.push_to_hub` and
             `--policy.repo_id` as in lerobot-train.
@@ -48,12 +48,13 @@ class DaggerConfig:
             own last movements, it mistakes the expert's retreat for the next step of the task. Shorter corrections are not
             learned from at all, unless all are shorter; one that an episode begins with is learned from whole. None: as long
             as the policy remembers, or 0 with `--method.type=redo`.
-        new_weights: With `episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation stays.
-        episodes: Attempts that the intervention dataset shall hold in the end. 0: none are collected and no environment is
-            needed, see `updates`.
+        new_weights: With `num_episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation
+            stays.
+        num_episodes: Attempts that the run keeps, those before a resume included, as `steps` counts updates. 0: none are
+            collected and no environment is needed, see `steps`.
         updates_per_episode: Updates after each kept attempt.
         warmup_episodes: Attempts that the dataset holds before the first updates.
-        updates: With `episodes=0`, how many updates to make from the corrections that are there.
+        steps: With `num_episodes=0`, how many updates to make from the corrections that are there.
         batch_size: Runs of windows per update, half of them from the demonstrations.
         learning_rate: Of Adam, the largest of each round. None: the policy's own (`optimizer_lr`). A smaller one leaves a
             policy that knows its demonstrations by heart where it is.
@@ -75,7 +76,7 @@ class DaggerConfig:
         wandb: As in lerobot-train.
     """
 
-    demos: DatasetPlace
+    dataset: DatasetPlace
     interventions: DatasetPlace
     policy: PreTrainedConfig | None = None
     env: EnvConfig | None = None
@@ -83,10 +84,10 @@ class DaggerConfig:
     method: Method = field(default_factory=HgDagger)
     skip_s: float | None = None
     new_weights: bool = False
-    episodes: int = 25
+    num_episodes: int = 25
     updates_per_episode: int = 100
     warmup_episodes: int = 5
-    updates: int = 0
+    steps: int = 0
     batch_size: int = 24
     learning_rate: float | None = None
     anneal: bool = True
@@ -111,7 +112,7 @@ class DaggerConfig:
     @property
     def is_online(self) -> bool:
         """Whether attempts are collected."""
-        return self.episodes > 0
+        return self.num_episodes > 0
 
     @property
     def eval_seeds(self) -> range:
@@ -130,14 +131,14 @@ class DaggerConfig:
             raise InputError(f"--eval.n_episodes={self.eval.n_episodes}: give at least 1, or --eval_every=0 for none.")
         if self.batch_size < 2 or self.batch_size % 2:
             raise InputError(f"--batch_size={self.batch_size} must be even: half of each batch are demonstrations.")
-        if self.is_online and self.updates:
-            raise InputError("--updates is for --episodes=0; with episodes give --updates_per_episode.")
-        if not self.is_online and not self.updates:
-            raise InputError("--episodes=0 collects nothing: give --updates, how many to make from what is there.")
+        if self.is_online and self.steps:
+            raise InputError("--steps is for --num_episodes=0; with episodes give --updates_per_episode.")
+        if not self.is_online and not self.steps:
+            raise InputError("--num_episodes=0 collects nothing: give --steps, how many updates to make.")
         self._check_method()
         if self.is_online and self.env is None:
             raise InputError(
-                "No environment: give --env.type and --env.task, or --episodes=0 --updates=N to learn from recorded "
+                "No environment: give --env.type and --env.task, or --num_episodes=0 --steps=N to learn from recorded "
                 "corrections alone."
             )
 
@@ -153,7 +154,7 @@ class DaggerConfig:
         if self.new_weights and self.is_online:
             raise InputError(
                 "--new_weights=true: a policy that knows nothing cannot be corrected. Collect attempts first, and then learn "
-                "from all of them with --episodes=0 --updates=N --new_weights=true and another --output_dir."
+                "from all of them with --num_episodes=0 --steps=N --new_weights=true and another --output_dir."
             )
 
     def n_skipped(self, fps: float) -> int:
@@ -178,7 +179,7 @@ class DaggerConfig:
         if not self.anneal:
             return rate
         if not self.is_online:  # rounds are there to be saved; nobody acts in between
-            number, n_updates = step, self.updates
+            number, n_updates = step, self.steps
         done = min(1.0, (step - number) / self.total_updates(n_before))
         return rate * (1 - 0.9 * done) * 0.5 * (1 + math.cos(math.pi * number / n_updates))
 
@@ -191,18 +192,19 @@ class DaggerConfig:
         return float(self.policy.get_optimizer_preset().lr)
 
     def total_updates(self, n_before: int = 0) -> int:
-        """Updates of a run that keeps all attempts it is asked for, from a dataset that held `n_before`."""
-        n_rounds = max(self.episodes - max(n_before, self.warmup_episodes - 1), 1)
-        return self.updates or n_rounds * self.updates_per_episode
+        """Updates of a run that keeps all attempts it is asked for, in a dataset that held `n_before`."""
+        n_rounds = max(self.num_episodes - max(self.warmup_episodes - 1 - n_before, 0), 1)
+        return self.steps or n_rounds * self.updates_per_episode
 
     def training(self) -> PlaybyearTrainConfig:
         """The same as options of playbyear-train, for what HG-DAgger shares with it."""
-        shared = vars(self).keys() & {option.name for option in fields(PlaybyearTrainConfig)}  # they mean the same
+        shared = vars(self).keys() & {option.name for option in fields(PlaybyearTrainConfig)}  # they mean the same,
+        shared -= {"dataset", "steps"}  # but for these
         assert self.policy is not None
         optimizer = self.policy.get_optimizer_preset()
         optimizer.lr = self.largest_rate
         return PlaybyearTrainConfig(
-            dataset=DatasetConfig(self.demos.repo_id, root=self.demos.root),
+            dataset=DatasetConfig(self.dataset.repo_id, root=self.dataset.root),
             steps=self.total_updates(),
             num_workers=0,
             env_eval_freq=0,

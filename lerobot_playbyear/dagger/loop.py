@@ -95,8 +95,8 @@ class Loop:
 
     def _is_complete(self) -> bool:
         if self.scene is None:
-            return self.state.step >= self.cfg.updates
-        return self.corrections.n_episodes >= self.cfg.episodes and self.state.kept == self.state.round
+            return self.state.step >= self.cfg.steps
+        return self.state.kept >= self.cfg.num_episodes and self.state.kept == self.state.round
 
     # Attempts
 
@@ -195,7 +195,10 @@ class Loop:
         state, outcome = self.state, figures["outcome"]
         state.attempts += 1
         setattr(state, outcome, getattr(state, outcome) + 1)
-        state.next_seed = figures["seed"] + 1
+        is_repeated = (
+            outcome == "discarded" and self.scene is not None and self.scene.expert.decides
+        )  # a person asks for it
+        state.next_seed = figures["seed"] + (not is_repeated)
         is_to_show = outcome == "failed" and self.method.shows_failures and state.to_show is None
         state.to_show = figures["seed"] if is_to_show else None
         self.report.write("attempt", figures)
@@ -212,7 +215,7 @@ class Loop:
 
     def _n_updates(self) -> int:
         if self.scene is None:
-            return min(max(self.cfg.updates_per_episode, 1), self.cfg.updates - self.state.step)
+            return min(max(self.cfg.updates_per_episode, 1), self.cfg.steps - self.state.step)
         is_warm = (self.state.first_episodes or 0) + self.state.kept >= self.cfg.warmup_episodes
         return self.cfg.updates_per_episode if is_warm else 0
 

@@ -29,8 +29,8 @@ class Report(Progress):
 
     def __init__(self, cfg: DaggerConfig, training: PlaybyearTrainConfig, folder: RunFolder, state: RunState) -> None:
         training.resume, training.wandb.run_id = state.wandb_run_id is not None, state.wandb_run_id
-        episodes = (cfg.episodes, (state.first_episodes or 0) + state.kept, "episode")
-        counted = episodes if cfg.is_online else (cfg.updates, state.step, "update")
+        episodes = (cfg.num_episodes, state.kept, "episode")
+        counted = episodes if cfg.is_online else (cfg.steps, state.step, "update")
         super().__init__(training, state, *counted, "HG-DAgger")
         training.resume = False  # checkpoints of a resumed run are those of one that was not
         state.wandb_run_id = training.wandb.run_id = self._wandb.cfg.run_id if self._wandb else None

@@ -57,6 +57,8 @@ def run_dagger(cfg: DaggerConfig) -> Path:
             stack.enter_context(folder.locked())
             state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
             loop = _make_loop(cfg, folder, state, stack)
+        if cfg.is_online:
+            print("Unlike in lerobot-rollout, attempts are not uploaded; playbyear-push does it.")
         loop.run()
     _print_results(cfg, folder, state, loop)
     if cfg.policy is not None and cfg.policy.push_to_hub and state.checkpoint is not None:
@@ -115,7 +117,7 @@ def _followed(policy: str) -> str:
 def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: ExitStack) -> Loop:
     """What the run needs, checked; `stack` closes it."""
     assert isinstance(cfg.policy, PlaybyearConfig)
-    demos = DatasetReader(cfg.demos.repo_id, cfg.demos.root)
+    demos = DatasetReader(cfg.dataset.repo_id, cfg.dataset.root)
     _check_dataset(cfg.policy, demos.meta, cfg.rename_map)
     method = cfg.method
     stack.callback(method.close)
@@ -146,7 +148,7 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     if state.first_episodes is None:
         state.first_episodes = corrections.n_episodes
         state.next_seed = next_seed(cfg.interventions.folder, cfg.episode_seed) if cfg.is_online else 0
-    _check_there_is_something_to_do(cfg, state, corrections)
+    _check_there_is_something_to_do(cfg, corrections)
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = read_store(demos, windows, training)
     corrections.read(windows.keys or [], demonstrations.device, demonstrations.image_size)
@@ -180,17 +182,11 @@ def _forget_all(learner: Learner, seed: int) -> None:
             weights[name].copy_(values)
 
 
-def _check_there_is_something_to_do(cfg: DaggerConfig, state: RunState, corrections: Corrections) -> None:
+def _check_there_is_something_to_do(cfg: DaggerConfig, corrections: Corrections) -> None:
     if not cfg.is_online and corrections.n_episodes == 0:
         raise InputError(
-            f"The intervention dataset '{cfg.interventions.repo_id}' is empty: collect attempts with --episodes, or give one "
-            "that holds some."
-        )
-    n_before = state.first_episodes or 0  # one more may be there, of a run that was killed before it counted
-    if cfg.is_online and state.kept == 0 and n_before >= cfg.episodes:
-        raise InputError(
-            f"The intervention dataset holds {n_before} attempts already, and --episodes={cfg.episodes} asks for "
-            "no more: give a larger number, or --episodes=0 --updates=N to learn from what is there."
+            f"The intervention dataset '{cfg.interventions.repo_id}' is empty: collect attempts with --num_episodes, or give "
+            "one that holds some."
         )
 
 
@@ -216,8 +212,8 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
         best = folder.checkpoints / BEST_LINK / PRETRAINED_MODEL_DIR if state.best["checkpoint"] else state.policy_path
         print(f"Best:        {state.best['success']:.1f} % of them: {printable(best)}")
         print("             The best of several evaluations looks better than it is: evaluate it on other seeds, too.")
-    more = "episodes" if cfg.is_online else "updates"
-    go_on = f"Go on:       playbyear-dagger --resume=true --output_dir={folder.path} --{more}=..."
+    more = f"--num_episodes={2 * cfg.num_episodes}" if cfg.is_online else f"--steps={2 * cfg.steps}"
+    go_on = f"Go on:       playbyear-dagger --resume=true --output_dir={shlex.quote(str(folder.path))} {more}"
     if state.checkpoint is None:
         print(f"No update was made: {_why_none(cfg, state)}.\n{go_on}")
         return
@@ -250,7 +246,7 @@ def _why_none(cfg: DaggerConfig, state: RunState) -> str:
     if state.kept == 0:
         return "no attempt was kept"
     if cfg.updates_per_episode == 0:
-        return "--updates_per_episode=0. To learn from all give --episodes=0 --updates=N and another --output_dir"
+        return "--updates_per_episode=0. To learn from all give --num_episodes=0 --steps=N and another --output_dir"
     return f"--warmup_episodes={cfg.warmup_episodes} is more than the dataset holds"
 
 
@@ -263,10 +259,10 @@ def _check_places(cfg: DaggerConfig) -> None:
     Raises:
         InputError: Attempts would be written among the demonstrations.
     """
-    demos, interventions = (source.folder.resolve() for source in (cfg.demos, cfg.interventions))
+    demos, interventions = (source.folder.resolve() for source in (cfg.dataset, cfg.interventions))
     if cfg.is_online and demos == interventions:
         raise InputError(
-            f"--demos and --interventions are the same dataset, {demos}: attempts would be written among the demonstrations, "
+            f"--dataset and --interventions are the same dataset, {demos}: attempts would be written among the demonstrations, "
             "with what the policy did wrong in them. Give --interventions.repo_id and --interventions.root of their own."
         )
     is_within = cfg.output_dir.resolve().is_relative_to(interventions)

@@ -48,7 +48,7 @@ LOCK = ".lock"
 _NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a checkpoint's folder: one that leads nowhere else
 
 _SAME_RUN = (
-    *("demos", "interventions", "env", "expert", "method", "skip_s", "new_weights", "seed"),
+    *("dataset", "interventions", "env", "expert", "method", "skip_s", "new_weights", "seed"),
     *("episode_seed", "warmup_episodes", "rename_map"),
 )
 """Options that stay as they are when a run goes on."""
@@ -269,8 +269,8 @@ class RunFolder:
         options = json.loads(json.dumps(cfg.options()))
         names = [name for name in _SAME_RUN if saved.get(name) != options[name]]
         changed = [f"--{name} was {_brief(saved.get(name))} and is {_brief(options[name])}" for name in names]
-        if (saved["episodes"] > 0) != cfg.is_online:  # one collects, and the other learns from what is there
-            changed.append(f"--episodes was {saved['episodes']} and is {cfg.episodes}")
+        if (saved["num_episodes"] > 0) != cfg.is_online:  # one collects, and the other learns from what is there
+            changed.append(f"--num_episodes was {saved['num_episodes']} and is {cfg.num_episodes}")
         return changed
 
     # Figures

@@ -25,11 +25,12 @@ Observation = dict[str, Any]
 class Verdict(Enum):
     """How an expert ends an episode before the environment does.
 
-    SUCCESS, FAILURE: It counts as solved, or as not. DISCARD: It counts for nothing; the next one begins.
+    SUCCESS, FAILURE: It counts as solved, or as not. ENDED: as what the environment says. DISCARD: It counts for nothing.
     """
 
     SUCCESS = "success"
     FAILURE = "failure"
+    ENDED = "ended"
     DISCARD = "discard"
 
 
@@ -159,7 +160,8 @@ def play(
         observations.append(observation)
         actions.append(action)
         rewards.append(float(reward))
-        successes.append(verdict is Verdict.SUCCESS or (verdict is None and bool(info["is_success"])))
+        is_open = verdict in (None, Verdict.ENDED)
+        successes.append(verdict is Verdict.SUCCESS or (is_open and bool(info["is_success"])))
         interventions.append(by_expert)
         if watch:
             watched.append(watch())

@@ -3,7 +3,6 @@
 import itertools
 import json
 import logging
-import shlex
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from huggingface_hub import HfApi
 
 from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.markdown import code, text
+from lerobot_playbyear.datasets.next_command import training_command
 from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.film.dataset_film import blocks_of, tile
 from lerobot_playbyear.film.video import compose, film_sound, write_film
@@ -100,8 +100,8 @@ def describe_dataset(dataset: SurveyedDataset, repo_id: str, film_url: str | Non
             "since the previous frame. To hear an episode, with the plugin lerobot-playbyear:",
             _LISTEN.format(repo_id=_quoted(repo_id), microphone=_quoted(dataset.microphones[0])),
             "To train a policy that hears:",
-            f"```bash\nplaybyear-train --policy.type=playbyear --policy.fps={dataset.fps} --policy.push_to_hub=false "
-            f"--dataset.repo_id={shlex.quote(repo_id)}\n```",
+            f"```bash\n{training_command(repo_id, dataset.fps, dataset.features, preset='cpu')}\n```",
+            "On a GPU: `--preset=gpu`.",
         ]
     else:
         parts.append("A plain LeRobotDataset, without sound: every tool that knows LeRobot reads it.")

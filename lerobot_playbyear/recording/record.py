@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.datasets.durable import DurableWriter, check_root
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, errors_of_input
+from lerobot_playbyear.datasets.next_command import training_command
 from lerobot_playbyear.datasets.reader import DatasetPlace
 from lerobot_playbyear.episodes.environment import EnvFacts, env_facts, env_spec
 from lerobot_playbyear.episodes.experts import ExpertConfig, ScriptedExpertConfig
@@ -25,7 +26,6 @@ from lerobot_playbyear.episodes.pool import RolloutPool
 from lerobot_playbyear.hub.push import PushOptions, check_upload, push_dataset
 from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
-_POLICY_FPS = 20  # of a policy that is not told
 _MIN_ATTEMPTS_PER_SUCCESS = 20  # attempts in a row without one success after which recording gives up
 
 
@@ -36,13 +36,15 @@ class RecordDatasetConfig(DatasetPlace):
     Args:
         repo_id: Its name, `user/name`.
         root: Its folder. None: in LeRobot's own cache, under its name.
-        num_episodes: How many successful episodes it shall have.
+        num_episodes: How many successful episodes are recorded, with `resume` beside those that are there.
         video: Whether pictures are encoded as video; otherwise each is stored without loss.
         rgb_encoder: Codec and quality of video, such as `--dataset.rgb_encoder.vcodec=h264`.
         push_to_hub: Whether to upload it when it is complete.
         private: Whether the uploaded repository is private. True: nothing goes to one that is there and public. None: as the
             account's default says.
         tags: For its card on the Hub.
+        single_task: What is done in it, in words. None: what the environment says.
+        fps: Its frames per second, as the environment has them. None: those.
     """
 
     num_episodes: int = 50
@@ -51,6 +53,8 @@ class RecordDatasetConfig(DatasetPlace):
     push_to_hub: bool = False
     private: bool | None = None
     tags: list[str] | None = None
+    single_task: str | None = None
+    fps: int | None = None
 
 
 @dataclass
@@ -61,7 +65,7 @@ class RecordConfig:
         env: The environment, `--env.type=playbyear --env.task=OccludedGrasp-v1`.
         dataset: What is written, and where.
         seed: The first attempt's seed; each further attempt takes the next one.
-        resume: Append to a dataset that is there already, up to `num_episodes`, with the seeds after its largest.
+        resume: Append `num_episodes` to a dataset, if it is there, with the seeds after its largest.
         num_workers: Processes that play. 0: none but this one. None: as many as there are processor cores, at
             most 8. The dataset does not depend on it.
         expert: Who demonstrates: `--expert.type=scripted`, the environment's own script, or `teleop`, a person.
@@ -80,7 +84,7 @@ class RecordConfig:
 
 
 def record(cfg: RecordConfig) -> Path:
-    """Records episodes of a script or of a person until the dataset has as many as asked for; only successes are kept.
+    """Records episodes of a script or of a person until as many are saved as asked for; only successes are kept.
 
     Args:
         cfg: The options.
@@ -100,7 +104,7 @@ def record(cfg: RecordConfig) -> Path:
             check_root(root, resume=cfg.resume)
         with _demonstrations(cfg) as (facts, episodes):
             with errors_of_input():
-                _check_facts(facts, cfg.env)
+                _check_facts(facts, cfg)
                 features = dataset_features(facts, cfg.dataset.video)
                 writer = DurableWriter(
                     cfg.dataset.repo_id,
@@ -111,6 +115,7 @@ def record(cfg: RecordConfig) -> Path:
                     robot_type=cfg.env.type,
                     rgb_encoder=cfg.dataset.rgb_encoder,
                 )
+            _say_what_differs(cfg.dataset)
             with writer:
                 seconds = writer.longest_episode / facts.fps
                 print(f"With the memory that is free an episode can last about {seconds / 60:.0f} min.")
@@ -120,12 +125,8 @@ def record(cfg: RecordConfig) -> Path:
         raise PlaybyearError(f"There is not enough memory to record to {root}. What was saved is complete.") from error
     except OSError as error:
         raise PlaybyearError(f"Cannot write to {root}: {error}") from error
-    fps = f" --policy.fps={facts.fps}" if facts.fps != _POLICY_FPS else ""
     print(f"\nDataset: {root} ({summary})")
-    print(
-        "Train on it: playbyear-train --policy.type=playbyear --policy.push_to_hub=false "
-        f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={root}{fps}"
-    )
+    print(f"Train on it: {training_command(cfg.dataset.repo_id, facts.fps, features, root)}")
     if cfg.dataset.push_to_hub:
         options = PushOptions(cfg.dataset.private, cfg.dataset.tags)
         print(f"On the Hub: {push_dataset(cfg.dataset.repo_id, cfg.dataset.root, options)}")
@@ -173,14 +174,12 @@ def _record_episodes(cfg: RecordConfig, demonstrations: Demonstrations, writer: 
     wanted = cfg.dataset.num_episodes
     first_seed = next_seed(writer.root, cfg.seed)
     attempts = successes = failures_in_a_row = 0
-    with tqdm(total=wanted, initial=writer.num_episodes, unit="episode", desc="Recording") as progress:
-        if writer.num_episodes >= wanted:
-            return
+    with tqdm(total=wanted, unit="episode", desc="Recording") as progress:
         for episode in demonstrations(itertools.count(first_seed)):
             attempts += 1
             failures_in_a_row = 0 if episode.success else failures_in_a_row + 1
             if episode.success:
-                save_episode(episode, writer)
+                save_episode(dataclasses.replace(episode, task=cfg.dataset.single_task or episode.task), writer)
                 successes += 1
                 progress.update()
             progress.set_postfix_str(f"success rate {successes / attempts:.0%} of {attempts} attempts")
@@ -189,7 +188,7 @@ def _record_episodes(cfg: RecordConfig, demonstrations: Demonstrations, writer: 
                     f"The expert failed {failures_in_a_row} times in a row, up to seed {episode.seed}: something is "
                     f"wrong with the task's options. {writer.num_episodes} episodes are saved in {writer.root}."
                 )
-            if writer.num_episodes >= wanted:
+            if successes >= wanted:
                 return
 
 
@@ -208,7 +207,15 @@ def _check_options(cfg: RecordConfig) -> None:
         check_upload("dataset.repo_id", cfg.dataset.repo_id, needs_user=True)
 
 
-def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:
+def _say_what_differs(dataset: RecordDatasetConfig) -> None:
+    """What `lerobot-record` would do otherwise."""
+    differing = [] if dataset.video else ["pictures are stored without loss (else --dataset.video=true)"]
+    differing += [] if dataset.push_to_hub else ["nothing is uploaded (else --dataset.push_to_hub=true)"]
+    print(f"Unlike in lerobot-record, {' and '.join([*differing, 'the name gets no date'])}.")
+
+
+def _check_facts(facts: EnvFacts, cfg: RecordConfig) -> None:
+    env = cfg.env
     if not facts.has_expert:
         raise InputError(
             f"--env.type={env.type} --env.task={env.task} has no scripted expert, so there is nobody to record. "
@@ -216,3 +223,8 @@ def _check_facts(facts: EnvFacts, env: EnvConfig) -> None:
         )
     if facts.fps != env.fps:
         raise InputError(f"--env.fps={env.fps}, but the environment runs at {facts.fps} steps per second: give that.")
+    if cfg.dataset.fps not in (None, facts.fps):
+        raise InputError(
+            f"--dataset.fps={cfg.dataset.fps}, but the environment runs at {facts.fps} steps per second: give that, or leave "
+            "it out."
+        )

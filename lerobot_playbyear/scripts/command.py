@@ -8,6 +8,7 @@ import io
 import json
 import logging
 import os
+import shlex
 import sys
 from collections.abc import Callable, Mapping
 from importlib import metadata
@@ -104,6 +105,9 @@ def answer_at_once(command: str) -> None:
     if "--help" in args or "-h" in args:
         print(short_help(command).strip())
         sys.exit(0)
+    if (lerobots := for_robots(command, args)) is not None:
+        print(f"error: {lerobots}", file=sys.stderr)
+        sys.exit(2)
     listed = json.loads(OPTIONS_FILE.read_text())
     if metadata.version("lerobot") != listed["lerobot"]:
         return  # another version may have other options
@@ -111,6 +115,41 @@ def answer_at_once(command: str) -> None:
     if wrong is not None:
         print(f"error: {wrong}\n`{command} --help` shows the options that matter.", file=sys.stderr)
         sys.exit(2)
+
+
+_DATA = "--dataset.repo_id=... --dataset.root=... --dataset.push_to_hub=false --dataset.video=false"
+_ON_ROBOTS = {
+    "playbyear-record": f"lerobot-record {{}} {_DATA} --dataset.single_task=... --dataset.fps=20",
+    "playbyear-dagger": "lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true {} --policy.path=... "
+    f"--fps=20 --task=... {_DATA} --dataset.fps=20",
+    "playbyear-video": "lerobot-rollout {} --policy.path=... --fps=20 --duration=60",
+}
+"""What LeRobot's command does on a robot, by ours that does it in a simulation; the robot's options stand in braces."""
+
+_ROBOT = {
+    "robot.type": "so101_follower",
+    "robot.port": "/dev/ttyACM0",
+    "robot.cameras": "{gripper: {type: microphone, device: USB Audio}}",
+    "teleop.type": "so101_leader",
+    "teleop.port": "/dev/ttyACM1",
+}
+
+
+def for_robots(command: str, args: list[str]) -> str | None:
+    """What to tell who gives a robot, or what moves one, to a command for simulations; None for all others."""
+    options = given_options(args)[0]
+    given = {name: value for name, value in options.items() if name.partition(".")[0] in ("robot", "teleop")}
+    if command not in _ON_ROBOTS or not given:
+        return None
+    robot = shlex.join(f"--{name}={value}" for name, value in {**_ROBOT, **given}.items())
+    after = {"playbyear-video": "", "playbyear-dagger": "playbyear-dagger --num_episodes=0 --steps=1000 ..."}
+    learns = after.get(command, "playbyear-train --preset=cpu ...")
+    then = f"\nThen: playbyear-attach-audio --dataset.repo_id=... --dataset.root=..., and {learns}" if learns else ""
+    return (
+        f"--{next(iter(given))}: {command} acts in simulations. On a robot it is LeRobot's command, with the microphone "
+        f"among the cameras (docs/robots.md):\n{_ON_ROBOTS[command].format(robot)}{then}\n"
+        "What a person moves a simulated arm with: --expert.type=teleop --expert.teleop.type=..."
+    )
 
 
 def find_mistake(args: list[str], listed: Mapping[str, Any], policies: Mapping[str, Any]) -> str | None:

@@ -7,7 +7,7 @@ from lerobot_playbyear.datasets.errors import printable
 from lerobot_playbyear.scripts.command import check_local_dataset, command, run_alone, run_with_lerobot
 
 
-@command("Interrupted. The saved episodes are safe; go on with the same command and --resume=true.")
+@command("Interrupted. The saved episodes are safe; --resume=true --dataset.num_episodes=N records N more.")
 def record() -> None:
     # Here, because the processes that roll out import this module, and start in 2 seconds without LeRobot.
     from lerobot_playbyear.recording.record import record
@@ -41,7 +41,7 @@ def dagger() -> None:
 
     def correct(cfg: DaggerConfig) -> None:
         cfg.check()
-        check_local_dataset(cfg.demos.repo_id, cfg.demos.root)
+        check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
         from lerobot_playbyear.dagger.run import run_dagger
 
         run_dagger(cfg)

@@ -35,10 +35,10 @@ class TeleopExpertConfig(ExpertConfig):
         directions: What moves the hand along x, y and z, such as `-y,x,z`. None: what fits the view of our tasks.
         gripper_cooldown_s: For how long after a change the gripper cannot change again [s]; the paper's and our tasks' is 2.
         steps_per_second: Control steps per second; fewer than the environment's are slow motion. None: the environment's.
-        begin_paused: Each attempt waits until the person presses P.
-        takeover: How a person takes over from a policy: `hold` the key, or `toggle` it with one press, and hand back with
-            another.
-        takeover_key: The key, such as `space` or `b`; most pedals are keyboards with one key.
+        begin_paused: Each attempt waits until the person presses Space.
+        takeover: How a person takes over from a policy: `toggle` with one press of the key, and hand back with another, or
+            `hold` it.
+        takeover_key: The key, such as `tab` or `b`; most pedals are keyboards with one key.
         play_sound: Play the first microphone, if the package sounddevice is installed.
     """
 
@@ -48,7 +48,7 @@ class TeleopExpertConfig(ExpertConfig):
     gripper_cooldown_s: float = 2.0
     steps_per_second: float | None = None
     begin_paused: bool = True
-    takeover: str = "hold"
+    takeover: str = "toggle"
     takeover_key: str = OVERRIDE
     play_sound: bool = True
 
@@ -78,7 +78,7 @@ class TeleopExpertConfig(ExpertConfig):
             (
                 "takeover_key",
                 key not in taken,
-                f"it means something else already: give another one than {', '.join(sorted(taken))}, such as space or b",
+                f"it means something else already: give another one than {', '.join(sorted(taken))}, such as tab or b",
             ),
         ):
             if not is_good:

@@ -26,11 +26,33 @@ _X, _Y, _Z = DELTAS
 MOVES = {"right": (_X, 1), "left": (_X, -1), "up": (_Y, 1), "down": (_Y, -1), "e": (_Z, 1), "d": (_Z, -1)}
 """Which displacement a key makes, and its sign."""
 
-OVERRIDE, GRIPPER_KEY, PAUSE, SUCCESS, RERECORD, FAILURE, LEAVE = "space", "g", "p", "s", "r", "q", "escape"
-TAKEN = frozenset({GRIPPER_KEY, PAUSE, SUCCESS, RERECORD, FAILURE, LEAVE})
-"""Keys that mean something."""
+OVERRIDE, PAUSE, LEAVE, SUCCESS, FAILURE = "tab", "space", "escape", "s", "f"
+"""As in lerobot-rollout."""
 
-_VERDICTS = {SUCCESS: Verdict.SUCCESS, RERECORD: Verdict.DISCARD, FAILURE: Verdict.FAILURE}
+GRIPPER_KEY, END, RERECORD = "g", "enter", "r"
+TAKEN = frozenset({PAUSE, LEAVE, SUCCESS, FAILURE, GRIPPER_KEY, END, RERECORD})
+"""Keys that mean something, whoever moves the arm with what."""
+
+KEYS = {
+    "Tab": "take over, hand back",
+    "Arrows": "right, left, away, near",
+    "E, D": "up, down",
+    "G": "close or open the gripper",
+    "Space": "pause, go on",
+    "S": "success: end and keep",
+    "F": "failure: end",
+    "Enter": "end, as the task judges",
+    "R": "repeat, keep nothing",
+    "Esc": "leave",
+}
+"""What the panel beside the scene says, and docs/teleoperation.md."""
+
+_VERDICTS = {
+    SUCCESS: Verdict.SUCCESS,
+    FAILURE: Verdict.FAILURE,
+    END: Verdict.ENDED,
+    RERECORD: Verdict.DISCARD,
+}
 _EVENTS = (
     (TeleopEvents.RERECORD_EPISODE, Verdict.DISCARD),
     (TeleopEvents.SUCCESS, Verdict.SUCCESS),
@@ -72,11 +94,11 @@ class Controls:
     Args:
         teleop: A connected teleoperator; `get_teleop_events` is used if it has it.
         keys: The window's.
-        toggles: Whether a press of the key takes over, or hands back, instead of holding it.
+        toggles: Whether a press of the key takes over, or hands back; otherwise it is held.
         override: The key.
     """
 
-    def __init__(self, teleop: Teleoperator, keys: WindowKeys, toggles: bool = False, override: str = OVERRIDE) -> None:
+    def __init__(self, teleop: Teleoperator, keys: WindowKeys, toggles: bool = True, override: str = OVERRIDE) -> None:
         self._teleop, self._keys = teleop, keys
         self._toggles, self._override, self._is_on = toggles, override, False
         self._events: dict[TeleopEvents, bool] = {}

@@ -12,7 +12,7 @@ from lerobot.teleoperators import Teleoperator
 from lerobot_playbyear.episodes.environment import task_description
 from lerobot_playbyear.episodes.experts import Expert
 from lerobot_playbyear.episodes.play import Observation, Verdict
-from lerobot_playbyear.teleoperation.controls import ActionMapping, Controls, Gripper, PersonLeftError, Wish
+from lerobot_playbyear.teleoperation.controls import KEYS, ActionMapping, Controls, Gripper, PersonLeftError, Wish
 from lerobot_playbyear.teleoperation.panel import HISTORY_S, Control, Status
 from lerobot_playbyear.teleoperation.speaker import Speaker, level_db, microphone_blocks
 from lerobot_playbyear.teleoperation.window import Window
@@ -24,14 +24,19 @@ _DIRECTIONS = {"keyboard_ee": "-x,-y,z", "gamepad": "-y,x,z"}
 """For the view of our tasks (right on the screen is x, away is y), per type of teleoperator; others have `x,y,z`."""
 
 _MOVING_KEYS = {
-    "keyboard_window": [("Arrows", "right, left, away, near"), ("E  D", "up, down")],
-    "keyboard_ee": [("Arrows", "right, left, away, near"), ("Shift", "left: down, right: up")],
+    "keyboard_window": [(name, KEYS[name]) for name in ("Arrows", "E, D")],
+    "keyboard_ee": [("Arrows", KEYS["Arrows"]), ("Shift", "left: down, right: up")],
     "gamepad": [("Sticks", "left: plane, right: height"), ("RB", "hold to take over")],
 }
 
 _RATE_OVER_S = 1.0
-_BEGIN = "Press P to begin"
-_NOTES = {Verdict.SUCCESS: "Ended as a success", Verdict.FAILURE: "Ended as failed", Verdict.DISCARD: "Thrown away"}
+_BEGIN = "Press Space to begin"
+_NOTES = {
+    Verdict.SUCCESS: "Ended as a success",
+    Verdict.FAILURE: "Ended as failed",
+    Verdict.ENDED: "Ended",
+    Verdict.DISCARD: "Once more",
+}
 
 
 class Pace:
@@ -78,7 +83,7 @@ class Pace:
 
 
 class TeleopExpert(Expert):
-    """Shows a person each step in its turn, and lets them take over while they hold a key.
+    """Shows a person each step in its turn, and lets them take over by a key.
 
     Args:
         options: How they move the arm and take over.
@@ -116,18 +121,15 @@ class TeleopExpert(Expert):
         self._is_called = self._stays = False
         self._verdict: Verdict | None = None
         self._last_command: float | None = None
-        takeover = [] if demonstrates else [(key.title(), "take over, hand back" if toggles else "hold to take over")]
+        takeover = [] if demonstrates else [(key.title(), KEYS["Tab"] if toggles else "hold to take over")]
+        ends = [(name, KEYS[name]) for name in ("Space", "S", "F", "Enter", "R", "Esc")]
         self._status = Status(
             fps=self.clock_fps,
             keys=[
                 *takeover,
                 *_MOVING_KEYS.get(kind, []),
-                *([("G", "open or close the gripper")] if self.mapping.has_gripper else []),
-                ("P", "pause"),
-                ("S", "success: end and keep"),
-                ("R", "throw away, once more" if demonstrates else "throw away, next one"),
-                ("Q", "end as failed"),
-                ("Esc", "leave"),
+                *([("G", KEYS["G"])] if self.mapping.has_gripper else []),
+                *ends,
             ],
             waiting="The next attempt is being prepared" if demonstrates else "The policy is learning or evaluated",
         )
@@ -208,14 +210,16 @@ class TeleopExpert(Expert):
         self._verdict = self._wish.verdict
 
     def _pause(self) -> None:
-        """Nothing moves until the person goes on, or ends the attempt."""
+        """Nothing moves until the person goes on, takes over, or ends the attempt."""
         status = self._status
-        note, status.note = status.note, _BEGIN if status.step == 0 else "Press P to go on"
+        note, status.note = status.note, _BEGIN if status.step == 0 else "Press Space to go on"
         while self._is_paused and self._verdict is None:
+            overrode = self._wish.overrides
             status.control = Control.PAUSED
             self._show()
             time.sleep(1 / self.pace.fps)
             self._read()
+            self._is_paused &= overrode or not self._wish.overrides
         status.note = note
         self.pace.start()
 

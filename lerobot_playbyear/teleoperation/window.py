@@ -21,7 +21,7 @@ import numpy as np
 
 from lerobot_playbyear.teleoperation.panel import SCENE, SIZE, Control, Status, draw
 
-NAMED_KEYS = ("space", "escape", "left", "right", "up", "down")
+NAMED_KEYS = ("space", "tab", "enter", "escape", "left", "right", "up", "down")
 """Keys that have no letter for a name, as the window names them."""
 
 _START_TIMEOUT_S = 60.0
