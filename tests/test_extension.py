@@ -8,8 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from draccus.utils import DecodingError
 from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
+from safetensors.torch import load_file
 from support.distributions import install_example, longest_file
 from support.policy import MICROPHONE, make_config, make_episode, make_policy, run_ending_at, step_through
 from support.shared import ENV, TINY, n_evaluated, run_in_process
@@ -47,20 +49,40 @@ def test_the_examples_are_short(example):
     ids=["playbyear-train", "lerobot-train"],
 )
 def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, noise, tmp_path):
-    own = ("--policy.audio_encoder=spectrogram_gru", "--policy.audio_steps=[remove_offset]")
+    options = "{waveform_cnn: {channels: 4}, remove_offset: {share: 0.5}}"
+    own = (
+        "--policy.audio_encoder=waveform_cnn",
+        "--policy.audio_steps=[remove_offset]",
+        f"--policy.extension_options={options}",
+    )
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}")
     run_in_process(command, *TINY, *own, *data, "--steps=2", f"--output_dir={tmp_path / 'train'}")
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
     saved = json.loads((checkpoint / "config.json").read_text())
-    assert (saved["audio_encoder"], saved["vision_encoder"]) == ("spectrogram_gru", "resnet18")
+    assert (saved["audio_encoder"], saved["vision_encoder"]) == ("waveform_cnn", "resnet18")
     steps = json.loads((checkpoint / "policy_preprocessor.json").read_text())["steps"]
     assert [step["registry_name"] for step in steps][-2:] == ["remove_offset", "normalizer_processor"]
+    assert steps[-2]["config"] == {"share": 0.5}
+    assert load_file(checkpoint / "model.safetensors")["model.hearing.audio_gripper.layers.0.weight"].shape == (
+        4,
+        1,
+        80,
+    )
     assert n_evaluated(checkpoint, tmp_path / "eval", *ENV, "--env.episode_length=5") == 1
 
 
 @torch.no_grad()
-def test_an_encoder_that_cannot_share_hears_the_same_in_training_and_in_a_rollout():
-    policy = make_policy(audio_encoder="spectrogram_gru")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"audio_encoder": "spectrogram_gru"},
+        {"audio_encoder": "waveform_cnn"},
+        {"audio_encoder": "waveform_cnn", "audio_envelope_gain": 1.0},
+    ],
+    ids=str,
+)
+def test_an_encoder_of_windows_hears_the_same_in_training_and_in_a_rollout(options):
+    policy = make_policy(**options)
     episode = make_episode(seed=1, config=policy.config)
     stepped = step_through(policy, [episode])
     whole = policy.predict_run(run_ending_at(episode, 54, policy.config, 55), 55)
@@ -76,6 +98,35 @@ def test_a_step_gets_runs_in_training_and_frames_in_a_rollout_and_nothing_but_so
     assert all(torch.equal(run[key], value) for key, value in others.items())
     frame = preprocess({MICROPHONE: sound[:, 3] / 32768})
     torch.testing.assert_close(frame[MICROPHONE], run[MICROPHONE][:, 3])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"waveform_cnn": {"width": 4}}, r"unexpected keyword argument 'width'. Its options: channels"),
+        (
+            {"spectrogram_gru": {}},
+            r"extension_options names spectrogram_gru; .* there are resnet18, waveform_cnn, remove_offset",
+        ),
+    ],
+)
+def test_an_option_that_theirs_lack_is_refused_by_name(options, said):
+    with pytest.raises((ValueError, DecodingError), match=said):
+        make_policy(audio_encoder="waveform_cnn", audio_steps=("remove_offset",), extension_options=options)
+
+
+def test_a_steps_option_is_refused_by_name():
+    config = make_config(audio_steps=("remove_offset",), extension_options={"remove_offset": {"channels": 4}})
+    with pytest.raises(ValueError, match=r"unexpected keyword argument 'channels'. Its options: share"):
+        make_playbyear_pre_post_processors(config)
+
+
+def test_lerobots_command_says_last_what_the_policy_refuses(commands):
+    for option in ("dtype=half", "action_range=0", "extension_options={nobody: {a: 1}}"):
+        result = commands.run(
+            "lerobot-train", "--policy.type=playbyear", f"--policy.{option}", "--dataset.repo_id=me/none"
+        )
+        assert f"--policy.{option.partition('=')[0]}" in result.output.strip().splitlines()[-1]
 
 
 def test_their_expert_takes_over_when_it_is_loud():

@@ -26,7 +26,7 @@ def knocking(fps: int, kinds: tuple[str, ...]):
         whole = {
             **Knocking.observation_space,
             "audio.finger": gym.spaces.Box(-32768, 32767, (SAMPLE_RATE // fps,), np.int16),
-        }  # noqa: RUF012
+        }
         observation_space = gym.spaces.Dict({kind: whole[kind] for kind in kinds})
 
         def _observation(self, knock):

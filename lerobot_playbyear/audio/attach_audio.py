@@ -25,6 +25,7 @@ from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_f
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import divides, exact_rate, nearest_sample_rate
 from lerobot_playbyear.datasets.info import check_links, nothing_in
+from lerobot_playbyear.datasets.next_command import training_command
 from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
 from lerobot_playbyear.datasets.remedies import repair_command

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import draccus
+from draccus.utils import DecodingError
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
@@ -60,6 +61,8 @@ class PlaybyearConfig(PreTrainedConfig):
         image_size: Pixels, height and width, that the vision encoder sees. 84 trains about five times faster than 224.
         audio_steps: Names in LeRobot's ProcessorStepRegistry: steps that sound passes through before the network, in training
             as in a rollout. A trained policy keeps those it was trained with (`extension.MicrophoneStep`).
+        extension_options: Options of encoders and `audio_steps` of other packages, by their names, such as
+            `{waveform_cnn: {channels: 32}}`. A trained policy keeps them.
 
     Architecture:
         vision_encoder, audio_encoder: Names of registered encoders (`extension.register_vision_encoder`, `_audio_encoder`).
@@ -127,6 +130,7 @@ class PlaybyearConfig(PreTrainedConfig):
     n_frequency_bins: int = 160
     image_size: int = 224
     audio_steps: tuple[str, ...] = ()
+    extension_options: dict[str, dict[str, Any]] = field(default_factory=dict)
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "VISUAL": NormalizationMode.IDENTITY,
@@ -176,7 +180,10 @@ class PlaybyearConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._check_options()
+        try:
+            self._check_options()
+        except ValueError as error:  # of which draccus would print no word
+            raise DecodingError((), str(error)) from error
         self.fps = frame_rate(self.fps)  # an option or JSON may have 20.0
         self._asked_dtype = self.dtype
         self.dtype = training_dtype(self.dtype, self.use_amp, str(self.device))  # LeRobot reads this, and not use_amp
@@ -321,6 +328,12 @@ class PlaybyearConfig(PreTrainedConfig):
         if not (self.use_vision or self.use_audio or self.low_dimensional_keys or not self.input_features):
             raise ValueError(
                 "--policy.use_vision=false and --policy.use_audio=false leave no observation to learn from: drop one of them."
+            )
+        strays = self.extension_options.keys() - {self.vision_encoder, self.audio_encoder, *self.audio_steps}
+        if strays:
+            raise ValueError(
+                f"--policy.extension_options names {', '.join(sorted(strays))}; of the policy's encoders and audio_steps there "
+                f"are {', '.join([self.vision_encoder, self.audio_encoder, *self.audio_steps])}."
             )
         if self.dtype not in (None, *DTYPES):
             raise ValueError(f"--policy.dtype must be one of {', '.join(DTYPES)}, got {self.dtype!r}.")

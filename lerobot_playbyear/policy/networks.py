@@ -45,12 +45,12 @@ class PlaybyearNetwork(nn.Module):
         if config.use_audio:
             assert config.sample_rate is not None
             grid = (config.sample_rate, config.segment_s, config.hop_s, config.n_frequency_bins)
-            spectrograms = {
-                _module_name(key): LogSpectrogram(*grid, config.spectrogram_momentum) for key in config.audio_keys
-            }
-            self.spectrogram = nn.ModuleDict(spectrograms)
-            encoders = {_module_name(key): make_encoder("audio_encoder", config) for key in config.audio_keys}
-            self.hearing = nn.ModuleDict(encoders)
+            self.spectrogram = nn.ModuleDict()
+            self.hearing = nn.ModuleDict()
+            for name in map(_module_name, config.audio_keys):
+                self.hearing[name] = make_encoder("audio_encoder", config)
+                if not _hears_waveform(self.hearing[name]) or config.audio_envelope_gain:
+                    self.spectrogram[name] = LogSpectrogram(*grid, config.spectrogram_momentum)
             self.disturb = SoundAugmentation(config)
             n_columns = config.n_segments if config.audio_envelope_gain else 0
             sizes += [encoder.embedding_size + n_columns for encoder in self.hearing.values()]  # type: ignore[misc, operator]
@@ -107,21 +107,30 @@ class PlaybyearNetwork(nn.Module):
         is_pad = before_episode(batch, n_heard)  # (B, n_heard)
         if is_pad is not None:
             begun = ~is_pad.repeat_interleave(sound.shape[2], dim=1)
-        spectrogram, encoder = self.spectrogram[_module_name(key)], self.hearing[_module_name(key)]
-        assert isinstance(spectrogram, LogSpectrogram)
-        # Neighbouring windows overlap: their segments are computed once.
-        shared = SharedStretches(n_frames, sound.shape[2], config.window_samples, spectrogram.hop)
-        if colour is not None:
-            colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
-        # (B * n_stretches, bins, columns)
-        levels = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
+        encoder, n_samples = self.hearing[_module_name(key)], sound.shape[2]
+        levels = None
+        if _module_name(key) in self.spectrogram:
+            spectrogram = self.spectrogram[_module_name(key)]
+            assert isinstance(spectrogram, LogSpectrogram)
+            # Neighbouring windows overlap: their segments are computed once.
+            shared = SharedStretches(n_frames, n_samples, config.window_samples, spectrogram.hop)
+            if colour is not None:
+                colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
+            # (B * n_stretches, bins, columns)
+            levels = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
         n_columns = getattr(encoder, "window_columns", None)
-        if isinstance(n_columns, int):  # convolutional along time: embeddings overlap, too
+        if _hears_waveform(encoder):
+            start = wave.shape[1] - config.window_samples - (n_frames - 1) * n_samples
+            windows = (wave * begun)[:, start:].unfold(1, config.window_samples, n_samples)  # (B, n, samples)
+            embeddings = encoder(windows.flatten(0, 1))
+        elif isinstance(n_columns, int):  # convolutional along time: embeddings overlap, too
+            assert levels is not None
             embeddings = shared.windows(encoder(levels), n_columns)  # (B * n, channels, n_columns)
         else:
+            assert levels is not None
             embeddings = encoder(shared.windows(levels, config.n_segments))
         heard = self._normalize(embeddings.flatten(1))
-        if config.audio_envelope_gain == 0:
+        if config.audio_envelope_gain == 0 or levels is None:
             return heard
         envelope = shared.windows(levels.mean(dim=1, keepdim=True), config.n_segments).flatten(1)  # (B * n, n_segments)
         return torch.cat([heard, config.audio_envelope_gain * envelope], dim=1)
@@ -388,6 +397,10 @@ def before_episode(batch: dict[str, Tensor], n_frames: int) -> Tensor | None:
     """
     flags = [batch[name] for name in batch if name.startswith(OBS_PREFIX) and name.endswith("_is_pad")]
     return next((is_pad[:, -n_frames:] for is_pad in flags if is_pad.shape[1] >= n_frames), None)
+
+
+def _hears_waveform(encoder: nn.Module) -> bool:
+    return bool(getattr(encoder, "hears_waveform", False))
 
 
 def _module_name(key: str) -> str:

@@ -22,7 +22,7 @@ from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, samples_per_frame
 from lerobot_playbyear.datasets.frame_rate import nearest_sample_rate
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.extension import SoundStep
+from lerobot_playbyear.policy.extension import SoundStep, made_with_options
 
 _FULL_SCALE = 32768  # int16: samples are in [-32768, 32767]
 _USUAL_RATES = (16000, 48000, 44100, 32000, 22050, 8000, 96000)  # Hz
@@ -50,7 +50,7 @@ def make_playbyear_pre_post_processors(
     """
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     steps.normalize.normalize_observation_keys = set(config.low_dimensional_keys)
-    heard = [_microphone_step(name) for name in config.audio_steps]
+    heard = [_microphone_step(name, config) for name in config.audio_steps]
     if config.use_audio and config.sample_rate is not None:
         heard.insert(0, MicrophonePicturesToAudioStep(config.audio_keys, config.sample_rate, config.fps))
     return make_policy_processor_pipelines(
@@ -59,13 +59,13 @@ def make_playbyear_pre_post_processors(
     )
 
 
-def _microphone_step(name: str) -> ProcessorStep:
+def _microphone_step(name: str, config: PlaybyearConfig) -> ProcessorStep:
     if name not in ProcessorStepRegistry.list():
         raise ValueError(
             f"--policy.audio_steps names '{name}', which no installed package registers in LeRobot's ProcessorStepRegistry: "
             "install the one that does; its distribution's name begins with lerobot_policy_ (docs/training.md)."
         )
-    return ProcessorStepRegistry.get(name)()
+    return made_with_options(name, ProcessorStepRegistry.get(name), config)
 
 
 @dataclass

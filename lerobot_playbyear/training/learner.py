@@ -21,7 +21,7 @@ from lerobot.envs import close_envs, make_env, make_env_pre_post_processors
 from lerobot.optim import load_optimizer_state, load_scheduler_state
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
-from lerobot.processor import PolicyProcessorPipeline, TransitionKey, create_transition
+from lerobot.processor import NormalizerProcessorStep, PolicyProcessorPipeline, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STR, TRAINING_STATE_DIR, TRAINING_STEP
 from lerobot.utils.io_utils import load_json
 from lerobot.utils.random_utils import load_rng_state
@@ -215,9 +215,11 @@ class Learner:
         logging.warning(text)
 
     def _normalized(self, actions: Tensor) -> Tensor:
-        transition = create_transition(observation={}, action=actions.float())
-        for step in self.preprocessor.steps:  # `process_action` would stop at a step that wants an observation
-            transition = step(transition)
+        """As the preprocessor does where there is nothing but actions: other steps may want an observation."""
+        transition = create_transition(observation={}, action=actions.float().to(self.accelerator.device))
+        for step in self.preprocessor.steps:
+            if isinstance(step, NormalizerProcessorStep):
+                transition = step(transition)
         normalized: Tensor = transition[TransitionKey.ACTION]  # type: ignore[assignment]
         return normalized
 

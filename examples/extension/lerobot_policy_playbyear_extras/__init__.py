@@ -8,8 +8,8 @@ Importing this registers them; every command of LeRobot's and of ours does so. A
 package wherever it acts.
 """
 
-from lerobot_policy_playbyear_extras.encoder import SpectrogramGRU
+from lerobot_policy_playbyear_extras.encoder import SpectrogramGRU, WaveformCNN
 from lerobot_policy_playbyear_extras.expert import StartledConfig
 from lerobot_policy_playbyear_extras.microphone import RemoveOffset
 
-__all__ = ["RemoveOffset", "SpectrogramGRU", "StartledConfig"]
+__all__ = ["RemoveOffset", "SpectrogramGRU", "StartledConfig", "WaveformCNN"]

@@ -11,8 +11,14 @@ from lerobot_playbyear.policy.extension import MicrophoneStep
 @dataclass
 @ProcessorStepRegistry.register(name="remove_offset")
 class RemoveOffset(MicrophoneStep):
-    """For microphones whose silence is not zero: every frame's mean becomes zero."""
+    """For microphones whose silence is not zero: of every frame so much of its mean is taken away.
+
+    Args:
+        share: `--policy.extension_options='{remove_offset: {share: 0.5}}'` takes half of it.
+    """
+
+    share: float = 1.0
 
     def sound(self, wave: Tensor) -> Tensor:
         """(..., S) -> (..., S)."""
-        return wave - wave.mean(dim=-1, keepdim=True)
+        return wave - self.share * wave.mean(dim=-1, keepdim=True)
