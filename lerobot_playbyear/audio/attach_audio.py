@@ -24,6 +24,7 @@ from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_fe
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder, scratch_folder
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.info import check_links
+from lerobot_playbyear.datasets.next_command import training_command
 from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
 
