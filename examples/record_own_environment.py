@@ -1,7 +1,7 @@
 """Record a Gymnasium environment of your own that has a microphone, so that every saved episode survives a crash.
 
     python examples/record_own_environment.py --root=outputs/knock
-    playbyear-train --policy.type=playbyear --policy.push_to_hub=false --dataset.repo_id=me/knock --dataset.root=outputs/knock
+    playbyear-train --preset=cpu --dataset.repo_id=me/knock --dataset.root=outputs/knock --output_dir=outputs/train/knock
 
 The environment here is a box that one knocks on: hollow where something lies in it (`gym_knock/environment.py`). Replace it and
 its expert. With the few lines of `gym_knock/configuration.py` LeRobot's commands know the environment, and `playbyear-record`

@@ -184,6 +184,13 @@ def test_only_successes_with_an_intervention_are_kept_and_seeds_are_consecutive_
     assert all(line["n_frames"] == 3 for line in metrics(tmp_path, "attempt"))  # the expert ends them
 
 
+def test_what_a_person_throws_away_is_repeated(tmp_path, monkeypatch):
+    attempts_end(monkeypatch, {10}, {10: Verdict.DISCARD})
+    monkeypatch.setattr(Quick, "decides", True)
+    dagger(tmp_path, *QUICK, "--episode_seed=10", "--num_episodes=1", "--max_attempts=2")
+    assert [(line["seed"], line["outcome"]) for line in metrics(tmp_path, "attempt")] == [(10, "discarded")] * 2
+
+
 def test_a_policy_that_needs_no_help_ends_the_run(tmp_path, monkeypatch, capfd):
     attempts_end(monkeypatch, {10}, dict.fromkeys(range(10, 14), Verdict.SUCCESS))
     out = dagger(tmp_path, *QUICK, "--episode_seed=10", "--num_episodes=5", "--max_attempts=3")

@@ -54,6 +54,8 @@ BASE = {
 
 COMMANDS = """
 # Told from the command line alone
+dagger | --strategy.num_episodes=3 | --strategy.num_episodes is no option; did you mean --num_episodes?
+dagger | --dataset.num_episodes=3 | did you mean --num_episodes?
 train | --bach_size=3 | --bach_size is no option; did you mean --batch_size?
 train | --policy.image_sise=3 | did you mean --policy.image_size?
 train | --steps=many | steps | 'many' into an int
@@ -62,6 +64,7 @@ train | cpu | 'cpu' is no option
 train | -dataset.repo_id | --dataset.repo_id is needed
 record | --robot.type=so101_follower | lerobot-record --robot.type=so101_follower | type: microphone | playbyear-attach-audio
 record | --robot.port=/dev/ttyUSB7 --robot.type=koch_follower | --robot.type=koch_follower --robot.port=/dev/ttyUSB7
+record | '--robot.cameras={{a: {{type: opencv}}}}' | {a: {type: opencv}, gripper: {type: microphone
 dagger | --teleop.type=so100_leader | lerobot-rollout --strategy.type=dagger | --teleop.type=so100_leader | --expert.teleop.type
 video | --robot.type=so101_follower | lerobot-rollout --robot.type=so101_follower
 # Places
@@ -145,7 +148,7 @@ dagger | --new_weights=true | --new_weights=true: a policy that knows nothing ca
 dagger | --method.type=redo --skip_s=1 | --skip_s=1 | --method.type=redo the expert chooses every frame
 dagger | --method.type=robot_gated --method.intervention_share=1.5 | intervention_share=1.5: give a share
 dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
-dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --policy.path
+dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --preset=cpu --policy.path
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
 dagger | --dataset.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
 dagger | --dataset.root={six_joints} | 'observation.state' has shape (6,) | trained with (7,)

@@ -21,13 +21,12 @@ def knocking(fps: int, kinds: tuple[str, ...]):
     from gym_knock import Knocking
     from gym_knock.environment import SAMPLE_RATE
 
+    sound = gym.spaces.Box(-32768, 32767, (SAMPLE_RATE // fps,), np.int16)
+    spaces = {**Knocking.observation_space, "audio.finger": sound}
+
     class Other(Knocking):
         metadata = {**Knocking.metadata, "render_fps": fps}  # noqa: RUF012
-        whole = {
-            **Knocking.observation_space,
-            "audio.finger": gym.spaces.Box(-32768, 32767, (SAMPLE_RATE // fps,), np.int16),
-        }
-        observation_space = gym.spaces.Dict({kind: whole[kind] for kind in kinds})
+        observation_space = gym.spaces.Dict({kind: spaces[kind] for kind in kinds})
 
         def _observation(self, knock):
             observation = super()._observation(knock)
@@ -46,6 +45,7 @@ def knocking(fps: int, kinds: tuple[str, ...]):
     ],
     ids=["gym_knock", "blind at 10 Hz", "deaf at 40 Hz"],
 )
+@pytest.mark.timeout(300)  # LeRobot is imported, records and trains
 def test_what_a_recording_says_to_type_next_trains_on_any_environment(fps, kinds, monkeypatch, tmp_path, capsys):
     """Nothing is added to it but that it ends soon; the folder's name has a blank."""
     monkeypatch.syspath_prepend(EXAMPLES)

@@ -1,13 +1,14 @@
 """`playbyear-record`: what is on disk, and what is said when it cannot be."""
 
 import multiprocessing
-import shutil
 from contextlib import closing
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from lerobot.configs.dataset import DatasetRecordConfig
 from recording_factory import load
 
 from gym_playbyear.environment import TaskEnv
@@ -72,17 +73,23 @@ def test_frame_t_is_the_observation_at_t_and_the_action_taken_then(recorded):
 
 
 def test_workers_and_resuming_do_not_change_the_dataset(recorded, tmp_path):
+    """As in lerobot-record, who resumes asks for so many more."""
     root = tmp_path / "dataset"
     record(config(root, num_episodes=1, num_workers=2))
-    record(config(root, num_episodes=2, num_workers=2, resume=True))
+    record(config(root, num_episodes=1, num_workers=2, resume=True))
     assert tables(root) == tables(recorded)
 
 
-def test_resuming_a_complete_dataset_changes_nothing(recorded, tmp_path):
-    root = shutil.copytree(recorded, tmp_path / "dataset")
-    before = {path: path.stat().st_mtime_ns for path in root.rglob("*") if path.is_file()}
-    record(config(root, num_episodes=1, resume=True))
-    assert {path: path.stat().st_mtime_ns for path in root.rglob("*") if path.is_file()} == before
+def test_options_are_named_as_in_lerobot_record_and_what_is_done_otherwise_is_said(tmp_path, capsys):
+    own, lerobots = ({option.name for option in fields(kind)} for kind in (RecordDatasetConfig, DatasetRecordConfig))
+    assert own <= lerobots
+    cfg = config(tmp_path / "dataset", num_episodes=1)
+    cfg.dataset.single_task, cfg.dataset.fps = "Find the tin", 20
+    assert load(record(cfg))[0]["task"] == "Find the tin"
+    assert (
+        "Unlike in lerobot-record, pictures are stored without loss (else --dataset.video=true) and nothing is uploaded "
+        "(else --dataset.push_to_hub=true) and the name gets no date." in capsys.readouterr().out
+    )
 
 
 def test_only_successes_are_kept_and_seeds_count_the_attempts(tmp_path):

@@ -5,7 +5,6 @@ The robot is the task's arm, simulated in real time; its sound goes through a so
 
 import json
 import os
-import shlex
 import subprocess
 import sys
 import tempfile
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import yaml
 from lerobot_operator import Corrections, Episodes, run_command
 from lerobot_robot_playbyear_sim.process import simulation
 from sound_server import SoundServer, why_not
@@ -28,6 +28,7 @@ class Robot:
     socket: str
     options: list[str]
     leader: list[str]
+    file: dict
     environment: dict[str, str]
 
 
@@ -42,9 +43,11 @@ def robot(tmp_path_factory) -> Iterator[Robot]:
                 camera = "{gripper: {type: microphone, device: gripper}}"
                 options = ["--robot.type=playbyear_sim", f"--robot.socket={socket}", f"--robot.cameras={camera}"]
                 leader = ["--teleop.type=playbyear_sim_leader", f"--teleop.socket={socket}"]
+                file = {"robot": {"type": "playbyear_sim", "socket": str(socket), "cameras": yaml.safe_load(camera)}}
+                file["teleop"] = {"type": "playbyear_sim_leader", "socket": str(socket)}
                 programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
                 own = {"PATH": programs, "HF_LEROBOT_HOME": str(home), "OMP_NUM_THREADS": "1"}
-                yield Robot(socket, options, leader, {**os.environ, **server.environment, **own})
+                yield Robot(socket, options, leader, file, {**os.environ, **server.environment, **own})
         finally:
             server.kill()
 
@@ -68,19 +71,18 @@ def heard(robot, tmp_path_factory) -> Path:
 
 def test_a_round_of_corrections_as_the_example_has_it(robot, heard, tmp_path):
     train = [
-        *("playbyear-train", "--preset=cpu", "--policy.type=playbyear", "--policy.push_to_hub=false", "--steps=4"),
+        *("playbyear-train", "--preset=cpu", "--steps=4"),
         *("--save_freq=4", f"--dataset.root={heard}", "--dataset.repo_id=me/demos_with_sound"),
         *(f"--output_dir={tmp_path / 'train'}", "--wandb.enable=false", "--policy.device=cpu"),
     ]
     subprocess.run(train, env=robot.environment, check=True, capture_output=True)
-    lines = {"ROBOT": robot.options, "TELEOP": robot.leader}
-    options = tmp_path / "robot.sh"
-    options.write_text("".join(f"{name}=({shlex.join(values)})\n" for name, values in lines.items()))
+    options = tmp_path / "robot.yaml"
+    options.write_text(yaml.safe_dump(robot.file))
     given = {
         "ROBOT": str(options),
         "POLICY": str(tmp_path / "train/checkpoints/last/pretrained_model"),
         "DEMOS": str(heard),
-        "UPDATES": "3",
+        "STEPS": "3",
         "ACT_S": "3",
     }
     command = ["bash", str(ROOT / "examples/corrections.sh"), str(tmp_path / "round")]

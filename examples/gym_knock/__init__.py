@@ -4,7 +4,7 @@
     env="--env.discover_packages_path=gym_knock --env.type=knock"
     data="--dataset.repo_id=me/knock --dataset.root=outputs/knock/dataset"
     playbyear-record $env $data --dataset.num_episodes=20
-    playbyear-train --policy.type=playbyear --policy.push_to_hub=false $data --output_dir=outputs/knock/train
+    playbyear-train --preset=cpu $data --output_dir=outputs/knock/train
     lerobot-eval --policy.path=outputs/knock/train/checkpoints/last/pretrained_model $env --eval.n_episodes=10
 
 Two files: `environment.py` is plain Gymnasium, `configuration.py` tells LeRobot about it. Installed as a distribution named

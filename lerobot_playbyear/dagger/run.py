@@ -353,7 +353,7 @@ def _check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig) -> 
     if wanted != seen:
         raise InputError(
             f"--policy.action_range={wanted}: the policy was trained with {seen}, and would act differently from now on. "
-            f"Train it on its demonstrations first: playbyear-train --policy.path={policy.pretrained_path} "
+            f"Train it on its demonstrations first: playbyear-train --preset=cpu --policy.path={policy.pretrained_path} "
             f"--policy.action_range={wanted}."
         )
 

@@ -4,17 +4,16 @@ import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
-from lerobot.utils.constants import OBS_IMAGE
-
 from lerobot_playbyear.datasets.features import audio_keys
 
 _POLICY_FPS = 20  # of a policy that is not told
+_PICTURES = "observation.image"  # what the keys of cameras start with
 
 
 def training_command(
     repo_id: str, fps: int, features: Iterable[str], root: str | Path | None = None, preset: str | None = None
 ) -> str:
-    """What to type to train a policy on a dataset, in under an hour; it works as it stands.
+    """What to type to train a policy on a dataset, within the hour; it works as it stands.
 
     Args:
         repo_id: The dataset's name.
@@ -23,19 +22,23 @@ def training_command(
         root: Its folder. None: LeRobot finds it by its name.
         preset: The preset. None: the one for this machine.
     """
-    if preset is None:
-        import torch  # here, because a process that plays scripts does without it
-
-        preset = "gpu" if torch.cuda.is_available() else "cpu"
     names = list(features)
     options = {
-        "preset": preset,
+        "preset": preset or ("gpu" if _has_gpu() else "cpu"),
         "dataset.repo_id": repo_id,
         "dataset.root": root,
         "output_dir": f"outputs/train/{repo_id.rpartition('/')[2]}",
         "policy.fps": fps if fps != _POLICY_FPS else None,
-        "policy.use_vision": None if any(name.startswith(OBS_IMAGE) for name in names) else "false",
+        "policy.use_vision": None if any(name.startswith(_PICTURES) for name in names) else "false",
         "policy.use_audio": None if audio_keys(names) else "false",
     }
     given = (f"--{name}={value}" for name, value in options.items() if value is not None)
     return " ".join(["playbyear-train", *map(shlex.quote, given)])
+
+
+def _has_gpu() -> bool:
+    try:
+        import torch  # here, because commands that work on files alone do without it
+    except ImportError:
+        return False
+    return torch.cuda.is_available()

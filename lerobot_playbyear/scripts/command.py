@@ -126,10 +126,11 @@ _ON_ROBOTS = {
 }
 """What LeRobot's command does on a robot, by ours that does it in a simulation; the robot's options stand in braces."""
 
+_MICROPHONE = "gripper: {type: microphone, device: USB Audio}"
 _ROBOT = {
     "robot.type": "so101_follower",
     "robot.port": "/dev/ttyACM0",
-    "robot.cameras": "{gripper: {type: microphone, device: USB Audio}}",
+    "robot.cameras": "",
     "teleop.type": "so101_leader",
     "teleop.port": "/dev/ttyACM1",
 }
@@ -137,11 +138,16 @@ _ROBOT = {
 
 def for_robots(command: str, args: list[str]) -> str | None:
     """What to tell who gives a robot, or what moves one, to a command for simulations; None for all others."""
-    options = given_options(args)[0]
-    given = {name: value for name, value in options.items() if name.partition(".")[0] in ("robot", "teleop")}
+    given = {
+        name: value for name, value in given_options(args)[0].items() if name.partition(".")[0] in ("robot", "teleop")
+    }
     if command not in _ON_ROBOTS or not given:
         return None
-    robot = shlex.join(f"--{name}={value}" for name, value in {**_ROBOT, **given}.items())
+    cameras = (given.get("robot.cameras") or "").strip().removeprefix("{").removesuffix("}")
+    if "microphone" not in cameras:
+        cameras = f"{cameras}, {_MICROPHONE}" if cameras else _MICROPHONE
+    options = {**_ROBOT, **given, "robot.cameras": f"{{{cameras}}}"}
+    robot = shlex.join(f"--{name}={value}" for name, value in options.items())
     after = {"playbyear-video": "", "playbyear-dagger": "playbyear-dagger --num_episodes=0 --steps=1000 ..."}
     learns = after.get(command, "playbyear-train --preset=cpu ...")
     then = f"\nThen: playbyear-attach-audio --dataset.repo_id=... --dataset.root=..., and {learns}" if learns else ""

@@ -207,8 +207,8 @@ class Learner:
         if reachable:
             option = f"--policy.action_range={math.ceil(10 * _SLACK * max(reachable)) / 10:g}"
             text += (
-                f" Train with {option}; a trained policy gets it with playbyear-train --policy.path=... {option} on its "
-                "demonstrations."
+                f" Train with {option}; a trained policy gets it with playbyear-train --preset=cpu --policy.path=... {option} "
+                "on its demonstrations."
             )
         if unmoved:
             text += f" {', '.join(unmoved)} hardly moves in the demonstrations: demonstrate it too."

@@ -128,7 +128,7 @@ def _check(cfg: PlaybyearTrainConfig) -> None:
     _check_links(Path(str(cfg.output_dir)))
     check_dataset_files(cfg.dataset.repo_id, cfg.dataset.root, cfg.dataset.revision)
     if cfg.policy is None:
-        raise ValueError("No policy: give --policy.type=playbyear, --policy.path or --preset.")
+        raise ValueError("No policy: give --preset=cpu or gpu, --policy.path, or --policy.type=playbyear.")
     if not isinstance(cfg.policy, PlaybyearConfig):
         raise ValueError(
             f"--policy.type={cfg.policy.type}: playbyear-train trains policies of --policy.type=playbyear alone; give that, "

@@ -1,0 +1,51 @@
+"""One file is a whole robot with its microphone, for each of LeRobot's commands that acts on it."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lerobot.configs import parser
+from lerobot.rollout.configs import DAggerStrategyConfig, RolloutConfig
+from lerobot.scripts.lerobot_record import RecordConfig
+from support.shared import trained
+
+from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
+
+FILE = Path(__file__).parents[1] / "examples" / "so101.yaml"
+DATA = ("--dataset.repo_id=me/demos", "--dataset.root=here/demos", "--dataset.single_task=Find the cube")
+CORRECTING = ("--strategy.type=dagger", "--strategy.record_autonomous=true", *DATA)
+
+
+def parsed(kind: type, *options: str) -> Any:
+    """What LeRobot's parser makes of a command line."""
+
+    def options_of(cfg: kind) -> Any:
+        return cfg
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["lerobot", *options])
+        return parser.wrap()(options_of)()
+
+
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [(RecordConfig, DATA), (RolloutConfig, ()), (RolloutConfig, CORRECTING)],
+    ids=["lerobot-record", "lerobot-rollout", "lerobot-rollout with corrections"],
+)
+def test_one_file_is_the_robot_of_every_command(kind, options, monkeypatch, tmp_path):
+    """From any folder, and an option on the command line wins over it."""
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "my robot.yaml"
+    file.write_text(FILE.read_text())
+    policy = (f"--policy.path={trained()}",) if kind is RolloutConfig else ()
+    cfg = parsed(kind, "--config_path=my robot.yaml", *policy, *options, "--robot.port=/dev/ttyUSB7")
+    assert (cfg.robot.type, cfg.robot.port, cfg.robot.id) == ("so101_follower", "/dev/ttyUSB7", "follower")
+    assert (cfg.teleop.type, cfg.teleop.port, cfg.teleop.id) == ("so101_leader", "/dev/ttyACM1", "leader")
+    assert cfg.robot.cameras["front"].index_or_path == 0
+    microphone = cfg.robot.cameras["gripper"]
+    assert isinstance(microphone, MicrophoneCameraConfig)
+    assert microphone.device == "USB Audio"
+    if options:
+        assert (cfg.dataset.root, cfg.dataset.single_task) == ("here/demos", "Find the cube")
+    assert not options or kind is RecordConfig or isinstance(cfg.strategy, DAggerStrategyConfig)
