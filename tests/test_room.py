@@ -13,6 +13,7 @@ from scipy import signal
 from scipy.io import wavfile
 
 from gym_playbyear.registry import OptionError
+from gym_playbyear.room import Room
 from gym_playbyear.sound import BACKGROUND_RMS
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.policy.sound_augmentation import RecordedNoise
@@ -90,15 +91,25 @@ def test_every_microphone_and_every_episode_is_somewhere_else_in_the_recording(c
 
 
 def test_what_cannot_be_is_refused_with_option_and_value(tmp_path):
-    silent, broken = tmp_path / "silent.wav", tmp_path / "broken.wav"
-    wavfile.write(silent, 16000, np.zeros(1000, np.int16))
-    broken.write_text("no sound")
-    for room, message in [
-        ({"noise": str(silent)}, "it is silent"),
-        ({"noise": str(broken)}, "cannot be read as a WAV file"),
-    ]:
-        with pytest.raises(OptionError, match=message):
-            gym.make(TASK, room=room)
+    wavfile.write(tmp_path / "silent.wav", 16000, np.zeros(1000, np.int16))
+    with pytest.raises(OptionError, match="it is silent"):
+        Room(("gripper",), 16000, str(tmp_path / "silent.wav"))
+    whole = (tmp_path / "silent.wav").read_bytes()
+    for content in (
+        b"no sound",
+        b"",
+        b"fLaC\0\0\0\x22",
+        whole[:20],
+        whole[:24] + bytes(4) + whole[28:],  # of rate 0
+        whole[:24] + b"\xff" * 4 + whole[28:],
+        whole[:22] + bytes(2) + whole[24:],  # of no channel
+        whole[:32] + bytes(4) + whole[36:],  # of samples of no bits
+        whole[:36],
+    ):
+        path = tmp_path / f"{len(content)}.wav"
+        path.write_bytes(content)
+        with pytest.raises(OptionError, match="cannot be read as a WAV file"):
+            Room(("gripper",), 16000, str(path))
 
 
 NOISES = ("hum", "speech_like", "music_like", "clatter", "hammering", "typing", "tool")

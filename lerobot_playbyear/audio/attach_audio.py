@@ -333,7 +333,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     if cfg.offsets is None:
         return [offset] * n_episodes
     try:
-        values = [float(value) for value in json.loads(cfg.offsets.read_text())]
+        values = [float(value) for value in json.loads(cfg.offsets.read_bytes())]
     except (OSError, ValueError, TypeError) as error:
         raise AttachError(f"--offsets={cfg.offsets} is no list of numbers in JSON: {error}") from error
     if len(values) != n_episodes:
