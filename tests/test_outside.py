@@ -165,6 +165,18 @@ def test_attempts_are_appended_to_no_other_file(finished, tmp_path, text):
     assert (tmp_path / "other").read_text() == text
 
 
+@pytest.mark.parametrize("text", ["{", "[]", "5", "[" * 9999])
+def test_damaged_options_are_named(finished, trained, tmp_path, text):
+    run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
+    (run / "dagger_config.json").write_text(text)
+    said = run_in_process(dagger_command, "--resume=true", f"--output_dir={run}")
+    assert said.startswith(f"error: {run / 'dagger_config.json'} is damaged")
+    policy = Path(shutil.copytree(trained, tmp_path / "policy"))
+    (policy / "config.json").write_text(text)
+    said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
+    assert said.startswith(f"error: {policy / 'config.json'} is damaged")
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"evil": 1}', "[" * 9999, '{"policy_path": "x", "made": "000002"}'])
 def test_a_damaged_state_of_a_run_is_named(finished, tmp_path, text):
     run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
@@ -278,6 +290,22 @@ def test_statistics_that_are_none_are_named(noise, tmp_path, text):
         check_dataset_files("a/b", root)
     findings = inspect(InspectConfig(InspectDatasetConfig("a/b", str(root))))
     assert [each.check for each in findings if each.level == "error"] == ["statistics"]
+
+
+@pytest.mark.parametrize(("name", "value"), [("chunks_size", 0), ("chunks_size", -1), ("features", 5)])
+def test_what_a_dataset_cannot_say_of_itself_is_named(noise, tmp_path, name, value):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    edit_info(root, lambda info: info.update({name: value}))
+    with pytest.raises(InputError, match=rf"info\.json is damaged: {name} is {value}"):
+        survey(root)
+
+
+@pytest.mark.parametrize(("name", "value"), [("video_info", 5), ("info", "x"), ("shape", "x")])
+def test_what_a_dataset_cannot_say_of_a_camera_is_named(noise, tmp_path, name, value):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    edit_info(root, lambda info: info["features"][CAMERA].update({name: value}))
+    with pytest.raises(InputError, match=f"the feature '{CAMERA}' has {name} {value!r}"):
+        survey(root)
 
 
 # What a checkpoint runs

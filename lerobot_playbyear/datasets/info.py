@@ -424,8 +424,9 @@ def _check_fields(info: Info) -> None:
         shape = feature.get("shape")
         if not isinstance(shape, list) or not all(map(_is_count, shape)):
             raise ValueError(f"the feature '{key}' has shape {shape!r}; wanted a list of whole numbers")
-        if not isinstance(feature.get("info") or {}, dict):
-            raise ValueError(f"the feature '{key}' has info {feature['info']!r}; wanted fields such as sample_rate")
+        for name in ("info", "video_info"):
+            if not isinstance(feature.get(name) or {}, dict):
+                raise ValueError(f"the feature '{key}' has {name} {feature[name]!r}; wanted fields such as sample_rate")
     if not isinstance(info.get("data_path"), str):
         raise ValueError(f"data_path is {info.get('data_path')!r}; wanted {DEFAULT_DATA_PATH!r}")
     if not isinstance(info.get("video_path"), str) and any(one["dtype"] == "video" for one in features.values()):

@@ -483,12 +483,11 @@ def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], found: Se
             break
         expected += episode.frames.length
     data = read_listed(root, STATS_PATH)
-    if data is None:
-        if n_frames:
-            yield _wrong("statistics", f"{STATS_PATH} is missing")
-        return
     try:
-        parse_stats(data)
+        if data is not None:
+            parse_stats(data)
+        elif n_frames:
+            yield _wrong("statistics", f"{STATS_PATH} is missing")
     except ValueError as error:
         yield _wrong("statistics", f"{STATS_PATH} cannot be read: {error}")
 

@@ -233,7 +233,28 @@ def run_with_lerobot[Result](work: Callable[[Any], Result]) -> Result:
             sys.stderr.write(said.getvalue())
 
     register_third_party_plugins()
+    _check_saved_options(sys.argv[1:])
     return run_alone(work, parse)
+
+
+def _check_saved_options(args: list[str]) -> None:
+    """Whether the files of options that a command line names can be read; LeRobot does not say which one cannot.
+
+    Raises:
+        InputError: One of them is damaged.
+    """
+    from lerobot_playbyear.datasets.errors import InputError
+    from lerobot_playbyear.datasets.files import parse_json
+
+    given, _ = given_options(args)
+    for option, name in (("config_path", ""), ("policy.path", "config.json")):
+        path = Path(given.get(option) or "") / name
+        if path.suffix == ".json" and path.is_file():
+            try:
+                if not isinstance(parse_json(path.read_bytes()), dict):
+                    raise ValueError("it holds no options")
+            except ValueError as error:
+                raise InputError(f"{path} is damaged: {error}. Put it back from a copy.") from error
 
 
 def check_local_dataset(repo_id: str, root: str | None) -> None:
