@@ -23,12 +23,8 @@ from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder, scratch_folder
 from lerobot_playbyear.datasets.findings import name_episodes
-<<<<<<< HEAD
 from lerobot_playbyear.datasets.frame_rate import divides, exact_rate, nearest_sample_rate
 from lerobot_playbyear.datasets.info import check_links, nothing_in
-=======
-from lerobot_playbyear.datasets.info import check_links
->>>>>>> room-habits
 from lerobot_playbyear.datasets.next_command import training_command
 from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
