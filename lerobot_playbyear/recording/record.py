@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import os
+import shlex
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -124,7 +125,7 @@ def record(cfg: RecordConfig) -> Path:
     print(f"\nDataset: {root} ({summary})")
     print(
         "Train on it: playbyear-train --policy.type=playbyear --policy.push_to_hub=false "
-        f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={root}{fps}"
+        f"--dataset.repo_id={cfg.dataset.repo_id} --dataset.root={shlex.quote(str(root))}{fps}"
     )
     if cfg.dataset.push_to_hub:
         options = PushOptions(cfg.dataset.private, cfg.dataset.tags)
