@@ -17,7 +17,10 @@ from support.old_layout import OLD
 from support.recording import edit_column, edit_info
 from support.shared import ENV, TINY, run_in_process
 
+from lerobot_playbyear.audio import write_audio
+from lerobot_playbyear.datasets.frame_rate import exact_rate
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
+from lerobot_playbyear.datasets.survey import survey
 from lerobot_playbyear.datasets.video_files import picture_times
 from lerobot_playbyear.hub.dataset_card import film_preview
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
@@ -179,6 +182,32 @@ def test_a_policy_learns_at_a_frame_rate_that_is_not_whole(fractional, tmp_path)
     assert f"give --policy.fps={fps}, or" in refused
 
 
+@pytest.mark.parametrize(
+    ("fps", "wanted"),
+    [(12.5, 16000), (29.97, 14985), (30000 / 1001, 30000), (20.0, 16000)],
+    ids=["12.5", "29.97", "ntsc", "20.0"],
+)
+def test_sound_and_its_pictures_are_attached_at_any_frame_rate(tmp_path, fps, wanted):
+    root, sounds = tmp_path / "deaf", tmp_path / "heard"
+    make_dataset(root, (9,), fps=fps, image_size=16, microphones=())
+    edit_info(root, lambda info: info.update(fps=fps))
+    sounds.mkdir()
+    noise = np.random.default_rng(0).normal(0, 300, (16000, 1)).astype(np.int16)
+    write_audio(sounds / "0.wav", noise, 16000)
+    data = ("--dataset.repo_id=a/b", f"--dataset.root={root}", f"--files={sounds}/{{episode}}.wav")
+    given = (*data, "--output.repo_id=a/c", f"--output.root={tmp_path / 'out'}")
+    if wanted != 16000:
+        assert f"--sample_rate={wanted}." in str(run_in_process(commands.attach_audio, *given))
+        said = str(run_in_process(commands.attach_audio, *given, "--sample_rate=16000"))
+        assert f"a multiple of {exact_rate(fps).numerator} Hz, such as {wanted}" in said
+    assert run_in_process(commands.attach_audio, *given, f"--sample_rate={wanted}") is None
+    info = json.loads((tmp_path / "out/meta/info.json").read_text())
+    assert (info["fps"], type(info["fps"])) == (fps, int if fps == 20 else float)
+    pictured = ("--dataset.repo_id=a/c", f"--dataset.root={tmp_path / 'out'}", "--output.repo_id=a/d", "--seconds=0.4")
+    assert run_in_process(commands.attach_spectrogram, *pictured, f"--output.root={tmp_path / 'seen'}") is None
+    assert survey(tmp_path / "seen").is_undamaged
+
+
 # What is no whole dataset
 
 
@@ -272,4 +301,4 @@ def test_what_is_no_whole_dataset_is_told_in_one_line(filmed, trained_config, tm
     said = str(ended) if command != "inspect" else capsys.readouterr().err
     assert re.search(wanted.replace("{root}", re.escape(str(root))), said.strip())
     assert said.strip().count("\n") == 0
-    assert not (tmp_path / "out").exists()
+    assert not list((tmp_path / "out").rglob("*"))

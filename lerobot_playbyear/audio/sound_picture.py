@@ -8,7 +8,6 @@ Here is numpy alone, in double precision and without matrix products, whose sums
 same samples give the same picture, whichever process makes it. Environments need neither torch nor LeRobot for it.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
@@ -85,8 +84,8 @@ class SoundPicture:
         for name in ("height", "width"):
             if getattr(self, name) > _LARGEST:
                 raise self._error(name, f"at most {_LARGEST} pixels")
-        if isinstance(self.fps, bool) or not isinstance(self.fps, int | float) or not 0 < self.fps < math.inf:
-            raise self._error("fps", "a number above 0")
+        if isinstance(self.fps, bool) or not isinstance(self.fps, int | float) or not 1 <= self.fps <= self.sample_rate:
+            raise self._error("fps", f"a number from 1 to sample_rate={self.sample_rate}")
         if not divides(self.fps, self.sample_rate) or self.columns_per_frame > self.samples_per_frame:
             raise self._error("columns_per_frame", "at most sample_rate / fps: more seconds, or a smaller width")
         if not FLOOR_DB <= self.low_db < self.high_db:

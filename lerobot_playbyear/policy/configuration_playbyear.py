@@ -1,6 +1,7 @@
 """Configuration of the policy `playbyear`: its options, the windows that follow from them, and what is refused."""
 
 import math
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -410,8 +411,8 @@ class PlaybyearConfig(PreTrainedConfig):
             if audio_key_of(key) not in meta.features:
                 raise ValueError(
                     f"'{key}' is a microphone's picture, and its sound is not attached: playbyear-attach-audio "
-                    f"--dataset.repo_id={meta.repo_id} --dataset.root={meta.root}. Then train on {meta.repo_id}_with_sound, in "
-                    f"{meta.root}_with_sound."
+                    f"--dataset.repo_id={meta.repo_id} --dataset.root={shlex.quote(str(meta.root))} (it writes "
+                    f"{meta.repo_id}_with_sound, in {meta.root}_with_sound: train on that)"
                 )
             del inputs[key]
 
