@@ -108,7 +108,7 @@ def main() -> None:
     args = parser.parse_args()
     folder = args.output_dir
     demos = f"--dataset.repo_id=me/demos --dataset.root={folder / 'demos'}".split()
-    small = ["--policy.fps=30", "--policy.use_vision=false", "--policy.use_audio=false", "--policy.hidden_size=64"]
+    small = ["--policy.use_vision=false", "--policy.use_audio=false", "--policy.hidden_size=64"]
 
     record(
         RecordConfig(CarConfig(), RecordDatasetConfig("me/demos", str(folder / "demos"), num_episodes=3), num_workers=0)

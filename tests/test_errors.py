@@ -130,7 +130,7 @@ train | --preset=paper --policy.type=act | --preset=paper is for --policy.type=p
 train | --store=tape | --store=tape is not known: wanted one of memory, disk, auto
 train | --dataset.streaming=true | --dataset.streaming does not work | --store=disk
 train | --dataset.image_transforms.enable=true | --dataset.image_transforms.enable does not work | lerobot-train
-train | --dataset.root={slow} | 10 frames per second | configured for 20 | --policy.fps=10
+train | --policy.fps=20 --dataset.root={slow} | 10 frames per second | configured for 20 | --policy.fps=10
 train | --dataset.root={deaf} | observation.audio | --policy.use_audio=false
 train | --policy.sample_rate=48001 | sample_rate / fps = 48001 / 20
 train | --policy.path={policy} -policy.type --policy.fps=0 | --policy.fps must be above 0 and at most 1000, got 0

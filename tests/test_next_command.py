@@ -69,6 +69,6 @@ def test_what_a_recording_says_to_type_next_trains_on_any_environment(fps, kinds
 @pytest.mark.parametrize(("has_gpu", "preset"), [(True, "gpu"), (False, "cpu")])
 def test_the_preset_is_the_one_for_the_machine(has_gpu, preset, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: has_gpu)
-    assert training_command("me/demos", 20, ["observation.images.front", "observation.audio.mic"], "here") == (
+    assert training_command("me/demos", ["observation.images.front", "observation.audio.mic"], "here") == (
         f"playbyear-train --preset={preset} --dataset.repo_id=me/demos --dataset.root=here --output_dir=outputs/train/demos"
     )

@@ -187,11 +187,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         write_new_dataset(dataset.root, target, added, removed, notes)
     heard = [f"{key} at {added[key].feature['info']['sample_rate']} Hz" for key in audio_keys(added)]
     print(printable(f"\nDataset: {target} ({len(dataset.episodes)} episodes with {', '.join(heard)})"))
-    print(
-        printable(
-            f"Train on it: {training_command(cfg.output.repo_id, dataset.fps, [*dataset.features, *added], target)}"
-        )
-    )
+    print(printable(f"Train on it: {training_command(cfg.output.repo_id, [*dataset.features, *added], target)}"))
     return target
 
 

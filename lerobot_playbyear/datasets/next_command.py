@@ -6,18 +6,16 @@ from pathlib import Path
 
 from lerobot_playbyear.datasets.features import audio_keys
 
-_POLICY_FPS = 20  # of a policy that is not told
 _PICTURES = "observation.image"  # what the keys of cameras start with
 
 
 def training_command(
-    repo_id: str, fps: int, features: Iterable[str], root: str | Path | None = None, preset: str | None = None
+    repo_id: str, features: Iterable[str], root: str | Path | None = None, preset: str | None = None
 ) -> str:
     """What to type to train a policy on a dataset, within the hour; it works as it stands.
 
     Args:
         repo_id: The dataset's name.
-        fps: Its frames per second.
         features: The names of its features; the policy does without what is not among them.
         root: Its folder. None: LeRobot finds it by its name.
         preset: The preset. None: the one for this machine.
@@ -28,7 +26,6 @@ def training_command(
         "dataset.repo_id": repo_id,
         "dataset.root": root,
         "output_dir": f"outputs/train/{repo_id.rpartition('/')[2]}",
-        "policy.fps": fps if fps != _POLICY_FPS else None,
         "policy.use_vision": None if any(name.startswith(_PICTURES) for name in names) else "false",
         "policy.use_audio": None if audio_keys(names) else "false",
     }

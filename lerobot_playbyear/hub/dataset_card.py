@@ -100,7 +100,7 @@ def describe_dataset(dataset: SurveyedDataset, repo_id: str, film_url: str | Non
             "since the previous frame. To hear an episode, with the plugin lerobot-playbyear:",
             _LISTEN.format(repo_id=_quoted(repo_id), microphone=_quoted(dataset.microphones[0])),
             "To train a policy that hears:",
-            f"```bash\n{training_command(repo_id, dataset.fps, dataset.features, preset='cpu')}\n```",
+            f"```bash\n{training_command(repo_id, dataset.features, preset='cpu')}\n```",
             "On a GPU: `--preset=gpu`.",
         ]
     else:

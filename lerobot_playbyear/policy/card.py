@@ -63,7 +63,7 @@ def _section(config: PlaybyearConfig) -> str:
     rows = [
         ("Microphones", "<br>".join(heard) or "none: it is deaf"),
         ("Cameras", "<br>".join(seen) or "none: it is blind"),
-        ("Steps per second", f"{config.fps}"),
+        ("Steps per second", f"{config.control_hz}"),
         ("Sound behind each step", f"{config.audio_window_s:g} s" if heard else ""),
         ("Memory", f"{config.memory_steps} steps, {config.frame_stack} images each" if config.use_memory else "none"),
     ]

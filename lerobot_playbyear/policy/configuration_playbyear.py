@@ -34,6 +34,7 @@ _SIZES = {
 }
 """From 1 to this: beyond it a configuration is damaged, or asks for all memory."""
 
+_USUAL_FPS = 20
 _LARGEST = 1000  # frames per second, and range of actions
 _AT_LEAST_0 = (
     *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
@@ -50,7 +51,8 @@ class PlaybyearConfig(PreTrainedConfig):
     microphone and the low-dimensional observations; an LSTM over the last `n_memory_steps` encodings gives the action.
 
     Inputs:
-        fps: Frames per second of the dataset and the control loop [Hz]. Window lengths in frames follow from it.
+        fps: Frames per second of the dataset and the control loop [Hz]. Window lengths in frames follow from it. None takes it
+            from the dataset, which `lerobot-train` can do at 20 alone.
         sample_rate: Samples per second of every microphone [Hz]. None takes it from the dataset.
         use_vision, use_audio: Off leaves that encoding out, which is what the paper's inputs of zeros amount to.
         use_memory: Off encodes one frame with one image: the paper's ablation of memory.
@@ -118,7 +120,7 @@ class PlaybyearConfig(PreTrainedConfig):
     """
 
     # Inputs
-    fps: float = 20
+    fps: float | None = None
     sample_rate: int | None = None
     use_vision: bool = True
     use_audio: bool = True
@@ -185,7 +187,7 @@ class PlaybyearConfig(PreTrainedConfig):
             self._check_options()
         except ValueError as error:  # of which draccus would print no word
             raise DecodingError((), str(error)) from error
-        self.fps = frame_rate(self.fps)  # an option or JSON may have 20.0
+        self.fps = self.fps and frame_rate(self.fps)  # an option or JSON may have 20.0
         self._asked_dtype = self.dtype
         self.dtype = training_dtype(self.dtype, self.use_amp, str(self.device))  # LeRobot reads this, and not use_amp
 
@@ -225,9 +227,14 @@ class PlaybyearConfig(PreTrainedConfig):
         return self.n_frame_stack if self.use_memory else 1
 
     @property
+    def control_hz(self) -> float:
+        """Frames per second; 20 as long as nothing has said it."""
+        return self.fps or _USUAL_FPS
+
+    @property
     def audio_frames(self) -> int:
         """Frames whose sound one encoding hears."""
-        return math.ceil(round(self.audio_window_s * self.fps, 6))
+        return math.ceil(round(self.audio_window_s * self.control_hz, 6))
 
     @property
     def n_run_frames(self) -> int:
@@ -304,7 +311,7 @@ class PlaybyearConfig(PreTrainedConfig):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"--policy.{name} must be at least 0 (none) and finite, got {getattr(self, name)}.")
         for name in ("fps", "action_range"):
-            if not 0 < getattr(self, name) <= _LARGEST:
+            if getattr(self, name) is not None and not 0 < getattr(self, name) <= _LARGEST:
                 raise ValueError(f"--policy.{name} must be above 0 and at most {_LARGEST}, got {getattr(self, name)}.")
         if self.memory_displacement_gain and not self.low_dimensional_gain:
             raise ValueError(
@@ -357,7 +364,7 @@ class PlaybyearConfig(PreTrainedConfig):
         if self.sample_rate is None:
             raise ValueError(f"The sample rate of {self.audio_keys} is not known: set --policy.sample_rate.")
         for key in self.audio_keys:
-            _check_samples(key, int(features[key].shape[0]), self.sample_rate, self.fps)
+            _check_samples(key, int(features[key].shape[0]), self.sample_rate, self.control_hz)
 
     def set_dataset_feature_metadata(self, features: dict[str, Any]) -> None:
         """Takes the sample rate from the dataset's features, and leaves microphones' pictures out of the observations: a policy
@@ -388,15 +395,17 @@ class PlaybyearConfig(PreTrainedConfig):
                     f"playbyear-train, which resamples, or a new policy with --policy.sample_rate={seen}."
                 )
             self.sample_rate = int(seen)
-            _check_samples(key, int(feature["shape"][0]), self.sample_rate, self.fps)
+            _check_samples(key, int(feature["shape"][0]), self.sample_rate, self.control_hz)
 
     def check_frame_rate(self, meta: "LeRobotDatasetMetadata") -> None:
-        """Raises a ValueError if a dataset has another one than the policy."""
-        if meta.fps != self.fps:
+        """Takes a dataset's frame rate. Raises a ValueError if the policy has another one."""
+        own, rate = self.control_hz, frame_rate(meta.fps)
+        if rate != own:
             raise ValueError(
-                f"The dataset '{meta.repo_id}' has {frame_rate(meta.fps)} frames per second, and the policy is configured for "
-                f"{self.fps}: give --policy.fps={frame_rate(meta.fps)}, or a dataset recorded at {self.fps}."
+                f"The dataset '{meta.repo_id}' has {rate} frames per second, and the policy is configured for {own}: "
+                f"give --policy.fps={rate}, or a dataset recorded at {own}."
             )
+        self.fps = rate
 
     def check_dataset(self, meta: "LeRobotDatasetMetadata") -> None:
         """Checks a dataset's frame rate, and leaves its microphones' pictures out of the observations.

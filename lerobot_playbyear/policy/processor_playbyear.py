@@ -52,7 +52,7 @@ def make_playbyear_pre_post_processors(
     steps.normalize.normalize_observation_keys = set(config.low_dimensional_keys)
     heard = [_microphone_step(name, config) for name in config.audio_steps]
     if config.use_audio and config.sample_rate is not None:
-        heard.insert(0, MicrophonePicturesToAudioStep(config.audio_keys, config.sample_rate, config.fps))
+        heard.insert(0, MicrophonePicturesToAudioStep(config.audio_keys, config.sample_rate, config.control_hz))
     return make_policy_processor_pipelines(
         input_steps=[steps.rename_observations, steps.add_batch_dim, steps.to_device, *heard, steps.normalize],
         output_steps=[steps.unnormalize, steps.to_cpu],

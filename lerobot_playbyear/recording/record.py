@@ -126,7 +126,7 @@ def record(cfg: RecordConfig) -> Path:
     except OSError as error:
         raise PlaybyearError(f"Cannot write to {root}: {error}") from error
     print(f"\nDataset: {root} ({summary})")
-    print(f"Train on it: {training_command(cfg.dataset.repo_id, facts.fps, features, root)}")
+    print(f"Train on it: {training_command(cfg.dataset.repo_id, features, root)}")
     if cfg.dataset.push_to_hub:
         options = PushOptions(cfg.dataset.private, cfg.dataset.tags)
         print(f"On the Hub: {push_dataset(cfg.dataset.repo_id, cfg.dataset.root, options)}")

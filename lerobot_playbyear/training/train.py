@@ -67,6 +67,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
         with accelerator.main_process_first():  # it downloads, and the others find what is there
             dataset, held_out = make_train_eval_datasets(cfg)
         reader = DatasetReader.of(dataset)
+        cfg.policy.fps = cfg.policy.fps or reader.fps
         meta = learned_meta(cfg.policy, reader.meta)
         learner = make_learner(cfg, meta, accelerator=accelerator)
         is_shared = accelerator.num_processes > 1
