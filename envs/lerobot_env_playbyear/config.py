@@ -242,9 +242,8 @@ class PlaybyearEnvConfig(EnvConfig):
                 raise self._error(name, f"--env.sound={self.sound} has no sound for it; leave one of them out")
         if self.room_noise is None and self.room_noise_level != 1.0:
             raise self._error("room_noise_level", "no noise plays in the room; name a WAV file with --env.room_noise")
-        self._asked(
-            lambda: _tasks().environment.TaskEnv(self.task or "", **self.gym_kwargs)
-        )  # whose messages tell what works
+        # Whose messages tell what works.
+        self._asked(lambda: _tasks().environment.TaskEnv(self.task or "", **self.gym_kwargs))
 
     def _asked[T](self, what: Callable[[], T]) -> T:
         """What the tasks answer; their complaint names the option of this configuration."""

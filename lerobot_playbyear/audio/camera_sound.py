@@ -123,9 +123,8 @@ class _MicrophoneReader:
         self._check_pace()
         for session, (start, stop) in self._taken.items():
             file = self._files[session]
-            print(
-                f"{printable(self._key)}: {start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s of {file.path}"
-            )
+            seconds = f"{start / file.sample_rate:.1f} to {stop / file.sample_rate:.1f} s"
+            print(printable(f"{self._key}: {seconds} of {file.path}"))
         return self._sound.columns(self._rate, self._dataset.fps), is_first
 
     def _read_episode(self, episode: int, pictures: Iterator[np.ndarray]) -> np.ndarray:
