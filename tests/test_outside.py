@@ -37,6 +37,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 SECRET = "what nobody else may read or change"
 
 
+ODD_STATES = ('{"policy_path": "x", "made": "000002"}', '{"policy_path": "x", "next_seed": -3}')
+
+
 @pytest.fixture
 def secret(tmp_path):
     """A file of this machine."""
@@ -177,12 +180,21 @@ def test_damaged_options_are_named(finished, trained, tmp_path, text):
     assert said.startswith(f"error: {policy / 'config.json'} is damaged")
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"evil": 1}', "[" * 9999, '{"policy_path": "x", "made": "000002"}'])
+@pytest.mark.parametrize("text", ["{", "[]", '{"evil": 1}', "[" * 9999, *ODD_STATES])
 def test_a_damaged_state_of_a_run_is_named(finished, tmp_path, text):
     run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
     (run / "dagger_state.json").write_text(text)
     with pytest.raises(InputError, match=r"dagger_state\.json is damaged"):
         command("--resume=true", f"--output_dir={run}")
+
+
+def test_lines_of_figures_that_say_nothing_are_dropped(finished, tmp_path):
+    run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
+    before = (run / "metrics.jsonl").read_text()
+    odd = ['{"kind": "x"}', "[1]", '{"kind": ["eval"], "round": 0}', '{"kind": "attempt", "attempt": "a"}', "[" * 9999]
+    (run / "metrics.jsonl").write_text("\n".join([*odd, before]))
+    command("--resume=true", f"--output_dir={run}")
+    assert (run / "metrics.jsonl").read_text().startswith(before)
 
 
 # Files that lead to others
@@ -444,3 +456,15 @@ def test_long_lists_of_equal_numbers_take_no_memory_that_is_not_there(noise, tmp
     for read in (check_dataset_files, lambda _, root: survey(root)):
         with pytest.raises(MemoryError, match="values in one piece"):
             read("a/b", root)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("hidden_size", 10**6), ("n_memory_steps", 10**8), ("vision_width", 3000), ("audio_window_s", 1e6)],
+)
+def test_a_checkpoint_does_not_ask_for_all_memory(trained, tmp_path, name, value):
+    policy = Path(shutil.copytree(trained, tmp_path / "policy"))
+    saved = json.loads((policy / "config.json").read_text())
+    (policy / "config.json").write_text(json.dumps({**saved, name: value}))
+    said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
+    assert f"--policy.{name} must be at most" in said

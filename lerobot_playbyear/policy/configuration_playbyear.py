@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from lerobot.datasets import LeRobotDatasetMetadata
 
 _AT_LEAST_1 = ("fps", "n_frame_stack", "n_memory_steps", "n_supervised_steps", "vision_width", "image_size")
+_AT_MOST = {  # a checkpoint may be a stranger's, and its options say how much memory the network takes
+    **{"n_memory_steps": 10_000, "n_supervised_steps": 10_000, "hidden_size": 8192, "memory_readers": 8192},
+    **{"vision_width": 512, "image_size": 4096, "n_frame_stack": 100, "audio_window_s": 60, "sample_rate": 1_000_000},
+}
 _AT_LEAST_0 = (
     *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
     *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
@@ -278,6 +282,9 @@ class PlaybyearConfig(PreTrainedConfig):
         for name in _AT_LEAST_1:
             if getattr(self, name) < 1:
                 raise ValueError(f"--policy.{name} must be at least 1, got {getattr(self, name)}.")
+        for name, most in _AT_MOST.items():
+            if not (getattr(self, name) or 0) <= most:
+                raise ValueError(f"--policy.{name} must be at most {most}, got {getattr(self, name)}.")
         for name in _AT_LEAST_0:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"--policy.{name} must be at least 0 (none) and finite, got {getattr(self, name)}.")
