@@ -468,3 +468,21 @@ def test_a_checkpoint_does_not_ask_for_all_memory(trained, tmp_path, name, value
     (policy / "config.json").write_text(json.dumps({**saved, name: value}))
     said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
     assert f"--policy.{name} must be at most" in said
+
+
+@pytest.mark.parametrize("kind", ["input_features", "output_features"])
+def test_a_checkpoint_does_not_claim_a_state_or_an_action_of_a_billion_numbers(trained, tmp_path, kind):
+    policy = Path(shutil.copytree(trained, tmp_path / "policy"))
+    saved = json.loads((policy / "config.json").read_text())
+    saved[kind]["observation.state" if kind == "input_features" else "action"]["shape"] = [10**9]
+    (policy / "config.json").write_text(json.dumps(saved))
+    said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
+    assert "wanted at most 65536 numbers" in said
+
+
+@pytest.mark.parametrize("data", [b"", (2**62).to_bytes(8, "little") + b"{}", b"\x02" + bytes(7) + b"{}" + b"x" * 9])
+def test_damaged_weights_are_named(trained, tmp_path, data):
+    policy = Path(shutil.copytree(trained, tmp_path / "policy"))
+    (policy / "model.safetensors").write_bytes(data)
+    said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
+    assert f"{policy / 'model.safetensors'} is damaged" in said

@@ -10,6 +10,7 @@ from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from lerobot.utils.device_utils import resolve_safetensors_device
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -75,6 +76,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
         try:
             weights = load_file(model_file, device=resolve_safetensors_device(map_location))
             missing, unexpected = model.load_state_dict(weights, strict=False)
+        except SafetensorError as error:
+            raise ValueError(f"{model_file} is damaged: {error}. Put it back from a copy.") from error
         except RuntimeError as error:
             raise ValueError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
         if missing or (strict and unexpected):
