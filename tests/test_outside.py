@@ -19,6 +19,7 @@ from support.shared import ENV, run_in_process
 
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import FolderLockedError, new_file, new_folder, write_atomically
 from lerobot_playbyear.datasets.info import check_dataset_files
@@ -153,6 +154,15 @@ def test_training_goes_on_in_its_own_folder(trained, tmp_path, file):
         assert f"is another folder. Give --output_dir={run} to go on there" in said
     else:  # where only options of ours are read
         assert (run / "checkpoints/000003").is_dir()
+
+
+@pytest.mark.parametrize("text", ["[]", '{"step": "x"}', '{"step": 1e400}', "[" * 9999])
+def test_a_damaged_number_of_updates_is_named(trained, tmp_path, text):
+    run = Path(shutil.copytree(trained.parents[2], tmp_path / "run", symlinks=True))
+    config = run / "checkpoints/000002/pretrained_model/train_config.json"
+    (run / "checkpoints/000002/training_state/training_step.json").write_text(text)
+    said = run_in_process(train, "--resume=true", f"--config_path={config}", f"--output_dir={run}", "--steps=3")
+    assert "training_step.json is damaged" in said
 
 
 @pytest.mark.parametrize("text", [SECRET, "[1]", '{"a": 1}\n', "[" * 9999])
@@ -335,6 +345,14 @@ def test_a_checkpoint_names_no_class_to_call(recorded, trained, tmp_path, file):
     for said in (run_in_process(train, *data, *resumed, "--num_workers=0"), run_in_process(video, *filmed)):
         assert "not registered by any package but names a class" in str(said)
     assert not ran.exists()
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "[" * 9999, '{"steps": [1]}'])
+def test_damaged_processors_are_named(trained, tmp_path, text):
+    checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))
+    (checkpoint / "policy_preprocessor.json").write_text(text)
+    with pytest.raises(InputError, match=r"policy_preprocessor\.json is no processor of LeRobot's"):
+        check_steps(checkpoint)
 
 
 def test_what_is_no_part_of_a_checkpoint_is_not_uploaded(trained, tmp_path, here):
