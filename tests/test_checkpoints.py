@@ -69,9 +69,9 @@ OF_POLICY: dict[str, tuple[Callable[[Path], object], str]] = {
     "weights: no file": (file(WEIGHTS, Path.unlink), "model.safetensors is missing or damaged"),
     "size: 10**6": (
         config(hidden_size=10**6),
-        "--policy.hidden_size must be at least 1 and at most 16,384, got 1000000",
+        "--policy.hidden_size must be at least 1 and at most 8,192, got 1000000",
     ),
-    "size: 0": (config(embedding_size=0), "--policy.embedding_size must be at least 1 and at most 16,384, got 0"),
+    "size: 0": (config(embedding_size=0), "--policy.embedding_size must be at least 1 and at most 8,192, got 0"),
     "size: pictures": (
         config(image_size=10**5),
         "--policy.image_size must be at least 1 and at most 4,096, got 100000",

@@ -19,6 +19,7 @@ from support.shared import ENV, run_in_process
 
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import FolderLockedError, new_file, new_folder, write_atomically
 from lerobot_playbyear.datasets.info import check_dataset_files
@@ -35,6 +36,9 @@ from lerobot_playbyear.scripts.commands import train, video
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SECRET = "what nobody else may read or change"
+
+
+ODD_STATES = ('{"policy_path": "x", "made": "000002"}', '{"policy_path": "x", "next_seed": -3}')
 
 
 @pytest.fixture
@@ -152,6 +156,15 @@ def test_training_goes_on_in_its_own_folder(trained, tmp_path, file):
         assert (run / "checkpoints/000003").is_dir()
 
 
+@pytest.mark.parametrize("text", ["[]", '{"step": "x"}', '{"step": 1e400}', "[" * 9999])
+def test_a_damaged_number_of_updates_is_named(trained, tmp_path, text):
+    run = Path(shutil.copytree(trained.parents[2], tmp_path / "run", symlinks=True))
+    config = run / "checkpoints/000002/pretrained_model/train_config.json"
+    (run / "checkpoints/000002/training_state/training_step.json").write_text(text)
+    said = run_in_process(train, "--resume=true", f"--config_path={config}", f"--output_dir={run}", "--steps=3")
+    assert "training_step.json is damaged" in said
+
+
 @pytest.mark.parametrize("text", [SECRET, "[1]", '{"a": 1}\n', "[" * 9999])
 def test_attempts_are_appended_to_no_other_file(finished, tmp_path, text):
     """Which the options of a stranger's run may name."""
@@ -177,12 +190,21 @@ def test_damaged_options_are_named(finished, trained, tmp_path, text):
     assert said.startswith(f"error: {policy / 'config.json'} is damaged")
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"evil": 1}', "[" * 9999, '{"policy_path": "x", "made": "000002"}'])
+@pytest.mark.parametrize("text", ["{", "[]", '{"evil": 1}', "[" * 9999, *ODD_STATES])
 def test_a_damaged_state_of_a_run_is_named(finished, tmp_path, text):
     run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
     (run / "dagger_state.json").write_text(text)
     with pytest.raises(InputError, match=r"dagger_state\.json is damaged"):
         command("--resume=true", f"--output_dir={run}")
+
+
+def test_lines_of_figures_that_say_nothing_are_dropped(finished, tmp_path):
+    run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
+    before = (run / "metrics.jsonl").read_text()
+    odd = ['{"kind": "x"}', "[1]", '{"kind": ["eval"], "round": 0}', '{"kind": "attempt", "attempt": "a"}', "[" * 9999]
+    (run / "metrics.jsonl").write_text("\n".join([*odd, before]))
+    command("--resume=true", f"--output_dir={run}")
+    assert (run / "metrics.jsonl").read_text().startswith(before)
 
 
 # Files that lead to others
@@ -325,6 +347,14 @@ def test_a_checkpoint_names_no_class_to_call(recorded, trained, tmp_path, file):
     assert not ran.exists()
 
 
+@pytest.mark.parametrize("text", ["{", "[]", "[" * 9999, '{"steps": [1]}'])
+def test_damaged_processors_are_named(trained, tmp_path, text):
+    checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))
+    (checkpoint / "policy_preprocessor.json").write_text(text)
+    with pytest.raises(InputError, match=r"policy_preprocessor\.json is no processor of LeRobot's"):
+        check_steps(checkpoint)
+
+
 def test_what_is_no_part_of_a_checkpoint_is_not_uploaded(trained, tmp_path, here):
     checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))
     for name in ("notes.json", "notes.yaml", "secret.safetensors"):
@@ -444,3 +474,33 @@ def test_long_lists_of_equal_numbers_take_no_memory_that_is_not_there(noise, tmp
     for read in (check_dataset_files, lambda _, root: survey(root)):
         with pytest.raises(MemoryError, match="values in one piece"):
             read("a/b", root)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("hidden_size", 10**6), ("n_memory_steps", 10**8), ("vision_width", 3000), ("audio_window_s", 1e6)],
+)
+def test_a_checkpoint_does_not_ask_for_all_memory(trained, tmp_path, name, value):
+    policy = Path(shutil.copytree(trained, tmp_path / "policy"))
+    saved = json.loads((policy / "config.json").read_text())
+    (policy / "config.json").write_text(json.dumps({**saved, name: value}))
+    said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
+    assert re.search(rf"--policy\.{name} must be (at least 1 and )?at most", said)
+
+
+@pytest.mark.parametrize("kind", ["input_features", "output_features"])
+def test_a_checkpoint_does_not_claim_a_state_or_an_action_of_a_billion_numbers(trained, tmp_path, kind):
+    policy = Path(shutil.copytree(trained, tmp_path / "policy"))
+    saved = json.loads((policy / "config.json").read_text())
+    saved[kind]["observation.state" if kind == "input_features" else "action"]["shape"] = [10**9]
+    (policy / "config.json").write_text(json.dumps(saved))
+    said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
+    assert "wanted at most 65536 numbers" in said
+
+
+@pytest.mark.parametrize("data", [b"", (2**62).to_bytes(8, "little") + b"{}", b"\x02" + bytes(7) + b"{}" + b"x" * 9])
+def test_damaged_weights_are_named(trained, tmp_path, data):
+    policy = Path(shutil.copytree(trained, tmp_path / "policy"))
+    (policy / "model.safetensors").write_bytes(data)
+    said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
+    assert f"{policy / 'model.safetensors'} is damaged" in said

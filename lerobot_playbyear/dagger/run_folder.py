@@ -47,6 +47,8 @@ LOCK = ".lock"
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")  # of a checkpoint's folder: one that leads nowhere else
 
+_COUNTS = ("round", "step", "attempts", "kept", "failed", "unneeded", "discarded", "next_seed")
+
 _SAME_RUN = (
     *("dataset", "interventions", "env", "expert", "method", "skip_s", "new_weights", "seed"),
     *("episode_seed", "warmup_episodes", "rename_map"),
@@ -179,6 +181,8 @@ class RunFolder:
             return None
         try:
             state = draccus.decode(RunState, parse_json(path.read_bytes()))
+            if negative := [name for name in _COUNTS if getattr(state, name) < 0]:
+                raise ValueError(f"{negative[0]} is {getattr(state, negative[0])}; wanted 0 or more")
         except (ValueError, ParsingError) as error:
             raise InputError(
                 f"{path} is damaged: {first_line(error)}. Put it back from a copy, or begin another run with the corrections "

@@ -23,7 +23,6 @@ from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep, PolicyProcessorPipeline, TransitionKey, create_transition
 from lerobot.utils.constants import ACTION, OBS_STR, TRAINING_STATE_DIR, TRAINING_STEP
-from lerobot.utils.io_utils import load_json
 from lerobot.utils.random_utils import load_rng_state
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
@@ -37,7 +36,7 @@ from lerobot_playbyear.compat import (
 )
 from lerobot_playbyear.datasets.checkpoint_steps import check_steps
 from lerobot_playbyear.datasets.features import is_depth, number_names
-from lerobot_playbyear.datasets.files import INFO_PATH
+from lerobot_playbyear.datasets.files import INFO_PATH, parse_json
 from lerobot_playbyear.datasets.remedies import without_feature
 from lerobot_playbyear.hub.push import push_checkpoint
 from lerobot_playbyear.policy.batch_norm import mean_over_processes
@@ -311,6 +310,7 @@ def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: Any) 
 
     Raises:
         NotADirectoryError: The checkpoint has no training state.
+        ValueError: The number of its updates is none.
     """
     folder = checkpoint / TRAINING_STATE_DIR
     if not folder.is_dir():
@@ -319,7 +319,10 @@ def load_training_state(checkpoint: Path, optimizer: Optimizer, scheduler: Any) 
     load_optimizer_state(optimizer, folder)
     if scheduler is not None:
         load_scheduler_state(scheduler, folder)
-    return int(load_json(folder / TRAINING_STEP)["step"])
+    try:
+        return int(parse_json((folder / TRAINING_STEP).read_bytes())["step"])
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
+        raise ValueError(f"{folder / TRAINING_STEP} is damaged: {error}. Put it back from a copy.") from error
 
 
 def check_dataset_suits(
