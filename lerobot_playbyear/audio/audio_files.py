@@ -121,7 +121,7 @@ def _opened(path: Path, formats: str) -> Iterator[av.container.InputContainer]:
     with _WholeSamples(path) as file:
         begin = file.read(4)
         file.seek(0)
-        source = file if file.room else str(path)
+        source: Any = file if file.room else str(path)
         found = [
             name for mark, name in _WITHOUT_HEADER.items() if begin.startswith(mark) and name in formats.split(",")
         ]
@@ -175,7 +175,7 @@ class _WholeSamples(io.FileIO):
         if tag in _NUMBERS and max(held) <= room and -(-min(held) // 8) * 8 < room:
             self.room, self._places = struct.pack("<H", room), [place + 14, place + 18][: len(held)]
 
-    def read(self, size: int = -1, /) -> bytes:
+    def read(self, size: int | None = -1, /) -> bytes:
         begin = self.tell()
         found = bytearray(super().read(size))
         for place in self._places:
