@@ -9,7 +9,7 @@ import draccus
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 
 from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
 from lerobot_playbyear.compat import encode_choice
@@ -24,7 +24,7 @@ _AT_MOST = {  # a checkpoint may be a stranger's, and its options say how much m
     **{"n_memory_steps": 10_000, "n_supervised_steps": 10_000, "hidden_size": 8192, "memory_readers": 8192},
     **{"vision_width": 512, "image_size": 4096, "n_frame_stack": 100, "audio_window_s": 60, "sample_rate": 1_000_000},
 }
-_MOST_NUMBERS = 2**16  # of a state or an action
+_MOST_NUMBERS = 2**16  # of a state
 _AT_LEAST_0 = (
     *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
     *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
@@ -329,9 +329,11 @@ class PlaybyearConfig(PreTrainedConfig):
             raise ValueError("The dataset has no 'action': a policy cannot be trained without.")
         if self.use_vision and not self.camera_keys:
             raise ValueError(f"No camera among the observations {sorted(features)}: give --policy.use_vision=false.")
-        for key, feature in {**features, ACTION: self.action_feature}.items():
-            if key in (*self.low_dimensional_keys, ACTION) and math.prod(feature.shape) > _MOST_NUMBERS:
-                raise ValueError(f"'{key}' has shape {tuple(feature.shape)}; wanted at most {_MOST_NUMBERS} numbers.")
+        for key in self.low_dimensional_keys:
+            if math.prod(self.feature_shape(key)) > _MOST_NUMBERS:
+                raise ValueError(
+                    f"'{key}' has shape {self.feature_shape(key)}; wanted at most {_MOST_NUMBERS} numbers."
+                )
         if not self.use_audio:
             return
         if not self.audio_keys:
