@@ -330,6 +330,41 @@ def test_what_a_dataset_cannot_say_of_a_camera_is_named(noise, tmp_path, name, v
         survey(root)
 
 
+@pytest.mark.parametrize("name", ["index", "timestamp", "task_index"])
+def test_texts_in_place_of_numbers_are_refused(noise, tmp_path, name):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path).replace_schema_metadata({})
+    texts = pa.array([str(value) for value in table.column(name).to_pylist()])
+    pq.write_table(table.set_column(table.column_names.index(name), name, texts), path)
+    with pytest.raises(InputError, match=f"its column '{name}' is string; wanted"):
+        check_dataset_files("a/b", root)
+    assert f"its column '{name}' is string; wanted" in str(survey(root))
+
+
+def test_two_columns_of_one_name_are_refused(noise, tmp_path):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path).replace_schema_metadata({})
+    pq.write_table(table.append_column("action", table.column("action")), path)
+    with pytest.raises(InputError, match="two columns of one name"):
+        check_dataset_files("a/b", root)
+    assert "one comes twice" in str(survey(root))
+
+
+@pytest.mark.parametrize("name", ["episode_index", "length", "dataset_to_index", "data/file_index"])
+@pytest.mark.parametrize("value", [None, "x"])
+def test_rows_without_whole_numbers_are_refused(noise, tmp_path, name, value):
+    root = Path(shutil.copytree(noise, tmp_path / "noise"))
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    table = pq.read_table(path).replace_schema_metadata({})
+    values = pa.array([value] * len(table), pa.string() if value else pa.int64())
+    pq.write_table(table.set_column(table.column_names.index(name), name, values), path)
+    with pytest.raises(InputError, match="are no whole numbers"):
+        check_dataset_files("a/b", root)
+    assert not survey(root).is_undamaged
+
+
 # What a checkpoint runs
 
 
@@ -488,11 +523,10 @@ def test_a_checkpoint_does_not_ask_for_all_memory(trained, tmp_path, name, value
     assert re.search(rf"--policy\.{name} must be (at least 1 and )?at most", said)
 
 
-@pytest.mark.parametrize("kind", ["input_features", "output_features"])
-def test_a_checkpoint_does_not_claim_a_state_or_an_action_of_a_billion_numbers(trained, tmp_path, kind):
+def test_a_checkpoint_does_not_claim_a_state_of_a_billion_numbers(trained, tmp_path):
     policy = Path(shutil.copytree(trained, tmp_path / "policy"))
     saved = json.loads((policy / "config.json").read_text())
-    saved[kind]["observation.state" if kind == "input_features" else "action"]["shape"] = [10**9]
+    saved["input_features"]["observation.state"]["shape"] = [10**9]
     (policy / "config.json").write_text(json.dumps(saved))
     said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
     assert "wanted at most 65536 numbers" in said

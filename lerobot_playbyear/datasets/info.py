@@ -29,7 +29,7 @@ from lerobot_playbyear.datasets.files import (
     parse_json,
 )
 from lerobot_playbyear.datasets.frame_rate import frame_rate
-from lerobot_playbyear.datasets.parquet import ParquetDamageError, check_room, open_checked, read_table
+from lerobot_playbyear.datasets.parquet import ParquetDamageError, check_room, holds_numbers, open_checked, read_table
 from lerobot_playbyear.datasets.remedies import convert_command, repair_command
 
 Info = Mapping[str, Any]
@@ -209,8 +209,29 @@ def check_dataset_files(
         ) from error
     data = [*footers[_DATA].values()]
     check_claims(folder, data, sum(footer.num_rows for footer in footers[_EPISODES].values()))
+    _check_columns(folder, footers[_DATA])
     _check_places(folder, footers[_DATA], list(footers[_EPISODES]))
     return data
+
+
+def _check_columns(folder: Path, data: Mapping[Path, pq.FileMetaData]) -> None:
+    """Refuses texts where a feature is of numbers, which LeRobot would read as they are, and columns of one name.
+
+    Raises:
+        InputError: Naming the file and the column.
+    """
+    texts = ("string", "language", "image", "video", "audio")
+    numbers = {key: own["dtype"] for key, own in read_info(folder)["features"].items() if own["dtype"] not in texts}
+    for path, footer in data.items():
+        schema = footer.schema.to_arrow_schema()
+        if len(set(schema.names)) < len(schema.names):
+            raise InputError(f"'{path}' has two columns of one name. Record it again.")
+        for column in schema:
+            if column.name in numbers and not holds_numbers(column.type):
+                raise InputError(
+                    f"'{path}': its column '{column.name}' is {column.type}; wanted {numbers[column.name]}. Record it "
+                    f"again, or correct the features in {INFO_PATH}."
+                )
 
 
 def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: Iterable[Path]) -> None:
@@ -234,6 +255,10 @@ def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: It
         except ParquetDamageError as error:
             raise InputError(f"'{path}' is damaged: {error}. {repair}") from error
         rows += zip(*(table.column(name).to_pylist() for name in _PLACES), strict=True)
+    if not all(isinstance(value, int) for row in rows for value in row):
+        raise InputError(
+            f"meta/episodes of '{folder}' has rows in which {', '.join(_PLACES)} are no whole numbers. {repair}"
+        )
     named = {folder / info["data_path"].format(chunk_index=row[-2], file_index=row[-1]) for row in rows}
     if lost := [*sorted(named - set(data)), *(path for path in sorted(used) if not path.is_file())]:
         raise InputError(f"'{lost[0]}' is missing, where meta/episodes says that episodes are. {repair}")

@@ -303,6 +303,19 @@ def leaf_columns(path: str, kind: pa.DataType) -> list[Leaf]:
     return [Leaf(path, kind, False, 1)]
 
 
+def holds_numbers(kind: pa.DataType) -> bool:
+    """Whether a column holds numbers or truth values, or lists of them."""
+    kinds = [leaf.kind for leaf in leaf_columns("", kind)]
+    return all(pa.types.is_integer(each) or pa.types.is_floating(each) or pa.types.is_boolean(each) for each in kinds)
+
+
+def are_alike(one: pa.DataType, other: pa.DataType) -> bool:
+    """Whether two columns hold the same kind of values; other tools write lists without their length."""
+    kinds = [each.storage_type if isinstance(each, pa.BaseExtensionType) else each for each in (one, other)]
+    sizes = {each.list_size for each in kinds if pa.types.is_fixed_size_list(each)}
+    return len(sizes) < 2 and len(set(map(pa.types.is_nested, kinds))) == len(set(map(holds_numbers, kinds))) == 1
+
+
 def _is_list(kind: pa.DataType) -> bool:
     return isinstance(kind, pa.BaseExtensionType) or pa.types.is_nested(kind)
 

@@ -34,6 +34,7 @@ from lerobot_playbyear.datasets.info import (
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
     ParquetDamageError,
+    are_alike,
     check_room,
     column_to_numpy,
     parsing,
@@ -248,15 +249,13 @@ def _open(root: Path, path: Path, schema: pa.Schema, rescue: Rescue | None, find
 
 
 def _difference(found: pa.Schema, wanted: pa.Schema) -> str | None:
-    """In what a file's columns differ from the dataset's features; other tools write lists without their length."""
-    if set(found.names) != set(wanted.names):
-        names = ", ".join(sorted(set(found.names) ^ set(wanted.names)))
+    """In what a file's columns differ from the dataset's features."""
+    if sorted(found.names) != sorted(wanted.names):
+        names = ", ".join(sorted(set(found.names) ^ set(wanted.names))) or "one comes twice"
         return f"its columns are not the dataset's features: {names}"
     for column in wanted:
         own, kind = found.field(column.name).type, column.type
-        own, kind = (each.storage_type if isinstance(each, pa.BaseExtensionType) else each for each in (own, kind))
-        sizes = [each.list_size for each in (own, kind) if pa.types.is_fixed_size_list(each)]
-        if pa.types.is_nested(own) != pa.types.is_nested(kind) or len(set(sizes)) > 1:
+        if not are_alike(own, kind):
             return f"its column '{column.name}' is {own}; wanted {kind}"
     return None
 

@@ -11,7 +11,7 @@ from draccus.utils import DecodingError
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamConfig
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 
 from lerobot_playbyear.audio.microphone_pictures import audio_key_of, microphone_pictures
 from lerobot_playbyear.compat import encode_choice
@@ -35,7 +35,7 @@ _SIZES = {
 """From 1 to this: beyond it a configuration is damaged, or asks for all memory."""
 
 _AT_MOST = {"memory_readers": 8192, "audio_window_s": 60, "sample_rate": 1_000_000}
-_MOST_NUMBERS = 2**16  # of a state or an action
+_MOST_NUMBERS = 2**16  # of a state
 _USUAL_FPS = 20
 _LARGEST = 1000  # frames per second, and range of actions
 _AT_LEAST_0 = (
@@ -362,9 +362,11 @@ class PlaybyearConfig(PreTrainedConfig):
             raise ValueError("The dataset has no 'action': a policy cannot be trained without.")
         if self.use_vision and not self.camera_keys:
             raise ValueError(f"No camera among the observations {sorted(features)}: give --policy.use_vision=false.")
-        for key, feature in {**features, ACTION: self.action_feature}.items():
-            if key in (*self.low_dimensional_keys, ACTION) and math.prod(feature.shape) > _MOST_NUMBERS:
-                raise ValueError(f"'{key}' has shape {tuple(feature.shape)}; wanted at most {_MOST_NUMBERS} numbers.")
+        for key in self.low_dimensional_keys:
+            if math.prod(self.feature_shape(key)) > _MOST_NUMBERS:
+                raise ValueError(
+                    f"'{key}' has shape {self.feature_shape(key)}; wanted at most {_MOST_NUMBERS} numbers."
+                )
         if not self.use_audio:
             return
         if not self.audio_keys:
