@@ -130,6 +130,47 @@ def test_twin_pouches_are_the_same_to_the_end():
     assert result.auc.value == 0.5
 
 
+def same_pieces(env, options):
+    """Whatever is in the pouch, it sounds like screws."""
+    shown = make_definition(POUCH, {}).initialize_episode(env, options)
+    env.materials |= dict.fromkeys(env.materials, "screws")
+    return shown
+
+
+def told_by_the_seam(env, options):
+    """The pouch's seam is red if screws are in it."""
+    shown = make_definition(POUCH, {}).initialize_episode(env, options)
+    env.model.geom_rgba[env.model.body("pouch").geomadr + 6] = (1, env.secrets["contents"] == "peanuts", 0, 1)
+    return shown
+
+
+def told_in_numbers(env):
+    return {"label": np.array([env.secrets["contents"] == "screws"], float)}
+
+
+def changed_pouch(**changes):
+    """A function that makes the pouch's task with some changes."""
+    return lambda contents=None: replace(make_definition(POUCH, {"contents": contents}), **changes)
+
+
+@pytest.mark.parametrize(
+    ("task", "options"),
+    [
+        (changed_pouch(initialize_episode=same_pieces), {}),  # alike to the last bit
+        (POUCH, {"noise_level": 1e4}),  # drowned
+        (POUCH, {"sound": "none"}),
+    ],
+)
+def test_a_task_whose_twin_worlds_sound_alike_is_refused(task, options):
+    """Its expert, which knows what is hidden, solves it all the same."""
+    report = check(POUCH, 4, names=["expert"], options=options)
+
+
+@pytest.mark.parametrize("name", [GRASP, POUCH, *(pytest.param(name, marks=pytest.mark.slow) for name in REST)])
+def test_twin_worlds_of_our_tasks_are_told_apart_by_sound(name):
+    assert twin_test(name, range(60000, 60006), n_pictured=0).heard.value > 0.9
+
+
 def test_twins_that_differ_are_found_out(monkeypatch):
     """Peanuts that move otherwise than screws: the arm's measurements tell."""
     begin = DeafTask.begin
