@@ -48,6 +48,7 @@ def test_the_examples_are_short(example):
 )
 def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, noise, tmp_path):
     own = ("--policy.audio_encoder=spectrogram_gru", "--policy.audio_steps=[remove_offset]")
+    own += ("--preset=cpu",) if command is train else ()  # as the page has it
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}")
     run_in_process(command, *TINY, *own, *data, "--steps=2", f"--output_dir={tmp_path / 'train'}")
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"
