@@ -55,6 +55,7 @@ def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, noi
         "--policy.audio_steps=[remove_offset]",
         f"--policy.extension_options={options}",
     )
+    own += ("--preset=cpu",) if command is train else ()  # as the page has it
     data = ("--dataset.repo_id=tests/noise", f"--dataset.root={noise}")
     run_in_process(command, *TINY, *own, *data, "--steps=2", f"--output_dir={tmp_path / 'train'}")
     checkpoint = tmp_path / "train/checkpoints/last/pretrained_model"

@@ -55,7 +55,7 @@ def test_what_a_recording_says_to_type_next_trains_on_any_environment(fps, kinds
         import gym_knock
 
         monkeypatch.setattr(gym_knock, "Other", knocking(fps, kinds), raising=False)
-        monkeypatch.setitem(gym.registry, "gym_knock/Knock-v0", gym.registry["gym_knock/Knock-v0"])
+        monkeypatch.delitem(gym.registry, "gym_knock/Knock-v0")
         register("gym_knock/Knock-v0", lambda **options: gym_knock.Other(**options), max_episode_steps=60)
     data = ["--dataset.repo_id=me/knock", "--dataset.root=my knocks", "--dataset.num_episodes=2", "--num_workers=0"]
     assert run_in_process(record, *env, *data) is None

@@ -6,8 +6,10 @@ from typing import Any
 
 import pytest
 from lerobot.configs import parser
+from lerobot.robots import RobotConfig
 from lerobot.rollout.configs import DAggerStrategyConfig, RolloutConfig
 from lerobot.scripts.lerobot_record import RecordConfig
+from lerobot.teleoperators import TeleoperatorConfig
 from support.shared import trained
 
 from lerobot_playbyear.microphones.camera import MicrophoneCameraConfig
@@ -40,8 +42,10 @@ def test_one_file_is_the_robot_of_every_command(kind, options, monkeypatch, tmp_
     file.write_text(FILE.read_text())
     policy = (f"--policy.path={trained()}",) if kind is RolloutConfig else ()
     cfg = parsed(kind, "--config_path=my robot.yaml", *policy, *options, "--robot.port=/dev/ttyUSB7")
-    assert (cfg.robot.type, cfg.robot.port, cfg.robot.id) == ("so101_follower", "/dev/ttyUSB7", "follower")
-    assert (cfg.teleop.type, cfg.teleop.port, cfg.teleop.id) == ("so101_leader", "/dev/ttyACM1", "leader")
+    assert isinstance(cfg.robot, RobotConfig.get_choice_class("so101_follower"))
+    assert isinstance(cfg.teleop, TeleoperatorConfig.get_choice_class("so101_leader"))
+    assert (cfg.robot.port, cfg.robot.id) == ("/dev/ttyUSB7", "follower")
+    assert (cfg.teleop.port, cfg.teleop.id) == ("/dev/ttyACM1", "leader")
     assert cfg.robot.cameras["front"].index_or_path == 0
     microphone = cfg.robot.cameras["gripper"]
     assert isinstance(microphone, MicrophoneCameraConfig)
@@ -49,3 +53,8 @@ def test_one_file_is_the_robot_of_every_command(kind, options, monkeypatch, tmp_
     if options:
         assert (cfg.dataset.root, cfg.dataset.single_task) == ("here/demos", "Find the cube")
     assert not options or kind is RecordConfig or isinstance(cfg.strategy, DAggerStrategyConfig)
+
+
+def test_the_page_shows_the_file():
+    page = (FILE.parents[1] / "docs/robots.md").read_text()
+    assert FILE.read_text().partition("\nrobot:")[2] in page
