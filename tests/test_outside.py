@@ -225,6 +225,23 @@ def test_a_playlist_is_no_film(tmp_path, secret, kind):
     assert len(picture_times(other)) == 5
 
 
+@pytest.mark.parametrize("codec", [b"zzzz", b"\0\0\0\0", b"mp4a"])
+def test_a_film_of_a_codec_that_nobody_knows_is_none(tmp_path, codec):
+    path = tmp_path / "file-000.mp4"
+    film(path)
+    path.write_bytes(path.read_bytes().replace(b"avc1\0", codec + b"\0"))
+    for read in (picture_times, lambda path: list(video_pictures(path, [0.0], 0.1))):
+        with pytest.raises(av.FFmpegError):
+            read(path)
+
+
+def test_a_name_in_a_film_may_be_no_text(tmp_path):
+    path = tmp_path / "file-000.mp4"
+    film(path)
+    path.write_bytes(path.read_bytes().replace(b"VideoHandler", b"Video\xc6andler"))
+    assert len(picture_times(path)) == 5
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

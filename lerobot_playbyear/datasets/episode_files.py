@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pandas as pd
 import pyarrow as pa
@@ -36,7 +35,7 @@ from lerobot_playbyear.datasets.parquet import (
     write_rows,
     write_tables,
 )
-from lerobot_playbyear.datasets.pictures import FILMS, decode_picture
+from lerobot_playbyear.datasets.pictures import decode_picture, open_film
 from lerobot_playbyear.datasets.statistics import add_stats, numeric_stats, picture_stats, stats_columns, write_stats
 
 logger = logging.getLogger(__name__)
@@ -194,7 +193,7 @@ def _stage_film(
         (folder / f"frame-{number:06d}.{'tiff' if is_depth(feature) else 'png'}").write_bytes(picture)
     encode_video_frames(folder, path, exact_rate(info.fps), video_encoder=encoder)  # type: ignore[arg-type]
     shutil.rmtree(folder)
-    with av.open(str(path), options=FILMS) as container:
+    with open_film(str(path)) as container:
         n_frames = sum(1 for packet in container.demux(video=0) if packet.size)
     if n_frames != len(pictures):
         raise OSError(

@@ -1,10 +1,11 @@
 """Pictures in columns and in films: opened, walked through, shrunk, and encoded."""
 
+import contextlib
 import io
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
@@ -18,8 +19,20 @@ from lerobot_playbyear.datasets.remedies import repair_command, without_feature
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF")
 """Of the pictures that are read; others have readers that start programs."""
 
-FILMS = {"format_whitelist": "mov,matroska"}
-"""Of FFmpeg, for the films of a dataset: what they hold decides. A playlist would have other files opened."""
+_FILMS = {"format_whitelist": "mov,matroska"}  # what a film holds decides; a playlist would have other files opened
+
+
+@contextlib.contextmanager
+def open_film(file: str | BinaryIO) -> Iterator[av.container.InputContainer]:
+    """Opens a film of a dataset, MP4 or Matroska, whose pictures can be decoded.
+
+    Raises:
+        av.FFmpegError: It is none, or of a codec that nobody knows, with which PyAV 15.1 ends in a segmentation fault.
+    """
+    with av.open(file, "r", options=_FILMS, metadata_errors="ignore") as container:
+        if not container.streams.video or getattr(container.streams.video[0], "codec_context", None) is None:
+            raise av.InvalidDataError(0, "it has no pictures that can be decoded", str(getattr(file, "name", file)))
+        yield container
 
 
 def has_shape(height: int, width: int, shape: Sequence[int]) -> bool:
@@ -105,7 +118,7 @@ def video_pictures(
     """
     if not times:
         return
-    with av.open(str(path), options=FILMS) as container:
+    with open_film(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.time_base is not None
         _check_size(path, key, shape, stream.height, stream.width)

@@ -16,7 +16,7 @@ import numpy as np
 
 from lerobot_playbyear.datasets.files import is_listed, naming
 from lerobot_playbyear.datasets.info import Info, file_inside
-from lerobot_playbyear.datasets.pictures import FILMS
+from lerobot_playbyear.datasets.pictures import open_film
 
 TOLERANCE_S = 1e-4
 """How far a picture's time may be from its frame's; LeRobot's own."""
@@ -156,14 +156,12 @@ def picture_times(path: Path) -> np.ndarray:
     times: list[float] = []
     with _Remembering(path) as file:
         try:
-            with av.open(file, "r", options=FILMS) as container:
+            with open_film(file) as container:
                 for packet in container.demux(container.streams.video[0]):
                     pictures: list[Any] = []
                     with contextlib.suppress(av.FFmpegError):  # what it held is missing from the times
                         pictures = packet.decode()
                     times += [each.time for each in pictures if each.time is not None and not each.is_corrupt]
-        except IndexError as error:
-            raise av.InvalidDataError(0, "it has no pictures", str(path)) from error
         finally:
             if file.problem is not None:
                 raise file.problem
