@@ -1,6 +1,7 @@
 """Other packages add an encoder, a step for microphones, an expert and a source of sound by name: the examples, installed."""
 
 import json
+import shutil
 import sys
 
 import draccus
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 import torch
 from draccus.utils import DecodingError
+from lerobot.processor import ProcessorStepRegistry
 from lerobot.scripts import lerobot_train
+from lerobot.utils.constants import OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from safetensors.torch import load_file
 from support.distributions import install_example, longest_file
@@ -20,7 +23,7 @@ from torch import nn
 from lerobot_playbyear.audio.microphone_pictures import read_strip
 from lerobot_playbyear.dagger import ExpertConfig
 from lerobot_playbyear.microphones import MicrophoneCamera, MicrophoneCameraConfig, MicrophoneError
-from lerobot_playbyear.policy.extension import register_vision_encoder
+from lerobot_playbyear.policy.extension import SoundStep, register_vision_encoder
 from lerobot_playbyear.policy.processor_playbyear import make_playbyear_pre_post_processors
 from lerobot_playbyear.scripts.commands import train
 
@@ -88,6 +91,40 @@ def test_an_encoder_of_windows_hears_the_same_in_training_and_in_a_rollout(optio
     stepped = step_through(policy, [episode])
     whole = policy.predict_run(run_ending_at(episode, 54, policy.config, 55), 55)
     torch.testing.assert_close(stepped, whole, atol=1e-5, rtol=0)
+
+
+@ProcessorStepRegistry.register("tests_halve_the_state")
+class HalveTheState(SoundStep):
+    def observation(self, observation):
+        return {**observation, OBS_STATE: observation[OBS_STATE] / 2}
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        {"registry_name": "tests_halve_the_state", "config": {}},
+        {
+            "registry_name": "rename_observations_processor",
+            "config": {"rename_map": {"observation.no": "observation.nothing"}},
+        },
+    ],
+    ids=lambda step: step["registry_name"],
+)
+def test_a_policy_whose_preprocessor_has_another_registered_step_trains_on(step, trained, recorded, tmp_path):
+    """Wherever actions alone are normalised, steps that want an observation are left out."""
+    checkpoint = shutil.copytree(trained, tmp_path / "policy")
+    file = checkpoint / "policy_preprocessor.json"
+    content = json.loads(file.read_text())
+    content["steps"].insert(2, step)
+    file.write_text(json.dumps(content))
+    data = ("--dataset.repo_id=tests/demos", f"--dataset.root={recorded}", "--num_workers=0", "--batch_size=2")
+    output = f"--output_dir={tmp_path / 'out'}"
+    assert (
+        run_in_process(train, f"--policy.path={checkpoint}", "--policy.push_to_hub=false", *data, "--steps=1", output)
+        is None
+    )
+    saved = json.loads((tmp_path / "out/checkpoints/last/pretrained_model/policy_preprocessor.json").read_text())
+    assert step["registry_name"] in [each["registry_name"] for each in saved["steps"]]
 
 
 def test_a_step_gets_runs_in_training_and_frames_in_a_rollout_and_nothing_but_sound():
