@@ -88,7 +88,8 @@ def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tup
                 )
             rate, begin = sound.rate, _begin(container)
             if not 0 < rate <= _MOST_HZ:
-                raise AudioFileError(f"{path} says that it has {rate} samples per second; wanted 1 to {_MOST_HZ:,}.")
+                says = f"says that it has {rate} samples per second; wanted 1 to {_MOST_HZ:,}"
+                raise AudioFileError(f"{path} {says if path.stat().st_size else 'holds no samples'}.")
             _warn_of_delay(path, container)
             for frame in container.decode(audio=0):
                 samples = _to_samples(frame)  # (n, channels)
