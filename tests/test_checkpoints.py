@@ -92,8 +92,7 @@ def test_a_spoilt_checkpoint_is_one_error_of_every_command(recorded, trained, tm
     policy, out = f"--policy.path={checkpoint}", f"--output_dir={tmp_path / 'out'}"
     demos = ("repo_id=tests/demos", f"root={recorded}")
     data = [f"--dataset.{each}" for each in demos]
-    corrected = [f"--demos.{each}" for each in demos]
-    more = [*corrected, "--interventions.repo_id=t/more", f"--interventions.root={tmp_path / 'more'}", "--eval_every=0"]
+    more = [*data, "--interventions.repo_id=t/more", f"--interventions.root={tmp_path / 'more'}", "--eval_every=0"]
     told = [
         run_in_process(train, policy, out, *data, "--policy.push_to_hub=false", "--steps=1", "--num_workers=0"),
         run_in_process(dagger, policy, out, *ENV, *more),

@@ -254,7 +254,12 @@ INCOMPLETE: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 NAMED = ("--dataset.repo_id=a/b", "--dataset.root={root}")
 ATTACHED = ("--output.repo_id=a/c", "--output.root={out}")
-DEMOS = ("--demos.repo_id=a/b", "--demos.root={root}", "--interventions.repo_id=a/i", "--interventions.root={out}/i")
+DEMOS = (
+    "--dataset.repo_id=a/b",
+    "--dataset.root={root}",
+    "--interventions.repo_id=a/i",
+    "--interventions.root={out}/i",
+)
 TOLD: dict[str, tuple[Callable[[], Any], tuple[str, ...]]] = {
     "inspect": (commands.inspect, NAMED),
     "repair": (commands.repair, ("--root={root}",)),

@@ -93,8 +93,6 @@ class PlaybyearPolicy(PreTrainedPolicy):
             )
         try:
             missing, unexpected = model.load_state_dict(weights, strict=False)
-        except SafetensorError as error:
-            raise ValueError(f"{model_file} is damaged: {error}. Put it back from a copy.") from error
         except RuntimeError as error:
             raise InputError(f"{model_file} does not fit the policy. {hint}\n{error}") from error
         told = (
