@@ -173,7 +173,7 @@ def test_attempts_are_appended_to_no_other_file(finished, tmp_path, text):
     saved = json.loads((run / "dagger_config.json").read_text())
     saved["env"]["attempts_file"] = str(tmp_path / "other")
     (run / "dagger_config.json").write_text(json.dumps(saved))
-    said = run_in_process(dagger_command, "--resume=true", f"--output_dir={run}", "--episodes=4")
+    said = run_in_process(dagger_command, "--resume=true", f"--output_dir={run}", "--num_episodes=4")
     assert "it holds something else than attempts" in said
     assert (tmp_path / "other").read_text() == text
 
@@ -554,4 +554,4 @@ def test_damaged_weights_are_named(trained, tmp_path, data):
     policy = Path(shutil.copytree(trained, tmp_path / "policy"))
     (policy / "model.safetensors").write_bytes(data)
     said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
-    assert f"{policy / 'model.safetensors'} is damaged" in said
+    assert f"{policy / 'model.safetensors'} is missing or damaged" in said
