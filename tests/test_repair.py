@@ -483,7 +483,7 @@ def damage_and_repair(original: Path, features: dict[str, Any], root: Path, seed
     before, error = everything(root), None
     try:
         report = repair_dataset(root, like=like)
-    except DatasetDamagedError as refusal:
+    except InputError as refusal:
         error = str(refusal)
     assert everything(root) == before, story
     if error is not None:
