@@ -13,7 +13,8 @@ from support.hub import HubServer, nothing_fails
 
 os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())  # where pytest keeps the last tests' folders
 HUB, HOME = HubServer(), tempfile.TemporaryDirectory(prefix="playbyear-")
-os.environ.update(HUB.environment(), HF_HOME=HOME.name, TMPDIR=HOME.name)  # before anything is imported that reads it
+os.environ.update(HUB.environment(), HF_HOME=HOME.name)  # before anything is imported that reads it
+os.environ.update(TMPDIR=HOME.name, PULSE_RUNTIME_PATH=f"{HOME.name}/pulse")
 tempfile.tempdir = HOME.name  # what LeRobot, or a test that is killed, leaves there goes with the tests
 
 

@@ -68,7 +68,7 @@ class SoundServer:
         self.environment = {
             "ALSA_CONFIG_PATH": str(folder / "alsa.conf"),
             "PULSE_COOKIE": str(folder / "cookie"),
-            "PULSE_RUNTIME_PATH": str(folder / "run"),  # else each program makes a folder in the system's temporary one
+            "PULSE_RUNTIME_PATH": str(folder / "run"),  # else a folder in the system's temporary one
             "PULSE_STATE_PATH": str(folder / "state"),
         }
 

@@ -57,7 +57,10 @@ def with_piece(**traits: Any) -> Callable[..., Task]:
         # Rules that are none
         (made(success=lambda env: True), r"success has <function .*no instance of .*Success: write Success\(\.\.\.\)"),
         (made(success=Success), r"success has <class .*write Success\(\.\.\.\)"),
-        (made(occluded_grasp, terminations=(Groped(), Wrong)), r"terminations has <class .*Wrong.*write Wrong\(\.\.\.\)"),
+        (
+            made(occluded_grasp, terminations=(Groped(), Wrong)),
+            r"terminations has <class .*Wrong.*write Wrong\(\.\.\.\)",
+        ),
         (made(terminations=Wrong()), r"terminations=<.*Wrong object.* is no tuple"),
         (made(terminations=(lambda env: False,)), r"terminations has <function .*write Termination\(\.\.\.\)"),
         (made(early_action=Pressed), r"early_action has <class .*Pressed"),
