@@ -126,6 +126,11 @@ class _Run:
     touched_at: int | None
 
 
+def _run_of(sensed: list[tuple[np.ndarray, np.ndarray]], touched_at: int | None) -> _Run:
+    measured, loudness = (np.stack(part) for part in zip(*sensed, strict=True))
+    return _Run(measured, loudness, touched_at)
+
+
 class TwinError(ValueError):
     """A task has no twin worlds to compare, or its expert touched too little in them."""
 
@@ -167,7 +172,7 @@ class Twins:
             sensed.append(_sensed(world, view))
             if touched_at is None and world.has_touched:
                 touched_at = len(actions)
-        return _Run(*map(np.stack, zip(*sensed, strict=True)), touched_at), actions, other
+        return _run_of(sensed, touched_at), actions, other
 
     def replay(self, world: DeafTask, seed: int, actions: list[np.ndarray]) -> _Run:
         """The same actions in the other world, as long as the attempt lasts there."""
@@ -177,7 +182,7 @@ class Twins:
             sensed.append(_sensed(world, view))
             if done:
                 break
-        return _Run(*map(np.stack, zip(*sensed, strict=True)), None)
+        return _run_of(sensed, None)
 
     def differing_observations(
         self, seed: int, actions: list[np.ndarray], touched_at: int
@@ -296,7 +301,7 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
         first_difference=differences[0] if differences else None,
         pictures_after_touch=float(np.mean(pictures)) if pictures else 0.0,
         auc=_area(np.concatenate(features), labels, episodes),
-        heard=_area(np.array(heard), is_heard_first, np.repeat(range(n_episodes), 2)),
+        heard=_area(np.array(heard), is_heard_first, np.repeat(range(n_episodes), 2).tolist()),
         can_be_touched=can_be_touched,
     )
 
