@@ -175,7 +175,7 @@ def path_as_file_number(root: Path) -> None:
     outside = pa.array(["../../../../secret"] * len(table))
     pq.write_table(table.set_column(table.column_names.index(name), name, outside), path)
     (root / "videos" / FILM / "0").mkdir()
-    next(root.rglob("*.mp4")).rename(root.parent / "secret.mp4")
+    shutil.copy(next(root.rglob("*.mp4")), root.parent / "secret.mp4")
 
 
 def larger_film(root: Path) -> None:

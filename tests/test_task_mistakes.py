@@ -80,7 +80,7 @@ def test_a_task_of_a_partial_function_or_without_options_is_made():
 @pytest.mark.parametrize("twins", [({"contents": "screws"}, {}), ({}, {"sound": "sonar"}), ({}, {"horizon": 0})])
 def test_twins_that_cannot_be_made_are_told_before_anyone_plays(twins, capsys):
     """What is no function any more has no options of its own, and a value may be wrong."""
-    with pytest.raises(OptionError, match="contents='screws'|sound='sonar'|horizon=0"):
+    with pytest.raises(OptionError, match=r"contents='screws'|sound='sonar'|horizon=0"):
         check(made(twins=twins)(), 1, names=["leave"])
     assert "leave" not in capsys.readouterr().err
 

@@ -31,6 +31,8 @@ _PROXY_LIFTED = 0.015  # m: above where a thing lay that lay higher than they do
 class TaskEnv(gym.Env):
     """A task as a Gymnasium environment.
 
+    Its action space is [-1, 1] in each number; an action beyond is clipped.
+
     A copy (`copy.deepcopy`, `pickle`), of the environment alone or together with an expert or a gate, goes on as the original
     would and independently of it; what it renders with it opens itself, when it first draws.
 
@@ -246,8 +248,6 @@ class TaskEnv(gym.Env):
 
     def step_physics(self, action) -> tuple[float, bool, bool, dict[str, Any]]:
         """`step` without the observation, for scripts that look at the state alone: no picture, no sound, no sensor noise.
-
-        An action beyond [-1, 1] is clipped, number by number.
 
         `info["is_success"]` says whether the task is solved, and at the last step `info["end"]` how the attempt ended:
         "success", the name of a termination, or "time". By then the task's secrets are there, and "acted_early" and

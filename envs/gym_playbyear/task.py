@@ -1,6 +1,6 @@
 """What a task is made of: parts that attach to one scene, and what is particular to it in a few functions."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any
@@ -169,8 +169,10 @@ class Task:
 
         parts = (self.arena, *self.props)
         props = [prop.name for prop in parts]
-        named = [(f"Prop {prop.name!r}, inside", prop.inside, props) for prop in parts]
-        named += [(f"Prop {prop.name!r}, material", prop.material, ALL_MATERIALS) for prop in parts]
-        for where, name, known in [*named, ("force_proxy_of", self.force_proxy_of, props)]:
+        named: list[tuple[str, str | None, Collection[str]]] = [("force_proxy_of", self.force_proxy_of, props)]
+        for prop in parts:
+            named.append((f"Prop {prop.name!r}, inside", prop.inside, props))
+            named.append((f"Prop {prop.name!r}, material", prop.material, ALL_MATERIALS))
+        for where, name, known in named:
             if name is not None and name not in known:
                 raise unknown_name(f"{self.name}: {where}", name, known)

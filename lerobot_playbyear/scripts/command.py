@@ -10,7 +10,8 @@ import logging
 import os
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,8 @@ def command(
 
             said = (OSError, ValueError) if is_file_work else ()
             try:
-                work()
+                with own_temporary_folder():
+                    work()
             except ParsingError as error:
                 sys.exit(f"error: {printable(_reason(error))}")
             except (PlaybyearError, MemoryError, *said) as error:
@@ -77,6 +79,20 @@ class _PrintableRecord(logging.LogRecord):
 
     def getMessage(self) -> str:  # noqa: N802  (as logging has it)
         return printable(super().getMessage())
+
+
+@contextlib.contextmanager
+def own_temporary_folder() -> Iterator[None]:
+    """What a command writes into the system's temporary folder goes with it: LeRobot leaves a file there of each policy's
+    configuration that it reads. What torch compiles stays where it looks for it again."""
+    before, system = tempfile.tempdir, tempfile.gettempdir()
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{system}/torchinductor_{os.getuid()}")
+    with tempfile.TemporaryDirectory(prefix="playbyear-", ignore_cleanup_errors=True) as folder:
+        tempfile.tempdir = folder
+        try:
+            yield
+        finally:
+            tempfile.tempdir = before
 
 
 def _reason(error: BaseException) -> BaseException:

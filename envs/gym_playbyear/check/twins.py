@@ -73,6 +73,9 @@ def fit_logistic(
 
 _HISTORY = 10  # steps in a window
 _AFTER = 10  # steps after the touch that are judged
+_RINGS = (
+    5  # steps from the touch on whose sound is judged: then the hand, which nothing stops there, may meet other things
+)
 _N_DRAWS = 500
 _N_BANDS = 16  # of equal width, in which a microphone's loudness is compared
 _SILENCE = 1e-9  # power that is added, relative to full scale
@@ -99,7 +102,8 @@ class TwinResult:
         first_difference: Where it was not: the seed, the step and the observation; None if it was.
         pictures_after_touch: Share of compared pictures after the touch that differ.
         auc: Area under the curve of a logistic regression on all but sound.
-        heard: The same on sound: how loud each band was in an episode, at most and in the mean, and how that varied.
+        heard: The same on sound: how loud each band was, at most and in the mean, and how that varied, in the first steps from
+            the touch on; to the end, if nothing can be touched.
     """
 
     n_episodes: int
@@ -120,6 +124,11 @@ class _Run:
     measured: np.ndarray
     loudness: np.ndarray
     touched_at: int | None
+
+
+def _run_of(sensed: list[tuple[np.ndarray, np.ndarray]], touched_at: int | None) -> _Run:
+    measured, loudness = (np.stack(part) for part in zip(*sensed, strict=True))
+    return _Run(measured, loudness, touched_at)
 
 
 class TwinError(ValueError):
@@ -163,7 +172,7 @@ class Twins:
             sensed.append(_sensed(world, view))
             if touched_at is None and world.has_touched:
                 touched_at = len(actions)
-        return _Run(*map(np.stack, zip(*sensed, strict=True)), touched_at), actions, other
+        return _run_of(sensed, touched_at), actions, other
 
     def replay(self, world: DeafTask, seed: int, actions: list[np.ndarray]) -> _Run:
         """The same actions in the other world, as long as the attempt lasts there."""
@@ -173,7 +182,7 @@ class Twins:
             sensed.append(_sensed(world, view))
             if done:
                 break
-        return _Run(*map(np.stack, zip(*sensed, strict=True)), None)
+        return _run_of(sensed, None)
 
     def differing_observations(
         self, seed: int, actions: list[np.ndarray], touched_at: int
@@ -270,7 +279,7 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
             features.append(windows(world, actions, steps))
             labels += [label] * len(steps)
             episodes += [n_episodes] * len(steps)
-            loudness = world.loudness[judged_from:end]
+            loudness = world.loudness[judged_from : judged_from + _RINGS if run.touched_at else end]
             heard.append(np.concatenate([loudness.max(axis=0), loudness.mean(axis=0), loudness.std(axis=0)]))
             is_heard_first.append(label)
         if n_episodes < n_pictured:
@@ -292,7 +301,7 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
         first_difference=differences[0] if differences else None,
         pictures_after_touch=float(np.mean(pictures)) if pictures else 0.0,
         auc=_area(np.concatenate(features), labels, episodes),
-        heard=_area(np.array(heard), is_heard_first, np.repeat(range(n_episodes), 2)),
+        heard=_area(np.array(heard), is_heard_first, np.repeat(range(n_episodes), 2).tolist()),
         can_be_touched=can_be_touched,
     )
 
