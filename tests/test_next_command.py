@@ -36,6 +36,12 @@ def knocking(fps: int, kinds: tuple[str, ...]):
     return Other
 
 
+def said(capsys, what: str) -> list[str]:
+    """The command that a line of the output names."""
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith(what)]
+    return shlex.split(line.removeprefix(what))
+
+
 @pytest.mark.parametrize(
     ("fps", "kinds"),
     [
@@ -59,11 +65,13 @@ def test_what_a_recording_says_to_type_next_trains_on_any_environment(fps, kinds
         register("gym_knock/Knock-v0", lambda **options: gym_knock.Other(**options), max_episode_steps=60)
     data = ["--dataset.repo_id=me/knock", "--dataset.root=my knocks", "--dataset.num_episodes=2", "--num_workers=0"]
     assert run_in_process(record, *env, *data) is None
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("Train on it: ")]
-    command, *options = shlex.split(line.removeprefix("Train on it: "))
+    command, *options = said(capsys, "Train on it: ")
     assert (command, options[0]) == ("playbyear-train", "--preset=cpu")
     assert run_in_process(train, *options, *SHORT) is None
-    assert (tmp_path / "outputs/train/knock/checkpoints/last/pretrained_model/model.safetensors").is_file()
+    command, *options = said(capsys, "Go on: ")
+    assert (command, options[0]) == ("playbyear-train", "--resume=true")
+    assert run_in_process(train, *options) is None
+    assert (tmp_path / "outputs/train/knock/checkpoints/000004/pretrained_model/model.safetensors").is_file()
 
 
 @pytest.mark.parametrize(("has_gpu", "preset"), [(True, "gpu"), (False, "cpu")])

@@ -195,9 +195,8 @@ class Loop:
         state, outcome = self.state, figures["outcome"]
         state.attempts += 1
         setattr(state, outcome, getattr(state, outcome) + 1)
-        is_repeated = (
-            outcome == "discarded" and self.scene is not None and self.scene.expert.decides
-        )  # a person asks for it
+        is_by_person = self.scene is not None and self.scene.expert.decides
+        is_repeated = outcome == "discarded" and is_by_person
         state.next_seed = figures["seed"] + (not is_repeated)
         is_to_show = outcome == "failed" and self.method.shows_failures and state.to_show is None
         state.to_show = figures["seed"] if is_to_show else None

@@ -22,7 +22,7 @@ from lerobot_playbyear.dagger.report import Report
 from lerobot_playbyear.dagger.run_folder import BEST_LINK, RunFolder, RunState
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input, printable
 from lerobot_playbyear.datasets.features import Features, differences
-from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
 from lerobot_playbyear.episodes.environment import env_facts, env_spec
 from lerobot_playbyear.episodes.experts import Expert, ExpertError
 from lerobot_playbyear.episodes.frames import dataset_features, next_seed
@@ -98,7 +98,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
     cfg.policy.pretrained_path = source  # type: ignore[assignment]
     _check_policy(cfg.policy)
     if overrides:
-        _check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source))
+        _check_action_range(cfg.policy, PreTrainedConfig.from_pretrained(source), cfg.dataset)
     if cfg.policy.push_to_hub and not cfg.policy.repo_id:
         raise InputError("--policy.push_to_hub=true needs a name: give --policy.repo_id, or push_to_hub=false.")
     if cfg.policy.push_to_hub:
@@ -339,12 +339,13 @@ def _check_alike(keys: Iterable[str], demos: LeRobotDatasetMetadata, own: Featur
         )
 
 
-def _check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig) -> None:
+def _check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig, demonstrations: DatasetPlace) -> None:
     """Refuse a policy whose actions would all become larger, or smaller, before it has learned anything.
 
     Args:
         policy: As it shall be improved.
         trained: As its checkpoint says.
+        demonstrations: Of it.
 
     Raises:
         InputError: Their action ranges differ.
@@ -354,7 +355,8 @@ def _check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig) -> 
         raise InputError(
             f"--policy.action_range={wanted}: the policy was trained with {seen}, and would act differently from now on. "
             f"Train it on its demonstrations first: playbyear-train --preset=cpu --policy.path={policy.pretrained_path} "
-            f"--policy.action_range={wanted}."
+            f"--policy.action_range={wanted} --dataset.repo_id={demonstrations.repo_id} "
+            f"--dataset.root={demonstrations.folder} --output_dir=outputs/train/wider"
         )
 
 

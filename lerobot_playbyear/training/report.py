@@ -3,6 +3,7 @@
 import abc
 import json
 import logging
+import shlex
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -139,9 +140,10 @@ def print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
     if cfg.save_checkpoint:
         policy = folder / "checkpoints" / "last" / "pretrained_model"
         env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."
+        config = shlex.quote(str(policy / "train_config.json"))
         print(f"Policy:     {policy}")
-        print(f"Evaluate:   lerobot-eval --policy.path={policy}{printable(env)}")
-        print(f"Go on:      playbyear-train --resume=true --config_path={policy / 'train_config.json'} --steps=...")
+        print(f"Evaluate:   lerobot-eval --policy.path={shlex.quote(str(policy))}{printable(env)}")
+        print(f"Go on:      playbyear-train --resume=true --config_path={config} --steps={2 * cfg.steps}")
 
 
 class Figures:
