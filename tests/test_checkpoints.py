@@ -84,7 +84,13 @@ OF_PROCESSORS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.parametrize("what", [*OF_POLICY, *OF_PROCESSORS])
+QUICK = ("weights: NaN", "weights: missing", "size: 10**6", "statistics: missing", "statistics: elsewhere")
+ALL = [*OF_POLICY, *OF_PROCESSORS]
+
+
+@pytest.mark.parametrize(
+    "what", [*QUICK, *(pytest.param(each, marks=pytest.mark.slow) for each in ALL if each not in QUICK)]
+)
 def test_a_spoilt_checkpoint_is_one_error_of_every_command(recorded, trained, tmp_path, what):
     spoil, said = {**OF_POLICY, **OF_PROCESSORS}[what]
     checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))

@@ -122,9 +122,8 @@ def test_both_trainers_compute_in_it_and_keep_their_weights_in_float32(script, n
 # A graphics card that is not there
 
 
-@pytest.mark.parametrize(
-    "options", [USUAL, pytest.param(EVERYTHING, marks=pytest.mark.slow)], ids=["usual", "everything"]
-)
+@pytest.mark.parametrize("options", [USUAL, EVERYTHING], ids=["usual", "everything"])
+@pytest.mark.slow
 def test_a_training_step_traces_as_one_graph_without_a_break(options):
     """Whatever compiles or replays it meets nothing that needs Python in between."""
     policy = PlaybyearPolicy(make_config(**options)).train()

@@ -134,7 +134,9 @@ def test_a_picture_carries_its_samples_and_one_wrong_bit_is_noticed(rate, tmp_pa
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"streaming_encoding": True, "encoder_queue_maxsize": 150}], ids=["after", "streaming"]
+    "options",
+    [{}, pytest.param({"streaming_encoding": True, "encoder_queue_maxsize": 150}, marks=pytest.mark.slow)],
+    ids=["after", "streaming"],
 )
 def test_timecodes_survive_lerobots_video_encoder_at_its_defaults(options, tmp_path):
     session, counters = Session(tmp_path, sound(5)), counters_of(60)

@@ -110,9 +110,9 @@ STATE = {"dtype": "float32", "shape": (2,), "names": None}
     ("key", "changes"),
     [
         ("observation.state", {"shape": (1,)}),
-        ("observation.state", {"names": {"motors": ["shoulder", "elbow"]}}),
-        ("observation.count", {"dtype": "int64"}),
-        ("observation.load", {"dtype": "float64"}),
+        pytest.param("observation.state", {"names": {"motors": ["shoulder", "elbow"]}}, marks=pytest.mark.slow),
+        pytest.param("observation.count", {"dtype": "int64"}, marks=pytest.mark.slow),
+        pytest.param("observation.load", {"dtype": "float64"}, marks=pytest.mark.slow),
         ("note", {"dtype": "string", "shape": (1,)}),
     ],
 )
@@ -153,7 +153,10 @@ def test_where_no_dataset_is_that_is_said_in_one_line(tmp_path):
 RATES = [(12.5, 16000), (29.97, 14985), (30000 / 1001, 30000)]  # with sample rates that they divide
 
 
-@pytest.fixture(params=RATES, ids=["12.5", "29.97", "30000/1001"])
+_SOME = [pytest.param(RATES[0], marks=pytest.mark.slow), RATES[1], pytest.param(RATES[2], marks=pytest.mark.slow)]
+
+
+@pytest.fixture(params=_SOME, ids=["12.5", "29.97", "30000/1001"])
 def fractional(request, tmp_path) -> tuple[Path, float, int]:
     """A dataset whose frame rate is no whole number, as LeRobot makes it, and its rates."""
     fps, rate = request.param

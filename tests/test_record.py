@@ -76,7 +76,7 @@ def test_workers_and_resuming_do_not_change_the_dataset(recorded, tmp_path):
     """As in lerobot-record, who resumes asks for so many more."""
     root = tmp_path / "dataset"
     record(config(root, num_episodes=1, num_workers=2))
-    record(config(root, num_episodes=1, num_workers=2, resume=True))
+    record(config(root, num_episodes=1, num_workers=0, resume=True))
     assert tables(root) == tables(recorded)
 
 

@@ -169,7 +169,7 @@ def test_episodes_are_left_out(root):
     assert json.loads((copy / "meta/info.json").read_text())["total_episodes"] == 2
 
 
-@pytest.mark.parametrize("length", [17, 400])
+@pytest.mark.parametrize("length", [17, pytest.param(400, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("value", [0.1, 100.3, -3333.3])
 def test_statistics_that_lerobot_rounds_are_no_fault(tmp_path, value, length):
     """It takes the small difference of two large sums of 32 bits; what its own command computes is the same."""
