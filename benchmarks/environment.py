@@ -60,7 +60,7 @@ def parts_of_a_step(env) -> dict[str, Callable[[], object]]:
     return {
         "physics": lambda: env._roll(hold),
         "picture": lambda: env._picture("front", 84),
-        "sound": lambda: env._listen(env._synthesizer),
+        "sound": env.listen,
         "inverse kinematics": lambda: env._controller.command(np.zeros(4), env.eef_position),
     }
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.shared import run_in_process
 
-from gym_playbyear import TASKS
+from gym_playbyear import ALL_TASKS, TASKS
 from gym_playbyear.check.__main__ import main
 from gym_playbyear.check.deaf import DeafTask
 from gym_playbyear.check.report import as_text, check, deaf_scripts, play, players
@@ -128,6 +128,54 @@ def test_twin_pouches_are_the_same_to_the_end():
     assert result.equal_until_touch, result.first_difference
     assert result.pictures_after_touch == 0
     assert result.auc.value == 0.5
+
+
+def with_screws_in_every_pouch(env):
+    """By their sound."""
+    env.materials |= dict.fromkeys(env.materials, "screws")
+
+
+def with_a_red_seam(env):
+    """If screws are in the pouch."""
+    env.model.geom_rgba[env.model.body("pouch").geomadr + 6] = (1, env.secrets["contents"] == "peanuts", 0, 1)
+
+
+def with_a_label(env):
+    return {"label": float(env.secrets["contents"] == "screws")}
+
+
+LIFTED = {"horizon": 20}
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "fault"),
+    [
+        (None, LIFTED, None),
+        (with_screws_in_every_pouch, LIFTED, "sound alike: by sound a classifier's area is 0.50, at least 0.80"),
+        (None, LIFTED | {"sound": "none"}, "sound alike: by sound a classifier's area is 0.50"),
+        (None, LIFTED | {"noise_level": 1e4}, "sound alike: by sound a classifier's area is 0."),  # drowned
+        (None, {"horizon": 12}, "sound alike: by sound a classifier's area is 0.50"),  # nobody has lifted the pouch
+        (with_a_red_seam, {"horizon": 12}, "differ before the touch: seed 80000, step 0: pixels.front"),
+        (with_a_label, {"horizon": 12}, "differ before the touch: seed 80000, step 0: agent_pos, or numbers of"),
+    ],
+)
+def test_a_task_that_no_ear_or_every_eye_can_solve_is_refused(monkeypatch, change, options, fault):
+    """Its expert, which knows what is hidden, solves it all the same."""
+
+    def of_an_author(*, contents=None):
+        task = make_definition(POUCH, {"contents": contents})
+
+        def initialize(env, given):
+            shown = task.initialize_episode(env, given)
+            return shown | ((change and change(env)) or {})
+
+        return replace(task, initialize_episode=initialize)
+
+    monkeypatch.setitem(ALL_TASKS._own, "Own-v1", of_an_author)
+    report = check("Own-v1", 4, names=["leave"], options=options)
+    faults = [found for found in report.broken if found.startswith("twin worlds")]
+    assert (fault is None and not faults) or any(fault in found for found in faults), faults
+    assert f"a classifier that hears: area {report.twin.heard.value:.3f}" in as_text(report)
 
 
 def test_twins_that_differ_are_found_out(monkeypatch):

@@ -31,6 +31,8 @@ _PROXY_LIFTED = 0.015  # m: above where a thing lay that lay higher than they do
 class TaskEnv(gym.Env):
     """A task as a Gymnasium environment.
 
+    Its action space is [-1, 1] in each number; an action beyond is clipped.
+
     A copy (`copy.deepcopy`, `pickle`), of the environment alone or together with an expert or a gate, goes on as the original
     would and independently of it; what it renders with it opens itself, when it first draws.
 
@@ -254,7 +256,7 @@ class TaskEnv(gym.Env):
         self._check_is_running("step")
         action = np.asarray(action, dtype=float)
         if action.shape != (4,) or not np.isfinite(action).all():
-            raise ValueError(f"action must be 4 finite numbers in [-1, 1], got {action!r}.")
+            raise ValueError(f"action must be 4 finite numbers, got {action!r}. Beyond [-1, 1] they are clipped.")
         self._roll(self._controller.command(np.clip(action, -1, 1), self.eef_position))
         self.n_steps += 1
         self._early_action.look(self)
@@ -321,9 +323,8 @@ class TaskEnv(gym.Env):
             "pixels": {camera.name: self._picture(camera.name, self._image_size) for camera in self.definition.cameras},
             "agent_pos": self._sensors.measure(self.true_proprioception(), self.np_random),
         }
-        if self._synthesizer is not None:
-            for microphone, block in self._listen(self._synthesizer).items():
-                observation[f"audio.{microphone}"] = block
+        for microphone, block in self.listen().items():
+            observation[f"audio.{microphone}"] = block
         if self._has_proxy:
             observation["contact_force"] = self._force_proxy()
         if self.render_mode == "human":
@@ -336,10 +337,15 @@ class TaskEnv(gym.Env):
             self._cameras[camera] = SceneRenderer(self.model, size)
         return self._cameras[camera].render(self.data, camera)
 
-    def _listen(self, synthesizer: Synthesizer) -> dict[str, np.ndarray]:
-        """What each microphone heard of the last control step, int16 (sample_rate / control_hz,)."""
+    def listen(self) -> dict[str, np.ndarray]:
+        """What each microphone heard of the last control step, int16 (sample_rate / control_hz,); without sound, nothing.
+
+        Once after `reset_physics` and each `step_physics`: `reset` and `step` have it in their observation.
+        """
+        if self._synthesizer is None:
+            return {}
         speeds = np.abs(self._rollout_state[0, :, 1 + self.model.nq :])  # (n_substeps, nv)
-        heard = synthesizer.step(
+        heard = self._synthesizer.step(
             self._reader.read(self._rollout_sensors[0], self._forces),
             speeds[:, : self._fingers.start].mean(axis=1),
             speeds[:, self._fingers].mean(axis=1),

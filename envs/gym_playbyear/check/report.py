@@ -5,7 +5,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 
 from gym_playbyear.check.deaf import DeafTask, DeafView, ScriptMaker
 from gym_playbyear.check.occluded import SCRIPTS
-from gym_playbyear.check.twins import TwinError, TwinResult, twin_test
+from gym_playbyear.check.twins import TwinError, TwinResult, Twins, twin_test
 from gym_playbyear.task import Task
 
 _SCRIPT_STREAM = 11  # tells a script's random numbers from the sensors' with the same seed
@@ -130,13 +130,15 @@ class Limits:
         expert: The expert solves at least this share.
         blind: No blind script solves more.
         deaf_margin: Nobody deaf solves more than this above the best blind script, or, where none is played, above `blind`.
-        auc: No classifier tells twin worlds apart better.
+        auc: No classifier tells twin worlds apart better that does not hear.
+        heard: One that hears tells them apart at least so well.
     """
 
     expert: float = 0.95
     blind: float = 0.25
     deaf_margin: float = 0.10
     auc: float = 0.6
+    heard: float = 0.8
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,8 @@ def check(
         progress: A file of who has played already; a check that was stopped goes on from there.
 
     Raises:
-        ValueError: A name is not among the task's players, or a learner's result is of another task.
+        ValueError: A name is not among the task's players, or a learner's result is of another task; or twin worlds cannot be
+            made with the task's options of them.
     """
     name = task if isinstance(task, str) else task.name
     by_learners = [_row_of(result, name) for result in learned or []]
@@ -216,6 +219,9 @@ def check(
     for player in names or []:
         if player not in known and player not in KINDS:
             raise ValueError(f"player={player!r} is not known: choose from {', '.join(map(repr, known))}.")
+    if twin:
+        with suppress(TwinError):  # told after who played
+            Twins(task, **options).close()  # an option that there is not, before anyone plays
     chosen = {player: kind for player, kind in known.items() if not names or {player, kind} & set(names)}
     seeds = range(first_seed, first_seed + n_episodes)
     play = partial(outcomes, task, seeds=seeds, options=options)
@@ -274,12 +280,21 @@ def describe(row: Row) -> str:
 
 
 def twin_faults(twin: TwinResult | None, limits: Limits) -> list[str]:
-    """What twin worlds give away and should not."""
+    """What twin worlds give away and should not, and what they do not tell by sound."""
     if twin is None:
         return []
-    area = f"twin worlds: a classifier's area is {twin.auc.value:.2f}, at most {limits.auc:.2f} was promised"
-    differ = f"twin worlds differ before the touch: {twin.first_difference}"
-    return [area] * (twin.auc.value > limits.auc) + [differ] * (not twin.equal_until_touch)
+    area, heard = twin.auc.value, twin.heard.value
+    faults = []
+    if area > limits.auc:
+        faults.append(f"twin worlds: a classifier's area is {area:.2f}, at most {limits.auc:.2f} was promised")
+    if not twin.equal_until_touch:
+        faults.append(f"twin worlds differ before the touch: {twin.first_difference}")
+    if heard < limits.heard:
+        faults.append(
+            f"twin worlds sound alike: by sound a classifier's area is {heard:.2f}, at least {limits.heard:.2f} was promised; "
+            "whoever hears cannot learn what is hidden"
+        )
+    return faults
 
 
 def as_text(report: Report) -> str:
@@ -297,7 +312,8 @@ def as_text(report: Report) -> str:
         same = "every observation but sound is the same" if twin.equal_until_touch else "OBSERVATIONS DIFFER"
         until, judged = ("until the touch", "after it") if twin.can_be_touched else ("to the end", "at any time")
         lines.append(f"twin worlds, {twin.n_episodes} episodes: {until} {same};")
-        lines.append(f"  {judged}, a classifier: area {twin.auc.value:.3f} ({twin.auc.low:.3f}-{twin.auc.high:.3f})")
+        for who, area in (("", twin.auc), (" that hears", twin.heard)):
+            lines.append(f"  {judged}, a classifier{who}: area {area.value:.3f} ({area.low:.3f}-{area.high:.3f})")
         if twin.can_be_touched:
             lines.append(f"  pictures that differ after it: {100 * twin.pictures_after_touch:.0f} %")
     lines += [f"broken: {fault}" for fault in report.broken] or ["all limits hold"]

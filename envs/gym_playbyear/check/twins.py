@@ -3,14 +3,14 @@ screws in the pouch and one with peanuts. The hand does the same in both.
 
 Until the hand touches the object, nothing but sound may differ at all; where what is hidden cannot be touched, never. After the
 touch, the arm's measurements may differ by less than their noise, and so may what the camera shows in numbers: a
-classifier that sees the last ten of them must not tell the worlds apart.
+classifier that sees the last ten of them must not tell the worlds apart. One that hears must.
 
 The hand moves as the scripted expert does in the world with the object, or in either of two that nothing can be touched in; its
 actions are replayed in the other.
 """
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from scipy.stats import rankdata
 from gym_playbyear.check.deaf import DeafTask, DeafView
 from gym_playbyear.panda import ACTION_SCALE
 from gym_playbyear.task import Task
+from gym_playbyear.wrappers import flat
 
 
 def area_under_curve(scores: np.ndarray, positive: np.ndarray) -> float:
@@ -72,7 +73,10 @@ def fit_logistic(
 
 _HISTORY = 10  # steps in a window
 _AFTER = 10  # steps after the touch that are judged
+_RINGS = 5  # steps from the touch on whose sound is judged: later, the hand may meet what is there in both worlds
 _N_DRAWS = 500
+_N_BANDS = 16  # of equal width, in which a microphone's loudness is compared
+_SILENCE = 1e-9  # power that is added, relative to full scale
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,9 @@ class TwinResult:
             nothing can be touched.
         first_difference: Where it was not: the seed, the step and the observation; None if it was.
         pictures_after_touch: Share of compared pictures after the touch that differ.
-        auc: Area under the curve of a logistic regression.
+        auc: Area under the curve of a logistic regression on all but sound.
+        heard: The same on sound: how loud each band was, at most and in the mean, and how that varied, in the first steps from
+            the touch on; to the end, if nothing can be touched.
     """
 
     n_episodes: int
@@ -104,15 +110,23 @@ class TwinResult:
     first_difference: str | None
     pictures_after_touch: float
     auc: Spread
+    heard: Spread
     can_be_touched: bool = True
 
 
 @dataclass
 class _Run:
-    """One world's episode: what was measured and seen (T, 7 + numbers of the camera), and which step touched first."""
+    """One world's episode: what was measured and seen (T, 7 + numbers of the camera), how loud each band of each microphone was
+    (T, F) [dB], and which step touched first."""
 
     measured: np.ndarray
+    loudness: np.ndarray
     touched_at: int | None
+
+
+def _run_of(sensed: list[tuple[np.ndarray, np.ndarray]], touched_at: int | None) -> _Run:
+    measured, loudness = (np.stack(part) for part in zip(*sensed, strict=True))
+    return _Run(measured, loudness, touched_at)
 
 
 class TwinError(ValueError):
@@ -141,7 +155,7 @@ class Twins:
                 f"twin worlds: {definition.name} hides nothing that can be touched, so that both worlds are the same and prove "
                 "nothing. Give what only hearing finds Prop(hidden=True, material=...), or the task other twins."
             )
-        self.worlds = DeafTask(task, **{**options, **first}), DeafTask(task, **{**options, **second})
+        self.worlds = tuple(DeafTask(task, **{"sound": "waveform", **options, **world}) for world in (first, second))
         self.can_be_touched = self.worlds[0].can_be_touched
 
     def expert_run(self, seed: int) -> tuple[_Run, list[np.ndarray], DeafTask]:
@@ -149,24 +163,24 @@ class Twins:
         world, other = self.worlds if self.can_be_touched or seed % 2 else self.worlds[::-1]
         view = world.begin(seed)
         expert = world.env.scripted_expert()
-        measured, actions, touched_at, done = [_numbers(view)], [], None, False
+        sensed, actions, touched_at, done = [_sensed(world, view)], [], None, False
         while not done and (touched_at is None or len(actions) < touched_at + _AFTER):
             actions.append(expert.act())
             view, done, _ = world.advance(actions[-1])
-            measured.append(_numbers(view))
+            sensed.append(_sensed(world, view))
             if touched_at is None and world.has_touched:
                 touched_at = len(actions)
-        return _Run(np.stack(measured), touched_at), actions, other
+        return _run_of(sensed, touched_at), actions, other
 
     def replay(self, world: DeafTask, seed: int, actions: list[np.ndarray]) -> _Run:
         """The same actions in the other world, as long as the attempt lasts there."""
-        measured = [_numbers(world.begin(seed))]
+        sensed = [_sensed(world, world.begin(seed))]
         for action in actions:
             view, done, _ = world.advance(action)
-            measured.append(_numbers(view))
+            sensed.append(_sensed(world, view))
             if done:
                 break
-        return _Run(np.stack(measured), None)
+        return _run_of(sensed, None)
 
     def differing_observations(
         self, seed: int, actions: list[np.ndarray], touched_at: int
@@ -191,9 +205,12 @@ class Twins:
             world.close()
 
 
-def _numbers(view: DeafView) -> np.ndarray:
-    """(7 + N,) what the arm measures, and what the camera shows."""
-    return np.concatenate([view.agent_pos, *(np.ravel(shown) for shown in view.shown.values())])
+def _sensed(world: DeafTask, view: DeafView) -> tuple[np.ndarray, np.ndarray]:
+    """Of a step: (7 + N,) what the arm measures and the camera shows, (F,) how loud each band of each microphone was [dB]."""
+    powers = [np.abs(np.fft.rfft(block / 32768)) ** 2 / len(block) for block in world.env.listen().values()]
+    bands = [band.sum() for power in powers for band in np.array_split(power, _N_BANDS)]
+    numbers = np.concatenate([view.agent_pos, *(np.ravel(shown) for shown in view.shown.values())])
+    return numbers, 10 * np.log10(np.array(bands) + _SILENCE)
 
 
 def _digests(env: Any, seed: int, actions: list[np.ndarray]) -> list[dict[str, str]]:
@@ -201,16 +218,13 @@ def _digests(env: Any, seed: int, actions: list[np.ndarray]) -> list[dict[str, s
     observations = [env.reset(seed=seed)[0]]
     observations += [env.step(action)[0] for action in actions]
     return [
-        {key: hashlib.sha256(value.tobytes()).hexdigest() for key, value in _flat(seen) if not key.startswith("audio")}
+        {
+            key: hashlib.sha256(value.tobytes()).hexdigest()
+            for key, value in flat(seen).items()
+            if not key.startswith("audio")
+        }
         for seen in observations
     ]
-
-
-def _flat(observation: dict[str, Any], prefix: str = "") -> list[tuple[str, np.ndarray]]:
-    parts: list[tuple[str, np.ndarray]] = []
-    for key, value in observation.items():
-        parts += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, np.asarray(value))]
-    return parts
 
 
 def windows(run: _Run, actions: list[np.ndarray], steps: range) -> np.ndarray:
@@ -232,7 +246,7 @@ def windows(run: _Run, actions: list[np.ndarray], steps: range) -> np.ndarray:
 
 
 def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options: Any) -> TwinResult:
-    """Whether anything but sound tells that the object was touched.
+    """Whether sound tells that the object was touched, and nothing else does.
 
     Args:
         task: Its name, or the task.
@@ -244,7 +258,7 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
         TwinError: As of `Twins`, or the expert touched the object in fewer than four episodes.
     """
     twins = Twins(task, **options)
-    features, labels, episodes = [], [], []
+    features, labels, episodes, heard, is_heard_first = [], [], [], [], []
     differences: list[str] = []
     pictures: list[bool] = []
     n_episodes = 0
@@ -263,6 +277,9 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
             features.append(windows(world, actions, steps))
             labels += [label] * len(steps)
             episodes += [n_episodes] * len(steps)
+            loudness = world.loudness[judged_from : judged_from + _RINGS if run.touched_at else end]
+            heard.append(np.concatenate([loudness.max(axis=0), loudness.mean(axis=0), loudness.std(axis=0)]))
+            is_heard_first.append(label)
         if n_episodes < n_pictured:
             found, changed = twins.differing_observations(seed, actions[: end - 1], same_until)
             differences += found
@@ -275,27 +292,30 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
             f"twin worlds: the expert touched the hidden object in {n_episodes} of {len(seeds)} episodes, which is too few to "
             "compare them: four are needed."
         )
-    of_episode = np.array(episodes)
-    held_out = of_episode % 2 == 1
     return TwinResult(
         n_episodes=n_episodes,
-        n_windows=int(held_out.sum()),
+        n_windows=int((np.array(episodes) % 2 == 1).sum()),
         equal_until_touch=not differences,
         first_difference=differences[0] if differences else None,
         pictures_after_touch=float(np.mean(pictures)) if pictures else 0.0,
-        auc=_area(_changing(np.concatenate(features)), np.array(labels), of_episode, held_out),
+        auc=_area(np.concatenate(features), labels, episodes),
+        heard=_area(np.array(heard), is_heard_first, np.repeat(range(n_episodes), 2).tolist()),
         can_be_touched=can_be_touched,
     )
 
 
-def _changing(features: np.ndarray) -> np.ndarray:
-    """(N, F) without what is always the same."""
-    return features[:, features.max(axis=0) > features.min(axis=0)]
+def _area(features: np.ndarray, of_first: list[bool], of_episode: Sequence[int]) -> Spread:
+    """The classifier's area under the curve on the held-out episodes, every second one.
 
-
-def _area(features: np.ndarray, labels: np.ndarray, episodes: np.ndarray, held_out: np.ndarray) -> Spread:
-    """The classifier's area under the curve on the held-out episodes."""
+    Args:
+        features: (N, F)
+        of_first: Whether each is of the first world.
+        of_episode: Which episode each is of.
+    """
     rng = np.random.default_rng(0)
+    labels, episodes = np.array(of_first), np.array(of_episode)
+    held_out = episodes % 2 == 1
+    features = features[:, features.max(axis=0) > features.min(axis=0)]
     rows = {episode: np.flatnonzero(episodes == episode) for episode in np.unique(episodes[held_out])}
     scores = np.zeros(len(labels))
     scores[held_out] = fit_logistic(features[~held_out], labels[~held_out])(features[held_out])
