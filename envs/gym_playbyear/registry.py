@@ -15,7 +15,7 @@ from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from gym_playbyear.task import Task
+from gym_playbyear.task import Task, unknown_name
 
 GROUP = "gym_playbyear"
 KINDS = ("tasks", "materials", "microphones")
@@ -133,6 +133,7 @@ def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str
 
     Raises:
         OptionError: No task has this name, or the task no such option, or not with this value.
+        ValueError: The task is put together wrongly.
         PluginError: The task belongs to another distribution, which cannot be loaded.
     """
     from gym_playbyear import ALL_TASKS  # which itself needs `Registry`
@@ -148,4 +149,16 @@ def make_definition(task: str | Task | Callable[..., Task], options: Mapping[str
     definition = named if isinstance(named, Task) else named(**options)
     if not isinstance(definition, Task):
         raise OptionError("task", task, f"it gave a {type(definition).__name__}, wanted a gym_playbyear.task.Task")
+    if not isinstance(named, Task):
+        _check_twins(definition, known)
     return definition
+
+
+def _check_twins(definition: Task, own: tuple[str, ...]) -> None:
+    """Raises ValueError if twins differ by an option that neither the task's function has, `own`, nor the environment."""
+    from gym_playbyear.environment import TaskEnv  # which itself needs `make_definition`
+
+    known = {*own, *inspect.signature(TaskEnv).parameters} - {"task", "task_options"}
+    for option in (option for world in definition.twins for option in world):
+        if option not in known:
+            raise unknown_name(f"{definition.name}: twins, option", option, known)

@@ -1,7 +1,8 @@
 """What a task is made of: parts that attach to one scene, and what is particular to it in a few functions."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from typing import Any
 
 import mujoco
@@ -11,6 +12,14 @@ from gym_playbyear.panda import Panda, SensorNoise
 from gym_playbyear.terminations import EarlyAction, Success, Termination
 
 PHYSICS_DT = 0.002  # s
+
+
+def unknown_name(where: str, name: Any, known: Iterable[str]) -> ValueError:
+    """The error for a name that nothing has, with the one that was probably meant."""
+    names = sorted(known)
+    near = get_close_matches(str(name), names, 1)
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    return ValueError(f"{where}={name!r} is not known: {meant}There is {', '.join(names) or 'none'}.")
 
 
 @dataclass(frozen=True)
@@ -89,7 +98,7 @@ class Task:
         deaf: Scripts that feel with the arm and do not hear, by name; each is `script(facts, rng)`, see
             `gym_playbyear.check`. Tasks whose camera shows a `hidden_range` have ours without naming any.
         sees: `sees(env)`: what the camera shows of the moment, in numbers by name, besides `env.shown`.
-        twins: Options of two worlds in which nothing differs but what only sound tells.
+        twins: Options of two worlds in which nothing differs but what only sound tells: the task's own, or of `TaskEnv`.
         control_hz, sample_rate: Steps, and samples of a microphone, per second.
         physics_dt: Duration of a physics step [s].
         microphones: Those that are on unless the environment is asked for others.
@@ -99,6 +108,9 @@ class Task:
         force_proxy_of: Prop whose contact force stands in for sound with `sound="contact_force"`.
         numbers: The task's own numbers, for its functions and scripts.
         limits: What the task promises of those who play it, where that differs from `check.Limits`.
+
+    Raises:
+        ValueError: A part names something that is not there, or is of another class than it must be; the message names it.
     """
 
     name: str
@@ -137,3 +149,30 @@ class Task:
                 f"{self.name}: physics_dt={self.physics_dt} s does not divide a control step of 1/{self.control_hz} s into "
                 "whole physics steps: change one of the two, for example to 0.002 and 20."
             )
+        self._check_names()
+        if not isinstance(self.terminations, tuple | list):
+            raise ValueError(
+                f"{self.name}: terminations={self.terminations!r} is no tuple: write (..., ), with a comma."
+            )
+        rules = [("success", self.success, Success), ("early_action", self.early_action, EarlyAction)]
+        for where, rule, kind in [*rules, *(("terminations", rule, Termination) for rule in self.terminations)]:
+            if not isinstance(rule, kind):
+                a_rule = rule.__name__ if isinstance(rule, type) else kind.__name__
+                raise ValueError(
+                    f"{self.name}: {where} has {rule!r}, which is no instance of gym_playbyear.terminations.{kind.__name__}: "
+                    f"write {a_rule}(...)."
+                )
+
+    def _check_names(self) -> None:
+        """Raises ValueError for a prop or a material that there is not."""
+        from gym_playbyear.sound.materials import ALL_MATERIALS  # which itself needs `Task`
+
+        parts = (self.arena, *self.props)
+        props = [prop.name for prop in parts]
+        named: list[tuple[str, str | None, Collection[str]]] = [("force_proxy_of", self.force_proxy_of, props)]
+        for prop in parts:
+            named.append((f"Prop {prop.name!r}, inside", prop.inside, props))
+            named.append((f"Prop {prop.name!r}, material", prop.material, ALL_MATERIALS))
+        for where, name, known in named:
+            if name is not None and name not in known:
+                raise unknown_name(f"{self.name}: {where}", name, known)

@@ -75,7 +75,24 @@ class Material:
 
 
 def plate(substance: Substance, sides: tuple[float, float], thickness: float, modes: str) -> tuple[float, ...]:
-    """Bending modes of a plate supported at its edges [Hz]; `modes`: half waves along each side [m], "2b" is 2 and 11."""
+    """Bending modes of a plate supported at its edges [Hz].
+
+    Args:
+        substance: What it is made of.
+        sides: Of the plate [m].
+        thickness: [m]
+        modes: Half waves along each side, two digits a mode, a for 10, b for 11 and so on, with spaces between
+            the modes: "11 2b".
+
+    Raises:
+        ValueError: `modes` is written otherwise.
+    """
+    wrong = [mode for mode in str(modes).split() or [""] if len(mode) != 2 or not mode.isalnum() or "0" in mode]
+    if wrong:
+        raise ValueError(
+            f"modes={modes!r}: {wrong[0]!r} is no mode. Write two digits for each, half waves along each side, a for 10, and "
+            "spaces between the modes, such as '11 12 2b'."
+        )
     stiffness = substance.young / (12.0 * substance.density * (1.0 - substance.poisson**2))
     waves = [(int(mode[0], 36) / sides[0]) ** 2 + (int(mode[1], 36) / sides[1]) ** 2 for mode in modes.split()]
     return tuple(float(0.5 * np.pi * thickness * np.sqrt(stiffness) * wave) for wave in waves)
