@@ -107,6 +107,16 @@ def test_bad_action_is_named():
     env.close()
 
 
+@pytest.mark.parametrize("action", [(5.0,) * 4, (-3.0, 0.5, 1e6, -1.5), (0.2, 1.0001, -np.finfo(np.float32).max, 2.0)])
+def test_an_action_beyond_its_range_is_clipped(action):
+    env, seen = make(image_size=16), []
+    for given in (action, np.clip(action, -1, 1)):
+        env.reset(seed=2)
+        seen.append([env.step(np.array(given, np.float32))[0] for _ in range(3)])
+    env.close()
+    assert_same(*seen)
+
+
 def play(env: gym.Env, gate, n_steps: int) -> list[dict]:
     """The expert corrects someone who does not move; what was observed."""
     observations = []

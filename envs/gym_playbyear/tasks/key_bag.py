@@ -82,7 +82,7 @@ def key_bag_easy(*, contents: str = "keys") -> Task:
     ## Action Space
     `Box(-1, 1, (4,), float32)`: displacement of the end effector along x, y, z in units of 0.05 m per step, and the gripper
     (> 0 closes). The hand's orientation is fixed. 5 steps per second. After a change of the gripper command the next one is
-    ignored for ten steps, as on the authors' robot.
+    ignored for ten steps, as on the authors' robot. What lies beyond [-1, 1] is clipped.
 
     ## Observation Space
     A dictionary:

@@ -61,7 +61,7 @@ def occluded_grasp(*, cube_material: str = "cube") -> Task:
     ## Action Space
     `Box(-1, 1, (4,), float32)`: displacement of the end effector along x, y, z in units of 0.05 m per step, and the gripper
     (> 0 closes). The hand's orientation is fixed. 20 steps per second. After a change of the gripper command the next one is
-    ignored for 2 s, as on the authors' robot.
+    ignored for 2 s, as on the authors' robot. What lies beyond [-1, 1] is clipped.
 
     ## Observation Space
     A dictionary:
@@ -118,7 +118,7 @@ def occluded_pick_place(*, cube_material: str = "cube") -> Task:
     ## Action Space
     `Box(-1, 1, (4,), float32)`: displacement of the end effector along x, y, z in units of 0.05 m per step, and the gripper
     (> 0 closes). The hand's orientation is fixed. 20 steps per second. After a change of the gripper command the next one is
-    ignored for 2 s, as on the authors' robot.
+    ignored for 2 s, as on the authors' robot. What lies beyond [-1, 1] is clipped.
 
     ## Observation Space
     A dictionary:

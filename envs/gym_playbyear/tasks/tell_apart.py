@@ -104,7 +104,7 @@ def tell_apart(*, contents: str | None = None) -> Task:
     ## Action Space
     `Box(-1, 1, (4,), float32)`: displacement of the end effector along x, y, z in units of 0.05 m per step, and the gripper
     (> 0 closes). The hand's orientation is fixed. 5 steps per second, as on the authors' robot. After a change of the gripper
-    command the next one is ignored for 2 s, as there.
+    command the next one is ignored for 2 s, as there. What lies beyond [-1, 1] is clipped.
 
     ## Observation Space
     A dictionary:
