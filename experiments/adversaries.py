@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -48,7 +49,7 @@ def make_model(arguments: Any) -> RecurrentPPO:
         options = environment_options(arguments)
         return Monitor(NumericTask(arguments.task, hears=arguments.hears, repeat=arguments.repeat, **options))
 
-    return RecurrentPPO(
+    model = RecurrentPPO(
         RecurrentPlayer,
         DummyVecEnv([make] * arguments.n_envs),
         n_steps=arguments.n_steps,
@@ -64,6 +65,8 @@ def make_model(arguments: Any) -> RecurrentPPO:
         device="cpu",
         policy_kwargs={"deviation": arguments.deviation},
     )
+    model.set_logger(Logger(folder=None, output_formats=[]))  # else it makes a folder in the system's temporary one
+    return model
 
 
 def environment_options(arguments: Any) -> dict[str, Any]:

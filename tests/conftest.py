@@ -11,8 +11,11 @@ from support import shared
 from support.commands import Commands, speed_up
 from support.hub import HubServer, nothing_fails
 
+os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())  # where pytest keeps the last tests' folders
 HUB, HOME = HubServer(), tempfile.TemporaryDirectory(prefix="playbyear-")
 os.environ.update(HUB.environment(), HF_HOME=HOME.name)  # before anything is imported that reads it
+os.environ.update(TMPDIR=HOME.name, PULSE_RUNTIME_PATH=f"{HOME.name}/pulse")
+tempfile.tempdir = HOME.name  # what LeRobot, or a test that is killed, leaves there goes with the tests
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -65,7 +65,12 @@ class SoundServer:
             f'pcm.{name} {{ type pulse device "{name}" server "unix:{self._socket}" }}\n' for name in self._sources
         )
         (folder / "alsa.conf").write_text(f"<{_ALSA}>\n{cards}")
-        self.environment = {"ALSA_CONFIG_PATH": str(folder / "alsa.conf"), "PULSE_COOKIE": str(folder / "cookie")}
+        self.environment = {
+            "ALSA_CONFIG_PATH": str(folder / "alsa.conf"),
+            "PULSE_COOKIE": str(folder / "cookie"),
+            "PULSE_RUNTIME_PATH": str(folder / "run"),  # else a folder in the system's temporary one
+            "PULSE_STATE_PATH": str(folder / "state"),
+        }
 
     def __enter__(self) -> Self:
         self._before = {name: os.environ.get(name) for name in self.environment}
@@ -94,8 +99,7 @@ class SoundServer:
             *("--realtime=no", "--high-priority=yes"),
             f"--load=module-native-protocol-unix auth-anonymous=1 socket={self._socket}",
         ]
-        own = {"PULSE_RUNTIME_PATH": str(self._folder / "run"), "PULSE_STATE_PATH": str(self._folder / "state")}
-        environment = {**os.environ, **self.environment, **own, "HOME": str(self._folder)}
+        environment = {**os.environ, **self.environment, "HOME": str(self._folder)}
         with (self._folder / "server.log").open("w") as log:
             self._process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
         deadline = time.perf_counter() + 10

@@ -6,8 +6,10 @@ import functools
 import inspect
 import io
 import json
+import os
 import sys
-from collections.abc import Callable, Mapping
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -45,7 +47,8 @@ def command(
 
             said = (OSError, ValueError) if is_file_work else ()
             try:
-                work()
+                with own_temporary_folder():
+                    work()
             except ParsingError as error:
                 sys.exit(f"error: {_reason(error)}")
             except (PlaybyearError, MemoryError, *said) as error:
@@ -56,6 +59,33 @@ def command(
         return run
 
     return decorate
+
+
+@contextlib.contextmanager
+def own_temporary_folder() -> Iterator[None]:
+    """What a command writes into the system's temporary folder goes with it: LeRobot leaves a file there of each policy's
+    configuration that it reads. What torch compiles stays where it looks for it again.
+
+    Raises:
+        InputError: Nothing can be written there.
+    """
+    from lerobot_playbyear.datasets.errors import InputError
+
+    before = tempfile.tempdir
+    try:
+        system = tempfile.gettempdir()
+        own = tempfile.TemporaryDirectory(prefix="playbyear-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise InputError(
+            f"The system's temporary folder cannot be written: {error}. Make room there, or name another: TMPDIR=..."
+        ) from error
+    os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{system}/torchinductor_{os.getuid()}")
+    with own as folder:
+        tempfile.tempdir = folder
+        try:
+            yield
+        finally:
+            tempfile.tempdir = before
 
 
 def _reason(error: BaseException) -> BaseException:
