@@ -144,30 +144,19 @@ def with_a_label(env):
     return {"label": float(env.secrets["contents"] == "screws")}
 
 
-LIFTED = {"horizon": 40}
+LIFTED = {"horizon": 20}
 
 
 @pytest.mark.parametrize(
     ("change", "options", "fault"),
     [
         (None, LIFTED, None),
-        (
-            with_screws_in_every_pouch,
-            LIFTED,
-            "sound alike: by sound a classifier's area is 0.50, at least 0.80 was promised",
-        ),
+        (with_screws_in_every_pouch, LIFTED, "sound alike: by sound a classifier's area is 0.50, at least 0.80"),
+        (None, LIFTED | {"sound": "none"}, "sound alike: by sound a classifier's area is 0.50"),
         (None, LIFTED | {"noise_level": 1e4}, "sound alike: by sound a classifier's area is 0."),  # drowned
         (None, {"horizon": 12}, "sound alike: by sound a classifier's area is 0.50"),  # nobody has lifted the pouch
-        (
-            with_a_red_seam,
-            {"horizon": 12, "image_size": 84},
-            "differ before the touch: seed 80000, step 0: pixels.front",
-        ),
-        (
-            with_a_label,
-            {"horizon": 12},
-            "differ before the touch: seed 80000, step 0: agent_pos, or numbers of the camera",
-        ),
+        (with_a_red_seam, {"horizon": 12}, "differ before the touch: seed 80000, step 0: pixels.front"),
+        (with_a_label, {"horizon": 12}, "differ before the touch: seed 80000, step 0: agent_pos, or numbers of"),
     ],
 )
 def test_a_task_that_no_ear_or_every_eye_can_solve_is_refused(monkeypatch, change, options, fault):

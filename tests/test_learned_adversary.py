@@ -27,6 +27,7 @@ def test_the_recurrent_players_actions_do_not_depend_on_the_truth():
 def test_a_learner_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
     adversaries = pytest.importorskip("experiments.adversaries")
     monkeypatch.setattr(adversaries, "RUNS", tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     options = ["--n_envs=2", "--n_steps=16", "--n_demonstrations=2", "--imitation_updates=2", "--updates_per_trial=1"]
     options += ["--trial_episodes=1", "--episodes=1", "--horizon=20", f"--output={tmp_path / 'result.json'}"]
     options += ["--teacher=none"]
@@ -34,6 +35,7 @@ def test_a_learner_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
     result = adversaries.run(adversaries.parser().parse_args([*options, "--steps=128"]))
     assert [point["steps"] for point in result["curve"]] == [0, 64, 128]
     assert json.loads((tmp_path / "result.json").read_text())["n_episodes"] == 1
+    assert not list(tmp_path.glob("SB3*"))
 
 
 @pytest.mark.parametrize(("name", "options"), [(EASY, {}), (POUCH, {"contents": "screws"})])

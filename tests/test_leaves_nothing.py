@@ -1,5 +1,6 @@
 """Nothing stays in the system's temporary folder: neither of a command, nor of the sound server that tests hear with."""
 
+import re
 import tempfile
 import time
 from pathlib import Path
@@ -52,6 +53,16 @@ def test_a_command_leaves_nothing(command, options, system, tmp_path):
     assert ended is None or "action_range=2" in ended
     assert left(system) == before
     assert tempfile.gettempdir() == str(system / "tmp")
+
+
+@pytest.mark.parametrize("command", ["train", "inspect", "repair"])
+def test_a_temporary_folder_that_cannot_be_written_is_told_in_one_line(command, tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "file"))
+    named = [f"--root={recorded()}"] if command == "repair" else ["--dataset.repo_id=tests/demos"]
+    ended = run_in_process(getattr(commands, command), *named)
+    assert re.fullmatch(r"error: The system's temporary folder cannot be written: .*file.*: TMPDIR=\.\.\.", ended)
+    assert tempfile.tempdir == str(tmp_path / "file")
 
 
 @pytest.mark.skipif(bool(why_not()), reason=why_not())

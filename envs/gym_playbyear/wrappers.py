@@ -10,14 +10,14 @@ from gymnasium import spaces
 _FULL_SCALE = 32768.0  # int16
 
 
-def flat(nested: Mapping[str, Any], joint: str = ".") -> dict[str, Any]:
-    """What is in dictionaries within a dictionary, in one; `joint` stands between their keys."""
+def flat(nested: Mapping[str, Any]) -> dict[str, Any]:
+    """What is in dictionaries within a dictionary, in one; dots join their keys."""
     found: dict[str, Any] = {}
     for key, value in nested.items():
-        is_nested = isinstance(value, Mapping)
-        found |= (
-            {f"{key}{joint}{name}": part for name, part in flat(value, joint).items()} if is_nested else {key: value}
-        )
+        if isinstance(value, Mapping):
+            found |= {f"{key}.{name}": part for name, part in flat(value).items()}
+        else:
+            found[key] = value
     return found
 
 

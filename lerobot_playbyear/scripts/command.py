@@ -6,9 +6,7 @@ import functools
 import inspect
 import io
 import json
-import logging
 import os
-import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -65,29 +63,26 @@ def command(
     return decorate
 
 
-def _prepare_console() -> None:
-    """A letter that the terminal lacks, and in the log what would command it, are shown as escapes."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
-    logging.setLogRecordFactory(_PrintableRecord)
-    os.environ.setdefault("NO_COLOR", "1")  # LeRobot's colours are such commands, too
-
-
-class _PrintableRecord(logging.LogRecord):
-    """A line of the log; what it says may be a stranger's."""
-
-    def getMessage(self) -> str:  # noqa: N802  (as logging has it)
-        return printable(super().getMessage())
-
-
 @contextlib.contextmanager
 def own_temporary_folder() -> Iterator[None]:
     """What a command writes into the system's temporary folder goes with it: LeRobot leaves a file there of each policy's
-    configuration that it reads. What torch compiles stays where it looks for it again."""
-    before, system = tempfile.tempdir, tempfile.gettempdir()
+    configuration that it reads. What torch compiles stays where it looks for it again.
+
+    Raises:
+        InputError: Nothing can be written there.
+    """
+    from lerobot_playbyear.datasets.errors import InputError
+
+    before = tempfile.tempdir
+    try:
+        system = tempfile.gettempdir()
+        own = tempfile.TemporaryDirectory(prefix="playbyear-", ignore_cleanup_errors=True)
+    except OSError as error:
+        raise InputError(
+            f"The system's temporary folder cannot be written: {error}. Make room there, or name another: TMPDIR=..."
+        ) from error
     os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", f"{system}/torchinductor_{os.getuid()}")
-    with tempfile.TemporaryDirectory(prefix="playbyear-", ignore_cleanup_errors=True) as folder:
+    with own as folder:
         tempfile.tempdir = folder
         try:
             yield

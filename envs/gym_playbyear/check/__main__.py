@@ -3,8 +3,8 @@
     python -m gym_playbyear.check OccludedGrasp-v1 --episodes=100 --output=check.json
 
 The expert must solve the task. Blind scripts, which know what the camera shows and feel nothing, must not, nor must deaf
-scripts, which feel with the arm; and nothing but sound may tell that the hidden object was touched. The exit status is 1
-where a limit is broken.
+scripts, which feel with the arm; and sound must tell that the hidden object was touched, and nothing else may. The exit status
+is 1 where a limit is broken.
 """
 
 import argparse

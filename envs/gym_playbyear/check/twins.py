@@ -73,9 +73,7 @@ def fit_logistic(
 
 _HISTORY = 10  # steps in a window
 _AFTER = 10  # steps after the touch that are judged
-_RINGS = (
-    5  # steps from the touch on whose sound is judged: then the hand, which nothing stops there, may meet other things
-)
+_RINGS = 5  # steps from the touch on whose sound is judged: later, the hand may meet what is there in both worlds
 _N_DRAWS = 500
 _N_BANDS = 16  # of equal width, in which a microphone's loudness is compared
 _SILENCE = 1e-9  # power that is added, relative to full scale
