@@ -6,7 +6,9 @@ import functools
 import inspect
 import io
 import json
+import logging
 import os
+import shlex
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -61,6 +63,22 @@ def command(
         return run
 
     return decorate
+
+
+def _prepare_console() -> None:
+    """A letter that the terminal lacks, and in the log what would command it, are shown as escapes."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    logging.setLogRecordFactory(_PrintableRecord)
+    os.environ.setdefault("NO_COLOR", "1")  # LeRobot's colours are such commands, too
+
+
+class _PrintableRecord(logging.LogRecord):
+    """A line of the log; what it says may be a stranger's."""
+
+    def getMessage(self) -> str:  # noqa: N802  (as logging has it)
+        return printable(super().getMessage())
 
 
 @contextlib.contextmanager
