@@ -37,7 +37,7 @@ DEMOS = ("--dataset.repo_id=tests/demos", "--steps=1")
 @pytest.mark.parametrize(
     ("command", "options"),
     [
-        ("dagger", lambda out: arguments(out, *QUICK, "--episodes=2")),
+        ("dagger", lambda out: arguments(out, *QUICK, "--num_episodes=2")),
         ("dagger", lambda out: arguments(out, *QUICK, "--policy.action_range=2")),  # is refused
         ("train", lambda out: [*TINY, *DEMOS, f"--dataset.root={recorded()}", f"--output_dir={out}/train"]),
         (
