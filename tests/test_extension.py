@@ -73,6 +73,19 @@ def test_a_policy_with_their_encoder_and_their_step_trains_and_acts(command, noi
         80,
     )
     assert n_evaluated(checkpoint, tmp_path / "eval", *ENV, "--env.episode_length=5") == 1
+    if command is train:
+        _trained_on_with_other_options(checkpoint, data, tmp_path)
+
+
+def _trained_on_with_other_options(checkpoint, data, tmp_path):
+    """What the configuration says is what the step does."""
+    on = (f"--policy.path={checkpoint}", "--policy.push_to_hub=false", *data, "--num_workers=0", "--batch_size=2")
+    options = '--policy.extension_options={"waveform_cnn": {"channels": 4}, "remove_offset": {"share": 0.25}}'
+    run_in_process(train, *on, options, "--steps=1", f"--output_dir={tmp_path / 'on'}")
+    saved = tmp_path / "on/checkpoints/last/pretrained_model"
+    assert json.loads((saved / "config.json").read_text())["extension_options"]["remove_offset"] == {"share": 0.25}
+    steps = json.loads((saved / "policy_preprocessor.json").read_text())["steps"]
+    assert steps[-2]["config"] == {"share": 0.25}
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from gym_playbyear.sound.materials import WOOD, plate
 from gym_playbyear.task import Task
 from gym_playbyear.tasks.occluded import occluded_grasp
 from gym_playbyear.tasks.tell_apart import PIECES, tell_apart
-from gym_playbyear.terminations import Groped, Pressed, Success, Termination
+from gym_playbyear.terminations import Groped, Pressed, Shoved, Success, Termination
 
 
 class Wrong(Termination):
@@ -64,6 +64,13 @@ def with_piece(**traits: Any) -> Callable[..., Task]:
         (made(terminations=Wrong()), r"terminations=<.*Wrong object.* is no tuple"),
         (made(terminations=(lambda env: False,)), r"terminations has <function .*write Termination\(\.\.\.\)"),
         (made(early_action=Pressed), r"early_action has <class .*Pressed"),
+        (made(terminations=(Shoved("puch", 0.02),)), r"Shoved, prop='puch' .* mean 'pouch'"),
+        (made(success=Success(bool, ("pouch", "wall"))), r"Success, prop=\('pouch', 'wall'\) is not known"),
+        # Collections that are none
+        (made(reset_options="contents"), r"reset_options='contents' is no tuple"),
+        (made(blind=(Wrong,)), r"blind=.* names no scripts: write \{\"name\": script\}"),
+        (made(twins=("contents", "screws", "peanuts")), r"twins=.* are no two worlds"),
+        (made(twins=({"contents": "screws"},)), r"twins=.* are no two worlds"),
     ],
 )
 def test_a_mistake_in_a_task_is_told_when_it_is_made(factory, said):
@@ -83,6 +90,23 @@ def test_twins_that_cannot_be_made_are_told_before_anyone_plays(twins, capsys):
     with pytest.raises(OptionError, match=r"contents='screws'|sound='sonar'|horizon=0"):
         check(made(twins=twins)(), 1, names=["leave"])
     assert "leave" not in capsys.readouterr().err
+
+
+def test_a_limit_that_there_is_not_is_told_before_anyone_plays():
+    with pytest.raises(ValueError, match=r"limits, limit='blnd' .* mean 'blind'"):
+        check(made(limits={"blnd": 0.5})(), 1, names=["leave"])
+
+
+def test_what_a_script_or_a_reset_names_wrongly_is_told():
+    env = TaskEnv(made(), sound="none")
+    env.reset_physics(seed=0)
+    with pytest.raises(KeyError, match=r"'gripper-puch' is no pair .* there is .*gripper-pouch"):
+        env.contact_forces["gripper-puch"]
+    with pytest.raises(ValueError, match=r"set_pose, prop='puch' .* mean 'pouch'"):
+        env.set_pose("puch", (0.0, 0.0, 1.0))
+    silent = TaskEnv(made(initialize_episode=lambda env, options: None), sound="none")
+    with pytest.raises(ValueError, match=r"initialize_episode returned None: return what the camera shows"):
+        silent.reset_physics(seed=0)
 
 
 @pytest.mark.parametrize("modes", ["11,12", "11, 12", "1 1", "112", "10", "", ("11", "12"), 11.5])

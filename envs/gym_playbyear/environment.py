@@ -19,13 +19,20 @@ from gym_playbyear.rendering import PeopleView, SceneRenderer
 from gym_playbyear.room import Room
 from gym_playbyear.scene import compose
 from gym_playbyear.sound import ALL_MICROPHONES, Bending, Synthesizer
-from gym_playbyear.task import Task
+from gym_playbyear.task import Task, unknown_name
 
 SOUND_MODES = ("waveform", "contact_force", "none")
 _SETTLE_STEPS = 10
 _ROOM_MICROPHONE = np.array((0.6, 0.0, 1.2))  # m, world frame: for microphones that no part of the arm carries
 _PROXY_SILENT_ABOVE = 0.84  # m, world frame: as in the authors' code, whose cubes lie on the table
 _PROXY_LIFTED = 0.015  # m: above where a thing lay that lay higher than they do, such as keys in a bag
+
+
+class _Forces(dict[str, float]):
+    """By pair; a pair that is not measured is told with those that are."""
+
+    def __missing__(self, pair: str) -> float:
+        raise KeyError(f"{pair!r} is no pair of bodies whose contact is measured: there is {', '.join(self)}.")
 
 
 class TaskEnv(gym.Env):
@@ -220,6 +227,11 @@ class TaskEnv(gym.Env):
         self.model.body_pos[:], self.model.body_quat[:] = self._usual_places
         check_spelling("reset(options)", options or {}, self.definition.reset_options)
         self.shown = self.definition.initialize_episode(self, options or {})
+        if not isinstance(self.shown, dict):
+            raise ValueError(
+                f"{self.definition.name}: initialize_episode returned {self.shown!r}: return what the camera shows, in numbers "
+                "by name, {} if it is nothing."
+            )
         self._expert_rng = np.random.default_rng(self.np_random.integers(2**63))
         if self._synthesizer is not None:
             rng = np.random.default_rng(self.np_random.integers(2**63))
@@ -415,7 +427,7 @@ class TaskEnv(gym.Env):
     @property
     def contact_forces(self) -> dict[str, float]:
         """Largest net force of each pair of bodies in the last control step [N], e.g. `gripper-table`."""
-        return {f"{a}-{b}": float(force) for (a, b), force in zip(self.pairs, self._peak_forces, strict=True)}
+        return _Forces((f"{a}-{b}", float(force)) for (a, b), force in zip(self.pairs, self._peak_forces, strict=True))
 
     def hand_forces(self, name: str) -> np.ndarray:
         """Forces between the parts of the hand (`Panda.touching`) and a loose prop in the last control step's T physics steps
@@ -433,9 +445,15 @@ class TaskEnv(gym.Env):
             name: Of the prop.
             position: (3,) of its body [m, world frame].
             yaw: Turn about the vertical [rad]; None: as it is in its own description.
+
+        Raises:
+            ValueError: The task has no such prop.
         """
+        props = {prop.name: prop for prop in self.definition.props}
+        if name not in props:
+            raise unknown_name(f"{self.definition.name}: set_pose, prop", name, props)
         turn = None if yaw is None else (np.cos(yaw / 2), 0, 0, np.sin(yaw / 2))
-        if next(prop for prop in self.definition.props if prop.name == name).loose:
+        if props[name].loose:
             address = self.model.joint(name).qposadr[0]
             self.data.qpos[address : address + 3] = position
             if turn is not None:

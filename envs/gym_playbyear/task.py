@@ -162,6 +162,27 @@ class Task:
                     f"{self.name}: {where} has {rule!r}, which is no instance of gym_playbyear.terminations.{kind.__name__}: "
                     f"write {a_rule}(...)."
                 )
+            prop = getattr(rule, "prop", None) if type(rule).__module__ == kind.__module__ else None
+            props = [part.name for part in (self.arena, *self.props)]
+            if prop is not None and prop not in props:
+                raise unknown_name(f"{self.name}: {type(rule).__name__}, prop", prop, props)
+        self._check_collections()
+
+    def _check_collections(self) -> None:
+        """Raises ValueError for what should be a collection and is none, or not of the right things."""
+        if isinstance(self.reset_options, str):
+            raise ValueError(
+                f"{self.name}: reset_options={self.reset_options!r} is no tuple: write (..., ), with a comma."
+            )
+        for where, scripts in (("blind", self.blind), ("deaf", self.deaf)):
+            if not isinstance(scripts, Mapping):
+                raise ValueError(f'{self.name}: {where}={scripts!r} names no scripts: write {{"name": script}}.')
+        twins = self.twins
+        if not isinstance(twins, tuple | list) or len(twins) != 2 or not all(isinstance(w, Mapping) for w in twins):
+            raise ValueError(
+                f"{self.name}: twins={twins!r} are no two worlds: write the options of each, such as "
+                '({"contents": "screws"}, {"contents": "peanuts"}).'
+            )
 
     def _check_names(self) -> None:
         """Raises ValueError for a prop or a material that there is not."""

@@ -50,7 +50,7 @@ def make_playbyear_pre_post_processors(
     """
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     steps.normalize.normalize_observation_keys = set(config.low_dimensional_keys)
-    heard = [_microphone_step(name, config) for name in config.audio_steps]
+    heard = [microphone_step(name, config) for name in config.audio_steps]
     if config.use_audio and config.sample_rate is not None:
         heard.insert(0, MicrophonePicturesToAudioStep(config.audio_keys, config.sample_rate, config.control_hz))
     return make_policy_processor_pipelines(
@@ -59,7 +59,7 @@ def make_playbyear_pre_post_processors(
     )
 
 
-def _microphone_step(name: str, config: PlaybyearConfig) -> ProcessorStep:
+def microphone_step(name: str, config: PlaybyearConfig) -> ProcessorStep:
     if name not in ProcessorStepRegistry.list():
         raise ValueError(
             f"--policy.audio_steps names '{name}', which no installed package registers in LeRobot's ProcessorStepRegistry: "

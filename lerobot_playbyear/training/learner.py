@@ -43,6 +43,7 @@ from lerobot_playbyear.policy.batch_norm import mean_over_processes
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import VisionEncoder
+from lerobot_playbyear.policy.processor_playbyear import microphone_step
 from lerobot_playbyear.policy.sound_augmentation import SoundAugmentation
 from lerobot_playbyear.training.batches import dataset_names
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
@@ -366,6 +367,15 @@ def _why_not(key: str, feature: Mapping[str, Any], is_used: bool, is_seen: bool)
     return ""
 
 
+def _sound_steps(config: PlaybyearConfig) -> dict[str, dict[str, Any]]:
+    """What a trained policy's own steps for sound are made with: its options, or those given now.
+
+    Raises:
+        ValueError: A step is not registered, or has no such option.
+    """
+    return {name: microphone_step(name, config).get_config() for name in config.audio_steps}
+
+
 def _make_processors(
     cfg: PlaybyearTrainConfig, policy: PreTrainedPolicy, dataset_stats: Any, device: torch.device
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
@@ -384,10 +394,19 @@ def _make_processors(
             "normalizer_processor": {"features": features, "norm_map": norm_map, **stats},
             "rename_observations_processor": {"rename_map": cfg.rename_map},
         }
+        kwargs["preprocessor_overrides"] |= _sound_steps(config)
         unnormalizer = {"features": config.output_features, "norm_map": norm_map, **stats}
         kwargs["postprocessor_overrides"] = {"unnormalizer_processor": unnormalizer}
     path, revision = config.pretrained_path, getattr(config, "pretrained_revision", None)
-    return make_pre_post_processors(policy_cfg=config, pretrained_path=path, pretrained_revision=revision, **kwargs)
+    try:
+        return make_pre_post_processors(policy_cfg=config, pretrained_path=path, pretrained_revision=revision, **kwargs)
+    except KeyError as error:
+        if not config.pretrained_path or not config.audio_steps:
+            raise
+        raise ValueError(
+            f"--policy.audio_steps={','.join(config.audio_steps)} names a step that {path} was trained without, and a trained "
+            "policy keeps its steps: leave the option out, or train anew."
+        ) from error
 
 
 # What makes updates faster and changes nothing that is learned (docs/scale.md)

@@ -18,7 +18,7 @@ from scipy.stats import binomtest
 from gym_playbyear.check.deaf import DeafTask, DeafView, ScriptMaker
 from gym_playbyear.check.occluded import SCRIPTS
 from gym_playbyear.check.twins import TwinError, TwinResult, Twins, twin_test
-from gym_playbyear.task import Task
+from gym_playbyear.task import Task, unknown_name
 
 _SCRIPT_STREAM = 11  # tells a script's random numbers from the sensors' with the same seed
 
@@ -214,7 +214,11 @@ def check(
     by_learners = [_row_of(result, name) for result in learned or []]
     options = options or {}
     deaf_task = DeafTask(task, **options)
-    known, limits = players(deaf_task), limits or Limits(**deaf_task.env.definition.limits)
+    definition = deaf_task.env.definition
+    for limit in definition.limits:
+        if limit not in Limits.__dataclass_fields__:
+            raise unknown_name(f"{definition.name}: limits, limit", limit, Limits.__dataclass_fields__)
+    known, limits = players(deaf_task), limits or Limits(**definition.limits)
     deaf_task.close()
     for player in names or []:
         if player not in known and player not in KINDS:
@@ -292,7 +296,7 @@ def twin_faults(twin: TwinResult | None, limits: Limits) -> list[str]:
     if heard < limits.heard:
         faults.append(
             f"twin worlds sound alike: by sound a classifier's area is {heard:.2f}, at least {limits.heard:.2f} was promised; "
-            "whoever hears cannot learn what is hidden"
+            "whoever hears cannot learn what is hidden, or the expert's first touch is not of the same thing in every episode"
         )
     return faults
 

@@ -290,7 +290,7 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
     if n_episodes < 4:
         raise TwinError(
             f"twin worlds: the expert touched the hidden object in {n_episodes} of {len(seeds)} episodes, which is too few to "
-            "compare them: four are needed."
+            "compare them: four are needed; give more --episodes, or an expert that touches it more often."
         )
     return TwinResult(
         n_episodes=n_episodes,

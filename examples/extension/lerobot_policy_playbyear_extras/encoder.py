@@ -23,7 +23,7 @@ class SpectrogramGRU(nn.Module):
 
 @register_audio_encoder("waveform_cnn")
 class WaveformCNN(nn.Module):
-    """Convolutions over samples; `--policy.extension_options='{waveform_cnn: {channels: 32}}'` makes it wider."""
+    """Convolutions over samples; `--policy.extension_options='{"waveform_cnn": {"channels": 32}}'` makes it wider."""
 
     hears_waveform = True
 

@@ -14,7 +14,7 @@ class RemoveOffset(MicrophoneStep):
     """For microphones whose silence is not zero: of every frame so much of its mean is taken away.
 
     Args:
-        share: `--policy.extension_options='{remove_offset: {share: 0.5}}'` takes half of it.
+        share: `--policy.extension_options='{"remove_offset": {"share": 0.5}}'` takes half of it.
     """
 
     share: float = 1.0
