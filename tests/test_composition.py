@@ -12,7 +12,7 @@ from gym_playbyear.environment import TaskEnv
 from gym_playbyear.registry import make_definition
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.tasks.arena import TABLE_TOP, loose_box
-from gym_playbyear.terminations import Success
+from gym_playbyear.terminations import EarlyAction, Success
 
 
 def never(env) -> bool:
@@ -39,6 +39,7 @@ def task(*props: Prop, **traits) -> Task:
         success=Success(never),
         terminations=(),
         force_proxy_of=None,
+        early_action=EarlyAction(),
         **traits,
     )
 
