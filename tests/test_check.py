@@ -152,9 +152,15 @@ LIFTED = {"horizon": 20}
     [
         (None, LIFTED, None),
         (with_screws_in_every_pouch, LIFTED, "sound alike: by sound a classifier's area is 0.50, at least 0.80"),
-        (None, LIFTED | {"sound": "none"}, "sound alike: by sound a classifier's area is 0.50"),
-        (None, LIFTED | {"noise_level": 1e4}, "sound alike: by sound a classifier's area is 0."),  # drowned
-        (None, {"horizon": 12}, "sound alike: by sound a classifier's area is 0.50"),  # nobody has lifted the pouch
+        pytest.param(
+            None, LIFTED | {"sound": "none"}, "alike: by sound a classifier's area is 0.50", marks=pytest.mark.slow
+        ),
+        pytest.param(  # drowned
+            None, LIFTED | {"noise_level": 1e4}, "alike: by sound a classifier's area is 0.", marks=pytest.mark.slow
+        ),
+        pytest.param(  # nobody has lifted the pouch
+            None, {"horizon": 12}, "alike: by sound a classifier's area is 0.50", marks=pytest.mark.slow
+        ),
         (with_a_red_seam, {"horizon": 12}, "differ before the touch: seed 80000, step 0: pixels.front"),
         (with_a_label, {"horizon": 12}, "differ before the touch: seed 80000, step 0: agent_pos, or numbers of"),
     ],

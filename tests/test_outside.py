@@ -493,9 +493,9 @@ def test_a_small_file_of_many_pieces_takes_no_time(noise, tmp_path):
     root = Path(shutil.copytree(noise, tmp_path / "noise"))
     (path,) = root.glob("data/*/*.parquet")
     table = pq.read_table(path).slice(0, 1)
-    pq.write_table(table.take([0] * 30_000), path)
+    pq.write_table(table.take([0] * 20_500), path)
     assert path.stat().st_size < 3e6
-    assert "30,000 pieces of episodes" in str(survey(root))
+    assert "20,500 pieces of episodes" in str(survey(root))
 
 
 def test_a_small_table_of_many_tasks_takes_no_memory_that_is_not_there(noise, tmp_path, monkeypatch):
