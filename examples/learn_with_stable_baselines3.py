@@ -1,7 +1,7 @@
 """A task in Stable-Baselines3: PPO on the picture, the arm and the sound of the last step.
 
     pip install stable-baselines3
-    MUJOCO_GL=egl python examples/stable_baselines3.py --task=OccludedGrasp-v1 --steps=1000000
+    MUJOCO_GL=egl python examples/learn_with_stable_baselines3.py --task=OccludedGrasp-v1 --steps=1000000
 
 It shows how the two fit together, not that it learns: a step's sound is short, the reward comes at the end, and this policy
 remembers nothing. What has memory and imitates first: `experiments/adversaries.py`.

@@ -15,7 +15,7 @@ import pytest
 from dagger_factory import FINISHED, QUICK, command, dagger, state
 from dataset_factory import CAMERA, make_dataset
 from support.recording import edit_column, edit_info
-from support.shared import ENV, run_in_process
+from support.shared import ENV, TINY, run_in_process
 
 from lerobot_playbyear.audio import write_audio
 from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
@@ -188,6 +188,15 @@ def test_damaged_options_are_named(finished, trained, tmp_path, text):
     (policy / "config.json").write_text(text)
     said = run_in_process(video, *ENV, f"--policy.path={policy}", f"--output={tmp_path / 'film.mp4'}")
     assert said.startswith(f"error: {policy / 'config.json'} is damaged")
+
+
+def test_another_programs_options_in_the_working_directory_are_not_looked_at(tmp_path, monkeypatch):
+    (tmp_path / "config.json").write_text("[")
+    monkeypatch.chdir(tmp_path)
+    said = run_in_process(
+        train, *TINY, "--dataset.repo_id=a/b", f"--dataset.root={tmp_path}", f"--output_dir={tmp_path / 'out'}"
+    )
+    assert said.startswith(f"error: There is no LeRobotDataset in '{tmp_path}'")
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"evil": 1}', "[" * 9999, *ODD_STATES])

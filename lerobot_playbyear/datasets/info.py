@@ -87,7 +87,7 @@ def read_info(root: Path) -> dict[str, Any]:
         raise
     except ValueError as error:
         raise InfoError(
-            f"{path} is damaged: {error}. Put it back from a copy, or let it be made anew: {repair_command(root)} "
+            f"{path} is damaged: {error}. Put it back from a copy, or let it be made again: {repair_command(root)} "
             "--like=<folder of a dataset that was recorded with the same settings>."
         ) from error
     _check_templates(root, info)

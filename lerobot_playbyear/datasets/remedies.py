@@ -18,7 +18,7 @@ def convert_command(root: Path) -> str:
 
 
 def recompute_command(root: Path) -> str:
-    """Computes `meta/stats.json` anew. Without the new name and place LeRobot would write a copy elsewhere."""
+    """Recomputes `meta/stats.json`. Without the new name and place LeRobot would write a copy elsewhere."""
     same = [f"--new_repo_id={_name(root)}", f"--new_root={root}"]
     return _edit(root, *same, "--operation.type=recompute_stats", "--operation.overwrite=true")
 

@@ -277,7 +277,9 @@ def _check_saved_options(args: list[str]) -> None:
 
     given, _ = given_options(args)
     for option, name in (("config_path", ""), ("policy.path", "config.json")):
-        path = Path(given.get(option) or "") / name
+        if not given.get(option):
+            continue
+        path = Path(str(given[option])) / name
         if path.suffix == ".json" and path.is_file():
             try:
                 if not isinstance(parse_json(path.read_bytes()), dict):

@@ -405,7 +405,7 @@ def _make_processors(
             raise
         raise ValueError(
             f"--policy.audio_steps={','.join(config.audio_steps)} names a step that {path} was trained without, and a trained "
-            "policy keeps its steps: leave the option out, or train anew."
+            f"policy keeps its steps: leave the option out, or train a new one. LeRobot: {error}"
         ) from error
 
 
