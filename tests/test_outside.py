@@ -416,6 +416,20 @@ def test_damaged_processors_are_named(trained, tmp_path, text):
         check_steps(checkpoint)
 
 
+def test_pipes_in_a_checkpoint_or_a_run_hold_nobody_up(trained, finished, tmp_path):
+    checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))
+    state = next(checkpoint.glob("policy_preprocessor_*.safetensors"))
+    state.unlink()
+    os.mkfifo(state)
+    run = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True)) / "out"
+    (run / "metrics.jsonl").unlink(missing_ok=True)
+    os.mkfifo(run / "metrics.jsonl")
+    with pytest.raises(InputError, match=f"{state.name}' is a pipe or a device; nothing was loaded"):
+        check_steps(checkpoint)
+    with pytest.raises(InputError, match=r"metrics\.jsonl' is a pipe or a device, no file"):
+        command("--resume=true", f"--output_dir={run}")
+
+
 def test_what_is_no_part_of_a_checkpoint_is_not_uploaded(trained, tmp_path, here):
     checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))
     for name in ("notes.json", "notes.yaml", "secret.safetensors"):

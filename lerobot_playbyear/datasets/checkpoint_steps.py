@@ -8,7 +8,7 @@ from huggingface_hub.errors import EntryNotFoundError
 from safetensors import SafetensorError, safe_open
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.files import parse_json
+from lerobot_playbyear.datasets.files import entries_below, is_special, parse_json
 
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 """LeRobot's names of the files."""
@@ -25,6 +25,11 @@ def check_steps(path: str | Path, revision: str | None = None) -> None:
     Raises:
         InputError: One of its steps is not named as packages register them, or its file is missing or damaged.
     """
+    for file in entries_below(Path(path)) if Path(path).is_dir() else ():
+        if is_special(file):
+            raise InputError(
+                f"'{file}' is a pipe or a device; nothing was loaded. Copy the checkpoint again, with its files."
+            )
     for name in PROCESSORS:
         file = Path(path) / name
         if not Path(path).is_dir():

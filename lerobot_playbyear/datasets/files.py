@@ -178,6 +178,11 @@ def append_line(path: Path, line: str) -> None:
         file.write(line + "\n")
 
 
+def is_special(path: Path) -> bool:
+    """Whether a pipe or a device is there, or a link leads to one: opening it may wait for ever."""
+    return path.exists() and not path.is_file() and not path.is_dir()
+
+
 def check_no_links(folder: Path, *names: str) -> None:
     """Whether what is written below a folder stays in it.
 
@@ -186,7 +191,7 @@ def check_no_links(folder: Path, *names: str) -> None:
         names: Of folders in it that are written into, and of files that are written in place.
 
     Raises:
-        InputError: One of them is a link.
+        InputError: One of them is a link, a pipe or a device.
     """
     for path in (folder / name for name in names):
         if path.is_symlink():
@@ -194,6 +199,8 @@ def check_no_links(folder: Path, *names: str) -> None:
                 f"'{path}' is a link to '{os.readlink(path)}', and nothing is written or removed there. Put what it leads to "
                 "in its place, or choose an --output_dir where there is room."
             )
+        if is_special(path):
+            raise InputError(f"'{path}' is a pipe or a device, no file. Remove it, or choose another --output_dir.")
 
 
 @contextlib.contextmanager

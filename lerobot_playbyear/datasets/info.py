@@ -25,6 +25,7 @@ from lerobot_playbyear.datasets.files import (
     entries_below,
     fits,
     is_listed,
+    is_special,
     list_files,
     parse_json,
 )
@@ -133,7 +134,7 @@ def ordinary(path: Path) -> Path:
     Raises:
         OutsideError: A pipe or a device is there, or a link leads to one.
     """
-    if path.exists() and not path.is_file() and not path.is_dir():
+    if is_special(path):
         raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
     return path
 
