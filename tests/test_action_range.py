@@ -80,6 +80,7 @@ def test_an_action_outside_the_demonstrations_is_learned_only_within_the_range(a
 # What is said
 
 
+@pytest.mark.slow
 def test_recorded_corrections_out_of_reach_are_said_before_any_update_and_a_wider_policy_takes_them(
     base, tmp_path, capfd
 ):

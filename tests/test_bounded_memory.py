@@ -46,6 +46,7 @@ def test_a_containers_limit_counts_as_the_memory_that_is_free(tmp_path, version)
     assert available_memory(tmp_path / "proc", tmp_path / "groups") > 900000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_videos", [False, True], ids=["image", "video"])
 def test_pictures_of_a_long_episode_come_a_few_at_a_time(tmp_path, use_videos):
     n_frames, size = 400, 128

@@ -150,7 +150,7 @@ LIFTED = {"horizon": 20}
 @pytest.mark.parametrize(
     ("change", "options", "fault"),
     [
-        (None, LIFTED, None),
+        pytest.param(None, LIFTED, None, marks=pytest.mark.slow),
         (with_screws_in_every_pouch, LIFTED, "sound alike: by sound a classifier's area is 0.50, at least 0.80"),
         pytest.param(
             None, LIFTED | {"sound": "none"}, "alike: by sound a classifier's area is 0.50", marks=pytest.mark.slow
@@ -162,7 +162,10 @@ LIFTED = {"horizon": 20}
             None, {"horizon": 12}, "alike: by sound a classifier's area is 0.50", marks=pytest.mark.slow
         ),
         (with_a_red_seam, {"horizon": 12}, "differ before the touch: seed 80000, step 0: pixels.front"),
-        (with_a_label, {"horizon": 12}, "differ before the touch: seed 80000, step 0: agent_pos, or numbers of"),
+        pytest.param(
+            *(with_a_label, {"horizon": 12}, "differ before the touch: seed 80000, step 0: agent_pos, or numbers of"),
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_task_that_no_ear_or_every_eye_can_solve_is_refused(monkeypatch, change, options, fault):

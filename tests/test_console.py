@@ -112,6 +112,7 @@ for name in sys.argv[1:]:
 """
 
 
+@pytest.mark.slow
 def test_a_way_to_draw_that_is_not_there_is_named_by_whoever_makes_an_environment():
     """In a process of its own: MuJoCo looks at the variable once, while it is imported."""
     names = ["elg", "EGL2", *(["osmesa"] if ctypes.util.find_library("OSMesa") is None else [])]

@@ -94,6 +94,7 @@ def test_without_a_hand_back_an_attempt_ends_with_its_correction(tmp_path):
     assert [line["takeover_steps"] for line in metrics(tmp_path, "attempt") if line["outcome"] == "kept"] == [[6], [6]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kills", [(3,), pytest.param((2,), marks=pytest.mark.slow)])
 def test_the_expert_shows_the_scenes_that_the_policy_fails_in(tmp_path, capfd, kills):
     run = (*RUN, "--method.type=redo")  # seeds that 3 divides end as failures, also of the expert
@@ -141,6 +142,7 @@ def succeeds_from_the_first_step_on(expert):
     expert.is_success |= expert.n == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kills", [(), pytest.param((1, 2, 3, 4, 5), marks=pytest.mark.slow)])
 def test_what_fails_although_the_robot_may_ask_is_shown_from_its_first_step(tmp_path, monkeypatch, kills):
     """Of two attempts that the policy makes alone one fails, and is made good; a run that is killed on the way ends alike."""
@@ -190,6 +192,7 @@ def walk(side, success, is_visited, n=30, seed=0):
     return Played(memories, actions, actions, np.full(n, not is_visited), success, is_visited, seed)
 
 
+@pytest.mark.slow
 def test_where_no_expert_was_is_new_and_where_attempts_fail_is_risky(monkeypatch):
     monkeypatch.setattr(gate_model, "_N_UPDATES", 200)
     demonstrations = [walk(1.0, True, False, seed=seed) for seed in range(6)]
@@ -207,6 +210,7 @@ def test_where_no_expert_was_is_new_and_where_attempts_fail_is_risky(monkeypatch
     assert model.trace(good).is_own[:6].tolist() == [True, True, True, False, False, True]
 
 
+@pytest.mark.slow
 def test_success_after_the_expert_took_over_is_not_the_policys(monkeypatch):
     """From the same places the policy alone fails, and with the expert's help the task is solved: they remain risky."""
     monkeypatch.setattr(gate_model, "_N_UPDATES", 200)

@@ -62,6 +62,7 @@ def test_wherever_it_stops_it_ends_alike(finished, tmp_path, owner, name, after)
     assert_a_power_cut_changes_nothing(tmp_path, finished, RUN, after, owner, name)
 
 
+@pytest.mark.slow
 def test_attempts_in_vain_count_on_after_a_resume(tmp_path, monkeypatch):
     monkeypatch.setattr(Quick, "verdict", lambda self: Verdict.FAILURE if self.n >= self.n_steps else None)
     run = (*QUICK, "--num_episodes=1", "--max_attempts=3")
@@ -102,6 +103,7 @@ def test_a_policys_options_stay_until_there_is_a_checkpoint(tmp_path, monkeypatc
     assert len(state(tmp_path)["policy_overrides"]) == 3
 
 
+@pytest.mark.slow
 def test_more_episodes_go_on_with_a_finished_run_that_asked_for_it(finished, tmp_path):
     dagger(tmp_path, *RUN, "--num_episodes=2", "--resume=true")  # where there is none yet
     command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--num_episodes=3")
@@ -168,6 +170,7 @@ def gives(monkeypatch):
     return rates
 
 
+@pytest.mark.slow
 def test_the_best_evaluation_keeps_its_weights(tmp_path, gives, monkeypatch, capfd):
     checkpoints = tmp_path / "out/checkpoints"
 

@@ -188,6 +188,7 @@ runpy.run_module("gym_playbyear.check", run_name="__main__")
 """
 
 
+@pytest.mark.slow
 def test_scripts_need_no_opengl():
     without = {key: value for key, value in os.environ.items() if not key.endswith("DISPLAY")}
     assert "all limits hold" in python(_BASELINES, environment={**without, "MUJOCO_GL": "disable"})
@@ -232,6 +233,7 @@ def spot_on(picture: np.ndarray, before: tuple[float, float] | None) -> tuple[fl
     return None if before is not None and np.hypot(row - before[0], column - before[1]) < 0.05 else (row, column)
 
 
+@pytest.mark.slow
 @needs_screen
 def test_a_window_shows_the_new_episode_at_its_reset_and_changes_nothing(screen):
     """The program does not close it: a window that is open when the process ends must not crash it either."""

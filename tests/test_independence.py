@@ -1,5 +1,6 @@
 """The two distributions do without each other: tasks without torch and LeRobot, the policy without MuJoCo."""
 
+import pytest
 from support.commands import run_without
 
 
@@ -15,6 +16,7 @@ print(sorted(observation))
     assert run_without(blocked, code).strip() == "['agent_pos', 'audio.gripper', 'pixels']"
 
 
+@pytest.mark.slow
 def test_every_module_of_the_policy_imports_without_mujoco_and_the_tasks():
     code = """
 import importlib, pkgutil

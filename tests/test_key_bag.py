@@ -111,6 +111,7 @@ def test_one_hears_the_bottom():
     assert min(louder) > 10
 
 
+@pytest.mark.slow
 def test_one_hears_which_finger_touches_the_keys():
     env, louder = make(HARD, sound="waveform"), []
     for seed in (3, 4, 5):
@@ -159,6 +160,7 @@ def test_the_expert_acts_on_what_it_felt_alone(task):
     assert solves(make(task), lambda env: (BagExpert(Felt(env)),))
 
 
+@pytest.mark.slow
 def test_the_force_that_stands_for_sound_is_felt_wherever_the_keys_lie():
     """They lie up to 10 cm above the table, where the cube tasks' proxy is silent because their cube was lifted."""
     for bottom in (0.03, 0.095):
@@ -178,6 +180,7 @@ def test_the_force_that_stands_for_sound_is_felt_wherever_the_keys_lie():
         assert touches[-1][1] == 0.0  # in the air
 
 
+@pytest.mark.slow
 def test_a_cloth_is_mute():
     """To touch it is much quieter than to touch keys."""
     levels = {}
@@ -195,6 +198,7 @@ def test_a_cloth_is_mute():
     assert levels["cloth"] < 0.2 * levels["keys"]
 
 
+@pytest.mark.slow
 def test_a_bad_policy_is_corrected():
     """Someone who waits far above the keys."""
     env, rescued, seed = make(EASY), False, 0

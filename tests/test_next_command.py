@@ -45,9 +45,9 @@ def said(capsys, what: str) -> list[str]:
 @pytest.mark.parametrize(
     ("fps", "kinds"),
     [
-        (20, ("pixels", "agent_pos", "audio.finger")),
+        pytest.param(20, ("pixels", "agent_pos", "audio.finger"), marks=pytest.mark.slow),
         (10, ("agent_pos", "audio.finger")),
-        (40, ("pixels", "agent_pos")),
+        pytest.param(40, ("pixels", "agent_pos"), marks=pytest.mark.slow),
     ],
     ids=["gym_knock", "blind at 10 Hz", "deaf at 40 Hz"],
 )

@@ -89,6 +89,7 @@ def test_a_cube_that_is_up_for_less_than_half_a_second_is_not_held():
     assert info["end"] == "success"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", CUBES)
 def test_a_second_search_after_a_failed_grasp_fits_into_the_time(task):
     env = make(task)

@@ -164,6 +164,7 @@ def fractional(request, tmp_path) -> tuple[Path, float, int]:
     return tmp_path / "odd", fps, rate
 
 
+@pytest.mark.slow
 def test_frame_rates_that_are_not_whole_are_inspected_filmed_and_not_damaged(fractional, tmp_path):
     root, fps, rate = fractional
     options = InspectConfig(InspectDatasetConfig("a/b", str(root)), html=tmp_path / "page.html")

@@ -512,6 +512,7 @@ def test_small_tables_of_many_rows_take_no_memory(noise, tmp_path):
     assert found.whole
 
 
+@pytest.mark.slow
 def test_a_small_file_of_many_pieces_takes_no_time(noise, tmp_path):
     root = Path(shutil.copytree(noise, tmp_path / "noise"))
     (path,) = root.glob("data/*/*.parquet")

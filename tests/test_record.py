@@ -113,6 +113,7 @@ def test_an_expert_that_never_succeeds(tmp_path):
         record(config(tmp_path / "dataset", env=PlaybyearEnvConfig(image_size=16, sound="none", episode_length=3)))
 
 
+@pytest.mark.slow
 def test_without_an_opengl_library_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "glfw")  # in the worker: needs a display
     for display in ("DISPLAY", "WAYLAND_DISPLAY"):

@@ -508,6 +508,7 @@ def damage_and_repair(original: Path, features: dict[str, Any], root: Path, seed
     assert not wrong, f"{wrong} {story}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ours", "one file", "lerobot"])
 @pytest.mark.parametrize(
     "seeds", [range(5), pytest.param(range(1000, 1100), marks=pytest.mark.slow)], ids=["few", "many"]

@@ -101,7 +101,10 @@ RECORDED = {
 }
 
 
-@pytest.mark.parametrize("strategy", ["base", *RECORDED])
+@pytest.mark.parametrize(
+    "strategy",
+    ["base", "dagger", *(pytest.param(name, marks=pytest.mark.slow) for name in RECORDED if name != "dagger")],
+)
 def test_a_policy_hears_on_a_robot_what_its_recording_holds(strategy, policy, told, heard, tmp_path):
     root, options = tmp_path / "rollout", [f"--strategy.type={strategy}", "--duration=1.5", "--play_sounds=false"]
     if strategy in RECORDED:

@@ -59,6 +59,7 @@ def take_one(folder: Path, then: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=40)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wait", [pytest.param(0.0, marks=pytest.mark.slow), 0.06])
 def test_a_worker_that_is_sending_an_episode_does_not_keep_the_program_from_ending(tmp_path, wait):
     done = take_one(tmp_path, f"time.sleep({wait})")

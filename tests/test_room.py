@@ -115,6 +115,7 @@ def test_what_cannot_be_is_refused_with_option_and_value(tmp_path):
 NOISES = ("hum", "speech_like", "music_like", "clatter", "hammering", "typing", "tool")
 
 
+@pytest.mark.slow
 def test_the_recordings_of_the_example_suit_environment_and_policy(tmp_path, monkeypatch, capsys):
     example = Path(__file__).parent.parent / "examples" / "room_noise.py"
     for seed in ("1", "2"):

@@ -99,6 +99,7 @@ def jumps(capfd):
     return [line for line in "\n".join(capfd.readouterr()).splitlines() if "The learning rate rises" in line]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "script",
     [train, pytest.param(lerobot_train.train, marks=pytest.mark.slow)],

@@ -208,6 +208,7 @@ def env_config(recorded: Path, **options) -> PlaybyearEnvConfig:
     return PlaybyearEnvConfig(**{"task": "OccludedGrasp-v1", "spectrogram": str(recorded), **options})
 
 
+@pytest.mark.slow
 def test_a_rollout_shows_what_the_dataset_holds_bit_for_bit(recorded):
     """Two environments side by side play both episodes, one after the other and in the other order."""
     dataset = load(recorded)

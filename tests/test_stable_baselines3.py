@@ -21,6 +21,7 @@ def make(task: str, **options) -> gym.Env:
     return gym.make(f"gym_playbyear:gym_playbyear/{task}", **{"image_size": 36, **options})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS)
 def test_its_checker_passes_every_task(task):
     checker = pytest.importorskip("stable_baselines3.common.env_checker")

@@ -155,6 +155,7 @@ def filled(root, cache) -> int:
     return child
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork")
 @pytest.mark.parametrize("n_kills", [3, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_store_that_was_killed_at_random_times_is_whole(tmp_path, n_kills):

@@ -104,6 +104,7 @@ class Remembering(PolicyActor):
         return self.wanted[-1]
 
 
+@pytest.mark.slow
 def test_an_override_is_recorded_on_exactly_the_held_frames_and_the_arm_moves_as_the_keys_say(screen):
     env_cfg = env_config(episode_length=36)
     held = {"Tab": (6, 30), "Right": (7, 13), "Up": (15, 21), "d": (23, 28)}

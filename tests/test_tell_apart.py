@@ -27,6 +27,7 @@ def level(wave: np.ndarray) -> float:
     return float(10 * np.log10(spectrum[(hertz > 1000) & (hertz < 4000)].sum() / len(wave) ** 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["lift", "leave"])
 def test_without_sound_every_observation_is_the_same_byte_for_byte(strategy):
     """Until the end, whatever is done; how it ends is all that differs."""

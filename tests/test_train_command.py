@@ -67,6 +67,7 @@ def test_measuring_held_out_episodes_changes_nothing_that_is_learned(trained, no
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
 
 
+@pytest.mark.slow
 def test_a_policy_is_tuned_with_sound_of_another_rate(trained, tmp_path):
     policy = trained / "checkpoints" / "last" / "pretrained_model"
     sample_rate = json.loads((policy / "config.json").read_text())["sample_rate"]
@@ -154,6 +155,7 @@ def test_presets_are_options_that_exist_and_configuration_files_as_well(name, mo
     assert by_name == by_file
 
 
+@pytest.mark.slow
 def test_a_run_from_the_disk_resumes_from_there_and_sees_shrunk_pictures(tmp_path):
     make_dataset(tmp_path / "data", (12, 17), image_size=48)
     options = (*TINY, *data(tmp_path / "data"), "--store=disk", f"--store.cache={tmp_path / 'cache'}")

@@ -102,6 +102,7 @@ def test_an_update_is_lerobots_to_the_last_bit(make, batches):
         assert torch.equal(value, expected[key]), key
 
 
+@pytest.mark.slow
 def test_a_whole_update_never_waits_for_the_card(make, batches, monkeypatch):
     """Preprocessor, forward, clipping, the fused optimizer, the schedule, and the figures of the log.
 
@@ -142,6 +143,7 @@ def _moved(step):
     return step
 
 
+@pytest.mark.slow
 def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(make, batches, tmp_path):
     _, plain = make()
     expected = learn(plain, batches(plain), 3)

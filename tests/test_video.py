@@ -94,6 +94,7 @@ def save_act(env: PlaybyearEnvConfig, folder: Path, **options) -> ACTConfig:
     return config
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("use_amp", [False, True])
 def test_any_lerobot_policy_acts_bit_for_bit_as_in_lerobot_eval_and_is_filmed(tmp_path, use_amp):
     env_cfg = small_env(episode_length=4)
