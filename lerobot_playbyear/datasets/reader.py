@@ -50,8 +50,8 @@ class DatasetPlace:
     """A dataset's name and place.
 
     Args:
-        repo_id: Its name, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
+        repo_id: Name of the dataset, `user/name`.
+        root: Its folder. None: the one in LeRobot's cache.
     """
 
     repo_id: str

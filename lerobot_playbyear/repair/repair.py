@@ -24,11 +24,11 @@ class RepairConfig:
     """Options of `playbyear-repair`.
 
     Args:
-        root: The dataset's folder.
-        output: The copy's; None: its name with `_repaired` behind it.
-        like: The folder of a dataset that was recorded with the same settings: its frame rate and features are taken.
-            Needed only where `meta/info.json` is lost.
-        dry_run: Only say what is wrong.
+        root: Folder of the dataset.
+        output: Folder of the copy. None: the dataset's with `_repaired` appended.
+        like: Folder of a dataset recorded with the same settings, whose frame rate and features are used. Needed only if
+            `meta/info.json` is lost.
+        dry_run: Report the damage without writing a copy.
     """
 
     root: Path
