@@ -9,7 +9,7 @@ TASK ?= OccludedGrasp-v1
 ALL_TASKS ?= OccludedGrasp-v1 OccludedPickPlace-v1 TellApart-v1 KeyBag-Easy-v1 KeyBag-Hard-v1
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
-# Images for containers often set it: then each start compiles PyTorch and LeRobot anew, which takes longer than all else of it.
+# Images for containers often set it: then each start compiles PyTorch and LeRobot again, which takes longer than all else of it.
 unexport PYTHONDONTWRITEBYTECODE
 
 # Each process takes half of what another has left: the tests of a module stay together, and all end at the same time.

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from draccus.utils import is_choice_type
-from lerobot_env_playbyear.config import PlaybyearEnvConfig
 
+from lerobot_env_playbyear.config import PlaybyearEnvConfig
 from lerobot_playbyear.dagger.methods import HgDagger, NoHandback, Redo
 from lerobot_playbyear.dagger.robot_gated import RobotGated
 from lerobot_playbyear.episodes.experts import ScriptedExpertConfig
@@ -97,7 +97,9 @@ def _rows(config: type, prefix: str) -> Iterator[tuple[dict[str, str], str]]:
 
 
 def _text_of(name: str, texts: Mapping[str, str]) -> str | None:
-    return next((text for names, text in texts.items() if any(fnmatch.fnmatch(name, n) for n in names.split(", "))), None)
+    return next(
+        (text for names, text in texts.items() if any(fnmatch.fnmatch(name, n) for n in names.split(", "))), None
+    )
 
 
 def _texts(config: type) -> dict[str, str]:
@@ -106,7 +108,9 @@ def _texts(config: type) -> dict[str, str]:
     for base in config.__mro__:
         if not base.__module__.startswith(("lerobot_playbyear.", "lerobot_env_playbyear.")):
             continue
-        items = re.findall(r"^ {4}([\w*]+(?:, [\w*]+)*): ((?:.*\n)(?: {8}.*\n)*)", f"{inspect.getdoc(base)}\n", re.MULTILINE)
+        items = re.findall(
+            r"^ {4}([\w*]+(?:, [\w*]+)*): ((?:.*\n)(?: {8}.*\n)*)", f"{inspect.getdoc(base)}\n", re.MULTILINE
+        )
         texts = {name: " ".join(text.split()) for name, text in items} | texts
     return texts
 

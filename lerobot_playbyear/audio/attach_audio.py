@@ -318,7 +318,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     """The offset of each episode [s], from the options.
 
     Raises:
-        AttachError: `offsets` is no list of as many numbers.
+        AttachError: `offsets` is not a list of as many numbers.
     """
     offset = cfg.offset or 0.0
     if cfg.offsets is None:
@@ -326,7 +326,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     try:
         values = [float(value) for value in json.loads(cfg.offsets.read_bytes())]
     except (OSError, ValueError, TypeError) as error:
-        raise AttachError(f"--offsets={cfg.offsets} is no list of numbers in JSON: {error}") from error
+        raise AttachError(f"--offsets={cfg.offsets} is not a list of numbers in JSON: {error}") from error
     if len(values) != n_episodes:
         raise AttachError(f"--offsets={cfg.offsets} has {len(values)} values; the dataset has {n_episodes} episodes.")
     return [offset + value for value in values]
@@ -379,7 +379,7 @@ def _new_rate(cfg: AttachAudioConfig, own_rate: int, fps: float, is_own: bool = 
         return rate
     if not is_own:
         raise AudioFileError(
-            f"it has {own_rate} samples per second, which is no multiple of {exact_rate(fps).numerator} Hz, and the dataset "
+            f"it has {own_rate} samples per second, which is not a multiple of {exact_rate(fps).numerator} Hz, and the dataset "
             f"{fps} frames per second. Resample it, for example with --sample_rate={nearest}."
         )
     return nearest

@@ -106,7 +106,7 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPic
         feature = picture_feature(key, cfg.name)
         if feature in features or feature in [plan.feature for plan in plans] or "/" in feature:
             raise AttachError(
-                f"--name={cfg.name}: '{feature}' is in the dataset in {dataset.root} already, or is no name. Give "
+                f"--name={cfg.name}: '{feature}' is in the dataset in {dataset.root} already, or is not a valid name. Give "
                 "another, such as --name='heard_{microphone}'."
             )
         levels = (FLOOR_DB, _LOUDEST_DB, (0,) * height)  # until they are known

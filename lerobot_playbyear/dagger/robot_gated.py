@@ -91,7 +91,7 @@ class RobotGated(Method):
     def prepare(self, demonstrates: bool) -> None:
         """Learns what is new and what is risky to the policy of this round, from what there was when the round began.
 
-        Thresholds are set anew before every attempt, with what was met in those of this round too.
+        Thresholds are set before every attempt, with what was met in those of this round too.
         """
         self._expert.demonstrates = demonstrates
         self._thresholds: Thresholds | None = None

@@ -37,10 +37,10 @@ RUN_FOLDERS = ("checkpoints", "eval", "wandb")
 """What is written into in a run's folder."""
 
 _WAITS_S = (1, 2, 5)  # between the tries of a step
-_PASSING = (408, 409, 412, 425, 429)  # besides all from 500; 412: a newer commit came before this one
+_PASSING = (408, 409, 412, 425, 429)  # and all from 500; 412: a newer commit came before this one
 
 _CONTENT = ("data/", "meta/", "videos/")
-_LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratch; what is made anew; what is the Hub's
+_LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratch; what is made again; what is the Hub's
 _POLICY_FILES = (  # that saving makes
     *("config.json", "train_config.json", "model*.safetensors", "model.safetensors.index.json"),
     *("policy_preprocessor*", "policy_postprocessor*", "adapter_config.json", "adapter_model.safetensors"),
@@ -162,7 +162,7 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
     Args:
         repo_id: Its name on the Hub, `user/name`.
         root: Its folder. None: in LeRobot's own cache, under its name.
-        options: Whether it is private, and what its card says besides. None: the usual.
+        options: Whether it is private, and what its card says in addition. None: the usual.
 
     Returns:
         Its address on the Hub.
@@ -234,7 +234,7 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
         path: The folder `pretrained_model` of a checkpoint, or one that it is in: a checkpoint, or the output folder of a
             training, whose last checkpoint is taken.
         repo_id: Its name on the Hub, `user/name`.
-        options: Whether it is private, and what its card says besides.
+        options: Whether it is private, and what its card says in addition.
 
     Returns:
         Its address on the Hub.

@@ -144,8 +144,8 @@ def _check_links(root: Path) -> None:
         check_links_out(root)
     except OutsideError as error:
         raise InputError(
-            f"No page is written, since it would hold what a link leads to: {error} Of a dataset that lies on another disk, "
-            "let the whole folder lie there, and name it with --dataset.root. Without --html it is checked as it is."
+            f"No page is written, because it would show what a link leads to: {error} If the dataset is on another disk, keep "
+            "its whole folder there and name it with --dataset.root. Without --html it is checked as it is."
         ) from error
     except OSError as error:
         raise InputError(f"The dataset in '{root}' cannot be read: {error}") from error

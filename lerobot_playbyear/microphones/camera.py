@@ -211,8 +211,8 @@ class MicrophoneCamera(Camera):
         recording, n_kept = card.recording, round(KEPT_S * config.sample_rate)  # no `self`: once forgotten, it ends
         file = SessionFile(path, config.sample_rate, lambda: recording.written, self._samples, n_kept)
         logging.info(
-            "%s listens. All that it hears, voices too, is written to %s, %.1f MB a minute, and what stands in its "
-            "pictures is sound as well.",
+            "%s listens. Everything that it hears, voices included, is written to %s (%.1f MB a minute). Its pictures hold "
+            "the sound, too.",
             str(self),  # a record of the log may be kept
             path,
             120 * config.sample_rate / 1e6,
@@ -241,7 +241,7 @@ class MicrophoneCamera(Camera):
             raise DeviceNotConnectedError(f"{self} is gone: {card.microphone.problem}.")
         silent_s = card.microphone.silent_for_s
         if silent_s > max(max_age_ms / 1000, _STALLED_S):
-            raise TimeoutError(f"{self} has brought nothing for {silent_s:.1f} s. Is it still plugged in?")
+            raise TimeoutError(f"{self} has given no sound for {silent_s:.1f} s. Is it still plugged in?")
         if self._file is not None and self._file.error:
             raise DeviceNotConnectedError(f"{self}: {self._file.error}. Make room, and begin again.")
         is_mute = card.recording.zeros_s(self.config.channel) > _ZEROS_S

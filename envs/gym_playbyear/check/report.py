@@ -254,7 +254,7 @@ def _row_of(result: dict[str, Any], task: str) -> Row:
     """A learned adversary's row."""
     if result.get("task", task) != task or not {"hears", "name", "successes", "n_episodes"} <= result.keys():
         raise ValueError(
-            f"learned: {result.get('name', result.get('task'))!r} is no learner's result on {task!r}: give files that "
+            f"learned: {result.get('name', result.get('task'))!r} is not a learner's result on {task!r}: give files that "
             "`python -m experiments.adversaries` wrote for it."
         )
     kind = "learned, hears" if result["hears"] else "learned, deaf"

@@ -152,8 +152,8 @@ class Twins:
         hides = {True, False} <= {world.get("hidden_object", True) for world in (first, second)}
         if hides and not any(prop.hidden and prop.material for prop in definition.props):
             raise TwinError(
-                f"twin worlds: {definition.name} hides nothing that can be touched, so that both worlds are the same and prove "
-                "nothing. Give what only hearing finds Prop(hidden=True, material=...), or the task other twins."
+                f"twin worlds: {definition.name} hides nothing that can be touched, so both worlds are the same and prove "
+                "nothing. Mark the object that only hearing finds with Prop(hidden=True, material=...), or give other twins."
             )
         self.worlds = tuple(DeafTask(task, **{"sound": "waveform", **options, **world}) for world in (first, second))
         self.can_be_touched = self.worlds[0].can_be_touched
