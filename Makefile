@@ -16,7 +16,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PYTEST = $(BIN)/pytest -n $(TEST_JOBS) --dist worksteal --durations=15
 BENCHMARKS ?= training acting windows recording environment
 
-.PHONY: help install demo test test-slow test-lerobot lint bench checks adversaries lock clean
+.PHONY: help install demo test test-slow test-lerobot lint docs links bench checks adversaries lock clean
 
 help:  ## Says what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -38,6 +38,12 @@ lint: install  ## Style and types
 test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, default 2)
 	./tools/test_programs.sh
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST)
+
+docs: install  ## The documentation site, in outputs/docs; a warning is an error
+	$(BIN)/sphinx-build -W --keep-going -q docs outputs/docs
+
+links:  ## Lists the links of the pages that lead elsewhere; nothing is fetched
+	@grep -rhoE --include='*.md' 'https?://[^] )>"`]+' *.md docs | sort -u
 
 test-slow: install  ## The tests that take minutes, side by side like the others
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST) -m slow --timeout 3600

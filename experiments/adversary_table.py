@@ -1,4 +1,4 @@
-"""The table of who solves which task without hearing: `python -m experiments.adversary_table`.
+"""The table of who solves which task without hearing, in docs/adversaries.md: `python -m experiments.adversary_table`.
 
 It is made of the results in experiments/results/adversaries: those of `python -m gym_playbyear.check TASK`
 (`TASK-check.json`) and those of `python -m experiments.adversaries` (`TASK-deaf-...json`, `TASK-hears-...json`).

@@ -25,24 +25,25 @@ from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 PAGE = Path(__file__).parents[1] / "docs/reference/options.md"
 
 _GROUPS: dict[str, tuple[type, str]] = {
-    "--policy.type=playbyear": (PlaybyearConfig, "policy"),
-    "--env.type=playbyear": (PlaybyearEnvConfig, "env"),
-    "--expert.type=scripted": (ScriptedExpertConfig, "expert"),
-    "--expert.type=teleop": (TeleopExpertConfig, "expert"),
-    "--method.type=hg_dagger": (HgDagger, "method"),
-    "--method.type=no_handback": (NoHandback, "method"),
-    "--method.type=redo": (Redo, "method"),
-    "--method.type=robot_gated": (RobotGated, "method"),
-    "type: microphone": (MicrophoneCameraConfig, ""),
+    "Policy": (PlaybyearConfig, "--policy.type=playbyear"),
+    "Environment": (PlaybyearEnvConfig, "--env.type=playbyear"),
+    "Scripted expert": (ScriptedExpertConfig, "--expert.type=scripted"),
+    "Person as expert": (TeleopExpertConfig, "--expert.type=teleop"),
+    "HG-DAgger": (HgDagger, "--method.type=hg_dagger"),
+    "No hand-back": (NoHandback, "--method.type=no_handback"),
+    "Redo": (Redo, "--method.type=redo"),
+    "Robot-gated": (RobotGated, "--method.type=robot_gated"),
+    "Microphone": (MicrophoneCameraConfig, "type: microphone"),
 }
-"""Headings, and what stands under them: what a command takes behind one of its `--....type`."""
+"""Headings, what stands under them, and what chooses it."""
 
 _HEAD = """# Options
 
 Every option of the commands, with its default. `playbyear-... --help` prints the most important ones, `--help=all` prints all.
 
-`null` stands for no value. `...` stands for a value that must be given. LeRobot's parser also reads options from a file:
-`--config_path=options.json`.
+- `null` stands for no value, `...` for a value without a default.
+- `--policy.*`, `--env.*`, `--expert.*` and `--method.*` depend on a type. They stand below the commands.
+- `--config_path=options.json` reads options from a file.
 """
 
 
@@ -56,21 +57,26 @@ def as_page(configs: Mapping[str, type], listed: Mapping[str, Any]) -> str:
     parts = [_HEAD]
     for command, config in configs.items():
         rows = list(_rows(config, ""))
-        covered = {name for names, _ in rows for name in names}
-        others = [name for name in listed[command]["options"] if name not in covered and name != "config_path"]
-        groups = {name.partition(".")[0] for name in others}
-        others = [name for name in others if not (name in groups and any(o.startswith(f"{name}.") for o in others))]
-        others = [name for name in others if not any(c.startswith(f"{name}.") for c in covered)]
-        parts.append(f"## {command}\n\n{_table(rows)}")
-        if others:
-            parts.append("LeRobot's own options: " + ", ".join(f"`--{name}`" for name in others) + ".\n")
-    for heading, (config, prefix) in _GROUPS.items():
-        rows = list(_rows(config, f"{prefix}." if prefix else ""))
-        about = inspect.getdoc(config) or ""
-        about = " ".join(re.split(r"\n\n?(?=(?:Args|Attributes|Inputs):)|\n\n", about)[0].split())
-        table = _table(rows, "--" if prefix else "") if rows else "It has no options.\n"
-        parts.append(f"## {heading}\n\n{about}\n\n{table}")
-    return "\n".join(parts)
+        parts += [f"## {command}\n", _table(rows), _others(rows, listed[command]["options"])]
+    for heading, (config, chosen_by) in _GROUPS.items():
+        prefix = re.match(r"--(\w+\.)|", chosen_by)
+        rows = list(_rows(config, (prefix and prefix[1]) or ""))
+        about, _, _ = re.sub(r"\n(?=\w+:\n)", "\n\n", inspect.getdoc(config) or "").partition("\n\n")
+        parts += [f"## {heading}\n", f"`{chosen_by}`: {' '.join(about.split())}\n"]
+        parts.append(_table(rows, "--" if prefix and prefix[1] else "") if rows else "It has no options.\n")
+        if config is PlaybyearConfig:
+            parts.append(
+                _others(rows, [f"policy.{name}" for name in listed["policies"]["playbyear"] if name != "config_path"])
+            )
+    return "\n".join(part for part in parts if part)
+
+
+def _others(rows: list[tuple[dict[str, str], str]], names: list[str]) -> str:
+    """Those that our docstrings say nothing of, without the names of whole groups."""
+    known = {name for options, _ in rows for name in options} | {"config_path"}
+    others = [name for name in names if not any(each == name or each.startswith(f"{name}.") for each in known)]
+    others = [name for name in others if not any(each.startswith(f"{name}.") for each in others)]
+    return "LeRobot's own: " + ", ".join(f"`--{name}`" for name in others) + ".\n" if others else ""
 
 
 def _rows(config: type, prefix: str) -> Iterator[tuple[dict[str, str], str]]:
