@@ -18,7 +18,7 @@ BENCHMARKS ?= training acting windows recording environment
 
 .PHONY: help install demo test test-slow test-lerobot lint docs links bench checks adversaries lock clean
 
-help:  ## Says what there is
+help:  ## Lists the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 install: .venv/.installed  ## Makes .venv with pinned versions (PYTHON=... to choose the Python)
@@ -54,10 +54,10 @@ test-lerobot:  ## The tests with another LeRobot, in .venv-lerobot (LEROBOT=... 
 	PYTHON="$(PYTHON)" LEROBOT="$(LEROBOT)" ./tools/setup.sh
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST)
 
-bench: install  ## Measures speed, beside alternatives, in a quarter of an hour (BENCHMARKS=...)
+bench: install  ## Measures speed beside alternatives, in a quarter of an hour (BENCHMARKS=...)
 	for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
 
-checks: install  ## Plays version 1 of every task with all who cannot hear, some hours (ALL_TASKS="...")
+checks: install  ## Checks that version 1 of every task needs hearing, some hours (ALL_TASKS="...")
 	for task in $(ALL_TASKS); do \
 	  OMP_NUM_THREADS=1 $(BIN)/python -m gym_playbyear.check $$task --jobs=$(TEST_JOBS) \
 	    --output=experiments/results/adversaries/$$task-check.json || [ $$? = 1 ]; done
