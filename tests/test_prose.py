@@ -58,6 +58,15 @@ def test_no_sentence_is_longer_than_35_words(page):
     assert found == []
 
 
+def test_the_pages_stay_short():
+    words = {str(page.relative_to(ROOT)): len(page.read_text().split()) for page in PAGES}
+    assert words.pop("README.md") <= 900
+    assert words.pop("CHANGELOG.md") <= 300
+    assert words.pop("docs/learning_log.md") <= 18_000
+    pages = {page: n for page, n in words.items() if page.startswith("docs/") and page != "docs/reference/options.md"}
+    assert sum(pages.values()) <= 20_000, pages
+
+
 def test_a_long_sentence_and_a_word_are_found():
     many = "word " * _MOST_WORDS
     page = f"# {many}\n\nOne two. A {many}.\n```\n{many}\n```\n|{many}|\n"
