@@ -9,16 +9,16 @@ TASK ?= OccludedGrasp-v1
 ALL_TASKS ?= OccludedGrasp-v1 OccludedPickPlace-v1 TellApart-v1 KeyBag-Easy-v1 KeyBag-Hard-v1
 export MUJOCO_GL ?= egl
 export HF_HUB_DISABLE_TELEMETRY ?= 1
-# Images for containers often set it: then each start compiles PyTorch and LeRobot anew, which takes longer than all else of it.
+# Images for containers often set it: then each start compiles PyTorch and LeRobot again, which takes longer than all else of it.
 unexport PYTHONDONTWRITEBYTECODE
 
 # Each process takes half of what another has left: the tests of a module stay together, and all end at the same time.
 PYTEST = $(BIN)/pytest -n $(TEST_JOBS) --dist worksteal --durations=15
 BENCHMARKS ?= training acting windows recording environment
 
-.PHONY: help install demo test test-slow test-lerobot lint bench checks adversaries lock clean
+.PHONY: help install demo test test-slow test-lerobot lint docs links bench checks adversaries lock clean
 
-help:  ## Says what there is
+help:  ## Lists the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
 
 install: .venv/.installed  ## Makes .venv with pinned versions (PYTHON=... to choose the Python)
@@ -39,6 +39,12 @@ test: lint  ## Style, types and tests (TEST_JOBS=... processes side by side, def
 	./tools/test_programs.sh
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST)
 
+docs: install  ## The documentation site, in outputs/docs; a warning is an error
+	$(BIN)/sphinx-build -W --keep-going -q docs outputs/docs
+
+links:  ## Lists the links of the pages that lead elsewhere; nothing is fetched
+	@grep -rhoE --include='*.md' 'https?://[^] )>"`]+' *.md docs | sort -u
+
 test-slow: install  ## The tests that take minutes, side by side like the others
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST) -m slow --timeout 3600
 
@@ -48,10 +54,10 @@ test-lerobot:  ## The tests with another LeRobot, in .venv-lerobot (LEROBOT=... 
 	PYTHON="$(PYTHON)" LEROBOT="$(LEROBOT)" ./tools/setup.sh
 	OMP_NUM_THREADS=$${OMP_NUM_THREADS:-1} $(PYTEST)
 
-bench: install  ## Measures speed, beside alternatives, in a quarter of an hour (BENCHMARKS=...)
+bench: install  ## Measures speed beside alternatives, in a quarter of an hour (BENCHMARKS=...)
 	for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python benchmarks/$$name.py || exit 1; done
 
-checks: install  ## Plays version 1 of every task with all who cannot hear, some hours (ALL_TASKS="...")
+checks: install  ## Checks that version 1 of every task needs hearing, some hours (ALL_TASKS="...")
 	for task in $(ALL_TASKS); do \
 	  OMP_NUM_THREADS=1 $(BIN)/python -m gym_playbyear.check $$task --jobs=$(TEST_JOBS) \
 	    --output=experiments/results/adversaries/$$task-check.json || [ $$? = 1 ]; done

@@ -1,4 +1,4 @@
-"""Latency of a control step, median and 99th percentile, beside encoding the whole window anew.
+"""Latency of a control step, median and 99th percentile, beside encoding the whole window again.
 
     python benchmarks/acting.py
 
@@ -47,7 +47,7 @@ def measure(args: argparse.Namespace) -> list[Row]:
         beside = {}
         if size == 224:  # the paper's
             theirs = medians(in_turns({"theirs": re_encoder(), **works}, max(5, args.turns // 30)))["theirs"]
-            beside = {"beside": "encoding the window anew", "theirs": 1e3 * theirs}
+            beside = {"beside": "encoding the window again", "theirs": 1e3 * theirs}
         limit = {"limit_is": "the ResNet alone", "limit": 1e3 * middle["bare"]}
         tail = float(np.percentile(seconds["ours"], 99))
         rows += [

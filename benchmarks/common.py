@@ -136,7 +136,7 @@ class Helper:
 
     Args:
         command: What to run.
-        environment: Variables besides this process's.
+        environment: Variables in addition to this process's.
     """
 
     def __init__(self, *command: str, **environment: str) -> None:

@@ -1,6 +1,6 @@
 """The published scheme, written plainly: what our training and acting are compared with; and our policy on the same noise.
 
-Du et al., "Play it by Ear" (RSS 2022): every training window of ten frames is encoded anew, all ten frames of it, to
+Du et al., "Play it by Ear" (RSS 2022): every training window of ten frames is encoded again, all ten frames of it, to
 supervise one action; so is the window behind every control step. The sizes are the paper's, and its augmentation is a
 shift, a change of colours and an affine map, one after the other, on every frame's stack. Memory layout, memory
 allocation and precision are PyTorch's defaults. Weights of a `PlaybyearPolicy` fit (`load_from`).

@@ -31,7 +31,7 @@ fi
 
 step "2/5 Train"
 if [ -e "$checkpoint" ]; then
-  echo "Using the policy in $checkpoint; remove $train to train anew."
+  echo "Using the policy in $checkpoint; remove $train to train again."
 else
   rm -rf "$train"
   run playbyear-train --preset=cpu \

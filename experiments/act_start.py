@@ -46,8 +46,8 @@ def saved_start(
 
     Args:
         options: Of the policy, without `--policy.`.
-        dataset: Folder of the dataset whose pictures it shall tell apart.
-        folder: Of the checkpoint; one that was made with other arguments is made anew.
+        dataset: Folder of the dataset whose pictures it tells apart.
+        folder: Of the checkpoint; one that was made with other arguments is made again.
         seed: Of the weights and of the pictures that are looked at.
         crop: What the preprocessor does with pictures first.
 

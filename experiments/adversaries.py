@@ -70,7 +70,7 @@ def make_model(arguments: Any) -> RecurrentPPO:
 
 
 def environment_options(arguments: Any) -> dict[str, Any]:
-    """What the environment is made with besides its name."""
+    """What the environment is made with, except its name."""
     options = {"horizon": arguments.horizon}
     return {name: value for name, value in options.items() if value is not None}
 

@@ -4,7 +4,7 @@
 
 1. A policy is trained on five demonstrations.
 2. `playbyear-dagger` keeps 25 attempts in which the expert had to help, and learns from them as they come. These attempts may
-   take longer than the task's own, so that the expert has the time to search anew after a mistake.
+   take longer than the task's own, so that the expert has the time to search again after a mistake.
 3. The control goes on with the same demonstrations, for as many updates at the same largest rate.
 
 All three are evaluated on the same 50 seeds: in the task's own time, and in that of the attempts, which suffices for a second

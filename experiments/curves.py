@@ -9,7 +9,7 @@
 
 Noise, materials and rooms take the full policies that `experiments.ablations` trained, as they are: those of the preset `cpu`,
 which mixes noise into the sound, and never heard another material, a voice, a clatter or another microphone. `--trained` trains
-others here: with quieter noise in their sound, with recordings besides, of other kinds than those that are tried, or without
+others here: with quieter noise in their sound, with recordings of other kinds than those that are tried, or without
 noise. Results that are there are kept.
 """
 

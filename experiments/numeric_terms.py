@@ -1,4 +1,4 @@
-"""What a learner is told of a task, besides the arm: what the camera shows, the truth for its critic, and how far it has come.
+"""What a learner is told of a task beside the arm: what the camera shows, the truth for its critic, and how far it has come.
 
 One class for each kind of task: a thing that lies somewhere on the table, things in a bag, a pouch that is lifted and
 dropped. All give as many numbers, so that the same player can learn any of them.

@@ -227,7 +227,7 @@ def record(task: str, n_episodes: int, root: Path | None = None, *environment: s
 
     Args:
         task: What the expert does.
-        n_episodes: How many there shall be.
+        n_episodes: How many there are to be.
         root: The dataset's folder; by default the task's own.
         environment: Further options of the environment, `--env.image_size=48`.
     """

@@ -5,7 +5,7 @@
         ...  # PortAudioMicrophoneConfig(device="bench")
 
 PortAudio reads ALSA's configuration once and sees no later change, so the server sets `ALSA_CONFIG_PATH` in this process and
-makes PortAudio look again. Another process that shall hear needs the variables of `server.environment`; one that shall be heard
+makes PortAudio look again. Another process that is to hear needs the variables of `server.environment`; one that is to be heard
 writes to `server.fifo(name)` at the pace of time, with a `Player` or by itself.
 """
 
@@ -158,7 +158,7 @@ def started(**sources: int) -> Iterator[SoundServer]:
 
 
 def look_again() -> None:
-    """Makes PortAudio in this process read ALSA's configuration anew. No stream may be open."""
+    """Makes PortAudio in this process read ALSA's configuration again. No stream may be open."""
     from lerobot_playbyear.microphones.portaudio import sound_cards
 
     sound_cards(fresh=True)
@@ -221,7 +221,7 @@ class Player(threading.Thread):
     def _write(self, data: bytes) -> None:
         with contextlib.suppress(FileNotFoundError):
             node = self._fifo.stat().st_ino
-            if node != self._node:  # the source was plugged in anew
+            if node != self._node:  # the source was plugged in again
                 if self._file is not None:
                     os.close(self._file)
                 self._file, self._node = os.open(self._fifo, os.O_RDWR | os.O_NONBLOCK), node

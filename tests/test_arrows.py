@@ -8,7 +8,7 @@ from pathlib import Path
 
 _ROOT = Path(__file__).parents[1] / "lerobot_playbyear"
 
-# Each package, and what it may import besides itself and `compat`. A package names only those above it: no circles.
+# Each package, and what it may import in addition to itself and `compat`. A package names only those above it: no circles.
 _ARROWS = """
 datasets
 audio           datasets

@@ -74,7 +74,7 @@ def test_a_checkpoint_keeps_it_all_and_one_with_heads_acts_without_them(tmp_path
         assert torch.equal(step_through(other, [episode]), step_through(policy, [episode]))
 
 
-# What the network reads besides
+# What else the network reads
 
 
 def test_an_offset_moves_all_frames_of_an_item_by_the_same():

@@ -15,7 +15,7 @@ def benchmarks_on_path(monkeypatch):
 
 @pytest.mark.slow
 def test_the_published_scheme_gives_our_actions_for_the_same_weights():
-    """Encoding ten frames per window anew is slower, and not something else."""
+    """Encoding ten frames per window again is slower, and not something else."""
     from reference import Reference, make_policy, random_windows
 
     torch.manual_seed(0)

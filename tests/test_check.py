@@ -1,4 +1,4 @@
-"""The check of a task: what deaf players see, twin worlds, the table; and a control that shows that the scripts are strong."""
+"""The check of a task: what deaf players see, twin environments, the table; and a control: the scripts are strong."""
 
 import gc
 import json
@@ -106,7 +106,7 @@ def test_a_script_that_knows_how_deep_the_keys_lie_takes_them_out():
     assert [play(task, told, seed, bottom=0.06) for seed in range(4)].count("success") >= 2
 
 
-# Twin worlds
+# Twin environments
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_a_task_that_no_ear_or_every_eye_can_solve_is_refused(monkeypatch, chang
 
     monkeypatch.setitem(ALL_TASKS._own, "Own-v1", of_an_author)
     report = check("Own-v1", 4, names=["leave"], options=options)
-    faults = [found for found in report.broken if found.startswith("twin worlds")]
+    faults = [found for found in report.broken if found.startswith("twin environments")]
     assert (fault is None and not faults) or any(fault in found for found in faults), faults
     assert f"a classifier that hears: area {report.twin.heard.value:.3f}" in as_text(report)
 

@@ -80,7 +80,7 @@ OF_POLICY: dict[str, tuple[Callable[[Path], object], str]] = {
 OF_PROCESSORS: dict[str, tuple[Callable[[Path], object], str]] = {
     "statistics: missing": (file(STATE, Path.unlink), "cannot be read"),
     "statistics: cut": (file(STATE, cut), "cannot be read"),
-    "statistics: elsewhere": (another_state, "it is no name of a file beside it"),
+    "statistics: elsewhere": (another_state, "it is not the name of a file beside it"),
 }
 
 

@@ -19,6 +19,7 @@ from lerobot_playbyear.scripts.command import OPTIONS_FILE, find_mistake, short_
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 from list_options import CONFIGS, as_text, list_options
+from options_page import PAGE, as_page
 
 LISTED = json.loads(OPTIONS_FILE.read_text())
 listed_lerobot = pytest.mark.skipif(
@@ -112,8 +113,10 @@ def _defaults(config: type) -> dict[str, str]:
 
 
 @listed_lerobot
-def test_the_list_of_options_is_that_of_the_parsers():
-    assert OPTIONS_FILE.read_text() == as_text(list_options()), "run `python tools/list_options.py`"
+def test_the_list_and_the_page_of_options_are_those_of_the_parsers():
+    listed = list_options()
+    assert OPTIONS_FILE.read_text() == as_text(listed), "run `python tools/list_options.py`"
+    assert PAGE.read_text() == as_page(CONFIGS, listed), "run `python tools/list_options.py`"
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,8 @@ from lerobot_playbyear.scripts.command import OPTIONS_FILE, find_mistake
 from lerobot_playbyear.training.command_line import apply_preset
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))]
+NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
 LISTED = json.loads(OPTIONS_FILE.read_text())
 FILMS = sorted(path.name for path in (ROOT / "docs/media/listen").glob("*.mp4"))
 
@@ -31,7 +32,7 @@ def named(page: Path) -> list[list[str]]:
     return [shlex.split(re.sub(r"--json\b", "--json=true", line), comments=True) for line in lines]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_the_options_in_a_pages_commands_exist(page):
     for command, *options in named(page):
         listed = {**LISTED[command], "required": []} if "..." in options else LISTED[command]
@@ -41,10 +42,22 @@ def test_the_options_in_a_pages_commands_exist(page):
         assert find_mistake(given, listed, LISTED["policies"]) is None, " ".join([command, *options])
 
 
-@pytest.mark.parametrize("page", PAGES, ids=[page.name for page in PAGES])
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_a_pages_links_lead_to_what_is_there(page):
-    for link in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
-        assert "://" in link or (page.parent / link).exists(), link
+    for link, _, anchor in (found.partition("#") for found in re.findall(r"\]\(([^)\s]+)", page.read_text())):
+        if "://" in link:
+            continue
+        target = page.parent / link if link else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), f"{link}#{anchor}"
+
+
+def anchors(page: Path) -> list[str]:
+    """The headings of a page, as GitHub makes anchors of them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    titles = [re.sub(r"\[(.*?)\]\(.*?\)", r"\1", title) for title in re.findall(r"^#+ (.+?) *$", text, re.MULTILINE)]
+    slugs = [re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles]
+    return [f"{slug}-{slugs[:i].count(slug)}" if slug in slugs[:i] else slug for i, slug in enumerate(slugs)]
 
 
 def test_the_guide_to_listening_names_the_films_that_are_there():

@@ -54,13 +54,13 @@ BASE = {
 
 COMMANDS = """
 # Told from the command line alone
-dagger | --strategy.num_episodes=3 | --strategy.num_episodes is no option; did you mean --num_episodes?
+dagger | --strategy.num_episodes=3 | --strategy.num_episodes is not an option; did you mean --num_episodes?
 dagger | --dataset.num_episodes=3 | did you mean --num_episodes?
-train | --bach_size=3 | --bach_size is no option; did you mean --batch_size?
+train | --bach_size=3 | --bach_size is not an option; did you mean --batch_size?
 train | --policy.image_sise=3 | did you mean --policy.image_size?
 train | --steps=many | steps | 'many' into an int
 train | --steps | --steps needs a value
-train | cpu | 'cpu' is no option
+train | cpu | 'cpu' is not an option
 train | -dataset.repo_id | --dataset.repo_id is needed
 record | --robot.type=so101_follower | lerobot-record --robot.type=so101_follower | type: microphone | playbyear-attach-audio
 record | --robot.port=/dev/ttyUSB7 --robot.type=koch_follower | --robot.type=koch_follower --robot.port=/dev/ttyUSB7
@@ -168,14 +168,14 @@ attach-audio | --files=sound.wav | --files=sound.wav | {episode}
 attach-audio | --offset=3 | episode 0, | it lasts 0.850 s; 12 frames | Correct the offset
 attach-audio | --microphone=left,right | 1 channels, and --microphone names 2
 attach-audio | --channel=4 | there is no --channel=4
-attach-audio | --offsets={out}/no.json | {out}/no.json | is no list of numbers
+attach-audio | --offsets={out}/no.json | {out}/no.json | is not a list of numbers
 attach-audio | --files={sounds}/odd/{{episode:03d}}.wav | 11025 samples per second | 20 | --sample_rate=11020
 attach-audio | --dataset.root={noise} | 'observation.audio.gripper' is in the dataset already
 attach-audio | --session={sounds}/day.wav | both are given. Give one
 session | -session | is for --files and one --session
 session | --session={out}/no.wav | There is no sound file | {out}/no.wav
 session | -clock | playbyear_clock.json. Give --clock=times.csv
-session | --marks=1.0 | '1.0' is no mark; wanted seconds in the sound file = seconds on the clock
+session | --marks=1.0 | '1.0' is not a mark; wanted seconds in the sound file = seconds on the clock
 session | --marks=1=5,2=5 | the same time on the clock
 session | --marks=10=1,20=5 | 2.5000 seconds of sound in a second of the clock
 attach-spectrogram | --microphones=[nose] | --microphones names 'nose'; the dataset in {noise} has gripper
@@ -217,7 +217,7 @@ reset | OccludedPickPlace-v1, {bin_position: 0.1} | bin_position= | give x and y
 reset | TellApart-v1, {pouch_position: [.nan, 0]} | pouch_position
 reset | TellApart-v1, {contents: gravel} | contents='gravel' is not known: choose one of screws, peanuts
 check | names: [tap_dance] | player='tap_dance' is not known: choose from 'expert', 'middle'
-check | learned: [{name: rl, task: KeyBag-Easy-v1}] | 'rl' is no learner's result on 'OccludedGrasp-v1'
+check | learned: [{name: rl, task: KeyBag-Easy-v1}] | 'rl' is not a learner's result on 'OccludedGrasp-v1'
 # Features of a microphone that is recorded, of 80 samples at 1600 Hz and 20 frames per second
 feature | info: {} | does not say its sample rate
 feature | info: {sample_rate: 1600.5} | sample_rate 1600.5 | whole number of Hz

@@ -8,9 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbformat
 import numpy as np
 import pytest
 from dataset_factory import make_dataset
+from nbclient import NotebookClient
 from recording_factory import load
 
 from lerobot_playbyear.audio import read_audio
@@ -48,6 +50,22 @@ def test_the_main_job_with_lerobots_own_commands(commands, tmp_path):
         commands.succeed(*json.loads(line))
 
     assert json.loads((tmp_path / "eval/eval_info.json").read_text())["overall"]["n_episodes"] == 1
+
+
+@pytest.mark.slow
+def test_the_notebook_runs_from_top_to_bottom(tmp_path, monkeypatch):
+    """With three demonstrations and two updates; as committed it has no outputs, and so none of somebody's machine."""
+    notebook = nbformat.read(EXAMPLES / "quickstart.ipynb", nbformat.NO_CONVERT)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.outputs for cell in cells] == [[]] * len(cells)
+    sizes = {"EPISODES=50": "EPISODES=3", "UPDATES=1250": "UPDATES=2", "TRIALS=20": "TRIALS=1"}
+    for usual, small in sizes.items():
+        assert usual in cells[0].source
+        cells[0].source = cells[0].source.replace(usual, small)
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+    NotebookClient(notebook, timeout=1800, resources={"metadata": {"path": tmp_path}}).execute()
+    assert "of 1 episodes" in str(cells[-3].outputs)
+    assert "data:video/mp4;base64" in str(cells[-1].outputs)
 
 
 def test_plain_gymnasium_hears_the_touch(run, capsys):

@@ -442,13 +442,13 @@ def grown_by(work: Callable[[], object]) -> float:
     def kilobytes(name: str) -> int:
         return int(re.search(rf"{name}:\s*(\d+) kB", Path("/proc/self/status").read_text())[1])
 
-    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins again
     before = kilobytes("VmRSS")
     work()
     return (kilobytes("VmHWM") - before) / 1024
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells a peak anew")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux resets a peak")
 @pytest.mark.parametrize("kind", ["sound", "cut", "state", "picture", "fps", "episodes"])
 def test_claims_that_ask_for_gigabytes_get_none(root, kind):
     if kind == "cut":
@@ -465,7 +465,7 @@ def test_claims_that_ask_for_gigabytes_get_none(root, kind):
         assert grown_by(lambda reader=reader: read(reader)) < 150
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells a peak anew")
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux resets a peak")
 def test_large_pictures_are_decoded_one_at_a_time(tmp_path):
     """Black ones of 12 million pixels fill 40 kB, and 36 MB each once they are read."""
     root, size = tmp_path / "set", 3464

@@ -93,7 +93,7 @@ def test_a_card_is_found_by_its_number_its_name_and_a_part_of_its_name_that_no_o
     ("changes", "said"),
     [
         ({"device": "benc"}, "fits more than one sound card"),
-        ({"device": 7}, "is no sound card with an input"),
+        ({"device": 7}, "is not a sound card with an input"),
         ({"device": "bench_left", "channel": 40}, "channel 40 is asked for"),
     ],
 )
@@ -114,7 +114,7 @@ def test_a_card_that_was_plugged_in_later_is_found_but_never_at_the_cost_of_an_o
     first, later = (MicrophoneCamera(options(device=name)) for name in ("table", "new_one"))
     with Player(server.fifo("table"), 2):
         first.connect()
-        with pytest.raises(MicrophoneError, match="is no sound card"):
+        with pytest.raises(MicrophoneError, match="is not a sound card"):
             later.connect()
         before = heard(first).counter
         time.sleep(0.2)

@@ -386,7 +386,7 @@ def test_rows_without_whole_numbers_are_refused(noise, tmp_path, name, value):
     table = pq.read_table(path).replace_schema_metadata({})
     values = pa.array([value] * len(table), pa.string() if value else pa.int64())
     pq.write_table(table.set_column(table.column_names.index(name), name, values), path)
-    with pytest.raises(InputError, match="are no whole numbers"):
+    with pytest.raises(InputError, match="are not whole numbers"):
         check_dataset_files("a/b", root)
     assert not survey(root).is_undamaged
 
@@ -412,7 +412,7 @@ def test_a_checkpoint_names_no_class_to_call(recorded, trained, tmp_path, file):
 def test_damaged_processors_are_named(trained, tmp_path, text):
     checkpoint = Path(shutil.copytree(trained, tmp_path / "policy"))
     (checkpoint / "policy_preprocessor.json").write_text(text)
-    with pytest.raises(InputError, match=r"policy_preprocessor\.json is no processor of LeRobot's"):
+    with pytest.raises(InputError, match=r"policy_preprocessor\.json is not a processor of LeRobot's"):
         check_steps(checkpoint)
 
 

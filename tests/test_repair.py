@@ -185,7 +185,7 @@ def test_what_is_lost_takes_only_its_episodes_with_it(copy, folder, how):
     assert 0 < len(hit) < N_EPISODES
     how(path)
     report = repaired(root, RICH_FEATURES, lost=hit)
-    assert "Numbered anew" in str(report)
+    assert "Renumbered" in str(report)
 
 
 @pytest.mark.parametrize(

@@ -209,7 +209,7 @@ def test_a_column_that_was_damaged_since_is_made_anew(noise, tmp_path, caplog, d
         victim.write_bytes(content)
     with caplog.at_level(logging.WARNING):
         assert_same(load(noise, tmp_path), in_memory(noise))
-    assert ("made anew" in caplog.text) is (damage == "shortened")
+    assert ("made again" in caplog.text) is (damage == "shortened")
 
 
 def test_two_at_once_make_one_and_share_it(noise, tmp_path, monkeypatch):

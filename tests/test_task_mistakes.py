@@ -61,16 +61,16 @@ def with_piece(**traits: Any) -> Callable[..., Task]:
             made(occluded_grasp, terminations=(Groped(), Wrong)),
             r"terminations has <class .*Wrong.*write Wrong\(\.\.\.\)",
         ),
-        (made(terminations=Wrong()), r"terminations=<.*Wrong object.* is no tuple"),
+        (made(terminations=Wrong()), r"terminations=<.*Wrong object.* is not a tuple"),
         (made(terminations=(lambda env: False,)), r"terminations has <function .*write Termination\(\.\.\.\)"),
         (made(early_action=Pressed), r"early_action has <class .*Pressed"),
         (made(terminations=(Shoved("puch", 0.02),)), r"Shoved, prop='puch' .* mean 'pouch'"),
         (made(success=Success(bool, ("pouch", "wall"))), r"Success, prop=\('pouch', 'wall'\) is not known"),
         # Collections that are none
-        (made(reset_options="contents"), r"reset_options='contents' is no tuple"),
+        (made(reset_options="contents"), r"reset_options='contents' is not a tuple"),
         (made(blind=(Wrong,)), r"blind=.* names no scripts: write \{\"name\": script\}"),
-        (made(twins=("contents", "screws", "peanuts")), r"twins=.* are no two worlds"),
-        (made(twins=({"contents": "screws"},)), r"twins=.* are no two worlds"),
+        (made(twins=("contents", "screws", "peanuts")), r"twins=.* are not two worlds"),
+        (made(twins=({"contents": "screws"},)), r"twins=.* are not two worlds"),
     ],
 )
 def test_a_mistake_in_a_task_is_told_when_it_is_made(factory, said):
@@ -100,7 +100,7 @@ def test_a_limit_that_there_is_not_is_told_before_anyone_plays():
 def test_what_a_script_or_a_reset_names_wrongly_is_told():
     env = TaskEnv(made(), sound="none")
     env.reset_physics(seed=0)
-    with pytest.raises(KeyError, match=r"'gripper-puch' is no pair .* there is .*gripper-pouch"):
+    with pytest.raises(KeyError, match=r"'gripper-puch' is not a pair .* there is .*gripper-pouch"):
         env.contact_forces["gripper-puch"]
     with pytest.raises(ValueError, match=r"set_pose, prop='puch' .* mean 'pouch'"):
         env.set_pose("puch", (0.0, 0.0, 1.0))
@@ -111,6 +111,6 @@ def test_what_a_script_or_a_reset_names_wrongly_is_told():
 
 @pytest.mark.parametrize("modes", ["11,12", "11, 12", "1 1", "112", "10", "", ("11", "12"), 11.5])
 def test_modes_of_a_plate_are_separated_by_spaces(modes):
-    with pytest.raises(ValueError, match=r"modes=.* is no mode\. Write two digits for each.*spaces.*'11 12 2b'"):
+    with pytest.raises(ValueError, match=r"modes=.* is not a mode\. Write two digits for each.*spaces.*'11 12 2b'"):
         plate(WOOD, (0.1, 0.1), 0.01, modes)
     assert len(plate(WOOD, (0.1, 0.1), 0.01, "11 12 2b")) == 3

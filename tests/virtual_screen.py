@@ -34,7 +34,7 @@ class VirtualScreen:
         read, write = os.pipe()
         size = f"{width}x{height}x24"
         command = ["Xvfb", f":{number}", "-displayfd", str(write), "-screen", "0", size, "-nolisten", "tcp"]
-        command += ["-noreset"]  # otherwise it starts anew when its last client leaves, and turns away who comes then
+        command += ["-noreset"]  # otherwise it starts again when its last client leaves, and turns away who comes then
         self._process = subprocess.Popen(
             command, pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -45,7 +45,7 @@ class VirtualScreen:
 
     @property
     def environment(self) -> dict[str, str]:
-        """For a process that shall use this screen."""
+        """For a process that uses this screen."""
         kept = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
         return {**kept, "DISPLAY": self.display, "XDG_SESSION_TYPE": "x11"}
 

@@ -1,8 +1,9 @@
-"""Writes the names of all options of our commands, by which they refuse what is misspelt before LeRobot is imported.
+"""Writes the names of all options of our commands, by which they refuse what is misspelt before LeRobot is imported; and
+docs/reference/options.md.
 
     python tools/list_options.py
 
-Needed when an option of ours, or LeRobot's version, changes; a test says when.
+Needed when an option of ours, its text, or LeRobot's version changes; a test says when.
 """
 
 import dataclasses
@@ -86,4 +87,7 @@ def as_text(listed: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
+    from options_page import PAGE, as_page
+
     OPTIONS_FILE.write_text(as_text(list_options()))
+    PAGE.write_text(as_page(CONFIGS, list_options()))

@@ -122,8 +122,8 @@ class TaskContacts:
         """
         if name not in self._loose:
             raise ValueError(
-                f"The parts of the hand are told apart on loose things with a material alone ({', '.join(self._loose)}"
-                f"), {name!r} is none: `contact_forces` has what the whole hand does to it."
+                f"Only loose bodies with a material have forces for each part of the hand ({', '.join(self._loose)}), and "
+                f"{name!r} is not one: `contact_forces` has those of the whole hand."
             )
         first = int(self._first[self.names.index((GRIPPER, name))])
         return forces[:, :, first : first + len(self._arm.touching)].transpose(0, 2, 1)

@@ -32,7 +32,7 @@ class _Forces(dict[str, float]):
     """By pair; a pair that is not measured is told with those that are."""
 
     def __missing__(self, pair: str) -> float:
-        raise KeyError(f"{pair!r} is no pair of bodies whose contact is measured: there is {', '.join(self)}.")
+        raise KeyError(f"{pair!r} is not a pair of bodies whose contact is measured: there is {', '.join(self)}.")
 
 
 class TaskEnv(gym.Env):

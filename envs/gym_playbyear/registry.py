@@ -85,7 +85,7 @@ class Registry(Mapping[str, Any]):
         return found
 
     def _others(self) -> dict[str, EntryPoint]:
-        # Asked for anew each time: a distribution may be installed while a notebook runs.
+        # Asked for again each time: a distribution may be installed while a notebook runs.
         return {point.name: point for point in entry_points(group=f"{GROUP}.{self.kind}")}
 
 

@@ -97,7 +97,7 @@ class Task:
         blind: Scripts without any sense of contact, by name; each is `script(env)`.
         deaf: Scripts that feel with the arm and do not hear, by name; each is `script(facts, rng)`, see
             `gym_playbyear.check`. Tasks whose camera shows a `hidden_range` have ours without naming any.
-        sees: `sees(env)`: what the camera shows of the moment, in numbers by name, besides `env.shown`.
+        sees: `sees(env)`: what the camera shows of the moment, in numbers by name, in addition to `env.shown`.
         twins: Options of two worlds in which nothing differs but what only sound tells: the task's own, or of `TaskEnv`.
         control_hz, sample_rate: Steps, and samples of a microphone, per second.
         physics_dt: Duration of a physics step [s].
@@ -152,15 +152,15 @@ class Task:
         self._check_names()
         if not isinstance(self.terminations, tuple | list):
             raise ValueError(
-                f"{self.name}: terminations={self.terminations!r} is no tuple: write (..., ), with a comma."
+                f"{self.name}: terminations={self.terminations!r} is not a tuple: write (..., ), with a comma."
             )
         rules = [("success", self.success, Success), ("early_action", self.early_action, EarlyAction)]
         for where, rule, kind in [*rules, *(("terminations", rule, Termination) for rule in self.terminations)]:
             if not isinstance(rule, kind):
                 a_rule = rule.__name__ if isinstance(rule, type) else kind.__name__
                 raise ValueError(
-                    f"{self.name}: {where} has {rule!r}, which is no instance of gym_playbyear.terminations.{kind.__name__}: "
-                    f"write {a_rule}(...)."
+                    f"{self.name}: {where} has {rule!r}, which is not an instance of "
+                    f"gym_playbyear.terminations.{kind.__name__}: write {a_rule}(...)."
                 )
             prop = getattr(rule, "prop", None) if type(rule).__module__ == kind.__module__ else None
             props = [part.name for part in (self.arena, *self.props)]
@@ -172,7 +172,7 @@ class Task:
         """Raises ValueError for what should be a collection and is none, or not of the right things."""
         if isinstance(self.reset_options, str):
             raise ValueError(
-                f"{self.name}: reset_options={self.reset_options!r} is no tuple: write (..., ), with a comma."
+                f"{self.name}: reset_options={self.reset_options!r} is not a tuple: write (..., ), with a comma."
             )
         for where, scripts in (("blind", self.blind), ("deaf", self.deaf)):
             if not isinstance(scripts, Mapping):
@@ -180,7 +180,7 @@ class Task:
         twins = self.twins
         if not isinstance(twins, tuple | list) or len(twins) != 2 or not all(isinstance(w, Mapping) for w in twins):
             raise ValueError(
-                f"{self.name}: twins={twins!r} are no two worlds: write the options of each, such as "
+                f"{self.name}: twins={twins!r} are not two worlds: write the options of each, such as "
                 '({"contents": "screws"}, {"contents": "peanuts"}).'
             )
 

@@ -61,29 +61,28 @@ class PcmToFloatProcessorStep(ObservationProcessorStep):
 @EnvConfig.register_subclass("playbyear")
 @dataclass
 class PlaybyearEnvConfig(EnvConfig):
-    """The tasks that contact sound solves and a camera does not.
+    """The simulated tasks, which contact sound solves and a camera does not.
 
     Args:
-        task: `OccludedGrasp-v1`, or any other task that `gym_playbyear` knows, those of other distributions among them.
-        fps: Control steps, pictures and sound blocks per second. 0: the task's own rate, the only one that it runs at.
-        episode_length: Steps after which an episode is cut off. None: the task's own horizon.
+        task: `OccludedGrasp-v1`, or another task of `gym_playbyear` or of an installed package.
+        fps: Control steps, pictures and blocks of sound per second. Only the task's own rate works. 0: that rate.
+        episode_length: Largest number of control steps in an episode. None: the task's own.
         image_size: Height and width of a camera's picture [pixels].
-        sample_rate: Of every microphone [Hz]; divisible by `fps`, so that each frame has the same number of samples. 0: the
-            task's own.
+        sample_rate: Samples per second of every microphone [Hz], divisible by `fps`. 0: the task's own.
         sound: `waveform` (int16 PCM per microphone), `contact_force` (the paper's proxy, 6 numbers), or `none`.
-        microphones: Names of the microphones that are on, with `sound=waveform`: `gripper`, `table`. None: the task's own.
-        noise_level: Multiplies the background noise and the arm's own hum. 1 is the task as published, 0 silence.
-        room_noise: A WAV file that plays in the room, over and over; None for a silent room.
-        room_noise_level: How loud it is, in units of the usual background's root mean square.
+        microphones: Names of the microphones, with `sound=waveform`: `gripper`, `table`. None: the task's own.
+        noise_level: Factor on the background noise and the arm's own hum. 1 is the task as published, 0 silence.
+        room_noise: A WAV file that plays in the room, over and over. None: no further noise.
+        room_noise_level: Loudness of that file, relative to the root mean square of the usual background.
         microphone_response: `flat`, or the frequency response of another microphone: `phone`, `dull`, `boomy`.
-        spectrogram: For policies that look at pictures of sound: the folder of the dataset that they learned from, made by
-            `playbyear-attach-spectrogram`, or its `meta/info.json`. The same pictures then come as `pixels/<microphone>`.
+        spectrogram: For policies that see pictures of the sound: the folder of their dataset, made by
+            `playbyear-attach-spectrogram`, or its `meta/info.json`. The same pictures come as `pixels/<microphone>`.
         task_options: The task's own options by name, such as `{cube_material: glass}` or `{contents: pens}`.
-        hidden_object: False: the hand passes through what is hidden; all else is the same world.
-        visualization_width, visualization_height: Of the picture that `render()` gives people; the same number twice [pixels].
+        hidden_object: False: the hand passes through the hidden object. Everything else is the same.
+        visualization_width, visualization_height: Size of the picture from `render()` [pixels]. Both must be equal.
         render_mode: `rgb_array` (for videos), or `human` for a window.
-        attempts_file: A file to which every attempt, at its end, appends a line of JSON: seed, steps, success, how it ended,
-            and whether the hand acted before anything was heard (`attempts.py`).
+        attempts_file: File to which each episode appends a line of JSON: seed, steps, success, how it ended, and whether the
+            hand acted before anything was heard (`attempts.py`).
 
     Raises:
         DecodingError: A value is not one that the tasks know. LeRobot's commands print it as one line and stop.

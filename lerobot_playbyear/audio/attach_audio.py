@@ -47,25 +47,24 @@ class AttachAudioConfig:
     """Options of `playbyear-attach-audio`.
 
     Args:
-        dataset: The dataset that gets sound; it is not changed. Without a root it may come from the Hub.
-        output: The copy with sound. Without a name: the dataset's name and folder with `_with_sound` behind them.
-        files: The sound of each episode, if each has a file: a path in which `{episode}` stands for the episode's number,
-            for example `sound/{episode:06d}.wav`. WAV, FLAC, or a film whose sound track is taken.
-        session: One file with the sound of the whole session, in place of `files`; or, where a microphone was recorded as a
-            camera, a folder with the files of its sessions, if these are not where the microphone left them.
-        clock: When each episode's first frame was taken [s]: a table (CSV) of episode and seconds, or JSON. None: the
-            dataset says so itself, in `meta/playbyear_clock.json`.
-        marks: Moments that are known in the session's file and on that clock, such as a clap at the start and one at the
-            end: `2.31=1754400000.12, 1802.74=1754401800.55`. None: the clock's seconds are the file's.
-        microphone: What the microphone is called: the column is `observation.audio.<microphone>`. For files of
-            several channels, a name for each, separated by commas. None: "microphone"; of those that were recorded as cameras,
-            all.
-        channel: Take only this channel of the files, counted from 0.
-        offset: Where in its file each episode's first frame was taken [s]; negative where the file begins after it. None:
-            0, or as the dataset says of its own files.
-        offsets: A JSON file with a list of offsets [s], one per episode, in addition to `offset`.
-        sample_rate: Resample to this rate [Hz]. None keeps the files' own.
-        pad: Fill what a file lacks at its beginning or its end with silence; otherwise that is an error.
+        dataset: The dataset that gets sound. It is not changed. Without a root it may come from the Hub.
+        output: The copy with sound. By default the dataset's name and folder with `_with_sound` appended.
+        files: The sound of each episode, if each has its own file: a path in which `{episode}` stands for the episode's number,
+            such as `sound/{episode:06d}.wav`. WAV, FLAC, or a video whose sound track is read.
+        session: One file with the sound of the whole session, instead of `files`. For microphones recorded as cameras: the
+            folder of their session files, if these were moved.
+        clock: When each episode's first frame was taken [s]: CSV lines of episode and seconds, or JSON. None: the dataset's
+            `meta/playbyear_clock.json`.
+        marks: Moments known both in the session's file and on that clock, such as a clap at the start and one at the end:
+            `2.31=1754400000.12, 1802.74=1754401800.55`. None: the clock counts the seconds of the file.
+        microphone: Name of the microphone: the column is `observation.audio.<microphone>`. For files with several channels: one
+            name per channel, separated by commas. None: "microphone", or all microphones that were recorded as cameras.
+        channel: Use only this channel of the files, counted from 0.
+        offset: Time in its file at which each episode's first frame was taken [s]. It is negative if the file begins later.
+            None: 0, or what the dataset says of its own files.
+        offsets: JSON file with a list of offsets [s], one per episode. They are added to `offset`.
+        sample_rate: Resample to this rate [Hz]. None: keep the files' rate.
+        pad: Fill missing sound at the beginning or end of a file with silence. Otherwise missing sound is an error.
     """
 
     dataset: DatasetPlace
@@ -319,7 +318,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     """The offset of each episode [s], from the options.
 
     Raises:
-        AttachError: `offsets` is no list of as many numbers.
+        AttachError: `offsets` is not a list of as many numbers.
     """
     offset = cfg.offset or 0.0
     if cfg.offsets is None:
@@ -327,7 +326,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     try:
         values = [float(value) for value in json.loads(cfg.offsets.read_bytes())]
     except (OSError, ValueError, TypeError) as error:
-        raise AttachError(f"--offsets={cfg.offsets} is no list of numbers in JSON: {error}") from error
+        raise AttachError(f"--offsets={cfg.offsets} is not a list of numbers in JSON: {error}") from error
     if len(values) != n_episodes:
         raise AttachError(f"--offsets={cfg.offsets} has {len(values)} values; the dataset has {n_episodes} episodes.")
     return [offset + value for value in values]
@@ -380,7 +379,7 @@ def _new_rate(cfg: AttachAudioConfig, own_rate: int, fps: float, is_own: bool = 
         return rate
     if not is_own:
         raise AudioFileError(
-            f"it has {own_rate} samples per second, which is no multiple of {exact_rate(fps).numerator} Hz, and the dataset "
+            f"it has {own_rate} samples per second, which is not a multiple of {exact_rate(fps).numerator} Hz, and the dataset "
             f"{fps} frames per second. Resample it, for example with --sample_rate={nearest}."
         )
     return nearest

@@ -36,14 +36,14 @@ class AttachSpectrogramConfig:
     """Options of `playbyear-attach-spectrogram`.
 
     Args:
-        dataset: The dataset with sound; it is not changed.
+        dataset: The dataset with sound. It is not changed.
         output: The copy with pictures of the sound.
-        microphones: Names of those that are to be seen. None: all.
-        name: What a microphone's pictures are called: `observation.images.<name>`. `{microphone}` stands for its name.
-        seconds: How much sound a picture shows at least [s]; it is made longer until a frame moves it by whole columns.
-        height, width: Of a picture [pixels]. None: as the first camera's; 84 without one.
-        low_db, high_db: Levels that are black and white [dB of full scale]. None: as loud as the dataset's quietest hundredth,
-            and as its loudest sound.
+        microphones: Names of the microphones to show. None: all.
+        name: Name of a microphone's pictures: `observation.images.<name>`. `{microphone}` stands for the microphone's name.
+        seconds: Least sound that a picture shows [s]. It is lengthened until every frame moves the picture by whole columns.
+        height, width: Size of a picture [pixels]. None: the first camera's, or 84 without a camera.
+        low_db, high_db: Levels shown as black and white [dB of full scale]. None: the level of the dataset's quietest 1 %, and
+            that of its loudest sound.
     """
 
     dataset: DatasetPlace
@@ -106,7 +106,7 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPic
         feature = picture_feature(key, cfg.name)
         if feature in features or feature in [plan.feature for plan in plans] or "/" in feature:
             raise AttachError(
-                f"--name={cfg.name}: '{feature}' is in the dataset in {dataset.root} already, or is no name. Give "
+                f"--name={cfg.name}: '{feature}' is in the dataset in {dataset.root} already, or is not a valid name. Give "
                 "another, such as --name='heard_{microphone}'."
             )
         levels = (FLOOR_DB, _LOUDEST_DB, (0,) * height)  # until they are known

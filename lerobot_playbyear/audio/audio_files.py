@@ -253,7 +253,7 @@ def resample(waveform: np.ndarray, sample_rate: int, new_sample_rate: int) -> np
     Args:
         waveform: (n,) or (n, channels), int16 PCM or floats in [-1, 1].
         sample_rate: What it has [Hz].
-        new_sample_rate: What it shall have [Hz].
+        new_sample_rate: The wanted rate [Hz].
 
     Returns:
         As many seconds at the new rate, in the same form.
@@ -351,7 +351,7 @@ def cut_into_frames(
         n_frames: The episode's length.
         offset: Where in the file the episode's first frame was taken [s]; negative if the file begins after it.
         pad: Fill what the file lacks at its beginning and its end with silence.
-        new_sample_rate: What the blocks shall have [Hz], which `fps` divides. None: `sample_rate`.
+        new_sample_rate: Rate of the blocks [Hz], which `fps` divides. None: `sample_rate`.
         speed: Seconds of the file in a second of the frames' clock, in which `offset` is given; 1.001: the recorder's
             clock is 0.1 % fast.
 

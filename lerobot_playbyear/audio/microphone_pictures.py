@@ -172,10 +172,10 @@ class SessionSound:
         with path.open("rb") as file:
             header = file.read(HEADER_BYTES)
         if len(header) < HEADER_BYTES or header[:4] != b"RIFF" or header[36:40] != b"data":
-            raise ValueError(f"{path} is no file of a microphone's session")
+            raise ValueError(f"{path} is not a microphone's session file")
         form, channels, self.sample_rate = struct.unpack_from("<HHI", header, 20)
         if (form, channels, header[34]) != (1, 1, 16) or not 0 < self.sample_rate <= HIGHEST_RATE:
-            raise ValueError(f"{path} is no file of a microphone's session: wanted one channel of 16 bits")
+            raise ValueError(f"{path} is not a microphone's session file: wanted one channel of 16 bits")
         n = (path.stat().st_size - HEADER_BYTES) // 2
         self._samples = np.memmap(path, "<i2", "r", HEADER_BYTES, (n,)) if n else np.zeros(0, "<i2")
 

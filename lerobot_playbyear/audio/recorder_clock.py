@@ -114,7 +114,7 @@ def _from_json(path: Path) -> dict[int, float]:
     try:
         content: Any = parse_json(path.read_bytes())
     except ValueError as error:
-        raise ClockError(f"{path} is no JSON ({error}); {_WANTED}.") from error
+        raise ClockError(f"{path} is not JSON ({error}); {_WANTED}.") from error
     if isinstance(content, Mapping) and _EPISODES in content:
         content = content[_EPISODES]
     if isinstance(content, list):
@@ -132,7 +132,7 @@ def _from_table(path: Path) -> dict[int, float]:
         table = csv.reader(rows, delimiter=separator)
         lines = [line for line in table if any(cell.strip() for cell in line)]
     except (ValueError, csv.Error) as error:
-        raise ClockError(f"{path} is no table ({error}); wanted lines such as 0,12.5.") from error
+        raise ClockError(f"{path} is not a table ({error}); wanted lines such as 0,12.5.") from error
     if lines and lines[0][0].strip()[:1].isalpha():
         del lines[0]  # names
     short = [line for line in lines if len(line) < 2]
@@ -215,7 +215,7 @@ def read_marks(text: str | None) -> ClockLine:
                 raise ValueError
         except ValueError as wrong:
             raise ClockError(
-                f"--marks: {part.strip()!r} is no mark; wanted seconds in the sound file = seconds on the clock, such as "
+                f"--marks: {part.strip()!r} is not a mark; wanted seconds in the sound file = seconds on the clock, such as "
                 "2.31=1754400000.12, and a comma between two of them."
             ) from wrong
         pairs.append((sound_s, clock_s))

@@ -166,8 +166,8 @@ def frames_learned_from(store: EpisodeStore, n_skipped: int) -> Tensor:
                 later[first : min(first + n_skipped, after)] = False
     if by_expert.any() and not later.any():
         logging.warning(
-            f"No correction is longer than the {n_skipped} frames that are left out at the beginning of each (--skip_s) so "
-            "far: for now all of them is learned from."
+            f"No correction is longer yet than the {n_skipped} frames that are ignored at its start (--skip_s). Until one is, "
+            "corrections are used whole."
         )
         return by_expert
     return later

@@ -37,43 +37,43 @@ class DaggerConfig:
     """Options of `playbyear-dagger`.
 
     Attributes:
-        dataset: Demonstrations, which half of each batch comes from: those that the policy was trained on.
-        interventions: Where attempts with corrections are kept; created, or appended to.
-        policy: What is improved, `--policy.path`; its normalisation stays as it is. `--policy.push_to_hub` and
-            `--policy.repo_id` as in lerobot-train.
-        env: Where it acts, as in lerobot-eval.
-        expert: Who corrects it, `--expert.type=scripted` or another registered one.
-        method: How attempts are made and what is learned of them, `--method.type=hg_dagger` or another registered one.
-        skip_s: Of every correction, how long its beginning is not learned from [s]: while the policy's memory still holds its
-            own last movements, it mistakes the expert's retreat for the next step of the task. Shorter corrections are not
-            learned from at all, unless all are shorter; one that an episode begins with is learned from whole. None: as long
-            as the policy remembers, or 0 with `--method.type=redo`.
-        new_weights: With `num_episodes=0`: begin with weights that know nothing instead of the policy's. Its normalisation
-            stays.
-        num_episodes: Attempts that the run keeps, those before a resume included, as `steps` counts updates. 0: none are
-            collected and no environment is needed, see `steps`.
-        updates_per_episode: Updates after each kept attempt.
-        warmup_episodes: Attempts that the dataset holds before the first updates.
-        steps: With `num_episodes=0`, how many updates to make from the corrections that are there.
-        batch_size: Runs of windows per update, half of them from the demonstrations.
-        learning_rate: Of Adam, the largest of each round. None: the policy's own (`optimizer_lr`). A smaller one leaves a
-            policy that knows its demonstrations by heart where it is.
-        anneal: Whether the rate falls to 0 over the updates of each round (a cosine), so that the policy that acts next has
-            settled; and its largest over the rounds to a tenth, so that the last policy is the most settled. Otherwise it
-            is constant.
-        warmup_updates: Over so many first updates of the run the rate rises, until Adam has its averages.
-        seed: Of the random numbers of training, and of the first evaluation episode, as in lerobot-train.
-        episode_seed: Of the first attempt; further ones take the next, but none of the evaluation's.
-        max_attempts: Attempts in a row without one to keep, after which the run ends; not counting those without any help.
-        eval_every: Rounds between two evaluations; there is one before the first round and one after the last. 0: none.
-            Checkpoints that were evaluated are kept, and the last one.
+        dataset: The demonstrations that the policy was trained on. Half of each batch comes from them.
+        interventions: The dataset of rollouts with corrections. It is created, or appended to.
+        policy: The policy to improve, `--policy.path`. Its normalisation is kept. `--policy.push_to_hub` and `--policy.repo_id`
+            work as in lerobot-train.
+        env: The environment, as in lerobot-eval.
+        expert: The source of corrections: `--expert.type=scripted` or another registered one.
+        method: When the expert acts, and what is learned: `--method.type=hg_dagger` or another registered one.
+        skip_s: Seconds ignored at the start of each correction. The policy's memory still holds its own last movements there,
+            so it would mistake the expert's retreat for the next step of the task. Shorter corrections are left out, unless all
+            are shorter. A correction that starts with the episode is used whole. None: the length of the policy's memory, or 0
+            with `--method.type=redo`.
+        new_weights: With `num_episodes=0`: start from newly initialised weights instead of the policy's. The normalisation is
+            kept.
+        num_episodes: Corrected rollouts to collect, including those before a resume. 0: collect none; no environment is needed,
+            see `steps`.
+        updates_per_episode: Updates after each collected rollout.
+        warmup_episodes: Rollouts that the dataset holds before the first update.
+        steps: With `num_episodes=0`: number of updates on the recorded corrections.
+        batch_size: Sequences of windows per update, half of them from the demonstrations.
+        learning_rate: Largest learning rate of each round (Adam). None: the policy's own (`optimizer_lr`). A smaller rate
+            hardly changes a policy that has memorised its demonstrations.
+        anneal: Decay the rate to 0 within each round (cosine), and its peak to a tenth over all rounds. Then the policy that
+            acts next has settled, and the last one most of all. False: a constant rate.
+        warmup_updates: Updates over which the rate rises at the start of the run.
+        seed: Seed of training, and of the first evaluation episode, as in lerobot-train.
+        episode_seed: Seed of the first rollout. Later rollouts count up and skip the evaluation's seeds.
+        max_attempts: Rollouts in a row without a correction, after which the run ends. Rollouts in which no expert can act do
+            not count.
+        eval_every: Rounds between two evaluations. There is also one before the first round and one after the last. 0: none.
+            Evaluated checkpoints are kept, and the last one.
         eval: Size of an evaluation, as in lerobot-eval.
-        output_dir: Folder of checkpoints, figures and options.
-        resume: Go on with the run in `output_dir`, or begin it if there is none; options that are not given again stay.
-        job_name: For wandb.
-        store: Where the datasets are kept in memory.
-        rename_map: The datasets' names of observations, with what the policy calls them.
-        wandb: As in lerobot-train.
+        output_dir: Folder of checkpoints, metrics and options.
+        resume: Continue the run in `output_dir`, or start it if there is none. Options that are not given keep their values.
+        job_name: Name of the run in Weights & Biases.
+        store: Where the datasets are kept, as in playbyear-train.
+        rename_map: Maps the datasets' observation names to the policy's.
+        wandb: Weights & Biases, as in lerobot-train.
     """
 
     dataset: DatasetPlace

@@ -3,7 +3,7 @@
 Both are small networks on what the policy's LSTM remembers: by default the policy `playbyear` has neither dropout nor an
 ensemble, five policies would cost five times the training, and passes through other augmentations tell of noise in a
 picture, not of places where no expert was. So several heads learn the expert's actions from the same memory, each from its
-own draw of the data; where they disagree nobody has shown what to do. They are learned anew in every round, because the
+own draw of the data; where they disagree nobody has shown what to do. They are learned again in every round, because the
 memory changes with the policy.
 """
 
@@ -158,7 +158,7 @@ def thresholds_for(traces: list[Trace], share: float) -> Thresholds:
 
     Args:
         traces: Of every attempt.
-        share: Of the steps in which the expert shall act.
+        share: Share of the steps in which the expert acts.
     """
     novelty = np.concatenate([each.novelty[each.is_own] for each in traces])
     risk = np.concatenate([each.risk[each.is_own] for each in traces])

@@ -46,7 +46,7 @@ class Scene:
 class Loop:
     """The rounds of a run.
 
-    Random numbers are seeded anew for every attempt and for the updates of every round, so that a run that was killed and
+    Random numbers are seeded for every attempt and for the updates of every round, so that a run that was killed and
     resumed ends with the weights of one that was not.
 
     Args:

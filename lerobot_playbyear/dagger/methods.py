@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Method(draccus.ChoiceRegistry):
-    """HG-DAgger; others override what they do otherwise, and register with `@Method.register_subclass("name")`.
+    """HG-DAgger. Other methods override what differs, and register with `@Method.register_subclass("name")`.
 
     Attributes:
         is_watched: A person who corrects has to watch all of every attempt.
@@ -107,13 +107,13 @@ class Method(draccus.ChoiceRegistry):
 @Method.register_subclass("hg_dagger")
 @dataclass
 class HgDagger(Method):
-    """The expert takes over and hands back as it likes (Kelly et al., 2019)."""
+    """The expert takes over and hands back at any time (HG-DAgger, Kelly et al., 2019)."""
 
 
 @Method.register_subclass("no_handback")
 @dataclass
 class NoHandback(Method):
-    """The expert takes over as it likes and acts to the end: an attempt holds one correction (as in RaC, Hu et al., 2025)."""
+    """The expert takes over at any time and finishes the episode: one correction per rollout (as in RaC, Hu et al., 2025)."""
 
     def wrap(self, expert: Expert) -> Expert:
         return Staying(expert)
@@ -122,10 +122,10 @@ class NoHandback(Method):
 @Method.register_subclass("redo")
 @dataclass
 class Redo(Method):
-    """Demonstrations of the scenes that the policy fails in; they weigh as much as those that are there, frame by frame.
+    """The expert demonstrates the scenes in which the policy fails. Every frame weighs as much as one of the demonstrations.
 
-    The policy tries first, until the expert would take over or the attempt ends. Where it fails, the scene is set up again, and
-    the expert demonstrates the task in it from the first step on.
+    The policy acts first, until the expert would take over or the episode ends. If it fails, the scene is set up again, and the
+    expert demonstrates the task in it from the first step.
     """
 
     needs_judge: ClassVar[bool] = False

@@ -34,15 +34,16 @@ _RUNS = 16  # that are encoded together
 @Method.register_subclass("robot_gated")
 @dataclass
 class RobotGated(Method):
-    """The robot asks. A script then acts to the end; a person is called, takes over when they like, and hands back likewise.
+    """The robot asks for help. A script then finishes the episode; a person is called, takes over and hands back at any time.
 
     In `state.method` it keeps how the round began, and the seeds of the scenes that were shown.
 
     Attributes:
-        intervention_share: Of the steps in which it shall ask; the thresholds follow from it, anew in every round.
-        rollouts: First attempts, in which the policy is alone: from them it learns what failing looks like.
-        redo_failed: Where an attempt fails all the same, the scene is set up again, and a script demonstrates the task in it
-            from the first step on, as with `--method.type=redo`. A person is not asked to.
+        intervention_share: Share of the control steps in which the robot asks for help. The thresholds are fitted to it in
+            every round.
+        rollouts: First rollouts without an expert. The robot learns from them to recognise failure.
+        redo_failed: If a rollout fails, set up its scene again and let a script demonstrate it, as with `--method.type=redo`. A
+            person is not asked to.
     """
 
     is_watched: ClassVar[bool] = False
@@ -90,7 +91,7 @@ class RobotGated(Method):
     def prepare(self, demonstrates: bool) -> None:
         """Learns what is new and what is risky to the policy of this round, from what there was when the round began.
 
-        Thresholds are set anew before every attempt, with what was met in those of this round too.
+        Thresholds are set before every attempt, with what was met in those of this round too.
         """
         self._expert.demonstrates = demonstrates
         self._thresholds: Thresholds | None = None

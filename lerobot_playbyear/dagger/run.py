@@ -79,7 +79,7 @@ def _begin_or_go_on(cfg: DaggerConfig, folder: RunFolder, state: RunState | None
         if given is None:
             raise InputError("HG-DAgger improves a trained policy: give its folder or name on the Hub, --policy.path.")
         if (folder.path / CONFIG_NAME).is_file():
-            logging.info(f"{folder.path}: the run was ended before its first attempt and begins anew.")
+            logging.info(f"{folder.path}: the run was ended before its first attempt and starts again.")
         state = RunState(policy_path=given, policy_overrides=overrides, first_episodes=None)
     else:
         changed = folder.differences(cfg)
@@ -343,7 +343,7 @@ def _check_action_range(policy: PreTrainedConfig, trained: PreTrainedConfig, dem
     """Refuse a policy whose actions would all become larger, or smaller, before it has learned anything.
 
     Args:
-        policy: As it shall be improved.
+        policy: The policy to improve.
         trained: As its checkpoint says.
         demonstrations: Of it.
 

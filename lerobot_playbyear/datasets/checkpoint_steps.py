@@ -42,7 +42,7 @@ def check_steps(path: str | Path, revision: str | None = None) -> None:
             strange = [step for step in steps if "class" in step or not isinstance(step["registry_name"], str)]
             states = [step["state_file"] for step in steps if "state_file" in step]
         except (ValueError, LookupError, TypeError) as error:
-            raise InputError(f"{file} is no processor of LeRobot's: {type(error).__name__}: {error}.") from error
+            raise InputError(f"{file} is not a processor of LeRobot's: {type(error).__name__}: {error}.") from error
         if strange:
             raise InputError(
                 f"{file} has the step {strange[0]}, which is not registered by any package but names a class to import; "
@@ -56,7 +56,7 @@ def _check_state(file: Path, state: object) -> None:
     """Looks at what a step keeps beside the processor that names it."""
     try:
         if not isinstance(state, str) or PurePath(state).name != state:
-            raise OSError("it is no name of a file beside it")
+            raise OSError("it is not the name of a file beside it")
         with safe_open(file.with_name(state), "numpy"):
             pass
     except (OSError, SafetensorError) as error:

@@ -2,7 +2,7 @@
 
 LeRobot writes the footers of its parquet files when a recording ends: a process killed before that leaves files that
 nothing can read. `DurableWriter` keeps the episode in progress in memory, its pictures compressed. `save_episode` writes
-the files that the dataset shall have with it beside the dataset, in LeRobot's layout and with LeRobot's functions for
+the files that the dataset will have with it beside the dataset, in LeRobot's layout and with LeRobot's functions for
 schema, statistics and video, and then moves them into place, so that the dataset on disk is complete at every moment.
 """
 
@@ -44,14 +44,14 @@ logger = logging.getLogger(__name__)
 _LOW_DISK_BYTES = 64 * 2**20
 _UNCOMPRESSED = 32  # frames whose pictures may wait to be compressed
 _THREADS = 4  # that compress pictures
-_SAVING = 2  # saving takes so many times the memory of the episode besides
+_SAVING = 2  # saving takes this many times the memory of the episode in addition
 _SPARE_BYTES = 256 * 2**20
 
 
 class DurableWriter:
     """Appends episodes to a LeRobotDataset v3.0; each is on disk for good when `save_episode` returns.
 
-    Protocol: the files that the dataset shall have with the episode are written into its scratch folder; a journal is
+    Protocol: the files that the dataset will have with the episode are written into its scratch folder; a journal is
     written (from here on the episode counts); they are moved into place one by one, `meta/info.json` last; the journal
     is removed. After a crash the next writer finishes the moves of a journal it finds and throws other staged files away.
     The dataset loads with plain LeRobot between any two of these steps. Files and folders are synchronised with the disk
@@ -236,8 +236,8 @@ class DurableWriter:
         if n_frames % _UNCOMPRESSED == 0 and available_memory() < _SAVING * self._n_bytes + _SPARE_BYTES:
             raise DatasetWriteError(
                 f"Episode {self.num_episodes} has {n_frames} frames ({n_frames / self._info.fps:.0f} s, "
-                f"{self._n_bytes / 2**30:.1f} GB), and with more the memory that is free would not do to save it. Save it "
-                "now, or give it up with discard_episode; record shorter episodes, or smaller pictures."
+                f"{self._n_bytes / 2**30:.1f} GB). The free memory is not enough to save a longer one. Save it now, or give "
+                "it up with discard_episode; record shorter episodes, or smaller pictures."
             )
 
     def _save(self, index: int) -> None:

@@ -48,7 +48,7 @@ SMALL_TABLE_BYTES = 2 * 2**20
 
 
 def stage_episode(root: Path, info: DatasetInfo, frames: Sequence[Mapping[str, Any]], rgb: RGBEncoderConfig) -> None:
-    """Writes all files that a dataset shall have other than now with one more episode, into its staging folder.
+    """Writes all files of a dataset that change with one more episode, into its staging folder.
 
     Args:
         root: The dataset's folder.

@@ -34,7 +34,7 @@ def errors_of_input(*more: type[Exception]) -> Iterator[None]:
     """For the time in which options and data are read: what is raised of some kinds says what is wrong with them.
 
     Args:
-        more: Kinds besides `ValueError` and `FileExistsError`.
+        more: Kinds other than `ValueError` and `FileExistsError`.
 
     Raises:
         InputError: In place of these.

@@ -106,7 +106,7 @@ def parse_stats(data: bytes) -> dict[str, dict[str, Any]]:
         raise ValueError("it holds no features")
     for key, own in stats.items():
         if not isinstance(own, dict) or not all(map(are_numbers, own.values())):
-            raise ValueError(f"the entries of {key} are no numbers")
+            raise ValueError(f"the entries of {key} are not numbers")
     return stats
 
 
@@ -135,7 +135,7 @@ def ordinary(path: Path) -> Path:
         OutsideError: A pipe or a device is there, or a link leads to one.
     """
     if is_special(path):
-        raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is no ordinary file. Remove it.")
+        raise OutsideError(f"'{path}' leads to '{real_path(path)}', which is not an ordinary file. Remove it.")
     return path
 
 
@@ -258,7 +258,7 @@ def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: It
         rows += zip(*(table.column(name).to_pylist() for name in _PLACES), strict=True)
     if not all(isinstance(value, int) for row in rows for value in row):
         raise InputError(
-            f"meta/episodes of '{folder}' has rows in which {', '.join(_PLACES)} are no whole numbers. {repair}"
+            f"meta/episodes of '{folder}' has rows in which {', '.join(_PLACES)} are not whole numbers. {repair}"
         )
     named = {folder / info["data_path"].format(chunk_index=row[-2], file_index=row[-1]) for row in rows}
     if lost := [*sorted(named - set(data)), *(path for path in sorted(used) if not path.is_file())]:
@@ -287,7 +287,7 @@ def nothing_in(root: Path) -> str:
     if not root.exists():
         problem = "it does not exist"
     elif not root.is_dir():
-        problem = "it is no folder"
+        problem = "it is not a folder"
     else:
         names, below = list_folder(root), list_files(root, f"*/{INFO_PATH}")
         more = ", ..." if len(names) > _MOST_NAMED else ""
@@ -309,7 +309,7 @@ def check_there(root: Path) -> None:
 
 
 def list_folder(root: Path) -> list[str]:
-    """The names in a folder, in order, but hidden ones; none where it is no folder."""
+    """The names in a folder, in order, but hidden ones; none where it is not a folder."""
     return sorted(each.name for each in root.iterdir() if not each.name.startswith(".")) if root.is_dir() else []
 
 

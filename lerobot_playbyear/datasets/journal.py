@@ -59,7 +59,7 @@ def finish_journal(root: Path) -> None:
     names = _staged_files(root)
     if journal.is_symlink() or not journal.is_file():
         remedy = f"If nothing is being recorded there, delete it and run `{repair_command(root)}`"
-        raise _error(journal, "is no ordinary file", remedy)
+        raise _error(journal, "is not an ordinary file", remedy)
     for name in names:
         target = root / name
         made = make_folders(target.parent)

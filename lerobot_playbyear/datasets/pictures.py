@@ -104,7 +104,7 @@ def video_pictures(
     Args:
         path: The video.
         times: When [s], in order.
-        tolerance_s: How far a picture's time may be from the one wanted [s], besides the rounding of LeRobot's
+        tolerance_s: How far a picture's time may be from the one wanted [s], in addition to the rounding of LeRobot's
             timestamps to 32 bits.
         key: The camera, for the message.
         shape: Its feature's; None: pictures of any size are decoded.

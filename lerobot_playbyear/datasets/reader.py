@@ -50,8 +50,8 @@ class DatasetPlace:
     """A dataset's name and place.
 
     Args:
-        repo_id: Its name, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
+        repo_id: Name of the dataset, `user/name`.
+        root: Its folder. None: the one in LeRobot's cache.
     """
 
     repo_id: str
@@ -321,7 +321,7 @@ class SurveyedDataset(EpisodeReader):
             dataset = cls(repo_id, found, episodes)
             check_claims(folder, [file.footer for file in dataset.files], len(found.episodes))
         except (OSError, MemoryError) as error:
-            said = f"it cannot be read now ({error or 'not enough memory'}); that is no damage, and may pass"
+            said = f"it cannot be read now ({error or 'not enough memory'}); this is not damage, and may pass"
             raise InputError(f"The dataset in '{folder}' cannot be opened: {said}.") from error
         if found.damage and not (damaged and dataset.episodes):
             said, more = "; ".join(map(str, found.damage[:_LISTED])), len(found.damage) - _LISTED

@@ -424,7 +424,7 @@ def _contradiction(root: Path, info: Info, row: Mapping[str, Any], episode: Epis
             key, name = column.removeprefix("stats/").rsplit("/", 1)
             names[key].add(name)
             if not are_numbers(value):
-                return f"its statistics '{key}/{name}' are no numbers"
+                return f"its statistics '{key}/{name}' are not numbers"
     if len(set(map(frozenset, names.values()))) > 1:
         return "parts of its statistics are missing"
     return None

@@ -142,7 +142,7 @@ class _Films:
                     with naming(path):
                         self._times[path] = picture_times(path)
                 except av.FFmpegError as error:
-                    self._wrong[path] = f"is no film that can be read: {error}"
+                    self._wrong[path] = f"is not a video that can be read: {error}"
         return self._times[path]
 
 

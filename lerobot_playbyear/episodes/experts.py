@@ -106,18 +106,18 @@ class ExpertConfig(draccus.ChoiceRegistry, abc.ABC):
 @ExpertConfig.register_subclass("scripted")
 @dataclass
 class ScriptedExpertConfig(ExpertConfig):
-    """The script that comes with the environment, `env.unwrapped.intervention_gate()`; where there is none its
-    `scripted_expert()`, which can only show whole scenes.
+    """The script that comes with the environment, `env.unwrapped.intervention_gate()`. Without it the environment's
+    `scripted_expert()`, which can only demonstrate whole episodes.
 
     Attributes:
-        person: Whether it corrects as a person does: late, with an unsteady hand, and now and then without need.
-        reaction_s: For so long it sees nothing yet of a mistake, of a call, or of the mistake's end [s].
-        tremor: Standard deviation of what its hand adds to displacements, in units of actions; the last number of an action,
-            the gripper's, is left alone.
-        tremor_s: How long the hand's error takes to change [s].
-        wrong_per_minute: How often it takes over without need, per minute in which the policy acts.
-        wrong_s: For how long it acts then [s].
-        seed: Of all that is random in it; an attempt with the same seed meets the same person.
+        person: Imitate a person: react late, tremble, and now and then take over without need.
+        reaction_s: Delay before the expert reacts to a mistake, to a call, or to the end of a mistake [s].
+        tremor: Standard deviation of the error of the hand's displacements, in units of actions. The last number of an action,
+            the gripper's, has none.
+        tremor_s: Time in which that error changes [s].
+        wrong_per_minute: Needless takeovers per minute in which the policy acts.
+        wrong_s: Duration of a needless takeover [s].
+        seed: Seed of the imitated person. It gives the same behaviour in the same episode.
     """
 
     person: bool = False
@@ -139,7 +139,7 @@ class ScriptedExpertConfig(ExpertConfig):
         if not self.person:
             for name in (each.name for each in fields(self) if getattr(self, each.name) != each.default):
                 raise InputError(
-                    f"--expert.{name}={getattr(self, name)} is of a person: give --expert.person=true, or leave it out."
+                    f"--expert.{name}={getattr(self, name)} needs --expert.person=true: add that, or leave it out."
                 )
             return ScriptedExpert() if _SCRIPTS[0] in scripts else ScriptedDemonstrator()
         for name in ("reaction_s", "tremor", "tremor_s", "wrong_per_minute", "wrong_s", "seed"):

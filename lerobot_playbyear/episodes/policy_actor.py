@@ -65,7 +65,7 @@ def load_policy_actor(policy_cfg: PreTrainedConfig, env_cfg: EnvConfig) -> Polic
 
     Args:
         policy_cfg: Its configuration, with `pretrained_path`.
-        env_cfg: Where it shall act.
+        env_cfg: Where it acts.
 
     Raises:
         InputError: Its processors have steps that nobody registered.

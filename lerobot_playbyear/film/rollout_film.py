@@ -25,13 +25,13 @@ class VideoConfig:
     """Options of `playbyear-video`.
 
     Args:
-        env: The environment; its `render()` gives the pictures.
-        policy: `--policy.path=`, a checkpoint's folder or its name on the Hub. Without it a script acts.
-        output: The film, an mp4.
-        seed: Of the first episode.
-        attempts: How many episodes, with the seeds after it, may be played until one succeeds; the last one played
-            is filmed.
-        baseline: Without a policy, the name of the environment's blind baseline that acts in the expert's stead.
+        env: The environment. Its `render()` gives the pictures.
+        policy: The policy, `--policy.path`: a checkpoint's folder or its name on the Hub. Without it the environment's script
+            acts.
+        output: The video, an mp4.
+        seed: Seed of the first episode.
+        attempts: Largest number of episodes, with successive seeds, until one succeeds. The last one is filmed.
+        baseline: Name of the blind baseline that acts instead of the script.
     """
 
     env: EnvConfig

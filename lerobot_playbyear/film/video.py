@@ -174,7 +174,7 @@ def write_film(
         sound: (n, n_microphones) int16. One microphone is mono, two are left and right, of
             more only the first two are heard; none makes a silent film.
         sample_rate: [Hz].
-        x264_options: Of the H.264 encoder, besides its preset; by default constant quality 20.
+        x264_options: Of the H.264 encoder, in addition to its preset; by default constant quality 20.
 
     Returns:
         The path. The file is there only when it is complete.

@@ -23,7 +23,7 @@ CARD = "README.md"
 FILM = "preview.mp4"
 
 AUDIO_TAGS = ("audio", "multimodal", "playbyear")
-"""Tags of a dataset with sound, besides LeRobot's own."""
+"""Tags of a dataset with sound, in addition to LeRobot's own."""
 
 _MOST_TASKS = 5
 _LONGEST_S = 30
@@ -50,7 +50,7 @@ def write_dataset_card(
         dataset: The dataset.
         repo_id: Its name on the Hub.
         folder: Where the files are written.
-        tags: Besides LeRobot's, and `AUDIO_TAGS` where there is sound.
+        tags: In addition to LeRobot's, and to `AUDIO_TAGS` where there is sound.
         license: As the Hub names licences.
         film: What the card shows. None: one is made, unless that fails.
 

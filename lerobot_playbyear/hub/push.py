@@ -37,10 +37,10 @@ RUN_FOLDERS = ("checkpoints", "eval", "wandb")
 """What is written into in a run's folder."""
 
 _WAITS_S = (1, 2, 5)  # between the tries of a step
-_PASSING = (408, 409, 412, 425, 429)  # besides all from 500; 412: a newer commit came before this one
+_PASSING = (408, 409, 412, 425, 429)  # and all from 500; 412: a newer commit came before this one
 
 _CONTENT = ("data/", "meta/", "videos/")
-_LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratch; what is made anew; what is the Hub's
+_LEFT_OUT = ("images", CARD, FILM, ".gitattributes", ".git", ".cache")  # scratch; what is made again; what is the Hub's
 _POLICY_FILES = (  # that saving makes
     *("config.json", "train_config.json", "model*.safetensors", "model.safetensors.index.json"),
     *("policy_preprocessor*", "policy_postprocessor*", "adapter_config.json", "adapter_model.safetensors"),
@@ -59,11 +59,10 @@ class PushOptions:
     """How something is uploaded.
 
     Args:
-        private: Whether a repository that is created is private. True: nothing goes to one that is there and public. None: as
-            the account's default says.
-        tags: For the card, besides those that it gets by itself.
-        license: As the Hub names licences. None: the policy's own, or else apache-2.0.
-        preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
+        private: Make a new repository private. True: refuse to upload to an existing public one. None: the account's default.
+        tags: Tags for the card, in addition to the automatic ones.
+        license: Licence, by its identifier on the Hub. None: the policy's own, or apache-2.0.
+        preview: An mp4 for the card, such as one of `playbyear-video`. None: one is made for a dataset.
     """
 
     private: bool | None = None
@@ -84,8 +83,8 @@ class PushDatasetConfig:
     """The dataset.
 
     Args:
-        repo_id: Its name on the Hub, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
+        repo_id: Name of the dataset on the Hub, `user/name`.
+        root: Its folder. None: the one in LeRobot's cache.
     """
 
     repo_id: str | None = None
@@ -97,8 +96,8 @@ class PushPolicyConfig:
     """The policy.
 
     Args:
-        path: The folder of a checkpoint, or the output folder of a training, whose last checkpoint is taken.
-        repo_id: Its name on the Hub, `user/name`.
+        path: Folder of a checkpoint, or the output folder of a training, whose last checkpoint is uploaded.
+        repo_id: Name of the policy on the Hub, `user/name`.
     """
 
     path: str | None = None
@@ -107,16 +106,15 @@ class PushPolicyConfig:
 
 @dataclass
 class PushConfig(PushOptions):
-    """Options of `playbyear-push`. One of `dataset` and `policy` has to be given.
+    """Options of `playbyear-push`. Give `dataset` or `policy`.
 
     Args:
         dataset: The dataset to upload.
         policy: The policy to upload.
-        private: Whether a repository that is created is private. True: nothing goes to one that is there and public. None: as
-            the account's default says.
-        tags: For the card, besides those that it gets by itself.
-        license: As the Hub names licences. None: the policy's own, or else apache-2.0.
-        preview: An mp4 that the card shows, as `playbyear-video` makes them. None: of a dataset, one is made.
+        private: Make a new repository private. True: refuse to upload to an existing public one. None: the account's default.
+        tags: Tags for the card, in addition to the automatic ones.
+        license: Licence, by its identifier on the Hub. None: the policy's own, or apache-2.0.
+        preview: An mp4 for the card, such as one of `playbyear-video`. None: one is made for a dataset.
     """
 
     dataset: PushDatasetConfig = field(default_factory=PushDatasetConfig)
@@ -164,7 +162,7 @@ def push_dataset(repo_id: str, root: str | Path | None = None, options: PushOpti
     Args:
         repo_id: Its name on the Hub, `user/name`.
         root: Its folder. None: in LeRobot's own cache, under its name.
-        options: Whether it is private, and what its card says besides. None: the usual.
+        options: Whether it is private, and what its card says in addition. None: the usual.
 
     Returns:
         Its address on the Hub.
@@ -236,7 +234,7 @@ def push_policy(path: str | Path, repo_id: str, options: PushOptions) -> str:
         path: The folder `pretrained_model` of a checkpoint, or one that it is in: a checkpoint, or the output folder of a
             training, whose last checkpoint is taken.
         repo_id: Its name on the Hub, `user/name`.
-        options: Whether it is private, and what its card says besides.
+        options: Whether it is private, and what its card says in addition.
 
     Returns:
         Its address on the Hub.

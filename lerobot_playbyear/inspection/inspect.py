@@ -38,9 +38,9 @@ class InspectDatasetConfig(DatasetPlace):
     """The dataset.
 
     Args:
-        repo_id: Its name, `user/name`.
-        root: Its folder. None: LeRobot's cache, or else the Hub.
-        episodes: Only these. None: all.
+        repo_id: Name of the dataset, `user/name`.
+        root: Its folder. None: the one in LeRobot's cache, or else the Hub.
+        episodes: Only these episodes, such as `[0, 1, 2]`. None: all.
     """
 
     episodes: list[int] | None = None
@@ -51,12 +51,12 @@ class InspectConfig:
     """Options of `playbyear-inspect`.
 
     Args:
-        dataset: What to look at.
-        json: Print the findings as JSON, and nothing else.
-        html: Also write a page to this file.
-        action_range: Lowest and highest action allowed, `[-1, 1]`; beyond it is an error. None: it is a warning where
+        dataset: The dataset to check.
+        json: Print the findings as JSON and nothing else.
+        html: Also write an HTML page to this file.
+        action_range: Lowest and highest allowed action, such as `[-1, 1]`. An action beyond it is an error. None: a warning, if
             the actions look normalised to [-1, 1].
-        picture_height: Of the page's films [pixels], at most; less makes a smaller file.
+        picture_height: Largest height of the page's videos [pixels]. A smaller one makes a smaller file.
     """
 
     dataset: InspectDatasetConfig
@@ -144,8 +144,8 @@ def _check_links(root: Path) -> None:
         check_links_out(root)
     except OutsideError as error:
         raise InputError(
-            f"No page is written, since it would hold what a link leads to: {error} Of a dataset that lies on another disk, "
-            "let the whole folder lie there, and name it with --dataset.root. Without --html it is checked as it is."
+            f"No page is written, because it would show what a link leads to: {error} If the dataset is on another disk, keep "
+            "its whole folder there and name it with --dataset.root. Without --html it is checked as it is."
         ) from error
     except OSError as error:
         raise InputError(f"The dataset in '{root}' cannot be read: {error}") from error

@@ -25,7 +25,7 @@ _OFFSET = 0.01  # of full scale
 _GAP_S = 0.002
 _GAP_EDGE_S = 0.01  # on both sides of a gap there must be live sound for so long
 _LIVE_RMS = 8.0  # steps
-_BLOCK_SIZES = (64, 128, 160, 256, 320, 480, 512, 1024, 2048, 4096)  # of sound drivers, besides the frame's
+_BLOCK_SIZES = (64, 128, 160, 256, 320, 480, 512, 1024, 2048, 4096)  # of sound drivers, in addition to the frame's
 _TOLERATED_SHARE = 0.01  # of the samples: more makes a warning an error
 
 
@@ -123,7 +123,7 @@ def repeats(samples: np.ndarray, samples_per_frame: int) -> list[tuple[int, int]
 
     Args:
         samples: (n,) in steps.
-        samples_per_frame: S, a block size to try besides those of sound drivers.
+        samples_per_frame: S, a block size to try in addition to those of sound drivers.
     """
     merged: list[tuple[int, int]] = []
     sizes = [size for size in {*_BLOCK_SIZES, samples_per_frame} if _BLOCK_SIZES[0] <= size <= len(samples) // 2]

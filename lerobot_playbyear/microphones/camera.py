@@ -53,20 +53,20 @@ class MicrophoneOptionError(PlaybyearError, DecodingError):
 @CameraConfig.register_subclass("microphone")
 @dataclass(kw_only=True)
 class MicrophoneCameraConfig(CameraConfig):
-    """Options of a microphone. Give one of `device`, `file`, `tone_hz` and `source`.
+    """A microphone among `--robot.cameras`. Give one of `device`, `file`, `tone_hz` and `source`.
 
     Args:
-        device: A sound card: its name, a part of it that no other has, or its number (`playbyear-find-microphones`).
-        file: A sound file that is played in real time, again and again.
+        device: Name of a sound card, a unique part of it, or its number. `playbyear-find-microphones` lists them.
+        file: A sound file that is played in real time, over and over.
         tone_hz: A tone instead of sound [Hz].
-        source: A source that another package registers, by its name; `device` is then for that source.
+        source: Name of a source that another package registers. `device` is then for that source.
         sample_rate: Samples per second [Hz].
-        channel: Of the card, counted from 0. Microphones of one card share its stream and its clock.
-        gain_db: Factor on the samples [dB]; what is too loud is clipped.
+        channel: Channel of the card, counted from 0. Microphones of one card share its stream and its clock.
+        gain_db: Gain on the samples [dB]. Louder samples than full scale are clipped.
         save_to: Folder for the session's sound. None: `playbyear_sessions` in LeRobot's home. "none": it is not saved.
-        low_db, high_db: Levels that are black and white in the spectrogram [dB; a sine at full scale has 0].
-        width, height: Of the picture [pixels].
-        fps: As other cameras have it; the picture is drawn whenever it is read.
+        low_db, high_db: Levels shown as black and white in the spectrogram [dB; a sine at full scale has 0].
+        width, height: Size of the picture [pixels].
+        fps: As for other cameras. The picture is drawn whenever it is read.
 
     Raises:
         MicrophoneOptionError: An option is out of range.
@@ -211,8 +211,8 @@ class MicrophoneCamera(Camera):
         recording, n_kept = card.recording, round(KEPT_S * config.sample_rate)  # no `self`: once forgotten, it ends
         file = SessionFile(path, config.sample_rate, lambda: recording.written, self._samples, n_kept)
         logging.info(
-            "%s listens. All that it hears, voices too, is written to %s, %.1f MB a minute, and what stands in its "
-            "pictures is sound as well.",
+            "%s listens. Everything that it hears, voices included, is written to %s (%.1f MB a minute). Its pictures hold "
+            "the sound, too.",
             str(self),  # a record of the log may be kept
             path,
             120 * config.sample_rate / 1e6,
@@ -241,7 +241,7 @@ class MicrophoneCamera(Camera):
             raise DeviceNotConnectedError(f"{self} is gone: {card.microphone.problem}.")
         silent_s = card.microphone.silent_for_s
         if silent_s > max(max_age_ms / 1000, _STALLED_S):
-            raise TimeoutError(f"{self} has brought nothing for {silent_s:.1f} s. Is it still plugged in?")
+            raise TimeoutError(f"{self} has given no sound for {silent_s:.1f} s. Is it still plugged in?")
         if self._file is not None and self._file.error:
             raise DeviceNotConnectedError(f"{self}: {self._file.error}. Make room, and begin again.")
         is_mute = card.recording.zeros_s(self.config.channel) > _ZEROS_S

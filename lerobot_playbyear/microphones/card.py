@@ -226,8 +226,8 @@ class OpenCard:
                 self.microphone.connect(self.recording.write)
             if not self.recording.wait_for(enough, _FIRST_SOUND_S):
                 raise MicrophoneError(
-                    f"From {self.microphone.name} nothing came in {_FIRST_SOUND_S:.0f} s, and nothing after it was opened "
-                    "again. Is it plugged in, and used by no other program? `playbyear-find-microphones` shows what it hears."
+                    f"{self.microphone.name} gave no sound in {_FIRST_SOUND_S:.0f} s, even after it was opened again. Is it "
+                    "plugged in? Does another program use it? `playbyear-find-microphones` shows what it hears."
                 )
         except BaseException:
             self.microphone.disconnect()

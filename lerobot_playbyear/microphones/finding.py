@@ -38,9 +38,9 @@ class FindMicrophonesConfig:
     """Options of `playbyear-find-microphones`.
 
     Args:
-        list: Only list them.
-        seconds: For how long to listen to each [s].
-        output_dir: Where what each hears is written.
+        list: List the microphones without listening.
+        seconds: How long to listen to each microphone [s].
+        output_dir: Folder of the WAV files, one per microphone.
     """
 
     list: bool = False

@@ -109,7 +109,7 @@ def find_card(wanted: str | int, channels: int) -> SoundCard:
         raise MicrophoneError(f"device='' of a microphone: name the sound card, of these: {listed}. {_FIND}")
     found = cards_called(text, cards)
     if len(found) != 1:
-        what = "is no sound card with an input" if not found else "fits more than one sound card"
+        what = "is not a sound card with an input" if not found else "fits more than one sound card"
         raise MicrophoneError(f"device={text!r} {what}. There are: {listed}. {_FIND}")
     (card,) = found
     if card.channels < channels:

@@ -47,78 +47,78 @@ _AT_LEAST_0 = (
 @PreTrainedConfig.register_subclass("playbyear")
 @dataclass
 class PlaybyearConfig(PreTrainedConfig):
-    """The audio-visual LSTM of "Play it by Ear" (Du et al., RSS 2022). Defaults are the paper's unless a line says otherwise.
+    """The audio-visual LSTM of "Play it by Ear" (Du et al., RSS 2022). Defaults are the paper's unless noted.
 
     Every frame is encoded from the last `n_frame_stack` images of every camera, the last `audio_window_s` of every
     microphone and the low-dimensional observations; an LSTM over the last `n_memory_steps` encodings gives the action.
 
     Inputs:
-        fps: Frames per second of the dataset and the control loop [Hz]. Window lengths in frames follow from it. None takes it
-            from the dataset, which `lerobot-train` can do at 20 alone.
-        sample_rate: Samples per second of every microphone [Hz]. None takes it from the dataset.
-        use_vision, use_audio: Off leaves that encoding out, which is what the paper's inputs of zeros amount to.
-        use_memory: Off encodes one frame with one image: the paper's ablation of memory.
+        fps: Frames per second of the dataset and the control loop [Hz]. Window lengths in frames follow from it. None: the
+            dataset's; with `lerobot-train` only if that is 20.
+        sample_rate: Samples per second of every microphone [Hz]. None: the dataset's.
+        use_vision, use_audio: Encode pictures, encode sound. Leaving an encoding out is equivalent to the paper's inputs of
+            zeros.
+        use_memory: Use memory. Otherwise one frame with one image is encoded (the paper's ablation).
         n_frame_stack: Images stacked channel-wise before the vision encoder.
-        n_memory_steps: Encodings that the LSTM reads, H.
-        audio_window_s: Seconds of sound behind one encoding.
-        segment_s, hop_s: Length and step of the spectrogram's segments [s].
-        n_frequency_bins: Lowest bins of the spectrogram that are kept; a bin is 1 / segment_s wide.
-        image_size: Pixels, height and width, that the vision encoder sees. 84 trains about five times faster than 224.
-        audio_steps: Names in LeRobot's ProcessorStepRegistry: steps that sound passes through before the network, in training
-            as in a rollout. A trained policy keeps those it was trained with (`extension.MicrophoneStep`).
-        extension_options: Options of encoders and `audio_steps` of other packages, by their names, such as
-            `{waveform_cnn: {channels: 32}}`. A trained policy keeps them.
+        n_memory_steps: Number of encodings that the LSTM reads, H.
+        audio_window_s: Sound in one encoding [s].
+        segment_s, hop_s: Segment length and hop length of the spectrogram [s].
+        n_frequency_bins: Number of frequency bins kept from the lowest up. A bin is 1 / segment_s wide.
+        image_size: Height and width of the images for the vision encoder [pixels]. 84 trains about five times faster than 224.
+        audio_steps: Names in LeRobot's ProcessorStepRegistry: processing steps for the sound before the network, in training
+            and at rollout. A trained policy keeps its own (`extension.MicrophoneStep`).
+        extension_options: Options of encoders and `audio_steps` of other packages, by their names, such as `{waveform_cnn:
+            {channels: 32}}`. A trained policy keeps its own.
 
     Architecture:
-        vision_encoder, audio_encoder: Names of registered encoders (`extension.register_vision_encoder`, `_audio_encoder`).
-        vision_width: Channels of the ResNet-18's first stage; 64 is ResNet-18, and its embedding has 8 times as many.
+        vision_encoder, audio_encoder: Names of registered encoders (`extension.register_vision_encoder`,
+            `register_audio_encoder`).
+        vision_width: Channels of the first stage of the ResNet-18. 64 is the standard; the embedding is 8 times as wide.
         audio_channels: Channels of the audio encoder's convolutions, all with kernel 7.
-        hidden_size: Of the two hidden layers in the fusion and in the head.
-        embedding_size: Of the fused encoding and of the LSTM, D.
-        normalize_encodings: Bring every camera's and microphone's encoding to the same size before the fusion (a layer norm
+        hidden_size: Size of the two hidden layers in the fusion and in the head.
+        embedding_size: Size of the fused encoding and of the LSTM, D.
+        normalize_encodings: Scale every camera's and microphone's encoding to the same size before the fusion (layer norm
             without parameters). Off is the paper's plain concatenation.
-        audio_envelope_gain: The fusion also reads how loud each column of a microphone's spectrogram is, the mean of its bins,
-            times this: next to the convolutions, and not brought to the same size, so that two microphones can be compared.
-            0: it does not (the paper).
+        audio_envelope_gain: Factor on the loudness of each column of a microphone's spectrogram (the mean of its bins), which
+            the fusion reads beside the convolutions. It is not normalised, so two microphones can be compared. 0: off (the
+            paper).
         low_dimensional_gain: Factor on the normalised low-dimensional observations before the fusion. With 1, the paper's, the
-            seven numbers of the arm drown among hundreds of encodings and training takes several times as long.
-        memory_displacement_gain: The LSTM also reads how far the low-dimensional observations of each remembered frame are from
-            the newest ones, in normalised units times this. 0: it does not (the paper).
-        memory_readers: Besides the LSTM's last output the head reads that many weighted means of these displacements, each with
-            weights over the remembered frames that follow from what was seen and heard in them. 0: none (the paper).
-        action_range: How far actions reach, in units of the normalised ones. With 1, the paper's, and normalisation to [-1, 1],
-            no action lies outside of the demonstrations'; 1.5 reaches a quarter of their range further at both ends.
+            arm's seven numbers weigh little among hundreds of encodings, and training takes several times as long.
+        memory_displacement_gain: Factor on the displacements that the LSTM reads: how far the low-dimensional observations of
+            each remembered frame are from the newest ones, in normalised units. 0: off (the paper).
+        memory_readers: Number of weighted means of these displacements that the head reads beside the LSTM's last output. Their
+            weights over the remembered frames follow from what was seen and heard there. 0: none (the paper).
+        action_range: Largest action, in normalised units. With 1, the paper's, and normalisation to [-1, 1] no action exceeds
+            those of the demonstrations. 1.5 reaches a quarter of their range further at both ends.
 
     Training:
-        n_supervised_steps: Windows, K, that a training item supervises: the windows that end on its last K frames. They
-            share the encodings of its K + H - 1 frames. 1 is the paper's; more is cheaper per window.
-        augmentation_*: Training only, one draw per item and camera. Crop: largest shift of a replicate-padded crop
-            [pixels of the original]; brightness: relative; hue: of the colour circle; degrees; translate: share of the
-            size; scale: either way.
-        audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]; None
-            mixes in none (the paper). Level, colour and a hum are drawn per item, the level uniformly from 20 dB below the
-            floor up to this. It decides how loud a room the policy bears: 18 stands 8 times the background's amplitude.
-        audio_noise_files: Folder of WAV or FLAC files; three quarters of the items get an excerpt of one mixed in besides, its
-            level drawn uniformly from the floor's up to `audio_noise_db`. Only training reads it.
-        audio_colour_db: Standard deviation of another microphone's gain, a smooth curve over frequency, drawn per item [dB].
-        low_dimensional_noise: Standard deviation of noise on the low-dimensional observations in training, after their
-            normalisation, drawn anew for every frame. The paper has none; without it a few dozen demonstrations are learned
-            by heart.
-        low_dimensional_offset: Standard deviation of an error besides that all frames of an item share: it hides where a
-            demonstration was recorded, and leaves ways as they are. 0: none (the paper).
+        n_supervised_steps: Windows that a training item supervises, K: those that end on its last K frames. They share the
+            encodings of its K + H - 1 frames. The paper's is 1; more is cheaper per window.
+        augmentation_*: Augmentation of images in training, one draw per item and camera. Crop: largest shift of a
+            replicate-padded crop [pixels of the original]; brightness: relative; hue: share of the colour circle; degrees:
+            rotation; translate: share of the size; scale: relative.
+        audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]. None: no
+            noise (the paper). Each item draws a colour, a hum and a level, uniformly from 20 dB below the floor to this one. It
+            decides how much noise the policy tolerates: 18 is 8 times the background's amplitude.
+        audio_noise_files: Folder of WAV or FLAC files. Three quarters of the items also get an excerpt of one. Its level is
+            drawn uniformly from the floor's to `audio_noise_db`. Only training reads it.
+        audio_colour_db: Standard deviation of a simulated microphone's gain, a smooth curve over frequency drawn per item [dB].
+        low_dimensional_noise: Standard deviation of noise on the normalised low-dimensional observations in training, drawn for
+            every frame. The paper has none. Without it a policy memorises a few dozen demonstrations.
+        low_dimensional_offset: Standard deviation of a second error, which all frames of an item share. It hides where a
+            demonstration was recorded and keeps displacements as they are. 0: none (the paper).
         spectrogram_momentum: Weight of the newest batch in the running statistics of the spectrogram.
-        auxiliary_*: Weights, beside the action's loss, of what training predicts besides (`auxiliary.py`); 0: not at all (the
-            paper). Nothing of it is used when the policy acts. onset: whether a sudden sound begins in the newest frame [cross
-            entropy, nats]; balance: at such an onset, each microphone's share of the power that they hear, which tells where it
-            was [Kullback-Leibler divergence, nats]; way: from the memory, how far the low-dimensional observations were at its
-            last onset from what they are now, 1 at most [Huber loss, normalised units]. A deaf policy leaves them out, and one
-            with a single microphone the second.
-        dtype: Format that training computes in, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto",
-            the fastest that the device has; the device's fallback is float32. None: as `use_amp` says, which on an NVIDIA
-            GPU means "auto". Acting always computes in float32.
-        optimizer_*: Adam, and the clip of the gradient's norm; 0, the paper's, clips nothing.
-        scheduler_*: Linear warm-up over this share of the steps, then a cosine down to this share of the rate. The paper's
-            rate is constant (0 and 1); the schedule is what lets thousands instead of a hundred thousand updates do.
+        auxiliary_*: Weights of auxiliary losses in training (`auxiliary.py`). 0: none (the paper). They change nothing when the
+            policy acts. onset: whether a sudden sound begins in the newest frame [cross entropy, nats]. balance: each
+            microphone's share of the power at such an onset, which tells where it was [Kullback-Leibler divergence, nats]. way:
+            how far the low-dimensional observations have moved since the memory's last onset, at most 1 [Huber loss, normalised
+            units]. A deaf policy has none of them. A policy with one microphone has no balance.
+        dtype: Format of training, by autocast: "float32", "bfloat16", "float16" (with loss scaling) or "auto", the device's
+            fastest. A format that the device lacks becomes float32. None: as `use_amp` says, which on an NVIDIA GPU means
+            "auto". Acting always uses float32.
+        optimizer_*: Adam's learning rate and weight decay, and the largest norm of the gradient. 0, the paper's, clips nothing.
+        scheduler_*: Linear warm-up over this share of the updates, then a cosine decay to this share of the rate. The paper's
+            rate is constant (0 and 1). With the schedule thousands of updates suffice instead of a hundred thousand.
     """
 
     # Inputs

@@ -34,7 +34,7 @@ def act_by_folded_copies(network: nn.Module) -> None:
 
 
 def prepare_to_act(network: nn.Module) -> None:
-    """Makes the copies anew: even a change of weights that passed torch's own count of changes by is seen."""
+    """Makes the copies again: even a change of weights that passed torch's own count of changes by is seen."""
     for module in network.modules():
         if isinstance(module, FoldedVisionEncoder):
             module.refresh()
@@ -80,7 +80,7 @@ class FoldedVisionEncoder(VisionEncoder):
         return super().train(mode)
 
     def refresh(self) -> None:
-        """Prepares for acting anew."""
+        """Prepares for acting again."""
         self._folded.drop()
         if self._can_act():
             self._folded.of(self.network)

@@ -75,8 +75,8 @@ def make_encoder(option: str, config: PlaybyearConfig) -> nn.Module:
     if name not in factories:
         raise ValueError(
             f"--policy.{option}={name}: there is no such encoder; there are: {', '.join(sorted(factories))}. Install the "
-            "package that registers it: a distribution that LeRobot imports by itself has a name that begins with "
-            "lerobot_policy_ (docs/training.md)."
+            "package that registers it. LeRobot imports it if its distribution's name begins with lerobot_policy_ "
+            "(docs/how_to/train.md)."
         )
     encoder = made_with_options(name, factories[name], config, config)
     if not isinstance(getattr(encoder, "embedding_size", None), int):

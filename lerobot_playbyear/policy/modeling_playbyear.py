@@ -88,8 +88,8 @@ class PlaybyearPolicy(PreTrainedPolicy):
         endless = sorted(name for name, value in weights.items() if not value.isfinite().all())
         if endless:
             raise InputError(
-                f"{model_file} holds numbers that are infinite or none (NaN), in {endless[:3]}, of {len(endless)}. Its "
-                "training went wrong: give an earlier checkpoint."
+                f"{model_file} holds infinite numbers or NaN, in {endless[:3]}, of {len(endless)}. Its training diverged: "
+                "give an earlier checkpoint."
             )
         try:
             missing, unexpected = model.load_state_dict(weights, strict=False)
@@ -102,7 +102,7 @@ class PlaybyearPolicy(PreTrainedPolicy):
         if missing or (strict and unexpected):
             raise InputError(f"{model_file} does not fit the policy: {told}")
         if unexpected:
-            logger.warning("%s does not fit the policy in all: %s What is too many is left out.", model_file, told)
+            logger.warning("%s does not fit the policy exactly: %s The surplus is left out.", model_file, told)
         return model
 
     def generate_model_card(self, *args: Any, **kwargs: Any) -> Any:

@@ -95,7 +95,7 @@ class PlaybyearNetwork(nn.Module):
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
     def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
-        """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` its columns' means besides."""
+        """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means."""
         config = self.config
         n_heard = n_frames + config.audio_frames - 1
         sound = newest(batch, key, n_heard, config.feature_shape(key))  # (B, n_heard, S)

@@ -103,8 +103,8 @@ class PlannedLR(LambdaLR):
             return
         n_warmup, n_decay = state_dict["n_warmup_steps"], state_dict["n_decay_steps"]
         logging.warning(
-            f"The learning rate rises from {before:.3g} to {after:.3g}: the run was planned for {n_decay} updates and is at "
-            f"{self.last_epoch}; planned for {self.n_decay_steps}, the rate falls anew until then. That unsettles a policy "
-            f"that had settled. To keep the rate as it was planned, and low after that, add "
+            f"The learning rate rises from {before:.3g} to {after:.3g} at update {self.last_epoch}: the run was planned for "
+            f"{n_decay} updates and now has {self.n_decay_steps}. A higher rate can undo what the policy has learned. To keep "
+            f"the planned rate, and a low one after it, add "
             f"--scheduler.num_warmup_steps={n_warmup} --scheduler.num_decay_steps={n_decay} to the command."
         )

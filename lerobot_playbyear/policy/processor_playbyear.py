@@ -63,7 +63,7 @@ def microphone_step(name: str, config: PlaybyearConfig) -> ProcessorStep:
     if name not in ProcessorStepRegistry.list():
         raise ValueError(
             f"--policy.audio_steps names '{name}', which no installed package registers in LeRobot's ProcessorStepRegistry: "
-            "install the one that does; its distribution's name begins with lerobot_policy_ (docs/training.md)."
+            "install the one that does; its distribution's name begins with lerobot_policy_ (docs/how_to/train.md)."
         )
     return made_with_options(name, ProcessorStepRegistry.get(name), config)
 
@@ -195,8 +195,8 @@ def _scaled(samples: Tensor, key: str) -> Tensor:
     strange = (wave != wave.round()) | (wave.abs() > _FULL_SCALE)
     if strange.any():
         raise ValueError(
-            f"{key} holds {wave[strange][0].item():.6g}, which is no int16 sample. Floats in [-1, 1] are what a policy wants: "
-            f"let {Pcm16ToFloatProcessorStep.__name__} out of the environment's `get_env_processors`. Other integers: give "
-            "int16 in the environment."
+            f"{key} holds {wave[strange][0].item():.6g}, which is not an int16 sample. If these are floats in [-1, 1], remove "
+            f"{Pcm16ToFloatProcessorStep.__name__} from the environment's `get_env_processors`. If they are other integers, "
+            "give int16 in the environment."
         )
     return wave / _FULL_SCALE

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 
 
 class SoundAugmentation(nn.Module):
-    """Noise and another microphone's response, drawn anew for every item; nothing of it is in a checkpoint."""
+    """Noise and another microphone's response, drawn for every item; nothing of it is in a checkpoint."""
 
     response: Tensor
 

@@ -28,8 +28,8 @@ def to_float_wave(wave: Tensor, key: str) -> Tensor:
     if peak > 1.5:
         raise ValueError(
             f"{key} holds float samples up to {peak:.4g}; wanted floats in [-1, 1], or integers as PCM at full scale. "
-            "Where an environment's int16 sound was made floats of, let its configuration's get_env_processors name "
-            "Pcm16ToFloatProcessorStep (docs/dataset.md)."
+            "If an environment's int16 sound was converted to floats, name Pcm16ToFloatProcessorStep in the "
+            "get_env_processors of its configuration (docs/reference/dataset_format.md)."
         )
     return wave.float()
 

@@ -34,17 +34,16 @@ class RecordDatasetConfig(DatasetPlace):
     """The dataset that is written.
 
     Args:
-        repo_id: Its name, `user/name`.
-        root: Its folder. None: in LeRobot's own cache, under its name.
-        num_episodes: How many successful episodes are recorded, with `resume` beside those that are there.
-        video: Whether pictures are encoded as video; otherwise each is stored without loss.
-        rgb_encoder: Codec and quality of video, such as `--dataset.rgb_encoder.vcodec=h264`.
-        push_to_hub: Whether to upload it when it is complete.
-        private: Whether the uploaded repository is private. True: nothing goes to one that is there and public. None: as the
-            account's default says.
-        tags: For its card on the Hub.
-        single_task: What is done in it, in words. None: what the environment says.
-        fps: Its frames per second, as the environment has them. None: those.
+        repo_id: Name of the dataset, `user/name`.
+        root: Its folder. None: the one in LeRobot's cache.
+        num_episodes: Successful episodes to record. With `resume` they are added to the recorded ones.
+        video: Encode pictures as video. Otherwise each picture is stored without loss.
+        rgb_encoder: Codec and quality of the video, such as `--dataset.rgb_encoder.vcodec=h264`.
+        push_to_hub: Upload the dataset when it is complete.
+        private: Make a new repository private. True: refuse to upload to an existing public one. None: the account's default.
+        tags: Tags for the card on the Hub.
+        single_task: Description of the task. None: the environment's.
+        fps: Frames per second. Only the environment's own rate works. None: that rate.
     """
 
     num_episodes: int = 50
@@ -63,12 +62,12 @@ class RecordConfig:
 
     Args:
         env: The environment, `--env.type=playbyear --env.task=OccludedGrasp-v1`.
-        dataset: What is written, and where.
-        seed: The first attempt's seed; each further attempt takes the next one.
-        resume: Append `num_episodes` to a dataset, if it is there, with the seeds after its largest.
-        num_workers: Processes that play. 0: none but this one. None: as many as there are processor cores, at
-            most 8. The dataset does not depend on it.
-        expert: Who demonstrates: `--expert.type=scripted`, the environment's own script, or `teleop`, a person.
+        dataset: The dataset to write.
+        seed: Seed of the first episode. Every further episode takes the next one.
+        resume: Append `num_episodes` to an existing dataset, with the seeds after its largest.
+        num_workers: Processes that roll out. 0: only this one. None: one per processor core, at most 8. The recorded data are
+            the same.
+        expert: Source of the demonstrations: `--expert.type=scripted`, the environment's script, or `teleop`, a person.
     """
 
     env: EnvConfig

@@ -1,4 +1,4 @@
-"""The repaired copy of a dataset: every episode that a survey calls whole, with what is right as it is, and the rest anew."""
+"""The repaired copy of a dataset: every episode that a survey calls whole; what is wrong around it is made again."""
 
 import math
 import shutil
@@ -144,7 +144,7 @@ def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
 
 
 def _row(survey: Survey, kept: _Kept) -> dict[str, Any]:
-    """An episode's row: its own, with the statistics of its new numbers, or one that is made anew."""
+    """An episode's row: its own, with the statistics of its new numbers, or one that is made again."""
     places = {name: value for key, own in kept.episode.places.items() for name, value in own.columns(key).items()}
     row = kept.episode.row
     if row is None:

@@ -1,8 +1,8 @@
-"""Footers of parquet files, made anew: of a recording that was killed, or cut off by a full disk.
+"""Footers of parquet files, made again: of a recording that was killed, or cut off by a full disk.
 
 A parquet file's footer says where everything is, and is written last. LeRobot writes it when the recording ends,
 but it writes every episode's pages, with a header each, when the episode is saved. From these headers, and the
-columns that the dataset's features demand, the footer is written anew; pyarrow then reads the file as usual.
+columns that the dataset's features demand, the footer is written again; pyarrow then reads the file as usual.
 
 Headers and footers are structures of Thrift's compact protocol, of which the second half of this module is as much as
 parquet uses.
@@ -128,7 +128,7 @@ def _page(start: int, header: Struct, header_bytes: int) -> _Page:
     details = header.value({_DATA_PAGE: 5, _DICTIONARY_PAGE: 7, _DATA_PAGE_V2: 8}.get(kind, -1))
     inflated, stored, n_values = header.value(2), header.value(3), details.value(1)
     if not all(isinstance(number, int) and number >= 0 for number in (inflated, stored, n_values)):
-        raise ThriftError("it is no page")
+        raise ThriftError("it is not a page")
     return _Page(start, header_bytes + stored, header_bytes + inflated, kind == _DICTIONARY_PAGE, n_values)
 
 

@@ -24,11 +24,11 @@ class RepairConfig:
     """Options of `playbyear-repair`.
 
     Args:
-        root: The dataset's folder.
-        output: The copy's; None: its name with `_repaired` behind it.
-        like: The folder of a dataset that was recorded with the same settings: its frame rate and features are taken.
-            Needed only where `meta/info.json` is lost.
-        dry_run: Only say what is wrong.
+        root: Folder of the dataset.
+        output: Folder of the copy. None: the dataset's with `_repaired` appended.
+        like: Folder of a dataset recorded with the same settings, whose frame rate and features are used. Needed only if
+            `meta/info.json` is lost.
+        dry_run: Report the damage without writing a copy.
     """
 
     root: Path
@@ -71,7 +71,7 @@ class RepairReport:
         moved = [f"{old} is now {new}" for old, new in self.kept.items() if old != new]
         if moved:
             more = " ..." if len(moved) > _MOST_MOVES else ""
-            lines.append(f"Numbered anew: {', '.join(moved[:_MOST_MOVES])}{more}.")
+            lines.append(f"Renumbered: {', '.join(moved[:_MOST_MOVES])}{more}.")
         lines.append(
             f"A copy with {len(self.kept)} whole episodes is in {self.target}; {self.survey.root} is as it was."
         )
@@ -110,7 +110,7 @@ def look(root: Path, like: Path | None = None) -> RepairReport:
 def repair_dataset(root: str | Path, target: str | Path | None = None, like: Path | None = None) -> RepairReport:
     """Writes a copy of a local dataset of ours or of LeRobot's with every whole episode, bit for bit.
 
-    A recording that was killed has lost its tables' ends, which are made anew from what is there; so are damaged or
+    A recording that was killed has lost its tables' ends, which are made again from what is there; so are damaged or
     deleted tables in `meta/`. Episodes of which frames or pictures are lost are not in the copy, and those after them move
     up. What a writer of ours had begun to move into the dataset is finished first; else nothing in the dataset is changed.
 

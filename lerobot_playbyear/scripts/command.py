@@ -181,9 +181,9 @@ def for_robots(command: str, args: list[str]) -> str | None:
     learns = after.get(command, "playbyear-train --preset=cpu ...")
     then = f"\nThen: playbyear-attach-audio --dataset.repo_id=... --dataset.root=..., and {learns}" if learns else ""
     return (
-        f"--{next(iter(given))}: {command} acts in simulations. On a robot it is LeRobot's command, with the microphone "
-        f"among the cameras (docs/robots.md):\n{_ON_ROBOTS[command].format(robot)}{then}\n"
-        "What a person moves a simulated arm with: --expert.type=teleop --expert.teleop.type=..."
+        f"--{next(iter(given))}: {command} works in simulations. On a robot use LeRobot's command, with the microphone "
+        f"among the cameras (docs/tutorials/so101.md):\n{_ON_ROBOTS[command].format(robot)}{then}\n"
+        "A person moves a simulated arm with --expert.type=teleop --expert.teleop.type=..."
     )
 
 
@@ -198,7 +198,7 @@ def find_mistake(args: list[str], listed: Mapping[str, Any], policies: Mapping[s
     """
     given, strays = given_options(args)
     if strays:
-        return f"'{strays[0]}' is no option: options begin with --."
+        return f"'{strays[0]}' is not an option: options begin with --."
     known, opened = set(listed["options"]), set(listed["open"])
     policy_type = given.get("policy.type") or ("playbyear" if given.get("preset") else "")
     if "policy" in opened and policy_type in policies and not given.keys() & {"policy.path", "config_path"}:
@@ -208,7 +208,7 @@ def find_mistake(args: list[str], listed: Mapping[str, Any], policies: Mapping[s
         is_open = name.partition(".")[0] in opened or name.endswith("discover_packages_path")
         if name not in known and not is_open:
             near = difflib.get_close_matches(name, sorted(known), 1)
-            return f"--{name} is no option{f'; did you mean --{near[0]}?' if near else '.'}"
+            return f"--{name} is not an option{f'; did you mean --{near[0]}?' if near else '.'}"
         if name in known and value is None:
             return f"--{name} needs a value, --{name}=..."
     if given.keys() & {"config_path", "resume"}:

@@ -81,7 +81,7 @@ def repair() -> None:
     except (OSError, MemoryError) as error:
         sys.exit(
             f"error: {printable(error) or 'there is not enough memory'}\n"
-            "Nothing was changed: that something cannot be read or written now is no damage. Try again when it can."
+            "Nothing was changed. A file cannot be read or written now, which is not damage. Try again later."
         )
     sys.exit(0 if report.is_done else 1)
 

@@ -29,16 +29,15 @@ class TeleopExpertConfig(ExpertConfig):
     """A person with any LeRobot teleoperator.
 
     Args:
-        teleop: What they move the arm with: `keyboard_window` (the keys of the window, nothing to install), `keyboard_ee`,
-            `gamepad`, or another registered one.
-        speed: What a full displacement is, as a share of the largest that the environment takes.
-        directions: What moves the hand along x, y and z, such as `-y,x,z`. None: what fits the view of our tasks.
-        gripper_cooldown_s: For how long after a change the gripper cannot change again [s]; the paper's and our tasks' is 2.
-        steps_per_second: Control steps per second; fewer than the environment's are slow motion. None: the environment's.
-        begin_paused: Each attempt waits until the person presses Space.
-        takeover: How a person takes over from a policy: `toggle` with one press of the key, and hand back with another, or
-            `hold` it.
-        takeover_key: The key, such as `tab` or `b`; most pedals are keyboards with one key.
+        teleop: LeRobot teleoperator that moves the arm: `keyboard_window` (the window's keys; nothing to install),
+            `keyboard_ee`, `gamepad`, or another registered one.
+        speed: Size of a full displacement, as a share of the environment's largest.
+        directions: Axes that move the hand along x, y and z, such as `-y,x,z`. None: those that fit the view of our tasks.
+        gripper_cooldown_s: Least time between two changes of the gripper [s]. The paper's and our tasks' is 2.
+        steps_per_second: Control steps per second. Fewer than the environment's are slow motion. None: the environment's.
+        begin_paused: Wait before each episode until the person presses Space.
+        takeover: How a person takes over: `toggle` with one key press and hand back with another, or `hold` the key.
+        takeover_key: The key, such as `tab` or `b`. Most pedals are keyboards with one key.
         play_sound: Play the first microphone, if the package sounddevice is installed.
     """
 

@@ -45,7 +45,7 @@ KEYS = {
     "R": "repeat, keep nothing",
     "Esc": "leave",
 }
-"""What the panel beside the scene says, and docs/teleoperation.md."""
+"""What the panel beside the scene says, and docs/how_to/record.md."""
 
 _VERDICTS = {
     SUCCESS: Verdict.SUCCESS,

@@ -20,7 +20,7 @@ PRESETS = {
     "gpu": "the paper's number of windows at 224 pixels, for a GPU; 5 minutes on an H200",
     "paper": "the published experiment: 1.6 million windows at 224 pixels, for a GPU",
 }
-"""When to choose which. What each is, and what differs from the publication on purpose: docs/training.md."""
+"""When to choose which. What each is, and what differs from the publication on purpose: docs/how_to/train.md."""
 
 _NETWORK = (
     *("type", "device", "image_size", "vision_width", "normalize_encodings", "low_dimensional_gain", "hop_s"),
@@ -37,7 +37,7 @@ def given_options(args: Sequence[str]) -> tuple[dict[str, str | None], list[str]
         args: Without the command's own name.
 
     Returns:
-        The value of every option, the first one where it is given twice, None where it has none; and what is no option.
+        The value of every option, the first one where it is given twice, None where it has none; and what is not an option.
     """
     options: dict[str, str | None] = {}
     strays: list[str] = []

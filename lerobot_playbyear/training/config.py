@@ -24,10 +24,10 @@ class StoreConfig:
     """Where the dataset is kept; `--store=disk` is short for `--store.place=disk`.
 
     Attributes:
-        place: "memory"; "disk" for files that are mapped into memory, with pictures no larger than the policy looks at them;
-            "auto" is memory where the recorded frames fill at most half of what is free and one process trains.
-        device: "cpu" or "cuda"; None means the GPU when at most half of its free memory is needed, otherwise the CPU.
-        cache: Folder of the files; None means one beside LeRobot's cache.
+        place: "memory", "disk" or "auto". "disk" maps files into memory, with pictures no larger than the policy's. "auto" is
+            memory if the frames fill at most half of what is free and one process trains.
+        device: "cpu" or "cuda". None: the GPU if at most half of its free memory is needed, otherwise the CPU.
+        cache: Folder of the files. None: one beside LeRobot's cache.
     """
 
     place: str = "auto"
@@ -37,16 +37,16 @@ class StoreConfig:
 
 @dataclass
 class PlaybyearTrainConfig(TrainPipelineConfig):
-    """All options of lerobot-train and, beside them, `--preset`, `--store.*` and `--compile`.
+    """All options of lerobot-train, and `--preset`, `--store.*` and `--compile`.
 
     A checkpoint keeps lerobot-train's options in its `train_config.json` and the others in a file of their own, so
     that lerobot-train can resume what playbyear-train began, and the other way round.
 
     Attributes:
-        preset: A named set of defaults, see `lerobot_playbyear.training.command_line`.
-        store: Where the dataset is kept.
-        compile: Whether torch compiles the encoders and the head, which takes a minute or more before the first update. Meant
-            for GPUs; what it is worth there was not measured.
+        preset: A named set of defaults: `cpu`, `gpu` or `paper`.
+        store: Where the dataset is kept. `--store=disk` is short for `--store.place=disk`.
+        compile: Compile the encoders and the head with torch, which takes a minute or more before the first update. Meant for
+            GPUs. Its gain there was not measured.
     """
 
     preset: str | None = None

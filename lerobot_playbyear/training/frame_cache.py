@@ -141,7 +141,7 @@ def _mapped(path: Path, n_rows: int) -> Tensor | None:
     except FileNotFoundError:
         return None
     except (ValueError, EOFError) as error:  # shortened since, or another program's
-        logger.warning(f"'{path}' is damaged ({error}), and is made anew.")
+        logger.warning(f"'{path}' is damaged ({error}), and is made again.")
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that the tensor could be written to, which nothing here does

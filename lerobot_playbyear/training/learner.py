@@ -262,7 +262,7 @@ def make_learner(
     if cfg.resume and cfg.checkpoint_path is not None:
         step = load_training_state(cfg.checkpoint_path, optimizer, scheduler)
     if accelerator.device.type == "cuda":
-        policy.to(accelerator.device)  # before its weights and the optimizer's state are laid out anew
+        policy.to(accelerator.device)  # before its weights and the optimizer's state are laid out again
         prefer_channels_last(policy, optimizer)
         fuse(optimizer)
     if cfg.compile:
@@ -409,7 +409,7 @@ def _make_processors(
         ) from error
 
 
-# What makes updates faster and changes nothing that is learned (docs/scale.md)
+# What makes updates faster and changes nothing that is learned (docs/how_to/train.md)
 
 
 def keep_freed_memory() -> None:

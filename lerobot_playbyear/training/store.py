@@ -100,7 +100,7 @@ class EpisodeStore:
 
         Args:
             dataset: An opened dataset; its `delta_timestamps` do not matter.
-            keys: The features to read besides the index columns; None reads all but depth, text and language.
+            keys: The features to read in addition to the index columns; None reads all but depth, text and language.
             device: Where to keep the tensors; None takes the GPU when at most half of its free memory is needed,
                 and the CPU otherwise.
             progress: Show a progress bar for the cameras.

@@ -346,7 +346,7 @@ _FOR_WRITERS = (HubServer.create, HubServer.preupload, HubServer.commit, HubServ
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """Reads a request, lets go wrong what shall, and writes the Hub's answer."""
+    """Reads a request, lets go wrong what is to, and writes the Hub's answer."""
 
     protocol_version = "HTTP/1.1"
     server_hub: HubServer

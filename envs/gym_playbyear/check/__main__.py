@@ -1,10 +1,10 @@
-"""Whether a task needs hearing: its expert, everyone who plays it deaf, and what twin worlds give away, in one table.
+"""Checks whether a task needs hearing: plays it with its expert, with deaf scripts, and in twin environments.
 
     python -m gym_playbyear.check OccludedGrasp-v1 --episodes=100 --output=check.json
 
-The expert must solve the task. Blind scripts, which know what the camera shows and feel nothing, must not, nor must deaf
-scripts, which feel with the arm; and sound must tell that the hidden object was touched, and nothing else may. The exit status
-is 1 where a limit is broken.
+The expert must solve the task. Blind scripts, which know what the camera shows and feel nothing, must fail. So must deaf
+scripts, which feel with the arm. Only the sound may tell that the hidden object was touched. The exit status is 1 if a limit is
+broken.
 """
 
 import argparse
@@ -21,14 +21,20 @@ def main() -> int:
         prog="python -m gym_playbyear.check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("task", help="such as OccludedGrasp-v1")
-    parser.add_argument("--episodes", type=int, default=100, help="of each player and of the twin test (default: 100)")
-    parser.add_argument("--seed", type=int, default=FIRST_SEED, help=f"of the first episode (default: {FIRST_SEED})")
+    parser.add_argument(
+        "--episodes", type=int, default=100, help="episodes of each player and of the twin test (default: 100)"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=FIRST_SEED, help=f"seed of the first episode (default: {FIRST_SEED})"
+    )
     parser.add_argument("--players", nargs="+", help=f"only these: {', '.join(KINDS)}, or names of scripts")
-    parser.add_argument("--no-twin", action="store_true", help="do not compare twin worlds")
+    parser.add_argument("--no-twin", action="store_true", help="do not compare twin environments")
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side (default: 1)")
-    parser.add_argument("--horizon", type=int, help="steps of an episode; by default the task's own")
+    parser.add_argument("--horizon", type=int, help="control steps of an episode (default: the task's own)")
     parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments.adversaries")
-    parser.add_argument("--output", type=Path, help="a JSON file for the results; a check that was stopped goes on")
+    parser.add_argument(
+        "--output", type=Path, help="a JSON file for the results; the same command continues a stopped check"
+    )
     arguments = parser.parse_args()
     progress = None
     if arguments.output:  # before the hours that it takes

@@ -1,4 +1,4 @@
-"""Plays a task with everyone who tries it, compares twin worlds, and judges the results by what the task promises."""
+"""Plays a task with everyone who tries it, compares twin environments, and judges the results by what the task promises."""
 
 import json
 import sys
@@ -130,7 +130,7 @@ class Limits:
         expert: The expert solves at least this share.
         blind: No blind script solves more.
         deaf_margin: Nobody deaf solves more than this above the best blind script, or, where none is played, above `blind`.
-        auc: No classifier tells twin worlds apart better that does not hear.
+        auc: No classifier tells twin environments apart better that does not hear.
         heard: One that hears tells them apart at least so well.
     """
 
@@ -192,14 +192,14 @@ def check(
     options: dict[str, Any] | None = None,
     progress: Path | None = None,
 ) -> Report:
-    """Plays a task with everyone, and compares twin worlds.
+    """Plays a task with everyone, and compares twin environments.
 
     Args:
         task: Its name, such as `OccludedGrasp-v1`, or the task.
         n_episodes: Of each player, and of the twin test.
         first_seed: Of the episodes; they count up.
         names: Of the players, or of their kinds (`KINDS`); all by default.
-        twin: Whether to compare twin worlds.
+        twin: Whether to compare twin environments.
         jobs: Processes side by side.
         limits: What the task promises; by default what it says itself, or else `Limits()`.
         learned: Results of learned adversaries: `name`, `successes`, `n_episodes`, `hears`.
@@ -207,8 +207,8 @@ def check(
         progress: A file of who has played already; a check that was stopped goes on from there.
 
     Raises:
-        ValueError: A name is not among the task's players, or a learner's result is of another task; or twin worlds cannot be
-            made with the task's options of them.
+        ValueError: A name is not among the task's players, or a learner's result is of another task; or its twin environments
+            cannot be made with the task's options.
     """
     name = task if isinstance(task, str) else task.name
     by_learners = [_row_of(result, name) for result in learned or []]
@@ -254,7 +254,7 @@ def _row_of(result: dict[str, Any], task: str) -> Row:
     """A learned adversary's row."""
     if result.get("task", task) != task or not {"hears", "name", "successes", "n_episodes"} <= result.keys():
         raise ValueError(
-            f"learned: {result.get('name', result.get('task'))!r} is no learner's result on {task!r}: give files that "
+            f"learned: {result.get('name', result.get('task'))!r} is not a learner's result on {task!r}: give files that "
             "`python -m experiments.adversaries` wrote for it."
         )
     kind = "learned, hears" if result["hears"] else "learned, deaf"
@@ -284,19 +284,19 @@ def describe(row: Row) -> str:
 
 
 def twin_faults(twin: TwinResult | None, limits: Limits) -> list[str]:
-    """What twin worlds give away and should not, and what they do not tell by sound."""
+    """What twin environments give away and should not, and what they do not tell by sound."""
     if twin is None:
         return []
     area, heard = twin.auc.value, twin.heard.value
     faults = []
     if area > limits.auc:
-        faults.append(f"twin worlds: a classifier's area is {area:.2f}, at most {limits.auc:.2f} was promised")
+        faults.append(f"twin environments: a classifier's area is {area:.2f}, at most {limits.auc:.2f} was promised")
     if not twin.equal_until_touch:
-        faults.append(f"twin worlds differ before the touch: {twin.first_difference}")
+        faults.append(f"twin environments differ before the touch: {twin.first_difference}")
     if heard < limits.heard:
         faults.append(
-            f"twin worlds sound alike: by sound a classifier's area is {heard:.2f}, at least {limits.heard:.2f} was promised; "
-            "whoever hears cannot learn what is hidden, or the expert's first touch is not of the same thing in every episode"
+            f"twin environments sound alike: by sound a classifier's area is {heard:.2f}, at least {limits.heard:.2f} was "
+            "promised. Hearing cannot tell what is hidden, or the expert's first touch differs between episodes"
         )
     return faults
 
@@ -315,7 +315,7 @@ def as_text(report: Report) -> str:
         twin = report.twin
         same = "every observation but sound is the same" if twin.equal_until_touch else "OBSERVATIONS DIFFER"
         until, judged = ("until the touch", "after it") if twin.can_be_touched else ("to the end", "at any time")
-        lines.append(f"twin worlds, {twin.n_episodes} episodes: {until} {same};")
+        lines.append(f"twin environments, {twin.n_episodes} episodes: {until} {same};")
         for who, area in (("", twin.auc), (" that hears", twin.heard)):
             lines.append(f"  {judged}, a classifier{who}: area {area.value:.3f} ({area.low:.3f}-{area.high:.3f})")
         if twin.can_be_touched:

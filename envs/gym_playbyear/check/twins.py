@@ -1,4 +1,4 @@
-"""Twin worlds, which differ in nothing but what only sound tells: one with the hidden object and one without, or one with
+"""Twin environments, which differ in nothing but what only sound tells: one with the hidden object and one without, or one with
 screws in the pouch and one with peanuts. The hand does the same in both.
 
 Until the hand touches the object, nothing but sound may differ at all; where what is hidden cannot be touched, never. After the
@@ -90,7 +90,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class TwinResult:
-    """What tells twin worlds apart.
+    """What tells twin environments apart.
 
     Attributes:
         n_episodes: Those in which the object was touched, of which half trained the classifier; all, if nothing can be.
@@ -130,7 +130,7 @@ def _run_of(sensed: list[tuple[np.ndarray, np.ndarray]], touched_at: int | None)
 
 
 class TwinError(ValueError):
-    """A task has no twin worlds to compare, or its expert touched too little in them."""
+    """A task has no twin environments to compare, or its expert touched too little in them."""
 
 
 class Twins:
@@ -152,8 +152,8 @@ class Twins:
         hides = {True, False} <= {world.get("hidden_object", True) for world in (first, second)}
         if hides and not any(prop.hidden and prop.material for prop in definition.props):
             raise TwinError(
-                f"twin worlds: {definition.name} hides nothing that can be touched, so that both worlds are the same and prove "
-                "nothing. Give what only hearing finds Prop(hidden=True, material=...), or the task other twins."
+                f"twin environments: {definition.name} hides nothing that can be touched, so both are the same and prove "
+                "nothing. Mark the object that only hearing finds with Prop(hidden=True, material=...), or give other twins."
             )
         self.worlds = tuple(DeafTask(task, **{"sound": "waveform", **options, **world}) for world in (first, second))
         self.can_be_touched = self.worlds[0].can_be_touched
@@ -289,8 +289,8 @@ def twin_test(task: str | Task, seeds: range, *, n_pictured: int = 3, **options:
     twins.close()
     if n_episodes < 4:
         raise TwinError(
-            f"twin worlds: the expert touched the hidden object in {n_episodes} of {len(seeds)} episodes, which is too few to "
-            "compare them: four are needed; give more --episodes, or an expert that touches it more often."
+            f"twin environments: the expert touched the hidden object in {n_episodes} of {len(seeds)} episodes, and four are "
+            "needed to compare them: give more --episodes, or an expert that touches it more often."
         )
     return TwinResult(
         n_episodes=n_episodes,

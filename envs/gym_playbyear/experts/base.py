@@ -61,7 +61,7 @@ class StagedGate:
 
     Args:
         env: The unwrapped environment, after `reset`.
-        expert: Made for this episode; its phase is set anew whenever it takes over.
+        expert: Made for this episode; its phase is set again whenever it takes over.
 
     Attributes:
         reason: Why the expert is in control, in one word; None while the policy is.

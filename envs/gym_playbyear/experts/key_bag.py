@@ -2,7 +2,7 @@
 
 The expert goes down slowly until a finger feels something. Which finger it was tells on which side the things lie, and where
 the hand was tells how high. It goes around them, closes, lifts and holds; after an empty grasp it tries again. (One that goes
-to where the things are, without having felt it, shows what nobody can learn.) Speeds, pauses and places are drawn anew for
+to where the things are, without having felt it, shows what nobody can learn.) Speeds, pauses and places are drawn for
 every episode.
 """
 
@@ -96,7 +96,7 @@ class BagExpert(Script):
             displacement = displacement + self.rng.uniform(-1, 1, 3) * self.NOISE
         return self._action(displacement, close)
 
-    # One method per phase: it returns where to (3,) [m, world], or None to stay, how fast, and whether the fingers shall close.
+    # One method per phase: it returns where to (3,) [m, world], or None to stay, how fast, and whether the fingers close.
 
     def _enter(self):
         upper = TABLE_TOP + self.env.definition.numbers.bottom[1] + TALLEST + TIP_BELOW_HAND

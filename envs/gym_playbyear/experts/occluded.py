@@ -1,7 +1,7 @@
 """Scripted experts: they feel contact and know where the cube is.
 
 The phases follow the authors' scripts (reference figures in the documentation): approach, sweep until contact, rise, hop over
-the cube, descend, close, lift, and in Pick and Place carry and release. Speeds, pauses and dwell times are drawn anew for
+the cube, descend, close, lift, and in Pick and Place carry and release. Speeds, pauses and dwell times are drawn for
 every episode, so that neither the time since contact nor the time since the start tells what to do next: only where the hand
 is when the sound comes.
 """
@@ -44,7 +44,9 @@ class GraspExpert(Script):
     HOP_ERROR = (-0.012, 0.012)  # by which a hop misses the cube, along the sweep, before it is mended
     DESCENT_STEP = 0.014
     BACK_OFF = (0.002, 0.014)  # how far it draws back from a touch
-    BRING_BACK_STEP = 0.04  # with which a correction carries the cube back to where it was lifted, to show the way anew
+    BRING_BACK_STEP = (
+        0.04  # with which a correction carries the cube back to where it was lifted, and shows the way again
+    )
     HOLD_HEIGHT = 0.085  # above the table, where it holds still
 
     def __init__(self, env):
@@ -93,7 +95,7 @@ class GraspExpert(Script):
     def _noise(self) -> np.ndarray:
         return np.zeros(3) if self.phase == "hold" else super()._noise()
 
-    # One method per phase: it returns the displacement (3,) [m] and whether the fingers shall close.
+    # One method per phase: it returns the displacement (3,) [m] and whether the fingers close.
 
     def _retreat(self):
         goal = np.array([*self.env.eef_position[:2], TABLE_TOP + self.TRAVEL_HEIGHT])

@@ -6,7 +6,7 @@ mistake is final: in our tasks a cube shoved over 2.2 cm ends the attempt, and f
 
 A policy can learn from a correction if what it senses tells it what to do. Therefore the gates wait until a mistake can be
 noticed: fingers closed on nothing, the hand stays on top of the cube. And the expert does not go where only it knows the cube
-to be: it rises and searches anew, as in a demonstration. A cube that would be put down beside the tray it carries back to
+to be: it rises and searches again, as in a demonstration. A cube that would be put down beside the tray it carries back to
 where it was lifted, and then to the tray: where a way ends is learned from the way, not from mending its end (recovery before
 correction, Hu et al., "RaC", 2025).
 """
@@ -32,7 +32,7 @@ LAND_X, LAND_HEIGHT, LAND_MARGIN = 0.035, 0.044, 0.012  # about to land: so near
 EMPTY_OPENING = 0.03  # fingers that were closed, and are this near to each other, hold nothing
 RELEASE_REACH = 0.02  # fingers may open when the held cube is this near to the tray's middle
 CARRY_PAST, CARRY_SINK = 0.03, 0.015  # a carried cube so far past the tray, or so far too low beside it, is misplaced
-FAR = 0.1  # from where it was lifted; a cube that is this far is carried back, to show the way to the tray anew
+FAR = 0.1  # from where it was lifted; a cube that is this far is carried back, to show the way to the tray again
 DROP_DISTANCE = 0.04  # a cube that was held and is this far from the hand was dropped
 STRAY_X, STRAY_Y = 0.03, 0.12  # how far a hand that searches may be beside the line of the sweep, and before its start
 HOP_PAST = 0.03  # how far a hand that rose after the touch may go past the cube
@@ -175,7 +175,7 @@ class InterventionGate(StagedGate):
         return bool(np.linalg.norm((self.env.position("cube") - self._lifted_at)[:2]) > FAR)
 
     def _brings_back(self) -> bool:
-        """Whether the way to the tray is to be shown anew: the policy has gone most of it, and there is time."""
+        """Whether the way to the tray is to be shown again: the policy has gone most of it, and there is time."""
         tray = self.env.shown.get("bin_position")
         if tray is None or not (self._holds() and self._is_far()):
             return False

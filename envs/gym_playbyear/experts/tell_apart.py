@@ -1,6 +1,6 @@
 """Scripts for the pouch: the expert, which knows what is in it, which knows what is in it.
 
-Heights, speeds, pauses and the time of listening are drawn anew for every attempt, so that time tells nothing. The second lift
+Heights, speeds, pauses and the time of listening are drawn for every attempt, so that time tells nothing. The second lift
 goes higher than the first, and a hand that leaves the pouch goes where it never was before: a policy with a memory of
 two seconds sees in what part of the task it is.
 """
@@ -51,7 +51,7 @@ class PouchExpert(Script):
         """Whether to lift the pouch again; asked once, when it was dropped and listened to."""
         return self.env.secrets["contents"] == "screws"
 
-    # One method per phase: it returns the displacement (3,) [m] and whether the fingers shall close.
+    # One method per phase: it returns the displacement (3,) [m] and whether the fingers close.
 
     def _approach(self):
         goal = self._over_pouch(self.hover_height)

@@ -90,7 +90,7 @@ def plate(substance: Substance, sides: tuple[float, float], thickness: float, mo
     wrong = [mode for mode in str(modes).split() or [""] if len(mode) != 2 or not mode.isalnum() or "0" in mode]
     if wrong:
         raise ValueError(
-            f"modes={modes!r}: {wrong[0]!r} is no mode. Write two digits for each, half waves along each side, a for 10, and "
+            f"modes={modes!r}: {wrong[0]!r} is not a mode. Write two digits for each, half waves along each side, a for 10, "
             "spaces between the modes, such as '11 12 2b'."
         )
     stiffness = substance.young / (12.0 * substance.density * (1.0 - substance.poisson**2))

@@ -3,7 +3,7 @@
 A blow is a half-sine pulse as long as Hertz's theory says: a hard and fast one is short and bright, a soft one long and dull.
 It rings the modes of both bodies (`modal`), a little differently wherever it falls. Friction rings them with noise, and hisses
 (`excitation`). A microphone hears what it is fixed to, what presses against that, and the rest through the air (`microphones`).
-Room, arm and hand are always there. Everything is drawn anew for every episode (`Draws`). What does not move is silent, and
+Room, arm and hand are always there. Everything is drawn for every episode (`Draws`). What does not move is silent, and
 nothing depends on the physics step but through the physics.
 """
 
@@ -219,7 +219,7 @@ class Synthesizer:
         self._own_weights = weights
 
 
-# Spreads of what is drawn anew for every episode; all are chosen. Factors in decibels or in octaves either way.
+# Spreads of what is drawn for every episode; all are chosen. Factors in decibels or in octaves either way.
 _PITCH_OCTAVES = 0.2  # of a body
 _MODE_OCTAVES = 0.04  # of each of its modes
 _DAMPING_OCTAVES = 0.6
@@ -307,7 +307,7 @@ def decibels(level):
 
 
 def _harmonics(amplitudes: tuple[float, ...], spread: np.ndarray) -> np.ndarray:
-    """Amplitudes of a tone's harmonics, mixed anew, of rms 1 together."""
+    """Amplitudes of a tone's harmonics, newly mixed, of rms 1 together."""
     mixed = np.array(amplitudes) * 2.0**spread
     return mixed * np.sqrt(2.0 / np.sum(mixed**2))
 

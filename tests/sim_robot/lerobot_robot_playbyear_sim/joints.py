@@ -17,7 +17,7 @@ JOINTS = ("shoulder.pos", "elbow.pos", "gripper.pos")
 @dataclass(kw_only=True)
 class JointArmConfig(RobotConfig):
     """Args:
-    cameras: Besides its own, `front`.
+    cameras: In addition to its own, `front`.
     """
 
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
