@@ -53,8 +53,8 @@ class AttachAudioConfig:
             such as `sound/{episode:06d}.wav`. WAV, FLAC, or a video whose sound track is read.
         session: One file with the sound of the whole session, instead of `files`. For microphones recorded as cameras: the
             folder of their session files, if these were moved.
-        clock: When each episode's first frame was taken [s]: CSV lines of episode and seconds, or JSON. None: the dataset's
-            `meta/playbyear_clock.json`.
+        clock: When each episode's first frame was taken [s]: CSV lines of episode and seconds, labels exported from Audacity,
+            or JSON. None: the dataset's `meta/playbyear_clock.json`.
         marks: Moments known both in the session's file and on that clock, such as a clap at the start and one at the end:
             `2.31=1754400000.12, 1802.74=1754401800.55`. None: the clock counts the seconds of the file.
         microphone: Name of the microphone: the column is `observation.audio.<microphone>`. For files with several channels: one

@@ -139,7 +139,7 @@ class ScriptedExpertConfig(ExpertConfig):
         if not self.person:
             for name in (each.name for each in fields(self) if getattr(self, each.name) != each.default):
                 raise InputError(
-                    f"--expert.{name}={getattr(self, name)} needs --expert.person=true: add that, or leave it out."
+                    f"--expert.{name}={getattr(self, name)} imitates a person: give --expert.person=true, or leave it out."
                 )
             return ScriptedExpert() if _SCRIPTS[0] in scripts else ScriptedDemonstrator()
         for name in ("reaction_s", "tremor", "tremor_s", "wrong_per_minute", "wrong_s", "seed"):
