@@ -53,8 +53,8 @@ class AttachAudioConfig:
             for example `sound/{episode:06d}.wav`. WAV, FLAC, or a film whose sound track is taken.
         session: One file with the sound of the whole session, in place of `files`; or, where a microphone was recorded as a
             camera, a folder with the files of its sessions, if these are not where the microphone left them.
-        clock: When each episode's first frame was taken [s]: a table (CSV) of episode and seconds, or JSON. None: the
-            dataset says so itself, in `meta/playbyear_clock.json`.
+        clock: When each episode's first frame was taken [s]: a table (CSV) of episode and seconds, labels exported from
+            Audacity, or JSON. None: the dataset says so itself, in `meta/playbyear_clock.json`.
         marks: Moments that are known in the session's file and on that clock, such as a clap at the start and one at the
             end: `2.31=1754400000.12, 1802.74=1754401800.55`. None: the clock's seconds are the file's.
         microphone: What the microphone is called: the column is `observation.audio.<microphone>`. For files of
@@ -418,10 +418,11 @@ def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], sc
         _new_rate(cfg, rate, dataset.fps)
     except (AudioFileError, ValueError) as error:
         raise AttachError(f"Nothing was written. {path}: {error}") from error
-    print(
-        f"{path}: its clock runs at {line.speed:.6f} of the episodes' clock ({(line.speed - 1) * 1e6:+.0f} parts in a "
-        f"million); the marks fit to {line.error_s * 1000:.1f} ms."
-    )
+    if cfg.marks is not None:
+        print(
+            f"{path}: its clock runs at {line.speed:.6f} of the episodes' clock ({(line.speed - 1) * 1e6:+.0f} parts in a "
+            f"million); the marks fit to {line.error_s * 1000:.1f} ms."
+        )
 
     def recording(episode: int) -> Recording:
         first_frame_s = line.sound_time(starts[episode]) + offsets[episode]
