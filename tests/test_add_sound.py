@@ -1,6 +1,6 @@
 """docs/tutorials/add_sound.md, as it stands there: a dataset of LeRobot's writer, and m4a files of a phone beside the robot.
 
-What is heard and seen was made up: taps whose times are known, and a voice that begins a little after each episode's first frame.
+What is heard and seen is made up: taps at known times, and a voice that begins a little after each episode's first frame.
 """
 
 import re
