@@ -264,6 +264,7 @@ def test_after_a_repair_the_times_are_those_of_the_same_episodes(tmp_path, monke
         "sep=;\r\nEpisode;Start, in s\r\n0;1,5\r\n1;20,000\r\n",
         "SEP=,\n0,1.5\n1,20\n",
         "sep=\t\nepisode\tstart; s\n0\t1,5\n1\t20\n",
+        "1.500000\t1.500000\tepisode 0\n20.000000\t20.000000\t\n",  # Audacity's labels
     ],
 )
 def test_a_table_of_times_may_come_from_a_spreadsheet(tmp_path, text, encoding):

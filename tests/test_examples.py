@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import runpy
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import pytest
 from dataset_factory import make_dataset
 from nbclient import NotebookClient
 from recording_factory import load
+from support.pages import ROOT, blocks
 
 from lerobot_playbyear.audio import read_audio
 from lerobot_playbyear.datasets import episode_waveform
@@ -125,14 +125,17 @@ def test_a_folder_of_films_becomes_a_dataset(run, tmp_path, capsys):
         np.testing.assert_array_equal(items[3]["action"].numpy(), [6, 7])
 
 
-def test_the_pages_programs_run(tmp_path, monkeypatch):
-    """Every Python block of docs/dataset.md, in a folder that holds the dataset of `make demo`."""
+def test_the_pages_programs_run(tmp_path, monkeypatch, capsys):
+    """Every Python block of two pages, in a folder that holds the datasets which they name."""
     monkeypatch.chdir(tmp_path)
-    make_dataset(tmp_path / "outputs/demo/dataset", (12,), image_size=16, repo_id="demo/occluded")
-    page = (EXAMPLES.parent / "docs" / "dataset.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
-    assert len(blocks) == 4
-    for block in blocks:
-        exec(compile(block, "docs/dataset.md", "exec"), {})
+    for root in ("outputs/demo/dataset", "outputs/occluded"):
+        make_dataset(tmp_path / root, (12,), image_size=16, repo_id="demo/occluded")
+    pages = {"reference/dataset_format.md": 4, "how_to/inspect_repair_hub.md": 1}
+    for name, n_blocks in pages.items():
+        programs = blocks(ROOT / "docs" / name, "python")
+        assert len(programs) == n_blocks
+        for program in programs:
+            exec(compile(program, name, "exec"), {})
+    assert capsys.readouterr().out.startswith("info []")
     assert read_audio("episode_0.flac")[0].shape == (12 * 800, 1)
     assert load(tmp_path / "outputs/knocks").num_frames == 60

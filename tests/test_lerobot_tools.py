@@ -66,7 +66,7 @@ def test_deleting_episodes_costs_a_few_bytes(tmp_path):
     edit(tmp_path / "ours", tmp_path / "left", "delete_episodes", "--operation.episode_indices=[0]")
     before, after = (sum(p.stat().st_size for p in (tmp_path / name).glob("data/*/*")) for name in ("ours", "left"))
     assert before / (400 * 800) < 1.1
-    assert after / (200 * 800) < 1.2 * before / (400 * 800), "more than docs/dataset.md says"
+    assert after / (200 * 800) < 1.2 * before / (400 * 800), "more than docs/reference/dataset_format.md says"
 
 
 def test_a_dataset_is_split_and_merged_again(original, tmp_path):

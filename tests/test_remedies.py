@@ -185,5 +185,5 @@ def test_statistics_that_lerobot_rounds_are_no_fault(tmp_path, value, length):
 
 
 def test_the_pages_advise_the_same():
-    page = " ".join((Path(__file__).parents[1] / "docs/dataset.md").read_text().split())
+    page = " ".join((Path(__file__).parents[1] / "docs/reference/dataset_format.md").read_text().split())
     assert f"`{recompute_command(Path('outputs/heard'))}`".replace("local/", "me/") in page

@@ -430,8 +430,9 @@ def test_what_is_no_whole_dataset_is_named_as_such(copy, tmp_path):
         (tmp_path / name).unlink()
 
 
-def test_the_command_looks_and_repairs(copy, capsys):
-    root = copy("killed")
+def test_the_command_looks_and_repairs(copy, capsys, monkeypatch):
+    monkeypatch.chdir(copy("killed").parent)
+    root = Path("dataset")  # what is said names places as they were given
     assert run_in_process(repair_command, f"--root={root}", "--dry_run=true") == 1
     assert "it is damaged" in capsys.readouterr().out
     assert run_in_process(repair_command, f"--root={root}") == 0

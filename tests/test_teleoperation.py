@@ -203,7 +203,7 @@ def test_the_keys_are_lerobots_and_the_page_and_the_panel_say_what_they_do():
     arrows = {"up", "down", "left", "right"}
     names = {"escape": "esc", **dict.fromkeys(arrows, "arrows")}
     assert {names.get(name, name) for name in (*TAKEN, *MOVES, OVERRIDE)} == letters
-    page = (Path(__file__).parents[1] / "docs/teleoperation.md").read_text()
+    page = (Path(__file__).parents[1] / "docs/how_to/record.md").read_text()
     for label, meaning in KEYS.items():
         assert f"| {label} | {meaning} |" in page
     window = Screenless()

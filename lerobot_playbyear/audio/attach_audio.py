@@ -417,10 +417,11 @@ def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], sc
         _new_rate(cfg, rate, dataset.fps)
     except (AudioFileError, ValueError) as error:
         raise AttachError(f"Nothing was written. {path}: {error}") from error
-    print(
-        f"{path}: its clock runs at {line.speed:.6f} of the episodes' clock ({(line.speed - 1) * 1e6:+.0f} parts in a "
-        f"million); the marks fit to {line.error_s * 1000:.1f} ms."
-    )
+    if cfg.marks is not None:
+        print(
+            f"{path}: its clock runs at {line.speed:.6f} of the episodes' clock ({(line.speed - 1) * 1e6:+.0f} parts in a "
+            f"million); the marks fit to {line.error_s * 1000:.1f} ms."
+        )
 
     def recording(episode: int) -> Recording:
         first_frame_s = line.sound_time(starts[episode]) + offsets[episode]

@@ -100,7 +100,8 @@ def read_clock(path: str | Path) -> dict[int, float]:
     Args:
         path: JSON, as `CLOCK_PATH` or `{"0": 12.5}`, or a list in the order of the episodes. Any other name: a table
             (CSV) with two columns, episode and seconds, and perhaps a line of names above, as spreadsheets of any language
-            save it: with a mark of the byte order or `sep=` first, in UTF-16, with decimal commas.
+            save it: with a mark of the byte order or `sep=` first, in UTF-16, with decimal commas. Or labels that Audacity
+            exports, one per episode in their order: beginning, end and text of each, with tabs between them.
 
     Raises:
         ClockError: It holds something else.
@@ -138,6 +139,8 @@ def _from_table(path: Path) -> dict[int, float]:
     short = [line for line in lines if len(line) < 2]
     if short:
         raise ClockError(f"{path}: a line is {','.join(short[0])!r}; wanted episode and seconds, such as 0,12.5.")
+    if separator == "\t" and all("." in line[0] for line in lines):  # labels: no episode's number has a point
+        return _numbered(path, [(episode, line[0]) for episode, line in enumerate(lines)])
     return _numbered(path, [(line[0], line[1]) for line in lines])
 
 

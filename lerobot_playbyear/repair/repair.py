@@ -132,8 +132,8 @@ def repair_dataset(root: str | Path, target: str | Path | None = None, like: Pat
     root = Path(root)
     if not (root / JOURNAL).exists():
         check_there(root)  # before anything is written there, if only a lock
-    real = root.absolute()
-    target = Path(target) if target is not None else real.with_name(f"{real.name}_repaired")
+    named = root if root.name else root.absolute()
+    target = Path(target) if target is not None else named.with_name(f"{named.name}_repaired")
     with locked(root) as is_locked:
         if is_locked:
             finish_journal(root)
