@@ -1,9 +1,16 @@
-"""The results as tables in Markdown: `python -m experiments.report`."""
+"""The results as tables in Markdown: `python -m experiments.report`.
 
+With `--write` they replace those in `docs/learning_log.md`; `tests/test_figures.py` says where the two differ.
+"""
+
+import argparse
+import re
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 from experiments.corrections import load_corrections
+from experiments.interactive import STUDY as INTERACTIVE
 from experiments.others import STUDY as OTHERS
 from experiments.others import OtherResult
 from experiments.protocol import (
@@ -22,13 +29,17 @@ from experiments.protocol import (
     wilson_interval,
 )
 
+LOG = Path(__file__).parents[1] / "docs/learning_log.md"
+BEGIN, END = "<!-- results: begin -->\n", "<!-- results: end -->"
+
 
 def table(head: str, rows: list[str], title: str = "") -> list[str]:
-    """A table, with a heading or without; nothing where there are no rows."""
+    """A table without blanks beside its bars, with a heading or without; nothing where there are no rows."""
     if not rows:
         return []
     heading = [f"### {title}", ""] if title else []
-    return [*heading, head, "|---" * (head.count("|") - 1) + "|", *rows, ""]
+    lines = [head, "|---" * (head.count("|") - 1) + "|", *rows]
+    return [*heading, *(re.sub(r" *\| *", "|", line) for line in lines), ""]
 
 
 def interval(n_successes: int, n: int) -> str:
@@ -52,10 +63,10 @@ def acted_early(results: list[Result]) -> str:
 def ablation_table(task: str) -> list[str]:
     rows = []
     found = [(condition, load_results(f"ablations/{task}-{condition}-*.json")) for condition in CONDITIONS]
-    for name, variant in PRESETS_OF_BEFORE.items():
+    for name, variant in EARLIER_PRESETS.items():
         for condition in ("full", "deaf"):
             results = load_results(f"presets/{task}-{condition}-{variant}-*.json")
-            found.append((f"{condition}, preset of before: {name}", results))
+            found.append((f"{condition}: {name}", results))
     for condition, trained in found:
         for steps in sorted({result.steps for result in trained}):
             results = [result for result in trained if result.steps == steps]
@@ -84,30 +95,31 @@ def _updates(results: list[Result]) -> str:
     return "" if steps == STEPS or results[0].task in TASKS else f", {steps} updates"
 
 
-PRESETS_OF_BEFORE = {
-    "up to 18 dB of noise in training": "quieter_noise",
-    "larger shifts and offset": "larger_shifts",
+EARLIER_PRESETS = {
+    "noise up to 18 dB": "quieter_noise",
+    "and larger shifts and offset": "larger_shifts",
     "and ways told however far": "far_way",
-    "and without `auxiliary_way`": "no_way",
-    "twice the noise on the arm": "twice_the_noise",
-    "twice the noise on the arm, action range 1": "action_range_1_twice_the_noise",
-    "no readers, no envelope": "no_readers_no_envelope",
-    "no readers, no envelope, and an expert whose hops do not miss": "no_readers_no_envelope_plain_expert",
-    "an expert whose hops miss and are mended": "missing_hops",
-    "no envelope, and an expert that hops more slowly": "no_envelope_slower_expert",
-    "envelope times 3": "envelope",
-    "steps of 35 ms": "hop_35ms",
-    "and without `auxiliary_onset`": "no_onset",
+    "and no `auxiliary_way`": "no_way",
+    "and twice the noise on the arm": "twice_the_noise",
+    "and twice the noise on the arm, action range 1": "action_range_1_twice_the_noise",
+    "and no readers, no envelope": "no_readers_no_envelope",
+    "and no readers, no envelope, an expert whose hops do not miss": "no_readers_no_envelope_plain_expert",
+    "and an expert whose hops miss and are mended": "missing_hops",
+    "and no envelope, an expert that hops more slowly": "no_envelope_slower_expert",
+    "and envelope times 3": "envelope",
+    "and steps of 35 ms": "hop_35ms",
+    "and no `auxiliary_onset`": "no_onset",
 }
+"""The latest first, by the names of their files."""
 CURVES = {
     "noise": "noise",
-    "noise-quieter_noise": "noise, trained with noise up to 18 dB above the recordings' own floor",
-    "noise-recorded_noise": "noise, trained with recordings besides, 4,000 updates",
+    "noise-quieter_noise": "noise, trained with up to 18 dB",
+    "noise-recorded_noise": "noise, trained with recordings too, 4,000 updates",
     "noise-no_noise": "noise, trained without noise in the sound",
     "noise_white": "noise, trained with white noise up to the recordings' own floor",
     "materials": "materials",
-    "rooms": "noise of kinds and microphones of responses that no training had",
-    "rooms-recorded_noise": "the same, trained with recordings of other kinds besides, 4,000 updates",
+    "rooms": "kinds of noise and microphones that no training had",
+    "rooms-recorded_noise": "the same, trained with recordings of other kinds, 4,000 updates",
 }
 
 
@@ -152,7 +164,7 @@ def demonstration_table(task: str) -> list[str]:
         rows.append(f"| {n} | {' | '.join(percent(of) if of else ' | ' for of in found)} |")
     head = "| demonstrations | full | training seeds | deaf | training seeds |"
     quieter = any((RESULTS / "demonstrations-quieter_noise").glob(f"{task}-*.json"))
-    noise = ", full policies with up to 18 dB of noise in training" if quieter else ""
+    noise = ", full policies trained with up to 18 dB" if quieter else ""
     return table(head, rows, f"{task}: demonstrations{noise}")
 
 
@@ -196,6 +208,58 @@ def _mean_of_seeds(rates: list[float]) -> str:
     """The mean, and in brackets the rate of each training seed."""
     mean = f"**{sum(rates) / len(rates):.0f} %**"
     return mean if len(rates) == 1 else f"{mean} ({', '.join(f'{rate:.0f}' for rate in rates)})"
+
+
+def interactive_tables(task: str) -> list[str]:
+    """Methods of correction: success before and after each round, what the expert spent, and what controls bring."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for path in sorted((RESULTS / INTERACTIVE).glob(f"{task}-*.json")):
+        study = load(path)
+        first, *rounds = study["outcomes"]
+        controls = (_control(name, control, first) for name, control in study["controls"].items())
+        cells = (
+            *(study["method"], study["training_seed"], _of_each(study["outcomes"], "success", ".0f")),
+            *(_of_each(rounds, name, form) for name, form in _SPENT.items()),
+            "; ".join(filter(None, [_contents(first), _contents(rounds[-1]), rounds[-1]["failures"]])),
+            "; ".join(filter(None, controls)),
+        )
+        options = "".join(f", `{option}`" for option in study["training_options"])
+        title = f"{task}: corrections of policies of {first['n_demonstrations']} demonstrations{options}"
+        groups[title].append(f"| {' | '.join(map(str, cells))} |")
+    names = " | ".join(name.replace("_", " ") for name in _SPENT)
+    head = f"| `--method` | seed | success | {names} | failures | instead |"
+    return [line for title, rows in groups.items() for line in table(head, rows, title)]
+
+
+_SPENT = {
+    "updates": ",",
+    "kept": "",
+    "attempts": "",
+    "expert_steps": ",",
+    "switches": "",
+    "autonomy": ".0%",
+    "person_seconds": ",.0f",
+}
+"""What each round took, and how it is written."""
+
+
+def _of_each(outcomes: list[dict[str, Any]], name: str, form: str) -> str:
+    """A figure of each outcome; empty where nobody counted."""
+    figures = [outcome.get(name, 0) for outcome in outcomes]
+    return "; ".join(f"{figure:{form}}" for figure in figures) if any(figures) else ""
+
+
+def _contents(outcome: dict[str, Any]) -> str:
+    return str(outcome.get("by_contents", ""))
+
+
+def _control(name: str, control: dict[str, Any], first: dict[str, Any]) -> str:
+    """What as many updates, or as many of the expert's steps in further demonstrations, brought; empty if it is the first."""
+    further = control["n_demonstrations"] - first["n_demonstrations"]
+    if not further and control["updates"] == first["updates"]:
+        return ""
+    what = f"{further} further demonstrations ({control['expert_steps']:,} steps)" if further else "none"
+    return f"{what}, {control['updates']:,} updates: {control['success']:.0f}"
 
 
 def run_length_table(task: str) -> list[str]:
@@ -242,15 +306,32 @@ def _order(item: tuple[str, list[Result]]) -> tuple[float, str]:
         return 0.0, item[0]
 
 
-def main() -> None:
+def report() -> str:
+    """All tables, in one text."""
     tasks = NEW_TASKS + TASKS
     lines = [line for task in tasks for line in ablation_table(task)] + sightless_table() + listening_table()
     for task in tasks:
         lines += demonstration_table(task)
         for study in CURVES:
             lines += curve_table(study, task)
-        lines += others_table(task) + run_length_table(task) + correction_tables(task)
-    print("\n".join(lines))
+        lines += others_table(task) + run_length_table(task) + correction_tables(task) + interactive_tables(task)
+    return "\n".join(lines)
+
+
+def in_log() -> str:
+    """The tables as the log has them."""
+    return LOG.read_text().partition(BEGIN)[2].partition(END)[0]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help=f"into {LOG.name} instead of to the terminal")
+    tables = report()
+    if parser.parse_args().write:
+        before, begin, rest = LOG.read_text().partition(BEGIN)
+        LOG.write_text(before + begin + tables + END + rest.partition(END)[2])
+    else:
+        print(tables)
 
 
 if __name__ == "__main__":
