@@ -1,4 +1,4 @@
-"""The table of who solves which task without hearing, in docs/adversaries.md: `python -m experiments.adversary_table`.
+"""The table of who solves which task without hearing, beside the results: `python -m experiments.adversary_table`.
 
 It is made of the results in experiments/results/adversaries: those of `python -m gym_playbyear.check TASK`
 (`TASK-check.json`) and those of `python -m experiments.adversaries` (`TASK-deaf-...json`, `TASK-hears-...json`).
@@ -11,7 +11,7 @@ import gym_playbyear
 from experiments.protocol import RESULTS, load
 
 FOLDER = RESULTS / "adversaries"
-PAGE = Path(__file__).parent.parent / "docs" / "adversaries.md"
+PAGE = FOLDER / "README.md"
 BEGIN, END = "<!-- table of adversaries -->\n", "<!-- end of the table -->\n"
 NOT_RUN, NOT_THERE = "not run", ""
 _LEARNED = {"deaf": "learned, deaf", "hears": "learned, hears"}

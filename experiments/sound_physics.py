@@ -2,7 +2,7 @@
 
     python -m experiments.sound_physics
 
-measures small MuJoCo scenes (`experiments.sound_scenes`), prints the table of docs/sound.md, and writes
+measures small MuJoCo scenes (`experiments.sound_scenes`), prints the table and writes it to
 `experiments/results/sound/physics.csv`. `tests/test_sound.py` asserts every row.
 """
 

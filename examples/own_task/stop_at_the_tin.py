@@ -44,6 +44,7 @@ def stop_at_the_tin() -> Task:
         success=Success(is_near, "tin", seconds=0.5, tolerance=0.003),
         terminations=(Shoved("tin", distance=0.03),),
         expert=Expert,
+        blind={"middle": StopInTheMiddle},
         horizon=200,
         start=(0.0, -0.25, 0.9),
     )
@@ -55,13 +56,13 @@ def place(env, options) -> dict:
     return {"hidden_range": RANGE}
 
 
-def gap(env) -> float:
-    """Between finger and tin [m]."""
-    return float(env.position("tin")[1] - env.eef_position[1]) - env.definition.arm.max_opening / 2 - 0.01 - RADIUS
+def gap(env, y: float) -> float:
+    """Between the finger and a tin whose middle is at y [m]."""
+    return y - env.eef_position[1] - env.definition.arm.max_opening / 2 - 0.01 - RADIUS
 
 
 def is_near(env) -> bool:
-    return env.eef_position[2] < TABLE_TOP + 2 * HALF_HEIGHT and gap(env) < NEAR
+    return env.eef_position[2] < TABLE_TOP + 2 * HALF_HEIGHT and gap(env, env.position("tin")[1]) < NEAR
 
 
 class Expert:
@@ -75,9 +76,19 @@ class Expert:
         back = np.array([-x, 0.0, TABLE_TOP + SWEEP_HEIGHT - z])
         if self.phase == "lower" and abs(back[2]) < 0.005:
             self.phase = "sweep"
-        if self.env.contact_forces["gripper-tin"] > 0.1:
+        if self.is_there():
             self.phase = "stop"
         move = np.clip(0.5 * back, -0.02, 0.02) + np.array([0, 0.008 if self.phase == "sweep" else 0, 0])
         if self.phase != "stop":
             move += self.env.expert_rng.uniform(-0.002, 0.002, 3)
         return np.append(move / ACTION_SCALE, -1.0).astype(np.float32)
+
+    def is_there(self) -> bool:
+        return self.env.contact_forces["gripper-tin"] > 0.1
+
+
+class StopInTheMiddle(Expert):
+    """Blind: sweeps like the expert, and stops where a tin in the middle of the range would be."""
+
+    def is_there(self) -> bool:
+        return gap(self.env, np.mean(RANGE)) < 0
