@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 from dataclasses import fields
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -56,39 +55,35 @@ def test_a_pages_commands_are_read_and_made_small(tmp_path):
     assert ran[2] == (("lerobot-y", "--steps=3"), {"A": "b"})
 
 
-def run(*words: str, environment: dict[str, str] | None = None) -> None:
-    """A command in a process that has nothing of the tests."""
-    programs = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    own = {**os.environ, "PATH": programs, "OMP_NUM_THREADS": "1", **(environment or {})}
-    done = subprocess.run(words, env=own, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
-    assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout[-3000:]}"
-
-
-PYTHON = partial(run, sys.executable)
+def python(*words: str) -> None:
+    """A program in a process of its own."""
+    subprocess.run([sys.executable, *words], check=True)
 
 
 @pytest.mark.slow
 def test_the_first_policy_in_simulation(commands, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     small = {**SMALL, "--episodes": 1}
-    run_page(commands.succeed, TUTORIALS / "simulation.md", small, {"pip": installs, "python": PYTHON})
+    run_page(commands.succeed, TUTORIALS / "simulation.md", small, {"pip": installs, "python": python})
     for made in ("occluded.html", "rollout.mp4", "eval/eval_info.json", "eval_deaf/eval_info.json"):
         assert (tmp_path / "outputs" / made).stat().st_size > 0
 
 
 @pytest.mark.slow
-def test_a_task_of_ones_own_and_act_and_diffusion_on_it(tmp_path, monkeypatch):
+def test_a_task_of_ones_own_and_act_and_diffusion_on_it(commands, tmp_path, monkeypatch):
     pytest.importorskip("diffusers")
-    page, site = TUTORIALS / "own_task.md", tmp_path / "site"
+    site = tmp_path / "site"
+    path = os.pathsep.join([str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]))
-    own = {"pip": lambda _, folder: install_example(Path(folder).name, site), "python": PYTHON}
-    run_page(run, page, {**SMALL, "--episodes": 4}, own)
-    for made in (
-        "tin.mp4",
-        "tin_check.json",
-        *(f"tin{which}_eval/eval_info.json" for which in ("", "_act", "_diffusion")),
-    ):
+    monkeypatch.setenv("PYTHONPATH", path)
+
+    def run(*words: str, environment: dict[str, str]) -> None:
+        commands.succeed(*words, environment={**environment, "PYTHONPATH": path})
+
+    own = {"pip": lambda _, folder: install_example(Path(folder).name, site), "python": python}
+    run_page(run, TUTORIALS / "own_task.md", {**SMALL, "--episodes": 4}, own)
+    results = [f"tin{which}_eval/eval_info.json" for which in ("", "_act", "_diffusion")]
+    for made in ("tin.mp4", "tin_check.json", *results):
         assert (tmp_path / "outputs" / made).stat().st_size > 0
 
 

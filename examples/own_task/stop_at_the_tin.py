@@ -10,12 +10,12 @@ of them.
 
 import numpy as np
 
-from gym_playbyear.panda import ACTION_SCALE, Panda
+from gym_playbyear.panda import ACTION_SCALE, FINGER_FRICTION, Panda
 from gym_playbyear.sound.materials import TINPLATE, cup, ringing
 from gym_playbyear.sound.microphones import Microphone
 from gym_playbyear.task import Prop, Task
 from gym_playbyear.tasks.arena import FRONT_CAMERA, TABLE, TABLE_TOP, WALL_COLOUR, box
-from gym_playbyear.terminations import Shoved, Success
+from gym_playbyear.terminations import Pressed, Shoved, Success
 
 RADIUS, HALF_HEIGHT = 0.025, 0.025  # m
 TIN_CAN = ringing(TINPLATE, cup(TINPLATE, RADIUS, 0.0003, (2, 3, 4, 5)), support=30.0)
@@ -42,7 +42,7 @@ def stop_at_the_tin() -> Task:
         cameras=(FRONT_CAMERA,),
         initialize_episode=place,
         success=Success(is_near, "tin", seconds=0.5, tolerance=0.003),
-        terminations=(Shoved("tin", distance=0.03),),
+        terminations=(Shoved("tin", distance=0.03), Pressed("tin", 5.0, FINGER_FRICTION)),
         expert=Expert,
         blind={"middle": StopInTheMiddle},
         horizon=200,
@@ -62,7 +62,7 @@ def gap(env, y: float) -> float:
 
 
 def is_near(env) -> bool:
-    return env.eef_position[2] < TABLE_TOP + 2 * HALF_HEIGHT and gap(env, env.position("tin")[1]) < NEAR
+    return env.eef_position[2] < TABLE_TOP + 2 * HALF_HEIGHT and abs(gap(env, env.position("tin")[1])) < NEAR
 
 
 class Expert:

@@ -94,7 +94,7 @@ class Commands:
         Args:
             arguments: Its name and its options.
             fresh: Whether it begins without anything from the Hub in its caches.
-            environment: For this command alone.
+            environment: For this command alone. It also finds distributions, with their tasks, on a `PYTHONPATH` in it.
             kill_when: The command is killed when this becomes true.
         """
         for name in ("hub", "lerobot") if fresh else ():
@@ -251,6 +251,9 @@ def _run(arguments: list[str], environment: dict[str, str], folder: str, output:
     status = 0
     os.environ.update(environment)
     os.chdir(folder)
+    if "PYTHONPATH" in environment:
+        sys.path[:0] = environment["PYTHONPATH"].split(os.pathsep)
+        importlib.import_module("gym_playbyear").register_tasks()
     with output.open("w") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
