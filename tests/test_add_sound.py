@@ -5,7 +5,6 @@ What is heard and seen is made up: taps at known times, and a voice that begins 
 
 import re
 import shutil
-from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,9 +14,11 @@ import numpy as np
 import pytest
 from dataset_factory import CAMERA, dataset_features, make_dataset
 from recording_factory import load
-from support.pages import ROOT, commands_of
+from support.pages import ROOT, run_page
 
 from lerobot_playbyear.datasets import episode_waveform
+
+pytestmark = pytest.mark.slow
 
 PAGE = ROOT / "docs/tutorials/add_sound.md"
 FPS, RATE = 30, 48000
@@ -84,20 +85,13 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def walked(folder, commands) -> tuple[Path, list[str], Callable[[], Any]]:
-    """The folder after all commands but the training, what they printed, and the training."""
-    said, train = [], None
+def said(folder, commands) -> list[str]:
+    """What the page's commands printed, with which its folder is left."""
+    small = {"--steps": 2, "--marks": "2.31=1754400002.3077, 27.3=1754400027.2727"}
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for words in commands_of(PAGE, {"--steps": 2, "--marks": "2.31=1754400002.3077, 27.3=1754400027.2727"}):
-            if words[0] == "playbyear-train":
-                train = words
-            elif words[0] == "rm":
-                shutil.rmtree(words[-1])
-            else:
-                said.append(commands.succeed(*words).output)
-    assert train is not None
-    return folder, said, lambda: commands.succeed(*train)
+        results = run_page(commands.succeed, PAGE, small, own={"rm": lambda _, path: shutil.rmtree(path)})
+    return [result.output for result in results if result is not None]
 
 
 def delay_ms(said: str) -> int:
@@ -106,8 +100,7 @@ def delay_ms(said: str) -> int:
     return int(found[1]) * (1 if found[2] == "after" else -1)
 
 
-def test_sound_of_files_fits_the_pictures_after_the_pages_two_rounds(walked):
-    folder, said, _ = walked
+def test_sound_of_files_fits_the_pictures_after_the_pages_two_rounds(folder, said):
     first, second = (text for text in said if "sound and picture" in text)
     assert delay_ms(first) == pytest.approx(-1000 * VOICE_S, abs=8)
     assert delay_ms(second) == pytest.approx(0, abs=8)
@@ -115,8 +108,7 @@ def test_sound_of_files_fits_the_pictures_after_the_pages_two_rounds(walked):
     assert load(folder / "outputs/demos_with_sound").features[KEY]["info"]["sample_rate"] == 15990
 
 
-def test_labels_and_a_clock_place_the_sound_of_a_session(walked):
-    folder, said, _ = walked
+def test_labels_and_a_clock_place_the_sound_of_a_session(folder, said):
     assert sum("the marks fit to" in text for text in said) == 1, "without marks nothing is said of them"
     by_label, by_clock = (load(folder / f"outputs/demos_{name}") for name in ("of_day", "by_clock"))
     for episode in range(3):
@@ -126,9 +118,5 @@ def test_labels_and_a_clock_place_the_sound_of_a_session(walked):
             assert loud[loud > 1][0] == pytest.approx(TAPS_S[0] + 0.07 * episode - late_s, abs=0.003)
 
 
-@pytest.mark.slow
-def test_a_policy_trains_on_it(walked, monkeypatch):
-    folder, _, train = walked
-    monkeypatch.chdir(folder)
-    train()
+def test_a_policy_trains_on_it(folder, said):
     assert (folder / "outputs/train/demos_with_sound/checkpoints/last/pretrained_model/model.safetensors").is_file()
