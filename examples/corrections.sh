@@ -14,7 +14,8 @@ lerobot-rollout --strategy.type=dagger --strategy.record_autonomous=true --polic
 
 playbyear-attach-audio --dataset.repo_id=me/rollout_corrections --dataset.root="$folder/corrections"
 
-playbyear-dagger --num_episodes=0 --steps="${STEPS:-1000}" --policy.path="$POLICY" --output_dir="$folder/dagger" \
+playbyear-dagger --num_episodes=0 --steps="${STEPS:-1250}" --new_weights=true --batch_size=12 \
+  --policy.path="$POLICY" --output_dir="$folder/dagger" \
   --dataset.repo_id=me/demos_with_sound --dataset.root="$DEMOS" \
   --interventions.repo_id=me/rollout_corrections_with_sound --interventions.root="$folder/corrections_with_sound"
 

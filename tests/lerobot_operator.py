@@ -181,7 +181,35 @@ class Corrections:
         return "space" if self._came_from == "correcting" else "tab"
 
 
-Operator = Episodes | Corrections
+class Watches:
+    """For commands that need no keys, such as `lerobot-rollout`: sets a scene up, and lets it be.
+
+    Args:
+        socket: Of the simulation.
+        ends_after_s: How long `lerobot-teleoperate` moves the arm until Ctrl+C ends it; None: a command ends by itself.
+    """
+
+    def __init__(self, socket: str, ends_after_s: float | None = None) -> None:
+        self._link, self._ends_after_s = Link(socket), ends_after_s
+        self._deadline: float | None = None
+        self.outcomes: list[Outcome] = []
+
+    def prepare(self) -> None:
+        self._link.ask("reset", seed=200)
+
+    def hears(self, line: str) -> str | None:
+        if self._ends_after_s is not None and self._deadline is None and "Teleop loop time" in line:
+            self._deadline = time.monotonic() + self._ends_after_s
+        return None
+
+    def looks(self) -> str | None:
+        if self._deadline is None or time.monotonic() < self._deadline:
+            return None
+        self._deadline = float("inf")
+        return "ctrl-c"
+
+
+Operator = Episodes | Corrections | Watches
 """Each prepares before the command begins, hears its lines and looks at the arm, and may return a key then."""
 
 
@@ -242,7 +270,10 @@ class Terminal:
         return lines
 
     def press(self, key: str) -> None:
-        os.write(self._ours, KEYS[key])
+        if key == "ctrl-c":
+            os.killpg(self.process.pid, signal.SIGINT)
+        else:
+            os.write(self._ours, KEYS[key])
 
     def close(self) -> int:
         """Ends the command if it still runs, and returns its exit status."""
