@@ -35,6 +35,8 @@ def named(page: Path) -> list[list[str]]:
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_the_options_in_a_pages_commands_exist(page):
     for command, *options in named(page):
+        if options == ["--help"]:
+            continue
         listed = {**LISTED[command], "required": []} if "..." in options else LISTED[command]
         given = [option for option in options if option != "..."]
         if command == "playbyear-train":
