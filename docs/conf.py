@@ -8,6 +8,7 @@ author = "The lerobot-playbyear authors"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_title = project
+html_static_path = html_css_files = ["site.css"]
 exclude_patterns = ["media"]
 
 myst_heading_anchors = 4  # as GitHub makes them

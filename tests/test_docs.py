@@ -35,8 +35,10 @@ def named(page: Path) -> list[list[str]]:
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_the_options_in_a_pages_commands_exist(page):
     for command, *options in named(page):
-        listed = {**LISTED[command], "required": []} if {"...", "--help"} & {*options} else LISTED[command]
-        given = [option for option in options if option not in ("...", "--help")]
+        if options == ["--help"]:
+            continue
+        listed = {**LISTED[command], "required": []} if "..." in options else LISTED[command]
+        given = [option for option in options if option != "..."]
         if command == "playbyear-train":
             given = apply_preset([option.replace("--store=", "--store.place=") for option in given])
         assert find_mistake(given, listed, LISTED["policies"]) is None, " ".join([command, *options])

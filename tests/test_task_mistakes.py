@@ -55,7 +55,10 @@ def with_piece(**traits: Any) -> Callable[..., Task]:
         (with_piece(material="steel"), r"material='steel' is not known: .*There is bag, .*cardboard"),
         (with_piece(material=WOOD), r"material=Substance\(.* is not known: .*There is bag"),
         # Rules that are none
-        (made(success=lambda env: True), r"success has <function .*not an instance of .*Success: write Success\(\.\.\.\)"),
+        (
+            made(success=lambda env: True),
+            r"success has <function .*not an instance of .*Success: write Success\(\.\.\.\)",
+        ),
         (made(success=Success), r"success has <class .*write Success\(\.\.\.\)"),
         (
             made(occluded_grasp, terminations=(Groped(), Wrong)),
