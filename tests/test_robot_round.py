@@ -131,7 +131,7 @@ def test_other_policies_hear_as_their_page_says(robot, walked):
 
 
 def test_demonstrations_of_failed_scenes_are_appended_as_the_page_has_it(robot, walked):
-    few = {"--preset": "cpu", "--steps": 4, "--dataset.num_episodes": 1}
+    few = {"--steps": 4, "--dataset.num_episodes": 1}
     page = commands("tutorials/improve.md", few)
     for words in page[[words[0] for words in page].index("lerobot-record") :]:
         robot.run(words)
