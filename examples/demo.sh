@@ -40,9 +40,10 @@ else
 fi
 
 step "3/5 Evaluate on $EVAL_EPISODES seeds that it has not seen"
+rm -f "$DEMO_DIR/eval/attempts.jsonl"  # to which evaluations append
 run lerobot-eval --policy.path="$checkpoint" --env.type=playbyear --env.task="$TASK" \
   --eval.n_episodes="$EVAL_EPISODES" --eval.batch_size=10 --eval.use_async_envs=false \
-  --seed="$EVAL_SEED" --output_dir="$DEMO_DIR/eval"
+  --env.attempts_file="$DEMO_DIR/eval/attempts.jsonl" --seed="$EVAL_SEED" --output_dir="$DEMO_DIR/eval"
 
 step "4/5 What the best of those who cannot hear does on the same seeds"
 run python -m gym_playbyear.check "$TASK" --seed="$EVAL_SEED" --episodes="$EVAL_EPISODES" --players expert blind --no-twin \
@@ -59,11 +60,16 @@ from pathlib import Path
 
 folder = Path(sys.argv[1])
 policy = json.loads((folder / "eval/eval_info.json").read_text())["overall"]
+attempts = [json.loads(line) for line in (folder / "eval/attempts.jsonl").read_text().splitlines()]
+attempts = sorted(attempts, key=lambda attempt: attempt["seed"])[: policy["n_episodes"]]
+early = [attempt["acted_early"] for attempt in attempts if "acted_early" in attempt]
 rows = json.loads((folder / "blind_floor.json").read_text())["rows"]
 blind = {row["name"]: row["successes"] / row["n_episodes"] for row in rows}
 expert = blind.pop("expert")
 name, rate = max(blind.items(), key=lambda item: item[1])
 print(f"Success of the policy, {policy['n_episodes']} unseen seeds: {policy['pc_success']:.0f} %")
+if early:
+    print(f"Acted before anything was heard, in:         {100 * sum(early) / len(early):.0f} %")
 print(f"Success of the best blind script ({name}):     {100 * rate:.0f} %")
 print(f"Success of the expert, who feels contact:    {100 * expert:.0f} %")
 print(f"Film with sound: {(folder / 'rollout.mp4').resolve()}")

@@ -164,7 +164,7 @@ def gives(monkeypatch):
     rates: list[float] = []
 
     def evaluate(*_):
-        return {"overall": {"pc_success": rates.pop(0), "n_episodes": 1}}
+        return {"overall": {"pc_success": rates.pop(0), "pc_acted_early": 7.5, "n_episodes": 1}}
 
     monkeypatch.setattr(Learner, "evaluate", evaluate)
     return rates
@@ -216,7 +216,8 @@ def test_the_policy_that_a_run_began_with_may_be_the_best_and_other_episodes_are
     assert f"Best:        30.0 % of them: {state(tmp_path)['policy_path']}" in capfd.readouterr().out
     gives += [40]
     command("--resume=true", f"--output_dir={tmp_path / 'out'}", "--eval.n_episodes=2")
-    assert "Success:     40.0 % of 2 episodes" in capfd.readouterr().out
+    printed = "Success:     40.0 % of 2 episodes\nEarly:       7.5 % of them acted before anything was heard\n"
+    assert printed in capfd.readouterr().out
     assert [line["pc_success"] for line in metrics(tmp_path, "eval")] == [30, 20, 40]
 
 

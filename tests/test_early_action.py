@@ -2,6 +2,7 @@
 
 import copy
 import json
+import logging
 
 import numpy as np
 import pytest
@@ -59,9 +60,9 @@ def test_a_hand_that_moves_on_while_the_pouch_falls_was_early(sideways, early):
     assert env._early_action.acted_early is False
 
 
-def vector_env(path, **options):
-    config = PlaybyearEnvConfig(task="OccludedGrasp-v1", episode_length=3, attempts_file=str(path), **options)
-    return config.create_envs(2)["playbyear"][0]
+def vector_env(path=None, use_async_envs=False):
+    config = PlaybyearEnvConfig(task="OccludedGrasp-v1", episode_length=3, attempts_file=path and str(path))
+    return config.create_envs(2, use_async_envs)["playbyear"][0]
 
 
 def test_every_attempt_leaves_one_line_in_the_file(tmp_path):
@@ -76,3 +77,18 @@ def test_every_attempt_leaves_one_line_in_the_file(tmp_path):
     assert [line["seed"] for line in lines] == [11, 12, 13, 14]
     assert lines[0].keys() == {"seed", "steps", "is_success", "end", "acted_early", "n_closings"}
     assert {(line["steps"], line["end"], line["is_success"]) for line in lines} == {(3, "time", False)}
+
+
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_every_evaluation_says_in_how_many_episodes_the_hand_acted_early(use_async_envs, caplog):
+    envs = vector_env(use_async_envs=use_async_envs)
+    caplog.set_level(logging.INFO)
+    for first in (11, 13):
+        envs.reset(seed=[first, first + 1], options={NEW_ROLLOUT_OPTION: True})
+        for _ in range(4):
+            envs.step(np.array([[0, 0, 0, CLOSE], [0, 0, 0, OPEN]], np.float32))
+    assert envs.acted_early == (True, False, True, False)
+    envs.reset(seed=[15, 16], options={NEW_ROLLOUT_OPTION: True})
+    assert envs.acted_early[4:] == (None, None)
+    envs.close()
+    assert caplog.messages[-1] == "Acted before anything was heard: 50.0% of 4 episodes"

@@ -103,7 +103,7 @@ def test_a_checkpoint_is_fine_tuned_with_a_preset_that_leaves_its_network_alone(
     assert tuned["n_supervised_steps"] == int(preset_options("cpu")["policy.n_supervised_steps"])
 
 
-def test_the_policy_is_rolled_out_while_it_trains(trained, tmp_path):
+def test_the_policy_is_rolled_out_while_it_trains(trained, tmp_path, capfd):
     pytest.importorskip("lerobot_env_playbyear")
     rollouts = ("--env.type=playbyear", "--env.episode_length=4", "--env_eval_freq=100", "--eval.n_episodes=1")
     checkpoint = f"--config_path={config_of(trained / 'checkpoints' / 'last')}"
@@ -112,6 +112,8 @@ def test_the_policy_is_rolled_out_while_it_trains(trained, tmp_path):
 
     last = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[-1])
     assert (last["kind"], last["step"], last["pc_success"]) == ("eval", 7, 0)
+    assert last["pc_acted_early"] in (0, 100)
+    assert f"Early:      {last['pc_acted_early']:.1f} % of them acted" in capfd.readouterr().out
     assert list((tmp_path / "eval").rglob("*.mp4"))
 
 

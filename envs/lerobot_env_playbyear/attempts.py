@@ -1,6 +1,7 @@
-"""How every attempt ended, in a file: LeRobot's evaluations keep successes alone."""
+"""How every attempt ended: LeRobot's evaluations keep successes alone."""
 
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -66,3 +67,41 @@ class AttemptsFile(gym.Wrapper):
             with self._path.open("a") as file:
                 file.write(line + "\n")  # one write: lines of several processes do not mix
         return outcome
+
+
+class _AsksWhoHeard(gym.vector.VectorEnv):
+    """Remembers of every episode whether the hand acted before anything was heard, and logs their share at the end.
+
+    Attributes:
+        acted_early: Of every episode that was begun, in the order of LeRobot's evaluations; None where it is not over, or
+            where the task does not tell.
+    """
+
+    acted_early: tuple[bool | None, ...] = ()
+
+    def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
+        self.acted_early += (None,) * self.num_envs
+        return super().reset(seed=seed, options=options)
+
+    def step(self, actions):
+        outcome = super().step(actions)
+        ended = outcome[-1].get("final_info", {})  # an episode that is over says so at every further step, too
+        if "acted_early" in ended:
+            before, now = self.acted_early[: -self.num_envs], self.acted_early[-self.num_envs :]
+            told = zip(now, ended["_acted_early"], ended["acted_early"], strict=True)
+            self.acted_early = before + tuple(bool(early) if is_over else known for known, is_over, early in told)
+        return outcome
+
+    def close_extras(self, **kwargs: Any) -> None:
+        told = [early for early in self.acted_early if early is not None]
+        if told:
+            logging.info(f"Acted before anything was heard: {sum(told) / len(told):.1%} of {len(told)} episodes")
+        super().close_extras(**kwargs)
+
+
+class SyncVectorEnv(_AsksWhoHeard, gym.vector.SyncVectorEnv):
+    """Environments in this process."""
+
+
+class AsyncVectorEnv(_AsksWhoHeard, gym.vector.AsyncVectorEnv):
+    """Environments in a process each."""

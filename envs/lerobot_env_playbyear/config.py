@@ -17,7 +17,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.processor import ObservationProcessorStep, PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_PREFIX, OBS_STATE, OBS_STR
 
-from lerobot_env_playbyear.attempts import AttemptsFile, holds_attempts
+from lerobot_env_playbyear.attempts import AsyncVectorEnv, AttemptsFile, SyncVectorEnv, holds_attempts
 
 if TYPE_CHECKING:
     from gym_playbyear.task import Task
@@ -159,7 +159,8 @@ class PlaybyearEnvConfig(EnvConfig):
 
         Each factory imports `gym_playbyear` itself, because the workers of an asynchronous vector environment start
         from a fresh process. An environment whose episode has ended stands still until the next rollout, instead of
-        simulating an episode that nobody looks at.
+        simulating an episode that nobody looks at. When they are closed, the log says in how many episodes the hand acted
+        before anything was heard; `acted_early` has it of each, in the order of LeRobot's evaluations.
 
         Args:
             n_envs: How many, at least 1.
@@ -186,9 +187,9 @@ class PlaybyearEnvConfig(EnvConfig):
         factories = [freeze_after_episode_end(make) for _ in range(n_envs)]
         vec: gym.vector.VectorEnv
         if use_async_envs and n_envs > 1:
-            vec = gym.vector.AsyncVectorEnv(factories, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
+            vec = AsyncVectorEnv(factories, context="forkserver", autoreset_mode=AutoresetMode.SAME_STEP)
         else:
-            vec = gym.vector.SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
+            vec = SyncVectorEnv(factories, autoreset_mode=AutoresetMode.SAME_STEP)
         return {self.type: {0: vec}}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:

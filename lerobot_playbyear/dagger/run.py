@@ -207,6 +207,8 @@ def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: 
         is_older = state.evaluated_round != state.round
         when = f", after {state.evaluated_round} of {state.round} rounds" if is_older else ""
         print(f"Success:     {state.success:.1f} % of {state.evaluated_episodes or cfg.eval.n_episodes} episodes{when}")
+    if loop.report.acted_early is not None:
+        print(f"Early:       {loop.report.acted_early:.1f} % of them acted before anything was heard")
     is_better = state.success is not None and state.best and state.best["success"] > state.success
     if is_better and state.best["seeds"] == [cfg.seed, cfg.eval.n_episodes]:
         best = folder.checkpoints / BEST_LINK / PRETRAINED_MODEL_DIR if state.best["checkpoint"] else state.policy_path

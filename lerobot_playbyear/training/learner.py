@@ -151,14 +151,18 @@ class Learner:
         )
 
     def evaluate(self, cfg: PlaybyearTrainConfig, n_videos: int = 4) -> dict[str, Any]:
-        """Roll the policy out in the run's environment through LeRobot's `eval_policy_all`, and return its report."""
+        """Roll the policy out in the run's environment through LeRobot's `eval_policy_all`, and return its report.
+
+        Where the environments say of each episode whether the hand acted before anything was heard (`acted_early`), its
+        `overall` has the share of these episodes, `pc_acted_early` [%], too.
+        """
         assert cfg.env is not None
         env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg=cfg.env, policy_cfg=cfg.policy)
         envs = make_env(cfg.env, n_envs=cfg.eval.batch_size, use_async_envs=cfg.eval.use_async_envs)
         videos = Path(str(cfg.output_dir)) / "eval" / f"videos_step_{get_step_identifier(self.step, cfg.steps)}"
         try:
             with torch.no_grad(), self.accelerator.autocast():
-                return eval_policy_all(
+                info = eval_policy_all(
                     envs=envs,
                     policy=self.unwrapped,
                     env_preprocessor=env_preprocessor,
@@ -174,6 +178,13 @@ class Learner:
         finally:
             close_envs(envs)
             self.policy.train()
+        of_each = [
+            getattr(env, "acted_early", ())[: cfg.eval.n_episodes] for group in envs.values() for env in group.values()
+        ]
+        told = [early for episodes in of_each for early in episodes if early is not None]
+        if told:
+            info["overall"]["pc_acted_early"] = 100.0 * sum(told) / len(told)
+        return info
 
     def warn_of_reach(self, actions: Tensor, what: str) -> None:
         """Logs which actions the policy cannot learn, if there are any, and what to do.

@@ -42,6 +42,7 @@ class Progress(abc.ABC):
     Attributes:
         bar: The bar.
         success: What the last evaluation gave [%]; None before.
+        acted_early: In how many of its episodes the hand acted before anything was heard [%]; None where nobody tells.
     """
 
     def __init__(self, cfg: PlaybyearTrainConfig, counter: Any, total: int, done: int, unit: str, name: str) -> None:
@@ -53,6 +54,7 @@ class Progress(abc.ABC):
         quiet = inside_slurm() or not self._is_told
         self.bar: tqdm = tqdm(total=total, initial=done, desc=name, unit=unit, disable=quiet)
         self.success: float | None = None
+        self.acted_early: float | None = None
 
     def __enter__(self) -> Self:
         self._redirect.__enter__()
@@ -76,7 +78,7 @@ class Progress(abc.ABC):
             more: Further figures.
         """
         overall = info["overall"]
-        self.success = float(overall["pc_success"])
+        self.success, self.acted_early = float(overall["pc_success"]), overall.get("pc_acted_early")
         self.write("eval", {k: v for k, v in overall.items() if isinstance(v, int | float)} | more)
         if self._wandb and overall.get("video_paths"):
             self._wandb.log_video(overall["video_paths"][0], self._counter.step, mode="eval")
@@ -131,12 +133,14 @@ def is_due(step: int, every: int) -> bool:
     return every > 0 and step % every == 0
 
 
-def print_results(cfg: PlaybyearTrainConfig, success: float | None) -> None:
+def print_results(cfg: PlaybyearTrainConfig, success: float | None, acted_early: float | None) -> None:
     """Where everything is, and what to type next."""
     folder = Path(str(cfg.output_dir))
     print(f"\nFigures:    {folder / METRICS_NAME}")
     if success is not None:
         print(f"Success:    {success:.1f} % of {cfg.eval.n_episodes} episodes, videos in {folder / 'eval'}")
+    if acted_early is not None:
+        print(f"Early:      {acted_early:.1f} % of them acted before anything was heard")
     if cfg.save_checkpoint:
         policy = folder / "checkpoints" / "last" / "pretrained_model"
         env = f" --env.type={cfg.env.type} --env.task={cfg.env.task}" if cfg.env is not None else " --env.type=..."

@@ -89,7 +89,7 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
     with Report(cfg, store, learner) as report:
         _loop(cfg, learner, batches, held_out_loss, report)
     if accelerator.is_main_process:
-        print_results(cfg, report.success)
+        print_results(cfg, report.success, report.acted_early)
         if cfg.policy.push_to_hub:
             _push(cfg, learner)
     accelerator.wait_for_everyone()  # gloo may hang if a group ends while a sum of tensors has just been made
