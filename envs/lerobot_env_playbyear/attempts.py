@@ -81,7 +81,7 @@ class _AsksWhoHeard(gym.vector.VectorEnv):
 
     def reset(self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None):
         self.acted_early += (None,) * self.num_envs
-        return super().reset(seed=seed, options=options)
+        return super().reset(seed=seed, options=options)  # type: ignore[arg-type]  # a list for each environment
 
     def step(self, actions):
         outcome = super().step(actions)
@@ -103,5 +103,5 @@ class SyncVectorEnv(_AsksWhoHeard, gym.vector.SyncVectorEnv):
     """Environments in this process."""
 
 
-class AsyncVectorEnv(_AsksWhoHeard, gym.vector.AsyncVectorEnv):
+class AsyncVectorEnv(_AsksWhoHeard, gym.vector.AsyncVectorEnv):  # type: ignore[misc]
     """Environments in a process each."""
