@@ -67,9 +67,9 @@ rows = json.loads((folder / "blind_floor.json").read_text())["rows"]
 blind = {row["name"]: row["successes"] / row["n_episodes"] for row in rows}
 expert = blind.pop("expert")
 name, rate = max(blind.items(), key=lambda item: item[1])
-print(f"Success of the policy, {policy['n_episodes']} unseen seeds: {policy['pc_success']:.0f} %")
 if early:
     print(f"Acted before anything was heard, in:         {100 * sum(early) / len(early):.0f} %")
+print(f"Success of the policy, {policy['n_episodes']} unseen seeds: {policy['pc_success']:.0f} %")
 print(f"Success of the best blind script ({name}):     {100 * rate:.0f} %")
 print(f"Success of the expert, who feels contact:    {100 * expert:.0f} %")
 print(f"Film with sound: {(folder / 'rollout.mp4').resolve()}")
