@@ -130,12 +130,12 @@ def test_other_policies_hear_as_their_page_says(robot, walked):
         assert {"observation.images.front", "observation.images.gripper"} <= seen.keys()
 
 
-def test_demonstrations_of_failed_scenes_are_appended_as_the_page_has_it(robot, walked):
-    few = {"--steps": 4, "--dataset.num_episodes": 1}
-    page = commands("tutorials/improve.md", few)
+def test_demonstrations_of_failed_scenes_are_added_as_the_page_has_it(robot, walked):
+    page = commands("tutorials/improve.md", {"--steps": 4, "--dataset.num_episodes": 1})
     for words in page[[words[0] for words in page].index("lerobot-record") :]:
         robot.run(words)
-    assert Path("outputs/find_cube_policy", CHECKPOINT, "model.safetensors").is_file()
+    (folder,) = [word.partition("=")[2] for word in words if word.startswith("--output_dir=")]
+    assert Path(folder, CHECKPOINT, "model.safetensors").is_file()
 
 
 def test_the_page_on_corrections_has_the_tutorials_commands_for_a_robot():
