@@ -244,6 +244,8 @@ class Terminal:
         environment = with_sim_robot(dict(environment))
         for name in ("DISPLAY", "WAYLAND_DISPLAY", "PYTHONDONTWRITEBYTECODE"):
             environment.pop(name, None)
+        if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in a shell's background; who ignores it hands that on
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         self._ours, theirs = pty.openpty()
         self.process = subprocess.Popen(
             command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment, start_new_session=True
