@@ -276,7 +276,7 @@ def test_pipes_and_devices_are_not_read(noise, tmp_path, name, target):
     else:
         (root / name).symlink_to(target)
     for read in (check_dataset_files, lambda _, root: survey(root)):
-        with pytest.raises(InputError, match="no ordinary file"):
+        with pytest.raises(InputError, match="not an ordinary file"):
             read("a/b", root)
 
 
@@ -295,7 +295,7 @@ def test_pictures_are_read_from_no_pipe_or_device(tmp_path, kind, target):
         os.mkfifo(root / name)
     else:
         (root / name).symlink_to(target)
-    with pytest.raises(InputError, match=r"no ordinary file|outside its folder"):
+    with pytest.raises(InputError, match=r"not an ordinary file|outside its folder"):
         _look(root)
 
 

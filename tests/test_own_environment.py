@@ -38,5 +38,5 @@ def test_int16_sound_is_divided_by_full_scale_however_quiet_it_is(dtype):
 
 @pytest.mark.parametrize("sample", [0.25, 40000.0, float("nan")])
 def test_what_is_no_int16_sound_is_refused(sample):
-    with pytest.raises(ValueError, match=r"observation\.audio\.finger holds .*no int16 sample.*get_env_processors"):
+    with pytest.raises(ValueError, match=r"observation\.audio\.finger holds .*not an int16 sample.*get_env_processors"):
         scale(torch.tensor([[0.0, sample]]))
