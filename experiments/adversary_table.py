@@ -104,12 +104,12 @@ def _most_of_the_deaf(check: dict[str, Any]) -> float:
 
 
 def _twin_rows(found: list[dict[str, Any]]) -> list[tuple[str, list[str]]]:
-    """What twin worlds give away."""
+    """What twin environments give away."""
     twins = [check.get("twin") for check in found]
     same = [NOT_RUN if twin is None else "same" if twin["equal_until_touch"] else "**differ**" for twin in twins]
-    rows = [("twin worlds: observations but sound, until the touch", same)]
+    rows = [("twin environments: observations but sound, until the touch", same)]
     areas = [NOT_RUN if twin is None else f"{twin['auc'].get(_CLASSIFIER, twin['auc'])['value']:.2f}" for twin in twins]
-    rows.append((f"twin worlds: area of {_CLASSIFIER}, after it", areas))
+    rows.append((f"twin environments: area of {_CLASSIFIER}, after it", areas))
     return rows
 
 
