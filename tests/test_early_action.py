@@ -79,7 +79,7 @@ def test_every_attempt_leaves_one_line_in_the_file(tmp_path):
     assert {(line["steps"], line["end"], line["is_success"]) for line in lines} == {(3, "time", False)}
 
 
-@pytest.mark.parametrize("use_async_envs", [False, True])
+@pytest.mark.parametrize("use_async_envs", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_every_evaluation_says_in_how_many_episodes_the_hand_acted_early(use_async_envs, caplog):
     envs = vector_env(use_async_envs=use_async_envs)
     caplog.set_level(logging.INFO)
