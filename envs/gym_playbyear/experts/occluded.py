@@ -44,9 +44,7 @@ class GraspExpert(Script):
     HOP_ERROR = (-0.012, 0.012)  # by which a hop misses the cube, along the sweep, before it is mended
     DESCENT_STEP = 0.014
     BACK_OFF = (0.002, 0.014)  # how far it draws back from a touch
-    BRING_BACK_STEP = (
-        0.04  # with which a correction carries the cube back to where it was lifted, and shows the way again
-    )
+    BRING_BACK_STEP = 0.04  # with which a correction carries the cube back, to show the way to the tray again
     HOLD_HEIGHT = 0.085  # above the table, where it holds still
 
     def __init__(self, env):
