@@ -40,6 +40,9 @@ def run_in_process(main: Callable[[], Any], *arguments: str | Path) -> Any:
             return main()
         except SystemExit as end:
             return end.code
+        finally:
+            if state := sys.modules.get("accelerate.state"):  # what a process computes in is decided once in it
+                state.AcceleratorState._reset_state()
 
 
 def n_evaluated(checkpoint: Path, folder: Path, *options: str) -> int:
