@@ -23,7 +23,7 @@ _LN_60_DB = math.log(1000.0)
 _FRAME, _STEP = 256, 64  # samples
 _EDGE_S = 0.02  # in which a clip that does not go round by itself fades in and out
 _FORMANTS = ((250.0, 900.0), (800.0, 2500.0), (2200.0, 3400.0))
-"""Ranges of an adult's first three formants [Hz] (Peterson and Barney, "Control methods used in a study of the vowels", 1952)."""
+"""Ranges of the first three formants [Hz] (Peterson and Barney, "Control methods used in a study of the vowels", 1952)."""
 
 _ROOMS = 4
 _LATEST_S = 0.01  # by which sound reaches one microphone later than another: 3.4 m
@@ -60,20 +60,19 @@ def generated_noise(seconds: float, n_bins: int, device: torch.device) -> Tensor
         (6, n_bins) complex, without the constant part; all are equally loud: as `torch.fft.irfft(..., norm="forward")` makes
         waves of them their root mean square is 1.
     """
-    draw, rate = Draw(device), 2 * n_bins / seconds
+    draw, n, rate = Draw(device), 2 * n_bins, 2 * n_bins / seconds
     scores = [score(draw, seconds, 0.45 * rate) for score in _SCORES.values()]
-    struck = strike(draw, Score(*map(torch.cat, zip(*scores, strict=True))), rate, 2 * n_bins)
-    streams = torch.cat([stream(draw, rate, 2 * n_bins) for stream in _STREAMS.values()])
-    edge = int(_EDGE_S * rate)
-    ramp = (torch.arange(streams.shape[1], device=device) / edge).clamp(max=1)
-    spectra = torch.cat([struck, torch.fft.rfft(streams * ramp * ramp.flip(0))])[:, 1:]  # (C, n_bins)
-    return equally_loud(spectra)
-
-
-def equally_loud(spectra: Tensor) -> Tensor:
-    """(C, n_bins) complex -> the same shape, of waves whose root mean square is 1."""
+    struck = strike(draw, Score(*map(torch.cat, zip(*scores, strict=True))), rate, n)
+    streams = torch.cat([stream(draw, rate, max(n, _FRAME))[:, :n] for stream in _STREAMS.values()])
+    spectra = torch.cat([struck, torch.fft.rfft(faded(streams, rate))])[:, 1:]  # (C, n_bins)
     power = 2 * torch.view_as_real(spectra).square().sum(dim=(1, 2))
     return spectra * power.clamp(min=1e-20).rsqrt().unsqueeze(1)
+
+
+def faded(waves: Tensor, rate: float) -> Tensor:
+    """(..., n) -> the same shape, from silence to silence: what goes round in an item must not click at its ends."""
+    ramp = (torch.arange(waves.shape[-1], device=waves.device) / (_EDGE_S * rate)).clamp(max=1)
+    return waves * ramp * ramp.flip(0)
 
 
 def rooms(n_microphones: int, seconds: float, n_bins: int, device: torch.device) -> Tensor:
@@ -184,7 +183,7 @@ def _clatter(draw: Draw, seconds: float, nyquist: float) -> Score:
 def _music(draw: Draw, seconds: float, nyquist: float) -> Score:
     """Notes with harmonics on the beats, plucked or drawn out, and one thing that is a drum."""
     beat = draw.log(0.1, 0.5, 1, 1, 1)
-    time = beat * torch.randint(int(seconds / 0.1), (1, _THINGS, _EVENTS), device=draw.device)
+    time = beat * torch.randint(math.ceil(seconds / 0.1), (1, _THINGS, _EVENTS), device=draw.device)
     steps = torch.tensor((0, 3, 4, 5, 7, 9, 10, 12, -12, -5), device=draw.device)
     note = steps[torch.randint(len(steps), (1, _THINGS, 1), device=draw.device)]  # semitones above the root
     overtone = torch.arange(1, _MODES + 1, device=draw.device)
@@ -240,7 +239,7 @@ def speech(draw: Draw, rate: float, n: int) -> Tensor:
     targets = torch.stack([*formants, draw.log(1200.0, 6000.0, n_sounds), loudness, voiced, glide])
     place = (torch.arange(frames, device=draw.device) * _STEP + _FRAME // 2) / rate
     controls = _moving(targets, lasting, place, 5)
-    loud, voice, pitch = controls[4:, :, None]  # (F, 1)
+    loud, voice = controls[4:6, :, None]  # (F, 1)
     per_sample = functional.interpolate(controls[None, 4:], size=n, mode="linear")[0]
     turns = torch.cumsum(per_sample[2] / rate, dim=0)
     pulses = (turns.floor().diff(prepend=turns[:1]) > 0).float() * (rate / per_sample[2]).sqrt()
