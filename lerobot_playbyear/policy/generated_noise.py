@@ -1,14 +1,14 @@
 """The noise of rooms with people in them, generated: voices, blows, clatter, music, footsteps and tools, and rooms around them.
 
-Each training update makes one clip of every kind and a few rooms; its items hear them from different moments on. Everything
-is chosen to be various, not to be true, except where a source is named. What is generated lasts as long as an item, goes round
-and round in it, and reaches as high as the policy hears: `n_bins` frequencies, multiples of 1 / `seconds`.
+Each training update makes clips of some kinds and a few rooms; its items hear them from different moments on. Everything is
+chosen to be various, not to be true, except where a source is named. What is generated lasts as long as an item, goes round and
+round in it, and reaches as high as the policy hears: `n_bins` frequencies, multiples of 1 / `seconds`.
 
 In comments: C clips, O things that sound, E events of each, M modes of each, n samples of a clip (2 n_bins), F short frames.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -53,18 +53,22 @@ class Draw:
         return torch.randn(shape, device=self.device)
 
 
-def generated_noise(seconds: float, n_bins: int, device: torch.device) -> Tensor:
-    """A clip of every kind, in the order of `KINDS`.
+def generated_noise(kinds: Sequence[str], seconds: float, n_bins: int, device: torch.device) -> Tensor:
+    """A clip of each of these `KINDS`.
 
     Returns:
-        (6, n_bins) complex, without the constant part; all are equally loud: as `torch.fft.irfft(..., norm="forward")` makes
+        (C, n_bins) complex, without the constant part; all are equally loud: as `torch.fft.irfft(..., norm="forward")` makes
         waves of them their root mean square is 1.
     """
     draw, n, rate = Draw(device), 2 * n_bins, 2 * n_bins / seconds
-    scores = [score(draw, seconds, 0.45 * rate) for score in _SCORES.values()]
-    struck = strike(draw, Score(*map(torch.cat, zip(*scores, strict=True))), rate, n)
-    streams = torch.cat([stream(draw, rate, max(n, _FRAME))[:, :n] for stream in _STREAMS.values()])
-    spectra = torch.cat([struck, torch.fft.rfft(faded(streams, rate))])[:, 1:]  # (C, n_bins)
+    clips = []
+    for kind in kinds:
+        if kind in _SCORES:
+            clips.append(strike(draw, _SCORES[kind](draw, seconds, 0.45 * rate), rate, n))
+        else:
+            wave = _STREAMS[kind](draw, rate, max(n, _FRAME))[:n]
+            clips.append(torch.fft.rfft(faded(wave, rate)))
+    spectra = torch.stack(clips)[:, 1:]  # (C, n_bins)
     power = 2 * torch.view_as_real(spectra).square().sum(dim=(1, 2))
     return spectra * power.clamp(min=1e-20).rsqrt().unsqueeze(1)
 
@@ -106,10 +110,10 @@ class Score(NamedTuple):
     """When things are struck, how hard, and how they ring.
 
     Attributes:
-        time, force: Of every event, (C, O, E) [s], [1].
-        pitch, decay, gain: Of every mode, (C, O, M) [Hz], [s to fall by 60 dB], [1].
-        burst, burst_decay: Of the noise of a blow, (C, O) [1], [s to fall by 60 dB].
-        attack: (C, O) [s]: a bow's or a voice's is slow.
+        time, force: Of every event, (O, E) [s], [1].
+        pitch, decay, gain: Of every mode, (O, M) [Hz], [s to fall by 60 dB], [1].
+        burst, burst_decay: Of the noise of a blow, (O,) [1], [s to fall by 60 dB].
+        attack: (O,) [s]: a bow's or a voice's is slow.
     """
 
     time: Tensor
@@ -123,101 +127,101 @@ class Score(NamedTuple):
 
 
 def strike(draw: Draw, score: Score, rate: float, n: int) -> Tensor:
-    """The spectra of clips, (C, n / 2 + 1) complex: every thing's ringing at all its events."""
+    """The spectrum of a clip, (n / 2 + 1,) complex: every thing's ringing at all its events."""
     n_ring = min(n, math.ceil(_RING_S * rate))
     time = torch.arange(n_ring, device=draw.device) / rate  # (ring,)
-    phase = 2 * math.pi * (score.pitch.unsqueeze(3) * time + draw.even(0, 1, *score.pitch.shape, 1))
-    ringing = torch.exp(-_LN_60_DB / score.decay.unsqueeze(3) * time) * phase.sin_()  # (C, O, M, ring)
-    ringing = (score.gain.unsqueeze(2) @ ringing).squeeze(2)  # (C, O, ring)
-    noise = draw.normal(*ringing.shape) * torch.exp(-_LN_60_DB / score.burst_decay.unsqueeze(2) * time)
-    ringing = (ringing + score.burst.unsqueeze(2) * noise) * -torch.expm1(-time / score.attack.unsqueeze(2))
+    phase = 2 * math.pi * (score.pitch.unsqueeze(2) * time + draw.even(0, 1, *score.pitch.shape, 1))
+    ringing = torch.exp(-_LN_60_DB / score.decay.unsqueeze(2) * time) * phase.sin_()  # (O, M, ring)
+    ringing = (score.gain.unsqueeze(1) @ ringing).squeeze(1)  # (O, ring)
+    noise = draw.normal(*ringing.shape) * torch.exp(-_LN_60_DB / score.burst_decay.unsqueeze(1) * time)
+    ringing = (ringing + score.burst.unsqueeze(1) * noise) * -torch.expm1(-time / score.attack.unsqueeze(1))
     ringing = ringing * (1 - time / time[-1])
     places = (score.time * rate).long() % n
-    blows = torch.zeros(*places.shape[:2], n, device=draw.device).scatter_add(2, places, score.force)
-    return (torch.fft.rfft(blows) * torch.fft.rfft(ringing, n=n)).sum(dim=1)
+    blows = torch.zeros(len(places), n, device=draw.device).scatter_add(1, places, score.force)
+    return (torch.fft.rfft(blows) * torch.fft.rfft(ringing, n=n)).sum(dim=0)
 
 
 def _modes(draw: Draw, low: float, high: float, decay: tuple[float, float], nyquist: float) -> dict[str, Tensor]:
     """Of things as they lie about: modes anywhere, which die the sooner the higher they are; a soft or a hard blow."""
-    pitch = draw.log(low, min(high, nyquist), 1, _THINGS, _MODES)
-    lasting = draw.log(*decay, 1, _THINGS, 1) * (pitch / 1000.0) ** -0.5 * draw.log(0.6, 1.7, *pitch.shape)
-    softness = draw.log(300.0, 10_000.0, 1, _THINGS, 1)  # [Hz] above which a blow excites little
+    pitch = draw.log(low, min(high, nyquist), _THINGS, _MODES)
+    lasting = draw.log(*decay, _THINGS, 1) * (pitch / 1000.0) ** -0.5 * draw.log(0.6, 1.7, *pitch.shape)
+    softness = draw.log(300.0, 10_000.0, _THINGS, 1)  # [Hz] above which a blow excites little
     gain = draw.normal(*pitch.shape) / (1 + (pitch / softness).square())
     return {"pitch": pitch, "decay": lasting, "gain": gain}
 
 
-def _bouncing(draw: Draw, seconds: float, share: float, n_bounces: int) -> dict[str, Tensor]:
+def _bouncing(draw: Draw, seconds: float, share: Tensor, n_bounces: int) -> dict[str, Tensor]:
     """Blows at any time, near and far, each with bounces that follow faster and faster."""
-    blows = (1, _THINGS, _EVENTS // n_bounces, 1)
+    blows = (_THINGS, _EVENTS // n_bounces, 1)
     bounce, gap = torch.arange(n_bounces, device=draw.device), draw.log(0.03, 0.3, *blows)
     left = draw.even(0.4, 0.9, *blows)  # of the speed, after a bounce
     time = draw.even(0, seconds, *blows) + gap * (1 - left**bounce) / (1 - left)
     force = draw.often(share, *blows) * draw.log(0.05, 1, *blows) * left**bounce * draw.log(0.6, 1.6, *time.shape)
-    return {"time": time.flatten(2), "force": force.flatten(2)}
+    return {"time": time.flatten(1), "force": force.flatten(1)}
 
 
 def _blows(draw: Draw, seconds: float, nyquist: float) -> Score:
     """Single blows on things of many materials: a door, a cup put down, a hammer, a drum."""
-    share = draw.even(0, 1, 1, 1, 1, 1) ** 2
+    share = draw.even(0, 1, 1, 1, 1) ** 2
     return Score(
         **_bouncing(draw, seconds, 0.04 + 0.5 * share, 1),
         **_modes(draw, 80.0, 5000.0, (0.02, 1.0), nyquist),
-        burst=draw.log(0.05, 3.0, 1, _THINGS),
-        burst_decay=draw.log(0.005, 0.3, 1, _THINGS),
-        attack=draw.log(0.0001, 0.003, 1, _THINGS),
+        burst=draw.log(0.05, 3.0, _THINGS),
+        burst_decay=draw.log(0.005, 0.3, _THINGS),
+        attack=draw.log(0.0001, 0.003, _THINGS),
     )
 
 
 def _clatter(draw: Draw, seconds: float, nyquist: float) -> Score:
     """Small hard things that fall and bounce."""
-    share = draw.even(0, 1, 1, 1, 1, 1)
+    share = draw.even(0, 1, 1, 1, 1)
     return Score(
         **_bouncing(draw, seconds, 0.15 + 0.7 * share, 6),
         **_modes(draw, 300.0, 7000.0, (0.02, 0.5), nyquist),
-        burst=draw.log(0.02, 1.0, 1, _THINGS),
-        burst_decay=draw.log(0.005, 0.05, 1, _THINGS),
-        attack=draw.log(0.0001, 0.001, 1, _THINGS),
+        burst=draw.log(0.02, 1.0, _THINGS),
+        burst_decay=draw.log(0.005, 0.05, _THINGS),
+        attack=draw.log(0.0001, 0.001, _THINGS),
     )
 
 
 def _music(draw: Draw, seconds: float, nyquist: float) -> Score:
     """Notes with harmonics on the beats, plucked or drawn out, and one thing that is a drum."""
-    beat = draw.log(0.1, 0.5, 1, 1, 1)
-    time = beat * torch.randint(math.ceil(seconds / 0.1), (1, _THINGS, _EVENTS), device=draw.device)
+    beat = draw.log(0.1, 0.5, 1, 1)
+    time = beat * torch.randint(math.ceil(seconds / 0.1), (_THINGS, _EVENTS), device=draw.device)
     steps = torch.tensor((0, 3, 4, 5, 7, 9, 10, 12, -12, -5), device=draw.device)
-    note = steps[torch.randint(len(steps), (1, _THINGS, 1), device=draw.device)]  # semitones above the root
+    note = steps[torch.randint(len(steps), (_THINGS, 1), device=draw.device)]  # semitones above the root
     overtone = torch.arange(1, _MODES + 1, device=draw.device)
-    pitch = draw.log(80.0, 600.0, 1, 1, 1) * 2 ** (note / 12) * overtone
-    gain = overtone ** draw.even(-2.0, -0.3, 1, _THINGS, 1) * draw.log(0.3, 3.0, *pitch.shape) * (pitch < nyquist)
-    is_drum = (torch.arange(_THINGS, device=draw.device) == 0).float().unsqueeze(0)
+    pitch = draw.log(80.0, 600.0, 1, 1) * 2 ** (note / 12) * overtone
+    gain = overtone ** draw.even(-2.0, -0.3, _THINGS, 1) * draw.log(0.3, 3.0, *pitch.shape) * (pitch < nyquist)
+    is_drum = (torch.arange(_THINGS, device=draw.device) == 0).float()
     return Score(
         time % seconds,
-        draw.often(draw.even(0.2, 0.9, 1, _THINGS, 1), 1, _THINGS, _EVENTS) * draw.log(0.3, 1, 1, _THINGS, _EVENTS),
+        draw.often(draw.even(0.2, 0.9, _THINGS, 1), _THINGS, _EVENTS) * draw.log(0.3, 1, _THINGS, _EVENTS),
         pitch,
-        draw.log(0.15, 3.0, 1, _THINGS, 1) * overtone**-0.5,
+        draw.log(0.15, 3.0, _THINGS, 1) * overtone**-0.5,
         gain,
-        is_drum * draw.log(0.3, 5.0, 1, _THINGS),
-        draw.log(0.02, 0.4, 1, _THINGS),
-        draw.log(0.001, 0.1, 1, _THINGS) ** (1 + is_drum),
+        is_drum * draw.log(0.3, 5.0, _THINGS),
+        draw.log(0.02, 0.4, _THINGS),
+        draw.log(0.001, 0.1, _THINGS) ** (1 + is_drum),
     )
 
 
 def _footsteps(draw: Draw, seconds: float, nyquist: float) -> Score:
     """Somebody who walks by: heel and sole of each foot, dull and short, with the scrape of the sole."""
-    pace = draw.even(0.3, 0.8, 1, 1, 1)
-    part = torch.arange(_THINGS, device=draw.device).reshape(1, _THINGS, 1)
+    pace = draw.even(0.3, 0.8, 1)
+    part = torch.arange(_THINGS, device=draw.device).reshape(_THINGS, 1)
     side, sole = part % 2, part // 2
     step = torch.arange(_EVENTS, device=draw.device)
-    time = pace * (2 * step + side) + sole * draw.even(0.04, 0.16, 1, 1, 1) + draw.even(0, 0.04, 1, 1, _EVENTS)
-    nearest = draw.even(0, seconds, 1, 1, 1)
-    near = 1 / (0.5 + (time - nearest).abs() / draw.log(0.3, 5.0, 1, 1, 1))
+    time = pace * (2 * step + side) + sole * draw.even(0.04, 0.16, 1) + draw.even(0, 0.04, _EVENTS)
+    nearest = draw.even(0, seconds, 1)
+    near = 1 / (0.5 + (time - nearest).abs() / draw.log(0.3, 5.0, 1))
     return Score(
         time,
         (time < seconds) * near * draw.log(0.4, 1.0, *time.shape) * torch.where(sole > 0, 0.5, 1.0),
         **_modes(draw, 60.0, 1500.0, (0.01, 0.08), nyquist),
-        burst=draw.log(0.1, 2.0, 1, _THINGS),
-        burst_decay=draw.log(0.01, 0.2, 1, _THINGS),
-        attack=draw.log(0.0003, 0.01, 1, _THINGS),
+        burst=draw.log(0.1, 2.0, _THINGS),
+        burst_decay=draw.log(0.01, 0.2, _THINGS),
+        attack=draw.log(0.0003, 0.01, _THINGS),
     )
 
 
@@ -225,7 +229,7 @@ def _footsteps(draw: Draw, seconds: float, nyquist: float) -> Score:
 
 
 def speech(draw: Draw, rate: float, n: int) -> Tensor:
-    """Somebody who speaks, (1, n): a gliding pitch through formants that move, hisses, bursts and pauses."""
+    """Somebody who speaks, (n,): a gliding pitch through formants that move, hisses, bursts and pauses."""
     frames = (n - _FRAME) // _STEP + 1
     n_sounds = math.ceil(n / rate / 0.04)
     kind = torch.rand(n_sounds, device=draw.device)
@@ -251,11 +255,11 @@ def speech(draw: Draw, rate: float, n: int) -> Tensor:
     weight = torch.tensor((1.0, 0.6, 0.4), device=draw.device)[:, None, None] * draw.log(0.6, 1.6, 3, 1, 1)
     dull = (1 + frequency / draw.log(200.0, 1500.0, 1)).reciprocal()
     envelope = loud * (voice * dull * (weight * peaks[:3]).sum(dim=0) + (1 - voice) * peaks[3])
-    return _filtered(source, envelope).unsqueeze(0)
+    return _filtered(source, envelope)
 
 
 def tool(draw: Draw, rate: float, n: int) -> Tensor:
-    """A motor that runs up and down, or a ratchet, (1, n): a pitch, noise and bursts of noise through resonances."""
+    """A motor that runs up and down, or a ratchet, (n,): a pitch, noise and bursts of noise through resonances."""
     frames, n_runs = n // _STEP, math.ceil(n / rate / 0.1)
     is_on = draw.often(0.6, n_runs) * draw.log(0.2, 1.0, n_runs)
     pitch = draw.log(8.0, 500.0, 1) * draw.log(0.5, 2.0, n_runs)
@@ -269,7 +273,7 @@ def tool(draw: Draw, rate: float, n: int) -> Tensor:
     frequency = torch.fft.rfftfreq(n, 1 / rate, device=draw.device)
     centre, sharpness = draw.log(100.0, 4000.0, 3, 1), draw.log(1.0, 20.0, 3, 1)
     peaks = (1 + (sharpness * (frequency / centre - 1)).square()).reciprocal().sum(dim=0)
-    return torch.fft.irfft(torch.fft.rfft(wave) * (0.1 + peaks), n=n).unsqueeze(0)
+    return torch.fft.irfft(torch.fft.rfft(wave) * (0.1 + peaks), n=n)
 
 
 def _moving(targets: Tensor, lasting: Tensor, place: Tensor, smoothing: int) -> Tensor:
@@ -293,4 +297,4 @@ _SCORES: dict[str, Callable[[Draw, float, float], Score]] = {
 }  # fmt: skip
 _STREAMS: dict[str, Callable[[Draw, float, int], Tensor]] = {"speech": speech, "tool": tool}
 KINDS = (*_SCORES, *_STREAMS)
-"""Names of what is generated, in the order of the clips."""
+"""Names of what is generated."""

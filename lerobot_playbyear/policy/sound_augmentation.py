@@ -13,7 +13,7 @@ from torch.nn import functional
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, resample
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.generated_noise import Draw, faded, generated_noise, rooms
+from lerobot_playbyear.policy.generated_noise import KINDS, Draw, faded, generated_noise, rooms
 
 _FAINTEST_DB = -20.0  # of a microphone's own noise, relative to an item's noise floor
 _NOISE_TILT = (0.0, 1.2)  # exponent of 1 / frequency: from white to a little steeper than pink
@@ -24,6 +24,7 @@ _HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
 _ROOM_SHARE = 0.75  # of the items that hear a room with people in it
 _RECORDED_SHARE = 0.5  # of those, if there are recordings: the others hear what is generated
 _ROOM_FAINTEST_DB = 0.0  # of it, relative to an item's noise floor, unless the loudest is fainter
+_KINDS_AT_ONCE = 3  # of generated noise in a batch: more take time
 _FARTHER_DB = 12.0  # at most, from the microphone that hears it best to another one
 _ENDINGS = (".wav", ".flac")  # of files with recorded noise
 _MOST_SECONDS = 7200  # of all recordings
@@ -78,7 +79,8 @@ class SoundAugmentation(nn.Module):
         with torch.autocast(
             waves.device.type, enabled=False
         ):  # eight bits are too few for what is 60 dB louder than the rest
-            spectrum = self._own(*waves.shape, n_bins) + self._of_the_room(*waves.shape, n_bins)
+            spectrum = self._own(self.max_db, *waves.shape, n_bins)
+            spectrum = spectrum + self._of_the_room(self.max_db, *waves.shape, n_bins)
             noise = torch.fft.irfft(functional.pad(spectrum, (1, n // 2 - n_bins)), n=n, norm="forward")
             return waves + noise_floor(waves) * noise, self.colour(*waves.shape[:2])
 
@@ -87,7 +89,7 @@ class SoundAugmentation(nn.Module):
         points = torch.randn(n_items, n_microphones, _COLOUR_POINTS, device=self.response.device)
         return _COLOUR_DB / 10 * points @ self.response.T
 
-    def _own(self, n_items: int, n_microphones: int, n: int, n_bins: int) -> Tensor:
+    def _own(self, max_db: float, n_items: int, n_microphones: int, n: int, n_bins: int) -> Tensor:
         """The spectrum of each microphone's own noise, (B, M, bins) complex, in units of its floor: broadband, with a hum.
 
         White noise alone teaches nothing about rooms, whose noise is louder the lower it is. Drawn per item and microphone,
@@ -97,7 +99,7 @@ class SoundAugmentation(nn.Module):
         """
         device = self.response.device
         draws = torch.rand(4, n_items, n_microphones, 1, device=device)
-        ranges = zip(((_FAINTEST_DB, self.max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
+        ranges = zip(((_FAINTEST_DB, max_db), _NOISE_TILT, _HUM_HZ, _HUM_DB), draws, strict=True)
         level, tilt, pitch, hum = (low + (high - low) * draw for (low, high), draw in ranges)
         resolution = self.sample_rate / n  # [Hz] of a bin
         frequency = resolution * torch.arange(1, n_bins + 1, device=device)
@@ -110,7 +112,7 @@ class SoundAugmentation(nn.Module):
         amplitude = 10 ** (level / 20) * power.sqrt() / 2  # as of both signs of a frequency
         return torch.view_as_complex(torch.randn(*power.shape, 2, device=device) * amplitude.unsqueeze(3))
 
-    def _of_the_room(self, n_items: int, n_microphones: int, n: int, n_bins: int) -> Tensor:
+    def _of_the_room(self, max_db: float, n_items: int, n_microphones: int, n: int, n_bins: int) -> Tensor:
         """The spectrum of what goes on in a room, (B, M, bins) complex, in units of each microphone's floor.
 
         One source reaches all microphones of an item, each by its own way through the room. Three quarters of the items hear
@@ -118,7 +120,8 @@ class SoundAugmentation(nn.Module):
         """
         device, seconds = self.response.device, n / self.sample_rate
         draw = Draw(device)
-        sources = generated_noise(seconds, n_bins, device)  # (clips, bins)
+        kinds = [KINDS[index] for index in torch.randperm(len(KINDS))[:_KINDS_AT_ONCE].tolist()]
+        sources = generated_noise(kinds, seconds, n_bins, device)  # (kinds, bins)
         index = torch.randint(len(sources), (n_items,), device=device)
         if self._recorded is not None:
             excerpts = faded(self._recorded.excerpts(n_items, n).to(device), self.sample_rate)
@@ -131,8 +134,8 @@ class SoundAugmentation(nn.Module):
         turns = moment * torch.arange(1, n_bins + 1, device=device) % n  # as integers: floats would lose the fraction
         angle = 2 * math.pi / n * turns
         shifted = sources[index] * torch.complex(angle.cos(), angle.sin())
-        faintest = min(_ROOM_FAINTEST_DB, self.max_db)
-        level = draw.even(faintest, self.max_db, n_items, 1, 1)  # [dB]
+        faintest = min(_ROOM_FAINTEST_DB, max_db)
+        level = draw.even(faintest, max_db, n_items, 1, 1)  # [dB]
         farther = draw.even(0, _FARTHER_DB, n_items, n_microphones, 1)
         level = level - farther + farther.amin(dim=1, keepdim=True)
         gain = 10 ** (level / 20) * draw.often(_ROOM_SHARE, n_items, 1, 1)
