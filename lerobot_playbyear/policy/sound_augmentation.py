@@ -74,15 +74,15 @@ class SoundAugmentation(nn.Module):
         if self.max_db is None:
             return waves, None
         self.read_recordings()
-        n = waves.shape[2]
+        n_items, n_microphones, n = waves.shape
         n_bins = min(n // 2, math.ceil(min(self.highest_hz, self.sample_rate) * n / self.sample_rate))
+        size = (self.max_db, n_items, n_microphones, n, n_bins)
         with torch.autocast(
             waves.device.type, enabled=False
-        ):  # eight bits are too few for what is 60 dB louder than the rest
-            spectrum = self._own(self.max_db, *waves.shape, n_bins)
-            spectrum = spectrum + self._of_the_room(self.max_db, *waves.shape, n_bins)
-            noise = torch.fft.irfft(functional.pad(spectrum, (1, n // 2 - n_bins)), n=n, norm="forward")
-            return waves + noise_floor(waves) * noise, self.colour(*waves.shape[:2])
+        ):  # of a format in which noise hides what is 50 dB below it
+            spectrum = functional.pad(self._own(*size) + self._of_the_room(*size), (1, n // 2 - n_bins))
+            noise = torch.fft.irfft(spectrum, n=n, norm="forward")
+            return waves + noise_floor(waves) * noise, self.colour(n_items, n_microphones)
 
     def colour(self, n_items: int, n_microphones: int) -> Tensor:
         """A microphone's gain in every bin of the spectrogram, a smooth curve, (B, M, bins) [10 dB]."""
