@@ -234,7 +234,7 @@ def _speech(draw: Draw, rate: float, n: int) -> Tensor:
     lasting = draw.log(0.04, 0.25, n_sounds) * (1 + 3 * pause * torch.rand_like(pause))
     size = draw.log(0.85, 1.35, 1)  # of man, woman or child
     formants = [size * draw.even(low, high, n_sounds) for low, high in _FORMANTS]
-    hiss = draw.log(0.1, 1.0, 1) * draw.log(0.1, 1.0, n_sounds)
+    hiss = draw.log(0.03, 0.4, 1) * draw.log(0.1, 1.0, n_sounds)
     loudness = (1 - pause) * torch.where(voiced > 0, draw.log(0.2, 1.0, n_sounds), hiss)
     glide = draw.log(80.0, 280.0, 1) * draw.log(0.75, 1.35, n_sounds)
     targets = torch.stack([*formants, draw.log(1200.0, 6000.0, n_sounds), loudness, voiced, glide])
