@@ -95,7 +95,7 @@ def test_an_envelope_keeps_how_loud_it_was():
     for factor in (1, 4):
         episode = clicks(policy, {})
         episode[MICROPHONE][15, 300:340] += 2000 * factor
-        heard.append(policy.model._hear(run_ending_at(episode, 15, policy.config), MICROPHONE, 2))
+        heard += policy.model._hear_all(run_ending_at(episode, 15, policy.config), 2)
     faint, loud = (one.detach() for one in heard)
     louder = (loud - faint)[:, -n:] / 0.3
     assert louder[0].abs().max() < 1e-4  # the frame before

@@ -8,7 +8,7 @@ In comments: C clips, O things that sound, E events of each, M modes of each, n 
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -17,7 +17,6 @@ from torch.nn import functional
 
 _THINGS, _MODES, _EVENTS = 4, 8, 24
 _RING_S = 0.6  # longest that a blow is heard
-_LOWEST_HZ = 40.0
 _LN_60_DB = math.log(1000.0)
 
 _FRAME, _STEP = 256, 64  # samples
@@ -25,6 +24,7 @@ _EDGE_S = 0.02  # in which a clip that does not go round by itself fades in and 
 _FORMANTS = ((250.0, 900.0), (800.0, 2500.0), (2200.0, 3400.0))
 """Ranges of the first three formants [Hz] (Peterson and Barney, "Control methods used in a study of the vowels", 1952)."""
 
+N_STRUCK = 2  # of all kinds that are struck, at a time: each takes 2 % of an update's time
 _ROOMS = 4
 _LATEST_S = 0.01  # by which sound reaches one microphone later than another: 3.4 m
 _REFLECTIONS = 10
@@ -53,22 +53,19 @@ class Draw:
         return torch.randn(shape, device=self.device)
 
 
-def generated_noise(kinds: Sequence[str], seconds: float, n_bins: int, device: torch.device) -> Tensor:
-    """A clip of each of these `KINDS`.
+def generated_noise(seconds: float, n_bins: int, device: torch.device) -> Tensor:
+    """Clips of some kinds, all equally loud.
 
     Returns:
-        (C, n_bins) complex, without the constant part; all are equally loud: as `torch.fft.irfft(..., norm="forward")` makes
-        waves of them their root mean square is 1.
+        (C, n_bins) complex, without the constant part: first `N_STRUCK` of different kinds in `SCORES`, then one of each in
+        `STREAMS`. As `torch.fft.irfft(..., norm="forward")` makes waves of them their root mean square is 1.
     """
     draw, n, rate = Draw(device), 2 * n_bins, 2 * n_bins / seconds
-    clips = []
-    for kind in kinds:
-        if kind in _SCORES:
-            clips.append(strike(draw, _SCORES[kind](draw, seconds, 0.45 * rate), rate, n))
-        else:
-            wave = _STREAMS[kind](draw, rate, max(n, _FRAME))[:n]
-            clips.append(torch.fft.rfft(faded(wave, rate)))
-    spectra = torch.stack(clips)[:, 1:]  # (C, n_bins)
+    scores = [make(draw, seconds, 0.45 * rate) for make in SCORES.values()]
+    chosen = torch.randperm(len(scores), device=device)[:N_STRUCK]
+    struck = strike(draw, Score(*(torch.stack(each)[chosen] for each in zip(*scores, strict=True))), rate, n)
+    waves = torch.stack([make(draw, rate, max(n, _FRAME))[:n] for make in STREAMS.values()])
+    spectra = torch.cat([struck, torch.fft.rfft(faded(waves, rate))])[:, 1:]  # (C, n_bins)
     power = 2 * torch.view_as_real(spectra).square().sum(dim=(1, 2))
     return spectra * power.clamp(min=1e-20).rsqrt().unsqueeze(1)
 
@@ -127,18 +124,18 @@ class Score(NamedTuple):
 
 
 def strike(draw: Draw, score: Score, rate: float, n: int) -> Tensor:
-    """The spectrum of a clip, (n / 2 + 1,) complex: every thing's ringing at all its events."""
+    """The spectra of clips, (C, n / 2 + 1) complex, of scores with one more dimension: every thing rings at all its events."""
     n_ring = min(n, math.ceil(_RING_S * rate))
     time = torch.arange(n_ring, device=draw.device) / rate  # (ring,)
-    phase = 2 * math.pi * (score.pitch.unsqueeze(2) * time + draw.even(0, 1, *score.pitch.shape, 1))
-    ringing = torch.exp(-_LN_60_DB / score.decay.unsqueeze(2) * time) * phase.sin_()  # (O, M, ring)
-    ringing = (score.gain.unsqueeze(1) @ ringing).squeeze(1)  # (O, ring)
-    noise = draw.normal(*ringing.shape) * torch.exp(-_LN_60_DB / score.burst_decay.unsqueeze(1) * time)
-    ringing = (ringing + score.burst.unsqueeze(1) * noise) * -torch.expm1(-time / score.attack.unsqueeze(1))
+    phase = 2 * math.pi * (score.pitch.unsqueeze(3) * time + draw.even(0, 1, *score.pitch.shape, 1))
+    ringing = torch.exp(-_LN_60_DB / score.decay.unsqueeze(3) * time) * phase.sin()  # (C, O, M, ring)
+    ringing = (score.gain.unsqueeze(2) @ ringing).squeeze(2)  # (C, O, ring)
+    noise = draw.normal(*ringing.shape) * torch.exp(-_LN_60_DB / score.burst_decay.unsqueeze(2) * time)
+    ringing = (ringing + score.burst.unsqueeze(2) * noise) * (1 - torch.exp(-time / score.attack.unsqueeze(2)))
     ringing = ringing * (1 - time / time[-1])
     places = (score.time * rate).long() % n
-    blows = torch.zeros(len(places), n, device=draw.device).scatter_add(1, places, score.force)
-    return (torch.fft.rfft(blows) * torch.fft.rfft(ringing, n=n)).sum(dim=0)
+    blows = torch.zeros(*places.shape[:2], n, device=draw.device).scatter_add(2, places, score.force)
+    return (torch.fft.rfft(blows) * torch.fft.rfft(ringing, n=n)).sum(dim=1)
 
 
 def _modes(draw: Draw, low: float, high: float, decay: tuple[float, float], nyquist: float) -> dict[str, Tensor]:
@@ -188,10 +185,10 @@ def _music(draw: Draw, seconds: float, nyquist: float) -> Score:
     """Notes with harmonics on the beats, plucked or drawn out, and one thing that is a drum."""
     beat = draw.log(0.1, 0.5, 1, 1)
     time = beat * torch.randint(math.ceil(seconds / 0.1), (_THINGS, _EVENTS), device=draw.device)
-    steps = torch.tensor((0, 3, 4, 5, 7, 9, 10, 12, -12, -5), device=draw.device)
-    note = steps[torch.randint(len(steps), (_THINGS, 1), device=draw.device)]  # semitones above the root
+    fifths, octaves = (torch.randint(many, (_THINGS, 1), device=draw.device) for many in (5, 3))
+    note = 7 * fifths % 12 + 12 * octaves  # semitones above the root, of a pentatonic scale
     overtone = torch.arange(1, _MODES + 1, device=draw.device)
-    pitch = draw.log(80.0, 600.0, 1, 1) * 2 ** (note / 12) * overtone
+    pitch = draw.log(40.0, 300.0, 1, 1) * 2 ** (note / 12) * overtone
     gain = overtone ** draw.even(-2.0, -0.3, _THINGS, 1) * draw.log(0.3, 3.0, *pitch.shape) * (pitch < nyquist)
     is_drum = (torch.arange(_THINGS, device=draw.device) == 0).float()
     return Score(
@@ -228,16 +225,16 @@ def _footsteps(draw: Draw, seconds: float, nyquist: float) -> Score:
 # What goes on
 
 
-def speech(draw: Draw, rate: float, n: int) -> Tensor:
+def _speech(draw: Draw, rate: float, n: int) -> Tensor:
     """Somebody who speaks, (n,): a gliding pitch through formants that move, hisses, bursts and pauses."""
     frames = (n - _FRAME) // _STEP + 1
     n_sounds = math.ceil(n / rate / 0.04)
     kind = torch.rand(n_sounds, device=draw.device)
     pause, voiced = (kind < 0.12).float(), (kind > 0.35).float()
     lasting = draw.log(0.04, 0.25, n_sounds) * (1 + 3 * pause * torch.rand_like(pause))
-    low, high = torch.tensor(_FORMANTS, device=draw.device).T.unsqueeze(2)  # (3, 1)
-    formants = (low + (high - low) * draw.even(0, 1, 3, n_sounds)) * draw.log(0.85, 1.35, 1)  # of man, woman or child
-    hiss = draw.log(0.1, 1.0, 1) * draw.log(0.1, 1.0, n_sounds)
+    size = draw.log(0.85, 1.35, 1)  # of man, woman or child
+    formants = [size * draw.even(low, high, n_sounds) for low, high in _FORMANTS]
+    hiss = draw.log(0.03, 0.4, 1) * draw.log(0.1, 1.0, n_sounds)
     loudness = (1 - pause) * torch.where(voiced > 0, draw.log(0.2, 1.0, n_sounds), hiss)
     glide = draw.log(80.0, 280.0, 1) * draw.log(0.75, 1.35, n_sounds)
     targets = torch.stack([*formants, draw.log(1200.0, 6000.0, n_sounds), loudness, voiced, glide])
@@ -250,15 +247,15 @@ def speech(draw: Draw, rate: float, n: int) -> Tensor:
     source = per_sample[1] * pulses + (1 - 0.9 * per_sample[1]) * draw.normal(n)
     frequency = torch.fft.rfftfreq(_FRAME, 1 / rate, device=draw.device)
     centre = controls[:4, :, None]  # (4, F, 1)
-    width = torch.tensor((45.0, 60.0, 90.0, 800.0), device=draw.device)[:, None, None] * draw.log(0.7, 1.6, 4, 1, 1)
+    width = torch.stack([draw.log(0.7 * hz, 1.6 * hz, 1, 1) for hz in (45.0, 60.0, 90.0, 800.0)])
     peaks = ((frequency - centre) / width).square().add_(1).reciprocal_().sqrt_()  # (4, F, bins)
-    weight = torch.tensor((1.0, 0.6, 0.4), device=draw.device)[:, None, None] * draw.log(0.6, 1.6, 3, 1, 1)
+    weight = torch.stack([draw.log(0.6 * share, 1.6 * share, 1, 1) for share in (1.0, 0.6, 0.4)])
     dull = (1 + frequency / draw.log(200.0, 1500.0, 1)).reciprocal()
     envelope = loud * (voice * dull * (weight * peaks[:3]).sum(dim=0) + (1 - voice) * peaks[3])
     return _filtered(source, envelope)
 
 
-def tool(draw: Draw, rate: float, n: int) -> Tensor:
+def _tool(draw: Draw, rate: float, n: int) -> Tensor:
     """A motor that runs up and down, or a ratchet, (n,): a pitch, noise and bursts of noise through resonances."""
     frames, n_runs = n // _STEP, math.ceil(n / rate / 0.1)
     is_on = draw.often(0.6, n_runs) * draw.log(0.2, 1.0, n_runs)
@@ -286,15 +283,14 @@ def _filtered(wave: Tensor, envelope: Tensor) -> Tensor:
     """(n,) through a filter that changes, (F, bins) magnitudes: short frames that overlap."""
     window = torch.hann_window(_FRAME, device=wave.device)
     frames = torch.fft.rfft(wave.unfold(0, _FRAME, _STEP) * window) * envelope  # (F, bins)
-    frames = torch.fft.irfft(frames, n=_FRAME) * window
-    n_covered = (len(frames) - 1) * _STEP + _FRAME
-    covered = functional.fold(frames.T.unsqueeze(0), (1, n_covered), (1, _FRAME), stride=(1, _STEP)).flatten()
-    return functional.pad(covered, (0, len(wave) - n_covered))
+    steps = (torch.fft.irfft(frames, n=_FRAME) * window).unflatten(1, (-1, _STEP))  # (F, steps of a frame, step)
+    last = steps.shape[1] - 1
+    parts = [functional.pad(steps[:, i], (0, 0, i, last - i)) for i in range(last + 1)]
+    covered = torch.stack(parts).sum(dim=0).flatten()
+    return functional.pad(covered, (0, len(wave) - len(covered)))
 
 
-_SCORES: dict[str, Callable[[Draw, float, float], Score]] = {
+SCORES: dict[str, Callable[[Draw, float, float], Score]] = {
     "blows": _blows, "clatter": _clatter, "music": _music, "footsteps": _footsteps,
 }  # fmt: skip
-_STREAMS: dict[str, Callable[[Draw, float, int], Tensor]] = {"speech": speech, "tool": tool}
-KINDS = (*_SCORES, *_STREAMS)
-"""Names of what is generated."""
+STREAMS: dict[str, Callable[[Draw, float, int], Tensor]] = {"speech": _speech, "tool": _tool}

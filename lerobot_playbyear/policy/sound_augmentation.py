@@ -13,7 +13,7 @@ from torch.nn import functional
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, resample
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.generated_noise import KINDS, Draw, faded, generated_noise, rooms
+from lerobot_playbyear.policy.generated_noise import N_STRUCK, SCORES, STREAMS, Draw, faded, generated_noise, rooms
 
 _FAINTEST_DB = -20.0  # of a microphone's own noise, relative to an item's noise floor
 _NOISE_TILT = (0.0, 1.2)  # exponent of 1 / frequency: from white to a little steeper than pink
@@ -24,7 +24,6 @@ _HUM_DB = (-20.0, 0.0)  # relative to the broadband noise
 _ROOM_SHARE = 0.75  # of the items that hear a room with people in it
 _RECORDED_SHARE = 0.5  # of those, if there are recordings: the others hear what is generated
 _ROOM_FAINTEST_DB = 0.0  # of it, relative to an item's noise floor, unless the loudest is fainter
-_KINDS_AT_ONCE = 3  # of generated noise in a batch: more take time
 _FARTHER_DB = 12.0  # at most, from the microphone that hears it best to another one
 _ENDINGS = (".wav", ".flac")  # of files with recorded noise
 _MOST_SECONDS = 7200  # of all recordings
@@ -74,15 +73,15 @@ class SoundAugmentation(nn.Module):
         if self.max_db is None:
             return waves, None
         self.read_recordings()
-        n = waves.shape[2]
+        n_items, n_microphones, n = waves.shape
         n_bins = min(n // 2, math.ceil(min(self.highest_hz, self.sample_rate) * n / self.sample_rate))
+        size = (self.max_db, n_items, n_microphones, n, n_bins)
         with torch.autocast(
             waves.device.type, enabled=False
-        ):  # eight bits are too few for what is 60 dB louder than the rest
-            spectrum = self._own(self.max_db, *waves.shape, n_bins)
-            spectrum = spectrum + self._of_the_room(self.max_db, *waves.shape, n_bins)
-            noise = torch.fft.irfft(functional.pad(spectrum, (1, n // 2 - n_bins)), n=n, norm="forward")
-            return waves + noise_floor(waves) * noise, self.colour(*waves.shape[:2])
+        ):  # of a format in which noise hides what is 50 dB below it
+            spectrum = functional.pad(self._own(*size) + self._of_the_room(*size), (1, n // 2 - n_bins))
+            noise = torch.fft.irfft(spectrum, n=n, norm="forward")
+            return waves + noise_floor(waves) * noise, self.colour(n_items, n_microphones)
 
     def colour(self, n_items: int, n_microphones: int) -> Tensor:
         """A microphone's gain in every bin of the spectrogram, a smooth curve, (B, M, bins) [10 dB]."""
@@ -120,9 +119,11 @@ class SoundAugmentation(nn.Module):
         """
         device, seconds = self.response.device, n / self.sample_rate
         draw = Draw(device)
-        kinds = [KINDS[index] for index in torch.randperm(len(KINDS))[:_KINDS_AT_ONCE].tolist()]
-        sources = generated_noise(kinds, seconds, n_bins, device)  # (kinds, bins)
-        index = torch.randint(len(sources), (n_items,), device=device)
+        sources = generated_noise(seconds, n_bins, device)  # (clips, bins)
+        # All kinds equally often.
+        is_struck = draw.often(len(SCORES) / (len(SCORES) + len(STREAMS)), n_items) > 0
+        struck, stream = (torch.randint(many, (n_items,), device=device) for many in (N_STRUCK, len(STREAMS)))
+        index = torch.where(is_struck, struck, N_STRUCK + stream)
         if self._recorded is not None:
             excerpts = faded(self._recorded.excerpts(n_items, n).to(device), self.sample_rate)
             is_recorded = draw.often(_RECORDED_SHARE, n_items) > 0
