@@ -69,37 +69,52 @@ def measured() -> dict[str, Measured]:
     }
 
 
-def measure(tdw: Path) -> list[Measured]:
-    """The table from the package's files.
+class Modes(NamedTuple):
+    """Of one object: pitches [Hz], levels [dB], times to fall by 60 dB [s]."""
+
+    pitches: tuple[float, ...]
+    levels: tuple[float, ...]
+    times: tuple[float, ...]
+
+
+def objects(tdw: Path) -> dict[str, list[Modes]]:
+    """The different objects of each kind, from the package's files.
 
     Raises:
         FileNotFoundError: The package's files are not in `tdw`.
     """
-    objects: dict[str, dict[str, list[float]]] = {}
+    found: dict[str, list[Modes]] = {}
     for path in sorted(tdw.glob("tdw/add_ons/py_impact/material_data/*_mm.json")):
         kind = re.sub(r"_\d_mm$", "", path.stem)
         if kind in ("Ceramic", "plastc_hard"):
             continue  # misspelt: PyImpact never loads them
-        times = json.loads(path.read_text())["rt"][:_PLAYED]  # s
-        objects.setdefault(kind, {})[repr(times)] = times
-    if not objects:
+        read = json.loads(path.read_text())
+        modes = Modes(*(tuple(read[name][:_PLAYED]) for name in ("cf", "op", "rt")))
+        if modes not in found.setdefault(kind, []):
+            found[kind].append(modes)
+    if not found:
         raise FileNotFoundError(f"--tdw={tdw}: no tdw/add_ons/py_impact/material_data/*_mm.json is in it; see --help.")
+    return found
+
+
+def measure(tdw: Path) -> list[Measured]:
+    """The table, from the package's files."""
     rows = []
-    for kind, each in objects.items():
-        times = 1000.0 * np.concatenate(list(each.values()))
+    for kind, different in objects(tdw).items():
+        times = 1000.0 * np.concatenate([modes.times for modes in different])
         quantiles = (round(float(np.percentile(times, share)), 1) for share in (10, 50, 90))
-        rows.append(Measured(kind, len(each), len(times), *quantiles))
+        rows.append(Measured(kind, len(different), len(times), *quantiles))
     return rows
 
 
 def page() -> str:
     """The table of docs/explanation/sound.md."""
-    table = measured()
-    lines = ["| material | ours [ms] | kind | measured [ms] |", "|---|---|---|---|"]
-    for name, kind in KINDS.items():
-        (least, middle, most), row = decay_times(name), table[kind]
-        theirs = f"{row.median:.0f} ({row.p10:.0f} to {row.p90:.0f})"
-        lines.append(f"| `{name}` | {middle:.0f} ({least:.0f} to {most:.0f}) | {kind.replace('_', ' ')} | {theirs} |")
+    lines = ["| kind | measured [ms] | ours [ms] |", "|---|---|---|"]
+    for kind, row in measured().items():
+        names = [name for name, each in KINDS.items() if each == kind]
+        if names:
+            own = ", ".join(f"{name} {decay_times(name)[1]:.0f}" for name in names)
+            lines.append(f"| {kind.replace('_', ' ')} | {row.median:.0f} ({row.p10:.0f} to {row.p90:.0f}) | {own} |")
     return "\n".join(lines)
 
 

@@ -42,7 +42,9 @@ def test_the_table_counts_each_object_once_and_what_pyimpact_plays(tmp_path):
         "Ceramic_3": [9.0],
     }
     for name, times in objects.items():
-        (folder / f"{name}_mm.json").write_text(json.dumps({"rt": times}))
+        (folder / f"{name}_mm.json").write_text(
+            json.dumps({"cf": [440.0] * len(times), "op": [-30.0] * len(times), "rt": times})
+        )
     assert [row[:6] for row in measure(tmp_path)] == [("metal", 2, 20, 100.0, 200.0, 300.0)]
     with pytest.raises(FileNotFoundError, match="--tdw="):
         measure(tmp_path / "elsewhere")

@@ -201,14 +201,13 @@ def test_all_microphones_hear_the_same_source_each_in_its_own_way(monkeypatch):
     """Later, by reflections of its own and not equally loud; in an empty room they have nothing in common."""
     augment = augmentation(microphones=("gripper", "room"), audio_noise_db=20.0)
     monkeypatch.setattr(sound_augmentation, "_ROOM_SHARE", 1.0)
-    monkeypatch.setattr(sound_augmentation, "_FAINTEST_DB", -21.0)  # their own noise is that faint for sure
     with monkeypatch.context() as quiet:
         quiet.setattr(augment, "_own", lambda *_: torch.zeros(()))
         together = added(augment, n_microphones=2)
     alike, later = likeness(together)
     assert alike.median() > 0.5
     assert alike.min() > 0.02
-    assert len(later.unique()) > 20
+    assert len(later.unique()) >= 4  # rooms of a batch
     difference = decibels(together).diff(dim=1)
     assert 3 < difference.abs().mean() < 9
     assert decibels(together).amax() < 20 + 6  # a room may raise a tone
@@ -255,7 +254,7 @@ def test_half_of_what_items_hear_of_a_room_is_recorded_and_none_louder_than_was_
     tones = power[:, 235:266].sum(dim=1) + power[:, 735:766].sum(dim=1)
     recorded = (tones > 0.98 * power.sum(dim=1)) & (level > -60)
     assert 0.28 < recorded.float().mean() < 0.47
-    assert -9 < level[recorded].min() < 3  # a room may lower a tone
+    assert -15 < level[recorded].min() < 3  # a room may lower a tone
     assert 16 < level[recorded].max() < 28
 
 
