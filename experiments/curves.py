@@ -8,9 +8,9 @@
     python -m experiments.curves rooms --recordings=held_out --levels 2 8
 
 Noise, materials and rooms take the full policies that `experiments.ablations` trained, as they are: those of the preset `cpu`,
-which mixes generated noise into the sound, and never heard another material or a recording. `--trained` trains others here: with
-quieter noise in their sound, with recordings of other kinds than those that are tried, or without noise. `--recordings` adds
-voices, hits, music and footsteps that were recorded (`experiments.room_recordings`). Results that are there are kept.
+which mixes generated noise into the sound, and never heard another material or a recording. `--trained` trains others here:
+with quieter noise in their sound, with recordings of other kinds than those that are tried, or without noise. `--recordings`
+adds voices, hits, music and footsteps that were recorded (`experiments.room_recordings`). Results that are there are kept.
 """
 
 from collections.abc import Sequence
