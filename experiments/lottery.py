@@ -1,7 +1,7 @@
 """Where does the spread between training seeds come from, and what narrows it? One change at a time, over several seeds.
 
     python -m experiments.lottery --task=OccludedGrasp-v1 --jobs=2
-    python -m experiments.lottery --task=OccludedGrasp-v1 --variants colour weight_decay
+    python -m experiments.lottery --task=OccludedGrasp-v1 --variants half_the_rate weight_decay
 
 The episodes are of seeds on which choices are made, not of those that are reported elsewhere. Resumes.
 """
@@ -44,7 +44,6 @@ NOISE_SEEDS = (101, 102, 103)
 VARIANTS: dict[str, tuple[str, ...]] = {
     "preset": (),
     "weight_decay": ("--policy.optimizer_weight_decay=1e-4",),
-    "colour": ("--policy.audio_colour_db=4",),
     "twice_the_rate": ("--policy.optimizer_lr=2e-3",),
     "half_the_rate": ("--policy.optimizer_lr=5e-4",),
     "less_noise_on_the_arm": ("--policy.low_dimensional_noise=0.01",),

@@ -87,12 +87,14 @@ class Room:
 
     def _draw_ways(self, shared: np.random.Generator, each: list[np.random.Generator]) -> None:
         """Delays [samples] and gains, each (microphones, ways): the first way is the straight one."""
-        decay = np.log(1000.0) / np.exp(shared.uniform(*np.log(_REVERBERATION)))  # 1/s
+        shortest, longest = np.log(_REVERBERATION)
+        decay = np.log(1000.0) / np.exp(shared.uniform(shortest, longest))  # 1/s
         direct = 10 ** (shared.uniform(*_DIRECT_DB) / 20)
         self._delays = np.zeros((len(each), 1 + _REFLECTIONS), int)
         self._gains = np.zeros((len(each), 1 + _REFLECTIONS))
+        earliest, latest = np.log(_REFLECTED_AFTER)
         for delays, gains, rng in zip(self._delays, self._gains, each, strict=True):
-            after = np.exp(rng.uniform(*np.log(_REFLECTED_AFTER), _REFLECTIONS))
+            after = np.exp(rng.uniform(earliest, latest, _REFLECTIONS))
             reflected = rng.standard_normal(_REFLECTIONS) * np.exp(-decay * after)
             delays[:] = np.rint((rng.uniform(0.0, _LATEST) + np.append(0.0, after)) * self._sample_rate)
             gains[:] = np.append(direct * np.linalg.norm(reflected), reflected)
