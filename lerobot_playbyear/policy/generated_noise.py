@@ -132,7 +132,7 @@ class GeneratedNoise(nn.Module):
 def _events(draw: Draw, kinds: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
     """When things are struck and how hard, both (C, O, E) [s], [1]."""
     shape = (len(kinds), _THINGS, _EVENTS)
-    clatter, music, steps = ((kinds == STRUCK.index(kind))[:, None, None] for kind in ("clatter", "music", "footsteps"))
+    blows, clatter, music, steps = ((kinds == index)[:, None, None] for index in range(len(STRUCK)))
     event = torch.arange(_EVENTS, device=draw.device)
     # At any time, far and near; what falls bounces, faster and faster.
     bounce = event % torch.where(clatter, _BOUNCES, 1)  # (C, 1, E)
