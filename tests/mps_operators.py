@@ -9,7 +9,7 @@ _KERNELS = """
     amax amin any any.dim as_strided avg_pool2d bitwise_and.Tensor bitwise_not bmm cat ceil_ clamp clamp_ clamp_min
     constant_pad_nd cos cumsum div.Tensor div_.Tensor empty.memory_format eq.Scalar equal exp exp_ fill_.Scalar
     fill_.Tensor flip floor floor_divide gather ge.Scalar grid_sampler_2d gt.Scalar gt.Tensor index.Tensor isnan
-    le.Scalar lerp.Scalar lerp.Tensor lerp_.Scalar lerp_.Tensor linalg_vector_norm log10 lt.Scalar lt.Tensor
+    le.Scalar le.Tensor lerp.Scalar lerp.Tensor lerp_.Scalar lerp_.Tensor linalg_vector_norm log10 lt.Scalar lt.Tensor
     max_pool2d_with_indices max_pool2d_with_indices_backward maximum mean.dim minimum mm mul.Tensor mul_.Tensor
     native_batch_norm native_batch_norm_backward native_layer_norm native_layer_norm_backward neg normal_ permute
     pow.Scalar pow.Tensor_Scalar pow.Tensor_Tensor reciprocal reciprocal_ relu relu_ remainder.Tensor repeat round

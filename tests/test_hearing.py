@@ -100,11 +100,10 @@ def augmentation(**options):
 
 
 def added(augment, n_items=400, n_samples=32000, n_microphones=1):
-    """The noise that is mixed into white noise, in units of its floor: (n_items, n_microphones, n_samples)."""
+    """The noise that is mixed into batches of white noise, in units of its floor: (n_items, n_microphones, n_samples)."""
     torch.manual_seed(0)
-    wave = 1e-3 * torch.randn(n_items, n_microphones, n_samples)
-    torch.manual_seed(1)
-    return (augment(wave)[0] - wave) / 1e-3
+    waves = 1e-3 * torch.randn(n_items, n_microphones, n_samples)
+    return torch.cat([(augment(wave)[0] - wave) / 1e-3 for wave in waves.split(25)])
 
 
 def decibels(waves):
@@ -215,9 +214,9 @@ def test_all_microphones_hear_the_same_source_each_in_its_own_way(monkeypatch):
         quiet.setattr(augment, "_own", lambda *_: torch.zeros(()))
         together = added(augment, n_microphones=2)
     alike, later = likeness(together)
-    assert alike.median() > 0.5
+    assert alike.median() > 0.4
     assert alike.min() > 0.02
-    assert len(later.unique()) >= 4  # rooms of a batch
+    assert len(later.unique()) > 20
     difference = decibels(together).diff(dim=1)
     assert 3 < difference.abs().mean() < 9
     assert decibels(together).amax() < 20 + 6  # a room may raise a tone

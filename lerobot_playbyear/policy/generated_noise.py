@@ -139,8 +139,8 @@ def _events(draw: Draw, kinds: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
     of_blow = (event - bounce).expand(shape).unsqueeze(0).expand(3, -1, -1, -1)
     start, rarity, strength = draw.even(0, 1, 3, *shape).gather(3, of_blow)
     left, gap = draw.even(*_LEFT, *shape[:2], 1), draw.log(*_BOUNCE_S, *shape[:2], 1)
-    share = draw.even(0.2, 1, len(kinds), 1, 1) ** 2
-    is_heard = rarity < torch.where(blows, 0.5 * share, share)
+    share = torch.where(blows, 0.5, 1.0) * draw.even(0.2, 1, len(kinds), 1, 1) ** 2
+    is_heard = rarity <= torch.maximum(share, rarity.amin(dim=(1, 2), keepdim=True))  # one at least
     when = seconds * start + gap * (1 - left**bounce) / (1 - left)
     force = is_heard * _FAINTEST**strength * left**bounce
     # On beats.
@@ -203,7 +203,7 @@ def _speech(draw: Draw, rate: float, n: int) -> Tensor:
     size = draw.log(0.85, 1.35, 1)  # of man, woman or child
     formants = [size * draw.even(low, high, n_sounds) for low, high in _FORMANTS]
     hiss = draw.log(0.03, 0.4, 1) * draw.log(0.1, 1.0, n_sounds)
-    loudness = (1 - pause) * torch.where(voiced > 0, draw.log(0.2, 1.0, n_sounds), hiss)
+    loudness = (1 - pause) * torch.where(voiced > 0, draw.log(0.3, 1.0, n_sounds), hiss)
     glide = draw.log(80.0, 280.0, 1) * draw.log(0.75, 1.35, n_sounds)
     targets = torch.stack([*formants, draw.log(1200.0, 6000.0, n_sounds), loudness, voiced, glide])
     place = (torch.arange(frames, device=draw.device) * _STEP + _FRAME // 2) / rate
@@ -216,7 +216,8 @@ def _speech(draw: Draw, rate: float, n: int) -> Tensor:
     frequency = torch.fft.rfftfreq(_FRAME, 1 / rate, device=draw.device)
     centre = controls[:4, :, None]  # (4, F, 1)
     width = torch.stack([draw.log(0.7 * hz, 1.6 * hz, 1, 1) for hz in (45.0, 60.0, 90.0, 800.0)])
-    peaks = ((frequency - centre) / width).square().add_(1).reciprocal_().sqrt_()  # (4, F, bins)
+    detuned = (frequency - centre) / width
+    peaks = torch.complex(torch.ones_like(detuned), detuned).reciprocal()  # (4, F, bins), which ring after a pulse
     weight = torch.stack([draw.log(0.6 * share, 1.6 * share, 1, 1) for share in (1.0, 0.6, 0.4)])
     dull = (1 + frequency / draw.log(200.0, 1500.0, 1)).reciprocal()
     envelope = loud * (voice * dull * (weight * peaks[:3]).sum(dim=0) + (1 - voice) * peaks[3])
@@ -226,7 +227,8 @@ def _speech(draw: Draw, rate: float, n: int) -> Tensor:
 def _tool(draw: Draw, rate: float, n: int) -> Tensor:
     """A motor that runs up and down, or a ratchet, (n,): a pitch, noise and bursts of noise through resonances."""
     frames, n_runs = n // _STEP, math.ceil(n / rate / 0.1)
-    is_on = (draw.even(0, 1, n_runs) < 0.6) * draw.log(0.2, 1.0, n_runs)
+    chance = draw.even(0, 1, n_runs)
+    is_on = (chance <= chance[:1].clamp(min=0.6)) * draw.log(0.2, 1.0, n_runs)
     pitch = draw.log(8.0, 500.0, 1) * draw.log(0.5, 2.0, n_runs)
     place = torch.arange(frames, device=draw.device) * _STEP / rate
     controls = _moving(torch.stack([is_on, pitch]), draw.log(0.1, 2.0, n_runs), place, 9)
@@ -248,7 +250,7 @@ def _moving(targets: Tensor, lasting: Tensor, place: Tensor, smoothing: int) -> 
 
 
 def _filtered(wave: Tensor, envelope: Tensor) -> Tensor:
-    """(n,) through a filter that changes, (F, bins) magnitudes: short frames that overlap."""
+    """(n,) through a filter that changes, (F, bins): short frames that overlap."""
     window = torch.hann_window(_FRAME, device=wave.device)
     frames = torch.fft.rfft(wave.unfold(0, _FRAME, _STEP) * window) * envelope  # (F, bins)
     steps = (torch.fft.irfft(frames, n=_FRAME) * window).unflatten(1, (-1, _STEP))  # (F, steps of a frame, step)
