@@ -214,12 +214,13 @@ def make(output: Path, packages: Path) -> None:
             print(f"{path}: {len(waves)} files", flush=True)
 
 
-def recordings(name: str, folder: Path = FOLDER) -> list[Path]:
-    """The files of a set, by kind.
+def recordings(name: str, folder: Path | None = None) -> list[Path]:
+    """The files of a set, in the order of `KINDS`.
 
     Raises:
         FileNotFoundError: They were not made.
     """
+    folder = folder or FOLDER
     paths = [folder / f"{name}_{kind}.wav" for kind in KINDS]
     for path in paths:
         if not path.is_file():

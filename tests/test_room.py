@@ -1,7 +1,9 @@
 """Recorded noise and other microphones in the environment: they change the sound, without seams, and nothing else."""
 
+import hashlib
 import itertools
 import runpy
+import shutil
 import sys
 from pathlib import Path
 
@@ -12,6 +14,8 @@ from lerobot.envs.configs import EnvConfig  # noqa: F401  (registers LeRobot's o
 from scipy import signal
 from scipy.io import wavfile
 
+from experiments import curves, room_recordings
+from experiments.protocol import load
 from gym_playbyear.registry import OptionError
 from gym_playbyear.room import Room
 from gym_playbyear.sound import BACKGROUND_RMS
@@ -172,6 +176,51 @@ def test_what_cannot_be_is_refused_with_option_and_value(tmp_path):
         path.write_bytes(content)
         with pytest.raises(OptionError, match="cannot be read as a WAV file"):
             Room(("gripper",), 16000, str(path))
+
+
+# Recordings to test with
+
+
+def test_the_held_out_recordings_share_nothing_with_those_that_choices_are_made_on():
+    sets = load(room_recordings.LIST)["recordings"]
+    assert set(sets) == set(room_recordings.SETS)
+    packages, hashes = [], []
+    for kinds in sets.values():
+        assert set(kinds) == set(room_recordings.KINDS)
+        sources = [source for found in kinds.values() for source in found]
+        assert all(source["licence"] and source["version"] and source["files"] for source in sources)
+        packages.append({source["package"] for source in sources})
+        hashes.append({each for source in sources for each in source["files"].values()})
+    assert packages[0].isdisjoint(packages[1])
+    assert hashes[0].isdisjoint(hashes[1])
+
+
+def test_another_file_than_the_listed_one_is_refused(tmp_path, hiss):
+    folder = tmp_path / "unpacked" / "sounds_1"
+    folder.mkdir(parents=True)
+    shutil.copy(hiss, folder / "hiss.wav")
+    seen = hashlib.sha256((folder / "hiss.wav").read_bytes()).hexdigest()
+    source = {"package": "sounds", "version": "1", "archive": None, "files": {"hiss.wav": seen}}
+    (wave,) = room_recordings.read(source, tmp_path)
+    assert len(wave) == 8000
+    with pytest.raises(ValueError, match="give sounds 1"):
+        room_recordings.read(source | {"files": {"hiss.wav": "0" * 64}}, tmp_path)
+    mixed = room_recordings.mix("footsteps", [wave], np.random.default_rng(0))
+    assert len(mixed) == room_recordings.SECONDS * room_recordings.RATE
+    assert 0.9 < np.abs(mixed).max() < 1
+
+
+def test_policies_are_evaluated_with_each_recording_at_each_level(tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "recordings", lambda *_: None)  # of generated noise
+    with pytest.raises(FileNotFoundError, match=r"python -m experiments\.room_recordings"):
+        room_recordings.recordings("held_out", tmp_path)
+    for kind in room_recordings.KINDS:
+        (tmp_path / f"held_out_{kind}.wav").write_bytes(b"")
+    monkeypatch.setattr(room_recordings, "FOLDER", tmp_path)
+    conditions = curves.rooms((2.0, 8.0), "held_out")
+    tried = {(Path(each["room_noise"]).stem, each["room_noise_level"]) for each in conditions if "room_noise" in each}
+    kinds = [*curves.KINDS, *(f"held_out_{kind}" for kind in room_recordings.KINDS)]
+    assert tried == {(kind, level) for kind in kinds for level in ("2", "8")}
 
 
 NOISES = ("hum", "speech_like", "music_like", "clatter", "hammering", "typing", "tool")

@@ -9,14 +9,31 @@ In comments: C clips, O things that sound, E events of each, M modes of each, n 
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
+STRUCK = ("blows", "clatter", "music", "footsteps")
+"""Kinds of noise that are things which are struck."""
+
+_RANGES = (
+    ((80.0, 5000.0), (0.02, 1.0), (300.0, 10_000.0), (0.05, 3.0), (0.005, 0.3), (0.0001, 0.003)),
+    ((300.0, 7000.0), (0.02, 0.5), (300.0, 10_000.0), (0.02, 1.0), (0.005, 0.05), (0.0001, 0.001)),
+    ((40.0, 300.0), (0.15, 3.0), (300.0, 10_000.0), (0.02, 5.0), (0.02, 0.4), (0.001, 0.1)),
+    ((60.0, 1500.0), (0.01, 0.08), (300.0, 10_000.0), (0.1, 2.0), (0.01, 0.2), (0.0003, 0.01)),
+)
+"""Of each: pitch of a mode, of music of the lowest note [Hz]; decay of a mode at 1 kHz [s to fall by 60 dB]; pitch above which
+a blow excites little [Hz]; amplitude of a blow's noise beside the modes', and its decay [s]; time in which it sets in [s]."""
+
+_N_STRUCK = 2  # of these kinds at a time: each takes 2 % of an update's time
 _THINGS, _MODES, _EVENTS = 4, 8, 24
 _RING_S = 0.6  # longest that a blow is heard
+_BOUNCES = 6  # of a thing that falls
+_BOUNCE_S, _LEFT = (0.03, 0.3), (0.4, 0.9)  # to the first bounce; of the speed, after each
+_FAINTEST = 0.05  # of blows, far and near
+_BEAT_S, _PACE_S = (0.1, 0.5), (0.3, 0.8)  # of music, of feet
+_SOLE_S, _JITTER_S = (0.04, 0.16), (0.0, 0.04)  # from heel to sole
 _LN_60_DB = math.log(1000.0)
 
 _FRAME, _STEP = 256, 64  # samples
@@ -24,7 +41,6 @@ _EDGE_S = 0.02  # in which a clip that does not go round by itself fades in and 
 _FORMANTS = ((250.0, 900.0), (800.0, 2500.0), (2200.0, 3400.0))
 """Ranges of the first three formants [Hz] (Peterson and Barney, "Control methods used in a study of the vowels", 1952)."""
 
-N_STRUCK = 2  # of all kinds that are struck, at a time: each takes 2 % of an update's time
 _ROOMS = 4
 _LATEST_S = 0.01  # by which sound reaches one microphone later than another: 3.4 m
 _REFLECTIONS = 10
@@ -40,34 +56,108 @@ class Draw:
         self.device = device
 
     def even(self, low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(shape, device=self.device)
+        return torch.empty(shape, device=self.device).uniform_(low, high)
 
     def log(self, low: float, high: float, *shape: int) -> Tensor:
-        return low * (high / low) ** torch.rand(shape, device=self.device)
+        return self.even(math.log(low), math.log(high), *shape).exp_()
 
-    def often(self, share: float | Tensor, *shape: int) -> Tensor:
-        """1 in this share of the cases, else 0."""
-        return (torch.rand(shape, device=self.device) < share).float()
+    def whole(self, below: int, *shape: int) -> Tensor:
+        return torch.randint(below, shape, device=self.device)
 
     def normal(self, *shape: int) -> Tensor:
         return torch.randn(shape, device=self.device)
 
 
-def generated_noise(seconds: float, n_bins: int, device: torch.device) -> Tensor:
-    """Clips of some kinds, all equally loud.
+class GeneratedNoise(nn.Module):
+    """Clips of noise of all kinds."""
 
-    Returns:
-        (C, n_bins) complex, without the constant part: first `N_STRUCK` of different kinds in `SCORES`, then one of each in
-        `STREAMS`. As `torch.fft.irfft(..., norm="forward")` makes waves of them their root mean square is 1.
-    """
-    draw, n, rate = Draw(device), 2 * n_bins, 2 * n_bins / seconds
-    scores = [make(draw, seconds, 0.45 * rate) for make in SCORES.values()]
-    chosen = torch.randperm(len(scores), device=device)[:N_STRUCK]
-    struck = strike(draw, Score(*(torch.stack(each)[chosen] for each in zip(*scores, strict=True))), rate, n)
-    waves = torch.stack([make(draw, rate, max(n, _FRAME))[:n] for make in STREAMS.values()])
-    spectra = torch.cat([struck, torch.fft.rfft(faded(waves, rate))])[:, 1:]  # (C, n_bins)
-    power = 2 * torch.view_as_real(spectra).square().sum(dim=(1, 2))
-    return spectra * power.clamp(min=1e-20).rsqrt().unsqueeze(1)
+    ranges: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("ranges", torch.tensor(_RANGES).log(), persistent=False)  # (kinds, parameters, 2)
+
+    def forward(self, seconds: float, n_bins: int, n_items: int) -> Tensor:
+        """A clip for every item, of any kind; items share a few.
+
+        Returns:
+            (n_items, n_bins) complex, without the constant part. As `torch.fft.irfft(..., norm="forward")` makes waves of them
+            their root mean square is 1.
+        """
+        draw = Draw(self.ranges.device)
+        chosen = torch.randperm(len(STRUCK), device=draw.device)[:_N_STRUCK]
+        struck = self.struck(chosen, seconds, n_bins)
+        clips = torch.cat([struck, *(self.stream(kind, seconds, n_bins).unsqueeze(0) for kind in STREAMS)])
+        kinds = draw.whole(len(STRUCK) + len(STREAMS), n_items)  # all equally often
+        return clips[torch.where(kinds < len(STRUCK), kinds % _N_STRUCK, kinds - len(STRUCK) + _N_STRUCK)]
+
+    def struck(self, kinds: Tensor, seconds: float, n_bins: int) -> Tensor:
+        """Clips of these kinds, indices of `STRUCK` (C,): (C, n_bins) complex."""
+        draw, n, rate = Draw(self.ranges.device), 2 * n_bins, 2 * n_bins / seconds
+        n_ring = min(n, math.ceil(_RING_S * rate))
+        time = torch.arange(n_ring, device=draw.device) / rate  # (ring,)
+        ringing = self._ringing(draw, kinds, time, 0.45 * rate)  # (C, O, ring)
+        when, force = _events(draw, kinds, seconds)  # (C, O, E)
+        silent = torch.zeros(*when.shape[:2], n, device=draw.device)
+        blows = silent.scatter_add(2, (when * rate).long() % n, force)
+        spectra = torch.fft.rfft(blows) * torch.fft.rfft(ringing * (1 - time / time[-1]), n=n)
+        return _equally_loud(spectra.sum(dim=1)[:, 1:])
+
+    def stream(self, kind: str, seconds: float, n_bins: int) -> Tensor:
+        """A clip of one of `STREAMS`, (n_bins,) complex."""
+        n, rate = 2 * n_bins, 2 * n_bins / seconds
+        wave = STREAMS[kind](Draw(self.ranges.device), rate, max(n, _FRAME))[:n]
+        return _equally_loud(torch.fft.rfft(faded(wave, rate))[1:])
+
+    def _ringing(self, draw: Draw, kinds: Tensor, time: Tensor, highest_hz: float) -> Tensor:
+        """What each thing sounds like when it is struck, (C, O, ring)."""
+        low, high = self.ranges[kinds].unsqueeze(3).unbind(2)  # (C, parameters, 1)
+        shape = (len(kinds), _THINGS, _MODES)
+        drawn = torch.lerp(low, high, draw.even(0, 1, *low.shape[:2], _THINGS)).exp()  # (C, parameters, O)
+        _, decay, softness, burst, burst_decay, attack = drawn.unsqueeze(3).unbind(1)  # (C, O, 1)
+        anywhere = torch.lerp(low[:, :1], high[:, :1], draw.even(0, 1, *shape)).exp()
+        fifths, octaves = draw.whole(5, *shape[:2], 1), draw.whole(3, *shape[:2], 1)
+        note = 7 * fifths % 12 + 12 * octaves  # semitones, of a pentatonic scale
+        overtone = torch.arange(1, _MODES + 1, device=draw.device)
+        is_music = (kinds == STRUCK.index("music"))[:, None, None]
+        pitch = torch.where(is_music, anywhere[:, :1, :1] * 2 ** (note / 12) * overtone, anywhere)  # (C, O, M)
+        lasting = decay * (pitch / 1000.0) ** -0.5 * draw.log(0.6, 1.7, *shape)
+        gain = draw.normal(*shape) / (1 + (pitch / softness).square()) * (pitch < highest_hz)
+        phase = 2 * math.pi * (pitch.unsqueeze(3) * time + draw.even(0, 1, *shape, 1))
+        modes = torch.exp(-_LN_60_DB / lasting.unsqueeze(3) * time) * phase.sin()  # (C, O, M, ring)
+        noise = burst * draw.normal(*shape[:2], len(time)) * torch.exp(-_LN_60_DB / burst_decay * time)
+        return ((gain.unsqueeze(2) @ modes).squeeze(2) + noise) * (1 - torch.exp(-time / attack))
+
+
+def _events(draw: Draw, kinds: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
+    """When things are struck and how hard, both (C, O, E) [s], [1]."""
+    shape = (len(kinds), _THINGS, _EVENTS)
+    blows, clatter, music, steps = ((kinds == index)[:, None, None] for index in range(len(STRUCK)))
+    event = torch.arange(_EVENTS, device=draw.device)
+    # At any time, far and near; what falls bounces, faster and faster.
+    bounce = event % torch.where(clatter, _BOUNCES, 1)  # (C, 1, E)
+    of_blow = (event - bounce).expand(shape).unsqueeze(0).expand(3, -1, -1, -1)
+    start, rarity, strength = draw.even(0, 1, 3, *shape).gather(3, of_blow)
+    left, gap = draw.even(*_LEFT, *shape[:2], 1), draw.log(*_BOUNCE_S, *shape[:2], 1)
+    share = torch.where(blows, 0.5, 1.0) * draw.even(0.2, 1, len(kinds), 1, 1) ** 2
+    is_heard = rarity <= torch.maximum(share, rarity.amin(dim=(1, 2), keepdim=True))  # one at least
+    when = seconds * start + gap * (1 - left**bounce) / (1 - left)
+    force = is_heard * _FAINTEST**strength * left**bounce
+    # On beats.
+    beat = draw.log(*_BEAT_S, len(kinds), 1, 1) * draw.whole(math.ceil(seconds / _BEAT_S[0]), *shape)
+    # Heel and sole of each foot, of somebody who walks by.
+    part = torch.arange(_THINGS, device=draw.device).unsqueeze(1)
+    pace, sole = draw.even(*_PACE_S, len(kinds), 1, 1), draw.even(*_SOLE_S, len(kinds), 1, 1)
+    step = pace * (2 * event + part % 2) + sole * (part // 2) + draw.even(*_JITTER_S, len(kinds), 1, _EVENTS)
+    away = (step - draw.even(0, seconds, len(kinds), 1, 1)).abs() / draw.log(0.3, 5.0, len(kinds), 1, 1)
+    near = (step < seconds) * draw.log(0.4, 1.0, *shape) / (0.5 + away)
+    return torch.where(steps, step, torch.where(music, beat, when)), torch.where(steps, near, force)
+
+
+def _equally_loud(spectra: Tensor) -> Tensor:
+    """(..., n_bins) complex -> the same shape, of waves whose root mean square is 1; what is silent stays so."""
+    power = 2 * torch.view_as_real(spectra).square().sum(dim=(-1, -2))
+    return spectra * power.clamp(min=1e-20).rsqrt().unsqueeze(-1)
 
 
 def faded(waves: Tensor, rate: float) -> Tensor:
@@ -100,128 +190,6 @@ def rooms(n_microphones: int, seconds: float, n_bins: int, device: torch.device)
     return torch.fft.rfft(response, n=2 * n_bins)[..., 1:]
 
 
-# What is struck
-
-
-class Score(NamedTuple):
-    """When things are struck, how hard, and how they ring.
-
-    Attributes:
-        time, force: Of every event, (O, E) [s], [1].
-        pitch, decay, gain: Of every mode, (O, M) [Hz], [s to fall by 60 dB], [1].
-        burst, burst_decay: Of the noise of a blow, (O,) [1], [s to fall by 60 dB].
-        attack: (O,) [s]: a bow's or a voice's is slow.
-    """
-
-    time: Tensor
-    force: Tensor
-    pitch: Tensor
-    decay: Tensor
-    gain: Tensor
-    burst: Tensor
-    burst_decay: Tensor
-    attack: Tensor
-
-
-def strike(draw: Draw, score: Score, rate: float, n: int) -> Tensor:
-    """The spectra of clips, (C, n / 2 + 1) complex, of scores with one more dimension: every thing rings at all its events."""
-    n_ring = min(n, math.ceil(_RING_S * rate))
-    time = torch.arange(n_ring, device=draw.device) / rate  # (ring,)
-    phase = 2 * math.pi * (score.pitch.unsqueeze(3) * time + draw.even(0, 1, *score.pitch.shape, 1))
-    ringing = torch.exp(-_LN_60_DB / score.decay.unsqueeze(3) * time) * phase.sin()  # (C, O, M, ring)
-    ringing = (score.gain.unsqueeze(2) @ ringing).squeeze(2)  # (C, O, ring)
-    noise = draw.normal(*ringing.shape) * torch.exp(-_LN_60_DB / score.burst_decay.unsqueeze(2) * time)
-    ringing = (ringing + score.burst.unsqueeze(2) * noise) * (1 - torch.exp(-time / score.attack.unsqueeze(2)))
-    ringing = ringing * (1 - time / time[-1])
-    places = (score.time * rate).long() % n
-    blows = torch.zeros(*places.shape[:2], n, device=draw.device).scatter_add(2, places, score.force)
-    return (torch.fft.rfft(blows) * torch.fft.rfft(ringing, n=n)).sum(dim=1)
-
-
-def _modes(draw: Draw, low: float, high: float, decay: tuple[float, float], nyquist: float) -> dict[str, Tensor]:
-    """Of things as they lie about: modes anywhere, which die the sooner the higher they are; a soft or a hard blow."""
-    pitch = draw.log(low, min(high, nyquist), _THINGS, _MODES)
-    lasting = draw.log(*decay, _THINGS, 1) * (pitch / 1000.0) ** -0.5 * draw.log(0.6, 1.7, *pitch.shape)
-    softness = draw.log(300.0, 10_000.0, _THINGS, 1)  # [Hz] above which a blow excites little
-    gain = draw.normal(*pitch.shape) / (1 + (pitch / softness).square())
-    return {"pitch": pitch, "decay": lasting, "gain": gain}
-
-
-def _bouncing(draw: Draw, seconds: float, share: Tensor, n_bounces: int) -> dict[str, Tensor]:
-    """Blows at any time, near and far, each with bounces that follow faster and faster."""
-    blows = (_THINGS, _EVENTS // n_bounces, 1)
-    bounce, gap = torch.arange(n_bounces, device=draw.device), draw.log(0.03, 0.3, *blows)
-    left = draw.even(0.4, 0.9, *blows)  # of the speed, after a bounce
-    time = draw.even(0, seconds, *blows) + gap * (1 - left**bounce) / (1 - left)
-    force = draw.often(share, *blows) * draw.log(0.05, 1, *blows) * left**bounce * draw.log(0.6, 1.6, *time.shape)
-    return {"time": time.flatten(1), "force": force.flatten(1)}
-
-
-def _blows(draw: Draw, seconds: float, nyquist: float) -> Score:
-    """Single blows on things of many materials: a door, a cup put down, a hammer, a drum."""
-    share = draw.even(0, 1, 1, 1, 1) ** 2
-    return Score(
-        **_bouncing(draw, seconds, 0.04 + 0.5 * share, 1),
-        **_modes(draw, 80.0, 5000.0, (0.02, 1.0), nyquist),
-        burst=draw.log(0.05, 3.0, _THINGS),
-        burst_decay=draw.log(0.005, 0.3, _THINGS),
-        attack=draw.log(0.0001, 0.003, _THINGS),
-    )
-
-
-def _clatter(draw: Draw, seconds: float, nyquist: float) -> Score:
-    """Small hard things that fall and bounce."""
-    share = draw.even(0, 1, 1, 1, 1)
-    return Score(
-        **_bouncing(draw, seconds, 0.15 + 0.7 * share, 6),
-        **_modes(draw, 300.0, 7000.0, (0.02, 0.5), nyquist),
-        burst=draw.log(0.02, 1.0, _THINGS),
-        burst_decay=draw.log(0.005, 0.05, _THINGS),
-        attack=draw.log(0.0001, 0.001, _THINGS),
-    )
-
-
-def _music(draw: Draw, seconds: float, nyquist: float) -> Score:
-    """Notes with harmonics on the beats, plucked or drawn out, and one thing that is a drum."""
-    beat = draw.log(0.1, 0.5, 1, 1)
-    time = beat * torch.randint(math.ceil(seconds / 0.1), (_THINGS, _EVENTS), device=draw.device)
-    fifths, octaves = (torch.randint(many, (_THINGS, 1), device=draw.device) for many in (5, 3))
-    note = 7 * fifths % 12 + 12 * octaves  # semitones above the root, of a pentatonic scale
-    overtone = torch.arange(1, _MODES + 1, device=draw.device)
-    pitch = draw.log(40.0, 300.0, 1, 1) * 2 ** (note / 12) * overtone
-    gain = overtone ** draw.even(-2.0, -0.3, _THINGS, 1) * draw.log(0.3, 3.0, *pitch.shape) * (pitch < nyquist)
-    is_drum = (torch.arange(_THINGS, device=draw.device) == 0).float()
-    return Score(
-        time % seconds,
-        draw.often(draw.even(0.2, 0.9, _THINGS, 1), _THINGS, _EVENTS) * draw.log(0.3, 1, _THINGS, _EVENTS),
-        pitch,
-        draw.log(0.15, 3.0, _THINGS, 1) * overtone**-0.5,
-        gain,
-        is_drum * draw.log(0.3, 5.0, _THINGS),
-        draw.log(0.02, 0.4, _THINGS),
-        draw.log(0.001, 0.1, _THINGS) ** (1 + is_drum),
-    )
-
-
-def _footsteps(draw: Draw, seconds: float, nyquist: float) -> Score:
-    """Somebody who walks by: heel and sole of each foot, dull and short, with the scrape of the sole."""
-    pace = draw.even(0.3, 0.8, 1)
-    part = torch.arange(_THINGS, device=draw.device).reshape(_THINGS, 1)
-    side, sole = part % 2, part // 2
-    step = torch.arange(_EVENTS, device=draw.device)
-    time = pace * (2 * step + side) + sole * draw.even(0.04, 0.16, 1) + draw.even(0, 0.04, _EVENTS)
-    nearest = draw.even(0, seconds, 1)
-    near = 1 / (0.5 + (time - nearest).abs() / draw.log(0.3, 5.0, 1))
-    return Score(
-        time,
-        (time < seconds) * near * draw.log(0.4, 1.0, *time.shape) * torch.where(sole > 0, 0.5, 1.0),
-        **_modes(draw, 60.0, 1500.0, (0.01, 0.08), nyquist),
-        burst=draw.log(0.1, 2.0, _THINGS),
-        burst_decay=draw.log(0.01, 0.2, _THINGS),
-        attack=draw.log(0.0003, 0.01, _THINGS),
-    )
-
-
 # What goes on
 
 
@@ -235,7 +203,7 @@ def _speech(draw: Draw, rate: float, n: int) -> Tensor:
     size = draw.log(0.85, 1.35, 1)  # of man, woman or child
     formants = [size * draw.even(low, high, n_sounds) for low, high in _FORMANTS]
     hiss = draw.log(0.03, 0.4, 1) * draw.log(0.1, 1.0, n_sounds)
-    loudness = (1 - pause) * torch.where(voiced > 0, draw.log(0.2, 1.0, n_sounds), hiss)
+    loudness = (1 - pause) * torch.where(voiced > 0, draw.log(0.3, 1.0, n_sounds), hiss)
     glide = draw.log(80.0, 280.0, 1) * draw.log(0.75, 1.35, n_sounds)
     targets = torch.stack([*formants, draw.log(1200.0, 6000.0, n_sounds), loudness, voiced, glide])
     place = (torch.arange(frames, device=draw.device) * _STEP + _FRAME // 2) / rate
@@ -248,7 +216,8 @@ def _speech(draw: Draw, rate: float, n: int) -> Tensor:
     frequency = torch.fft.rfftfreq(_FRAME, 1 / rate, device=draw.device)
     centre = controls[:4, :, None]  # (4, F, 1)
     width = torch.stack([draw.log(0.7 * hz, 1.6 * hz, 1, 1) for hz in (45.0, 60.0, 90.0, 800.0)])
-    peaks = ((frequency - centre) / width).square().add_(1).reciprocal_().sqrt_()  # (4, F, bins)
+    detuned = (frequency - centre) / width
+    peaks = torch.complex(torch.ones_like(detuned), detuned).reciprocal()  # (4, F, bins), which ring after a pulse
     weight = torch.stack([draw.log(0.6 * share, 1.6 * share, 1, 1) for share in (1.0, 0.6, 0.4)])
     dull = (1 + frequency / draw.log(200.0, 1500.0, 1)).reciprocal()
     envelope = loud * (voice * dull * (weight * peaks[:3]).sum(dim=0) + (1 - voice) * peaks[3])
@@ -258,7 +227,8 @@ def _speech(draw: Draw, rate: float, n: int) -> Tensor:
 def _tool(draw: Draw, rate: float, n: int) -> Tensor:
     """A motor that runs up and down, or a ratchet, (n,): a pitch, noise and bursts of noise through resonances."""
     frames, n_runs = n // _STEP, math.ceil(n / rate / 0.1)
-    is_on = draw.often(0.6, n_runs) * draw.log(0.2, 1.0, n_runs)
+    chance = draw.even(0, 1, n_runs)
+    is_on = (chance <= chance[:1].clamp(min=0.6)) * draw.log(0.2, 1.0, n_runs)
     pitch = draw.log(8.0, 500.0, 1) * draw.log(0.5, 2.0, n_runs)
     place = torch.arange(frames, device=draw.device) * _STEP / rate
     controls = _moving(torch.stack([is_on, pitch]), draw.log(0.1, 2.0, n_runs), place, 9)
@@ -280,7 +250,7 @@ def _moving(targets: Tensor, lasting: Tensor, place: Tensor, smoothing: int) -> 
 
 
 def _filtered(wave: Tensor, envelope: Tensor) -> Tensor:
-    """(n,) through a filter that changes, (F, bins) magnitudes: short frames that overlap."""
+    """(n,) through a filter that changes, (F, bins): short frames that overlap."""
     window = torch.hann_window(_FRAME, device=wave.device)
     frames = torch.fft.rfft(wave.unfold(0, _FRAME, _STEP) * window) * envelope  # (F, bins)
     steps = (torch.fft.irfft(frames, n=_FRAME) * window).unflatten(1, (-1, _STEP))  # (F, steps of a frame, step)
@@ -290,7 +260,5 @@ def _filtered(wave: Tensor, envelope: Tensor) -> Tensor:
     return functional.pad(covered, (0, len(wave) - len(covered)))
 
 
-SCORES: dict[str, Callable[[Draw, float, float], Score]] = {
-    "blows": _blows, "clatter": _clatter, "music": _music, "footsteps": _footsteps,
-}  # fmt: skip
 STREAMS: dict[str, Callable[[Draw, float, int], Tensor]] = {"speech": _speech, "tool": _tool}
+"""Kinds of noise that go on."""

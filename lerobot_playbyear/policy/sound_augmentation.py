@@ -13,7 +13,7 @@ from torch.nn import functional
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, resample
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
-from lerobot_playbyear.policy.generated_noise import N_STRUCK, SCORES, STREAMS, Draw, faded, generated_noise, rooms
+from lerobot_playbyear.policy.generated_noise import Draw, GeneratedNoise, faded, rooms
 
 _FAINTEST_DB = -20.0  # of a microphone's own noise, relative to an item's noise floor
 _NOISE_TILT = (0.0, 1.2)  # exponent of 1 / frequency: from white to a little steeper than pink
@@ -49,6 +49,7 @@ class SoundAugmentation(nn.Module):
         self.sample_rate, self.max_db = config.sample_rate, config.audio_noise_db
         self.files = config.audio_noise_files
         self.highest_hz = (config.n_frequency_bins + _LEAKAGE) / config.segment_s
+        self.generated = GeneratedNoise()
         self._recorded: RecordedNoise | None = None
         octaves = torch.log2(torch.arange(1, config.n_frequency_bins + 1).float())
         place = octaves / octaves.max().clamp(min=1e-6) * (_COLOUR_POINTS - 1)  # of a bin, in points
@@ -119,27 +120,22 @@ class SoundAugmentation(nn.Module):
         """
         device, seconds = self.response.device, n / self.sample_rate
         draw = Draw(device)
-        sources = generated_noise(seconds, n_bins, device)  # (clips, bins)
-        # All kinds equally often.
-        is_struck = draw.often(len(SCORES) / (len(SCORES) + len(STREAMS)), n_items) > 0
-        struck, stream = (torch.randint(many, (n_items,), device=device) for many in (N_STRUCK, len(STREAMS)))
-        index = torch.where(is_struck, struck, N_STRUCK + stream)
+        sources = self.generated(seconds, n_bins, n_items)  # (B, bins)
         if self._recorded is not None:
             excerpts = faded(self._recorded.excerpts(n_items, n).to(device), self.sample_rate)
-            is_recorded = draw.often(_RECORDED_SHARE, n_items) > 0
-            index = torch.where(is_recorded, len(sources) + torch.arange(n_items, device=device), index)
-            sources = torch.cat([sources, torch.fft.rfft(excerpts, norm="forward")[:, 1 : n_bins + 1]])
+            spectra = torch.fft.rfft(excerpts, norm="forward")[:, 1 : n_bins + 1]
+            sources = torch.where(draw.even(0, 1, n_items, 1) < _RECORDED_SHARE, spectra, sources)
         ways = rooms(n_microphones, seconds, n_bins, device)  # (rooms, M, bins)
-        ways = ways[torch.randint(len(ways), (n_items,), device=device)]
-        moment = torch.randint(n, (n_items, 1), device=device)
+        ways = ways[draw.whole(len(ways), n_items)]
+        moment = draw.whole(n, n_items, 1)
         turns = moment * torch.arange(1, n_bins + 1, device=device) % n  # as integers: floats would lose the fraction
         angle = 2 * math.pi / n * turns
-        shifted = sources[index] * torch.complex(angle.cos(), angle.sin())
+        shifted = sources * torch.complex(angle.cos(), angle.sin())
         faintest = min(_ROOM_FAINTEST_DB, max_db)
         level = draw.even(faintest, max_db, n_items, 1, 1)  # [dB]
         farther = draw.even(0, _FARTHER_DB, n_items, n_microphones, 1)
         level = level - farther + farther.amin(dim=1, keepdim=True)
-        gain = 10 ** (level / 20) * draw.often(_ROOM_SHARE, n_items, 1, 1)
+        gain = 10 ** (level / 20) * (draw.even(0, 1, n_items, 1, 1) < _ROOM_SHARE)
         return gain * ways * shifted.unsqueeze(1)
 
 
