@@ -1,11 +1,13 @@
 """Our materials ring as long as measured objects of the same kind: the table of `experiments.decay_times`."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.decay_times import KINDS, decay_times, measure, measured
+from experiments.decay_times import KINDS, decay_times, measure, measured, page
 from experiments.sound_scenes import box_on_table, listen
 from gym_playbyear.sound.materials import MATERIALS
 
@@ -30,6 +32,11 @@ def test_what_is_heard_falls_silent_as_fast_as_the_table_says(material):
         slope = np.polyfit(np.flatnonzero(fits) / 48000, level[fits], 1)[0]
         times.append(1000 * 60 / -slope)
     assert np.median(times) == pytest.approx(decay_times(material)[1], rel=0.15)
+
+
+def test_the_page_on_sound_has_the_table():
+    shown = (Path(__file__).parents[1] / "docs/explanation/sound.md").read_text()
+    assert page() in re.sub(r"\[([^]]*)\]\(\.\./media/materials/\w+\.flac\)", r"\1", shown)
 
 
 def test_the_table_counts_each_object_once_and_what_pyimpact_plays(tmp_path):
