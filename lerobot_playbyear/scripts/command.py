@@ -122,6 +122,14 @@ def short_help(command: str) -> str:
     return (HELP / f"{command}.txt").read_text()
 
 
+def _print_to_a_reader(text: str) -> None:
+    """Prints what may be read to its beginning only, as `head` does."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
+
+
 def answer_at_once(command: str) -> None:
     """Prints the help, or which option there is not, and ends the process; otherwise does nothing.
 
@@ -132,7 +140,7 @@ def answer_at_once(command: str) -> None:
         sys.argv[1:] = [*(argument for argument in args if argument != "--help=all"), "--help"]
         return
     if "--help" in args or "-h" in args:
-        print(short_help(command).strip())
+        _print_to_a_reader(short_help(command).strip())
         sys.exit(0)
     if (lerobots := for_robots(command, args)) is not None:
         print(f"error: {lerobots}", file=sys.stderr)
