@@ -23,7 +23,8 @@ training        datasets audio policy hub
 teleoperation   datasets episodes
 recording       datasets episodes hub teleoperation
 dagger          datasets policy episodes hub training
-scripts         datasets audio microphones repair policy episodes film inspection hub training teleoperation recording dagger
+reproduce       datasets policy episodes film training recording dagger
+scripts         datasets audio microphones repair policy episodes film inspection hub training teleoperation recording dagger reproduce
 """
 _ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}
 _AT_THE_TOP = {"__init__.py", "compat.py"}
