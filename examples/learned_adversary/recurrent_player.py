@@ -15,7 +15,7 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from experiments.numeric_task import N_PLAYER, NumericTask
+from numeric_task import N_PLAYER, NumericTask
 from gym_playbyear.check.report import EXPERT, deaf_scripts
 from gym_playbyear.panda import ACTION_SCALE
 
