@@ -32,7 +32,8 @@ class AttemptsFile(gym.Wrapper):
 
     A line has `seed` (null where the environment drew it), `steps`, and what the environment's `info` says at the end:
     `is_success`, `end`, `acted_early` and `n_closings` where the task tells them, and what the task kept secret. Of a failure
-    in one of our tasks it has `failure`, its mode (`gym_playbyear.failures`). Attempts that are broken off leave none. Several environments, also in processes of their own, may share a file.
+    in one of our tasks it has `failure`, its mode (`gym_playbyear.failures`). Attempts that are broken off leave none.
+    Several environments, also in processes of their own, may share a file.
 
     Args:
         env: The environment.

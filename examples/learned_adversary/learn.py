@@ -18,11 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from sb3_contrib import RecurrentPPO
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
-
 from numeric_task import DISCOUNT, NumericTask
 from recurrent_player import (
     RecurrentPlayer,
@@ -32,6 +27,11 @@ from recurrent_player import (
     play_episode,
     save_checkpoint,
 )
+from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
 from gym_playbyear.check.report import EXPERT
 
 DEMONSTRATION_SEED = 10000
