@@ -25,7 +25,7 @@ from safetensors.torch import load_file, save
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import write_atomically
 from lerobot_playbyear.episodes.environment import env_spec
-from lerobot_playbyear.episodes.play import Observation, play
+from lerobot_playbyear.episodes.play import Observation
 from lerobot_playbyear.episodes.policy_actor import PolicyActor, load_policy_actor
 from lerobot_playbyear.film.rollout_film import env_of_lerobot
 
@@ -129,20 +129,6 @@ class ResidualEnv(gym.Env):
         self.env.close()
 
 
-class ResidualActor:
-    """The policy with what was learned, without chance."""
-
-    def __init__(self, base: Base, model: Any, bound: float) -> None:
-        self._base, self._model, self._bound = base, model, bound
-
-    def reset(self, env: gym.Env) -> None:
-        self._base.reset(env)
-
-    def act(self, observation: Observation) -> np.ndarray:
-        seen, action = self._base.look(observation)
-        return added(action, self._model.predict(seen, deterministic=True)[0], self._bound)
-
-
 def added(action: np.ndarray, residual: np.ndarray, bound: float) -> np.ndarray:
     """An action (action dim,) with its displacement changed by at most `bound`, within [-1, 1]."""
     sum_ = action[:_N_DISPLACED] + bound * np.clip(residual, -1, 1)
@@ -220,33 +206,30 @@ def learn(cfg: ResidualConfig) -> Path:
 
 def evaluate(cfg: ResidualConfig) -> None:
     """Plays episodes from `cfg.seed` on; `--env.attempts_file` keeps how they ended."""
-    base, env = Base(load_policy_actor(cfg.policy, cfg.env)), env_of_lerobot(cfg.env)
-    model = make_model(cfg, ResidualEnv(env_spec(cfg.env).make(), base, cfg.bound))
+    env = ResidualEnv(env_of_lerobot(cfg.env), Base(load_policy_actor(cfg.policy, cfg.env)), cfg.bound)
+    model = make_model(cfg, env)
     model.actor.load_state_dict(load_file(Path(str(cfg.residual)) / "model.safetensors"))
-    actor = ResidualActor(base, model, cfg.bound)
-    solved = [play(env, actor, seed).success for seed in range(cfg.seed, cfg.seed + cfg.n_episodes)]
+    n_solved = 0
+    for seed in range(cfg.seed, cfg.seed + cfg.n_episodes):
+        seen, done, info = env.reset(seed=seed)[0], False, {}
+        while not done:
+            seen, _, terminated, truncated, info = env.step(model.predict(seen, deterministic=True)[0])
+            done = terminated or truncated
+        n_solved += bool(info["is_success"])
     env.close()
-    print(f"{sum(solved)} of {len(solved)}")
+    print(f"{n_solved} of {cfg.n_episodes}")
 
 
-# What a run is made of, in one file of tensors: weights, optimisers, what was seen
-
-
-def _optimizers(model: Any) -> dict[str, Any]:
-    return {"actor": model.actor.optimizer, "critic": model.critic.optimizer, "entropy": model.ent_coef_optimizer}
-
+# What a run is made of, in one file of tensors: weights and what was seen. Its optimisers begin again after a kill.
 
 _SEEN = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 def _kept(model: Any) -> bytes:
-    tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
-    tensors["log_ent_coef"] = model.log_ent_coef.detach()
-    for name, optimizer in _optimizers(model).items():
-        for index, state in optimizer.state_dict()["state"].items():
-            tensors |= {f"optimizer.{name}.{index}.{key}": torch.as_tensor(value) for key, value in state.items()}
     n = model.replay_buffer.size()
+    tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
     tensors |= {f"seen.{name}": torch.from_numpy(getattr(model.replay_buffer, name)[:n]) for name in _SEEN}
+    tensors["log_ent_coef"] = model.log_ent_coef.detach()
     progress = {"steps": model.num_timesteps, "updates": model._n_updates, "pos": model.replay_buffer.pos}
     return save(
         {name: value.clone().contiguous() for name, value in tensors.items()}, {"progress": json.dumps(progress)}
@@ -259,13 +242,6 @@ def _restore(model: Any, path: Path) -> None:
         progress = json.loads(file.metadata()["progress"])
     model.policy.load_state_dict({name[7:]: value for name, value in tensors.items() if name.startswith("policy.")})
     model.log_ent_coef.data.copy_(tensors["log_ent_coef"])
-    for name, optimizer in _optimizers(model).items():
-        state: dict[int, dict[str, torch.Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith(f"optimizer.{name}."):
-                _, _, index, what = key.split(".")
-                state.setdefault(int(index), {})[what] = value
-        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
     buffer, n = model.replay_buffer, len(tensors["seen.rewards"])
     for name in _SEEN:
         getattr(buffer, name)[:n] = tensors[f"seen.{name}"].numpy()

@@ -9,6 +9,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
+from itertools import batched
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from lerobot_playbyear.datasets.files import FolderLock, FolderLockedError, pars
 from lerobot_playbyear.reproduce.config import ReproduceConfig
 from lerobot_playbyear.reproduce.plan import Candidate, Cell, Plan, Step
 from lerobot_playbyear.reproduce.steps import StepError, carry_out, end_with_parent, prepare
-from lerobot_playbyear.reproduce.table import Row, Table, machine, rate, told, versions
+from lerobot_playbyear.reproduce.table import KEY, Row, Table, machine, rate, told, versions
 
 _N_BEST = 3
 _DONE, _FAILED, _BUSY = 0, 1, 3
@@ -75,7 +76,7 @@ def run(cells: Sequence[Cell], cfg: ReproduceConfig) -> None:
 
 
 def is_done(cell: Cell, table: Table) -> bool:
-    return table.get(cell.study, cell.task, cell.variant, cell.seed, cell.size) is not None
+    return table.get(*(getattr(cell, name) for name in KEY)) is not None
 
 
 def _forked(cells: Sequence[Cell], cfg: ReproduceConfig) -> list[tuple[Cell, int]]:
@@ -116,15 +117,14 @@ def _submitted(cells: Sequence[Cell], cfg: ReproduceConfig) -> list[tuple[Cell, 
     executor.update_parameters(timeout_min=cfg.minutes, cpus_per_task=cfg.threads, name="playbyear")
     if cfg.cluster == "slurm":
         executor.update_parameters(slurm_partition=cfg.partition, slurm_array_parallelism=cfg.jobs)
-    jobs: list[tuple[Cell, Any]] = []
-    for first in range(0, len(cells), len(cells) if cfg.cluster == "slurm" else cfg.jobs):
-        at_once = cells[first : first + (len(cells) if cfg.cluster == "slurm" else cfg.jobs)]
+    n_at_once, jobs = len(cells) if cfg.cluster == "slurm" else cfg.jobs, []
+    for at_once in batched(cells, max(n_at_once, 1)):
         with executor.batch():
-            submitted = [(cell, executor.submit(work_alone, cell.name, cfg)) for cell in at_once]
+            submitted = [executor.submit(work_alone, cell.name, cfg) for cell in at_once]
         jobs += submitted
-        for _, job in submitted:
+        for job in submitted:
             job.wait()
-    return [(cell, job.result() if job.exception() is None else _FAILED) for cell, job in jobs]
+    return [(cell, _FAILED if job.exception() else job.result()) for cell, job in zip(cells, jobs, strict=True)]
 
 
 def work_alone(name: str, cfg: ReproduceConfig) -> int:
@@ -179,7 +179,7 @@ def do(cell: Cell, table: Table, threads: int = 1) -> Row | None:
         row = _evaluated(cell, carry) if cell.candidates else _of_players(cell)
         size = {key: cell.values[key] for key in ("n", "steps", "kept", "n_held_out") if key in cell.values}
         row = {
-            **dict(zip(("study", "task", "variant", "seed", "size"), (*_key(cell),), strict=True)),
+            **{name: getattr(cell, name) for name in KEY},
             **row,
             "values": size,
             "commands": commands,
@@ -190,10 +190,6 @@ def do(cell: Cell, table: Table, threads: int = 1) -> Row | None:
         }
         table.put([row])
         return row
-
-
-def _key(cell: Cell) -> tuple[Any, ...]:
-    return cell.study, cell.task, cell.variant, cell.seed, cell.size
 
 
 def _evaluated(cell: Cell, carry: Any) -> Row:
@@ -216,7 +212,7 @@ def _evaluated(cell: Cell, carry: Any) -> Row:
     return {
         **last,
         "curve": [{"at": each.at, "choice": successes} for each, successes in curve],
-        "best": {f"{each.name}": scored[each.name]["successes"] for each in best},
+        "best": {each.name: scored[each.name]["successes"] for each in best},
         "expert": _expert(cell),
     }
 
@@ -276,29 +272,26 @@ def summary(row: Row) -> str:
 def print_plan(cells: Sequence[Cell], table: Table) -> None:
     """The commands of every cell, each where it is first needed, and what they will cost by the rows that are there."""
     measured: dict[str, list[float]] = {}
-    for row in table.rows(cells[0].size):
-        for name, minutes in row.get("minutes", {}).items():
-            measured.setdefault(name, []).append(minutes)
+    for name, minutes in (item for row in table.rows(cells[0].size) for item in row.get("minutes", {}).items()):
+        measured.setdefault(name, []).append(minutes)
     known: set[Path] = set()
-    cost, unknown = 0.0, set()
+    needed: Counter[str] = Counter()
     for cell in cells:
         print(f"\n# {cell.name}{' (done)' if is_done(cell, table) else ''}")
         candidates = cell.candidates
-        evaluations = [cell.evaluation("choice", each) for each in candidates] if len(candidates) > 1 else []
-        for step in (*cell.steps, *evaluations, *(cell.evaluation("held_out", each) for each in candidates)):
-            is_first = step.folder not in known
-            if "held_out" in step.folder.name and len(candidates) > 1 and candidates[-1].name not in step.folder.name:
-                print(f"# if it is among the best {_N_BEST} on the seeds of choice:")
-            print(step.shown if is_first else f"# as above: {step.folder}")
+        choice = [cell.evaluation("choice", each) for each in candidates] if len(candidates) > 1 else []
+        for step in (*cell.steps, *choice, *(cell.evaluation("held_out", each) for each in candidates)):
+            if step.folder in known:
+                print(f"# as above: {step.folder}")
+                continue
             known.add(step.folder)
-        if not is_done(cell, table):
-            for name in {step.name for step in cell.steps} | ({"evaluate"} if candidates else set()):
-                cost += statistics.median(measured[name]) if name in measured else 0.0
-                unknown |= {name} - measured.keys()
-    shared = "; steps that cells share are counted for each of them" if cost else ""
-    print(f"\n{len(cells)} cells. What is missing takes about {cost / 60:.1f} hours of a core{shared}.")
-    if unknown:
-        print(f"Not measured yet, and not counted: {', '.join(sorted(unknown))}.")
+            is_sure = "held_out" not in step.folder.name or step.folder.name.endswith("-last")
+            print(step.shown if is_sure else f"# if it is among the best {_N_BEST}:\n{step.shown}")
+            needed[step.name] += not is_done(cell, table)
+    cost = sum(n * statistics.median(measured[name]) for name, n in needed.items() if name in measured)
+    print(f"\n{len(cells)} cells. What is missing takes about {cost / 60:.1f} hours of a core.")
+    if unknown := sorted(needed.keys() - measured.keys()):
+        print(f"Not measured yet, and not counted: {', '.join(unknown)}.")
 
 
 def print_status(cells: Sequence[Cell], table: Table) -> None:

@@ -3,10 +3,10 @@
 Beside a step's folder stand its lock, its log, what its attempts took (`.begun.json`) and, when it is done, `.done.json`.
 """
 
+import contextlib
 import ctypes
 import importlib
 import json
-import logging
 import os
 import runpy
 import shutil
@@ -46,9 +46,12 @@ def prepare() -> None:
     """Imports LeRobot and what learns, once for all forks."""
     for module in _IMPORTED:
         importlib.import_module(module)
+    from lerobot.envs import EnvConfig
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
+    with contextlib.suppress(KeyError, ImportError):
+        EnvConfig.get_choice_class("playbyear")()  # imports MuJoCo and the tasks
 
 
 def done(step: Step) -> dict[str, Any] | None:
@@ -101,25 +104,22 @@ def carry_out(step: Step, threads: int = 1) -> float:
 def resumed(step: Step) -> list[str]:
     """The command that goes on where the step's last attempt stopped; empty if nothing is missing."""
     command, folder = list(step.command), step.folder
+    given = dict(word.removeprefix("--").split("=", 1) for word in command if "=" in word)
     if command[0] == "playbyear-record":
         info = folder / "meta" / "info.json"
-        n_there = parse_json(info.read_bytes())["total_episodes"] if info.is_file() else 0
-        n = int(_option(command, "dataset.num_episodes"))
-        return [_with(word, "dataset.num_episodes", n - n_there) for word in command] if n_there < n else []
+        there = parse_json(info.read_bytes())["total_episodes"] if info.is_file() else 0
+        name = "--dataset.num_episodes="
+        missing = int(given[name.strip("-=")]) - there
+        return [f"{name}{missing}" if word.startswith(name) else word for word in command] if missing > 0 else []
     if command[0] == "playbyear-train":
-        last = folder / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-        if last.is_file():
-            if int(parse_json((last.parents[1] / "training_state" / "training_step.json").read_bytes())["step"]) >= int(
-                _option(command, "steps")
-            ):
-                return []
-            return ["playbyear-train", "--resume=true", f"--config_path={last}"]
-        shutil.rmtree(folder, ignore_errors=True)
-    if command[0] == "playbyear-dagger" and not (folder / "dagger_config.json").is_file():
-        shutil.rmtree(folder, ignore_errors=True)  # it was killed before it began
-    if "evaluate" in step.name:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
+        last = folder / "checkpoints" / "last"
+        options = last / "pretrained_model" / "train_config.json"
+        if options.is_file():
+            step_ = parse_json((last / "training_state" / "training_step.json").read_bytes())["step"]
+            return [] if step_ >= int(given["steps"]) else [command[0], "--resume=true", f"--config_path={options}"]
+    begun = command[0] == "playbyear-dagger" and (folder / "dagger_config.json").is_file()
+    if command[0] in ("playbyear-train", "lerobot-eval") or (command[0] == "playbyear-dagger" and not begun):
+        shutil.rmtree(folder, ignore_errors=True)  # what was killed before there was anything to go on with
     return command
 
 
@@ -157,11 +157,7 @@ def _become(command: list[str], log: Path, threads: int) -> None:
     with log.open("a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
-    for logger in (logging.root, *logging.root.manager.loggerDict.values()):
-        for handler in getattr(logger, "handlers", ()):
-            if isinstance(handler, logging.StreamHandler):
-                handler.setStream(sys.stderr)
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     os.environ["OMP_NUM_THREADS"] = str(threads)
     try:
         import torch
@@ -192,8 +188,7 @@ def _call(command: list[str]) -> None:
             runpy.run_path(str(path), run_name="__main__")
         return
     sys.argv = command
-    scripts = metadata.entry_points(group="console_scripts", name=name)
-    next(iter(scripts)).load()()
+    next(iter(metadata.entry_points(group="console_scripts", name=name))).load()()
 
 
 def _beside(step: Step, ending: str) -> Path:
@@ -214,11 +209,3 @@ def _minutes_before(begun: Path, log: Path) -> float:
 
 def _telling(command: str) -> list[str]:
     return [word for word in command.split() if not word.startswith(_WITHOUT_WEIGHT)]
-
-
-def _option(command: list[str], name: str) -> str:
-    return next(word.partition("=")[2] for word in command if word.startswith(f"--{name}="))
-
-
-def _with(word: str, name: str, value: int) -> str:
-    return f"--{name}={value}" if word.startswith(f"--{name}=") else word
