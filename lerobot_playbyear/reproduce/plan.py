@@ -160,7 +160,8 @@ class Cell:
         return Step(kind, folder, self._words(text, folder=folder, **made, **values))
 
     def _words(self, text: str, **values: Any) -> tuple[str, ...]:
-        own = {"options": self.plan.text["policies"][self.values["policy"]], "learning": self.plan.text["learning"]}
+        shared = {name: text for name, text in self.plan.text.items() if isinstance(text, str)}
+        own = {**shared, "options": self.plan.text["policies"][self.values["policy"]]}
         return tuple(shlex.split(self.fill(text, **own, **values)))
 
 

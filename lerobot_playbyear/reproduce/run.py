@@ -13,7 +13,6 @@ from itertools import batched
 from pathlib import Path
 from typing import Any
 
-from lerobot_playbyear.dagger.report import Totals
 from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, printable
 from lerobot_playbyear.datasets.files import FolderLock, FolderLockedError, parse_json, write_atomically
 from lerobot_playbyear.reproduce.config import ReproduceConfig
@@ -239,6 +238,8 @@ def _expert(cell: Cell) -> Row:
     attempts = [line for line in lines if line.get("kind") == "attempt"]
     if not attempts:
         return {}
+    from lerobot_playbyear.dagger.report import Totals  # imports what learns, which only running needs
+
     totals = Totals.of(attempts)
     return {
         "kept": sum(line.get("outcome") == "kept" for line in attempts),

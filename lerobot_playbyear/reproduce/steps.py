@@ -160,9 +160,8 @@ def _become(command: list[str], log: Path, threads: int) -> None:
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     os.environ["OMP_NUM_THREADS"] = str(threads)
     try:
-        import torch
-
-        torch.set_num_threads(threads)
+        if "torch" in sys.modules:
+            sys.modules["torch"].set_num_threads(threads)
         print(f"$ {' '.join(command)}", flush=True)
         _call(command)
     except SystemExit as end:

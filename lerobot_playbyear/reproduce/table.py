@@ -4,6 +4,7 @@ import json
 import os
 import platform
 import statistics
+import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from importlib import metadata
@@ -157,10 +158,9 @@ def versions() -> dict[str, str]:
 
 def machine() -> dict[str, Any]:
     """The processor, its cores and the card. Asks CUDA, so nothing may be forked after it."""
-    import torch
-
+    torch: Any = sys.modules.get("torch")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    card = {"card": torch.cuda.get_device_name()} if torch.cuda.is_available() else {}
+    card = {"card": torch.cuda.get_device_name()} if torch and torch.cuda.is_available() else {}
     return {"processor": _processor(), "cores": cores, **card}
 
 
