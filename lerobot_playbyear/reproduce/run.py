@@ -4,11 +4,11 @@ import json
 import os
 import signal
 import statistics
-import sys
 import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from itertools import batched
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from lerobot_playbyear.datasets.errors import InputError, PlaybyearError, printa
 from lerobot_playbyear.datasets.files import FolderLock, FolderLockedError, parse_json, write_atomically
 from lerobot_playbyear.reproduce.config import ReproduceConfig
 from lerobot_playbyear.reproduce.plan import Candidate, Cell, Plan, Step
-from lerobot_playbyear.reproduce.steps import StepError, carry_out, end_with_parent, prepare
+from lerobot_playbyear.reproduce.steps import StepError, carry_out, forked, prepare
 from lerobot_playbyear.reproduce.table import KEY, Row, Table, machine, rate, told, versions
 
 _N_BEST = 3
@@ -87,12 +87,7 @@ def _forked(cells: Sequence[Cell], cfg: ReproduceConfig) -> list[tuple[Cell, int
         while waiting or running:
             while waiting and len(running) < cfg.jobs:
                 cell = waiting.pop(0)
-                sys.stdout.flush()
-                pid = os.fork()
-                if pid == 0:
-                    end_with_parent()
-                    os._exit(work(cell, cfg))
-                running[pid] = cell
+                running[forked(partial(work, cell, cfg))] = cell
             pid, status = os.wait()
             if pid in running:
                 outcomes.append((running.pop(pid), os.waitstatus_to_exitcode(status)))

@@ -14,6 +14,8 @@ import signal
 import sys
 import time
 import traceback
+import warnings
+from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -129,15 +131,7 @@ def in_a_fork(command: list[str], log: Path, threads: int) -> int:
     Returns:
         Its exit status, negative if a signal ended it.
     """
-    sys.stdout.flush()
-    sys.stderr.flush()
-    pid = os.fork()
-    if pid == 0:
-        try:
-            end_with_parent()
-            _become(command, log, threads)
-        finally:
-            os._exit(1)
+    pid = forked(lambda: _become(command, log, threads))
     try:
         return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     except BaseException:
@@ -145,15 +139,35 @@ def in_a_fork(command: list[str], log: Path, threads: int) -> int:
         raise
 
 
-def end_with_parent() -> None:
-    """On Linux: whoever started this process takes it along when it is killed. Elsewhere it goes on, and keeps its lock."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+def forked(work: Callable[[], int]) -> int:
+    """Starts a copy of this process that does some work and ends with its status; on Linux also when this process ends.
+
+    Elsewhere what outlives this process keeps its locks, so that nobody else begins its work.
+
+    Returns:
+        The copy's number.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the threads that libraries keep: none of them is at work yet
+        pid = os.fork()
+    if pid == 0:
+        status = 1
+        try:
+            if sys.platform == "linux":
+                ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+            status = work()
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+    return pid
 
 
-def _become(command: list[str], log: Path, threads: int) -> None:
-    """Never returns."""
-    status = 0
+def _become(command: list[str], log: Path, threads: int) -> int:
     with log.open("a") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
@@ -165,15 +179,10 @@ def _become(command: list[str], log: Path, threads: int) -> None:
         print(f"$ {' '.join(command)}", flush=True)
         _call(command)
     except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else int(end.code is not None)
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
-    except BaseException:
-        traceback.print_exc()
-        status = 1
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    return 0
 
 
 def _call(command: list[str]) -> None:
