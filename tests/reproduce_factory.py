@@ -1,8 +1,10 @@
 """A plan whose commands take no time, and what they are: a cell of it does all that a real one does."""
 
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +12,7 @@ import yaml
 
 _COMMAND = """
 import sys
-from lerobot_playbyear.reproduce import run
 from lerobot_playbyear.scripts.commands import reproduce
-run.prepare = lambda: None  # what the plan's commands import is nothing
 sys.argv[0] = "playbyear-reproduce"
 reproduce()
 """
@@ -98,9 +98,12 @@ def arguments(folder: Path, action: str, *options: str) -> list[str]:
     return [sys.executable, "-c", _COMMAND, action, *words, "--size=tiny", *given, *(set(options) - set(words))]
 
 
-def call(folder: Path, action: str, *options: str) -> subprocess.CompletedProcess[str]:
-    """Runs it to its end."""
-    return subprocess.run(arguments(folder, action, *options), capture_output=True, text=True, check=False)
+def call(
+    folder: Path, action: str, *options: str, environment: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Runs it to its end, with more in its environment."""
+    own = {**os.environ, **(environment or {})}
+    return subprocess.run(arguments(folder, action, *options), capture_output=True, text=True, check=False, env=own)
 
 
 def rows(folder: Path) -> list[dict[str, Any]]:

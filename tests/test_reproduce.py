@@ -1,6 +1,7 @@
 """`playbyear-reproduce`: every cell once, whatever is killed; tables, their merging, the report; the plan's commands."""
 
 import json
+import os
 import random
 import re
 import shlex
@@ -187,3 +188,22 @@ def test_demonstrations_attempts_choices_and_scores_share_no_seed():
     seeds = Plan("paper", Path("out")).text["seeds"]
     ranges = [range(first, first + 2000) for first in seeds.values()]
     assert all(not set(one) & set(other) for i, one in enumerate(ranges) for other in ranges[:i])
+
+
+def test_jobs_of_submitit_do_the_same(tmp_path):
+    """Its local executor, a process for each cell, runs the code that its Slurm executor submits; no cluster was at hand."""
+    pytest.importorskip("submitit")
+    write_plan(tmp_path, n_seeds=1)
+    done = call(tmp_path, "run", "--cluster=local", "--only=Grasp/full,Place/no_audio", "--jobs=2")
+    assert done.returncode == 0, done.stderr
+    assert {(row["task"], row["variant"]) for row in rows(tmp_path)} == {("Grasp", "full"), ("Place", "no_audio")}
+    assert max(Counter(counted(tmp_path)).values()) == 1
+
+
+def test_without_submitit_a_cluster_is_refused(tmp_path):
+    write_plan(tmp_path)
+    (tmp_path / "submitit.py").write_text("raise ImportError('blocked')\n")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    refused = call(tmp_path, "run", "--cluster=local", environment={"PYTHONPATH": path})
+    assert refused.returncode == 1
+    assert "pip install 'lerobot_policy_playbyear[cluster]'" in refused.stderr

@@ -80,8 +80,7 @@ def is_done(cell: Cell, table: Table) -> bool:
 
 def _forked(cells: Sequence[Cell], cfg: ReproduceConfig) -> list[tuple[Cell, int]]:
     """Each cell in a fork of this process; with what became of it."""
-    if cells:
-        prepare()
+    _prepare_for(cells)
     waiting, running, outcomes = list(cells), {}, []
     try:
         while waiting or running:
@@ -123,9 +122,15 @@ def _submitted(cells: Sequence[Cell], cfg: ReproduceConfig) -> list[tuple[Cell, 
 
 def work_alone(name: str, cfg: ReproduceConfig) -> int:
     """A cell in a process that has imported nothing yet. Returns what became of it."""
-    prepare()
     cells = Plan(cfg.size, cfg.output_dir, cfg.plan, cfg.device).cells
-    return work(next(cell for cell in cells if cell.name == name), cfg)
+    cell = next(cell for cell in cells if cell.name == name)
+    _prepare_for([cell])
+    return work(cell, cfg)
+
+
+def _prepare_for(cells: Sequence[Cell]) -> None:
+    if any(step.command[0] != "python" for cell in cells for step in cell.steps):
+        prepare()
 
 
 def work(cell: Cell, cfg: ReproduceConfig) -> int:
