@@ -75,7 +75,9 @@ def _task(found: Found, task: str, paper: dict[str, str]) -> dict[str, Any]:
         own.setdefault(cell.variant, []).append(row)
     done = {variant: [row for row in rows if row is not None] for variant, rows in own.items()}
     best = {variant: [value for value in map(best_rate, rows) if value is not None] for variant, rows in done.items()}
-    failures = {name: sum((Counter(row.get("failures", {})) for row in rows), Counter()) for name, rows in done.items()}
+    failures: dict[str, Counter[str]] = {
+        name: sum((Counter(row.get("failures", {})) for row in rows), Counter()) for name, rows in done.items()
+    }
     films = [(cell.variant, path) for cell, _ in found for path in sorted((cell.folder / "films").glob("*.mp4"))]
     return {
         "name": task,

@@ -160,7 +160,7 @@ def make_model(cfg: ResidualConfig, env: ResidualEnv) -> Any:
                     if optimizer is not self.critic.optimizer:
                         optimizer.param_groups[0]["lr"] = 0.0
 
-    model = Residual(
+    model: Any = Residual(
         "MlpPolicy",
         env,
         learning_rate=cfg.learning_rate,

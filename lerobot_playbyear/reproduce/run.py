@@ -81,7 +81,8 @@ def is_done(cell: Cell, table: Table) -> bool:
 def _forked(cells: Sequence[Cell], cfg: ReproduceConfig) -> list[tuple[Cell, int]]:
     """Each cell in a fork of this process; with what became of it."""
     _prepare_for(cells)
-    waiting, running, outcomes = list(cells), {}, []
+    waiting, outcomes = list(cells), []
+    running: dict[int, Cell] = {}
     try:
         while waiting or running:
             while waiting and len(running) < cfg.jobs:
@@ -165,11 +166,11 @@ def do(cell: Cell, table: Table, threads: int = 1) -> Row | None:
     with FolderLock(cell.folder / ".lock", f"{cell.name} is at work in another run."):
         if is_done(cell, table):
             return None
-        minutes: Counter[str] = Counter()
+        minutes: dict[str, float] = {}
         commands: list[str] = []
 
         def carry(step: Step) -> Path:
-            minutes[step.name] += carry_out(step, threads)
+            minutes[step.name] = minutes.get(step.name, 0.0) + carry_out(step, threads)
             commands.append(step.shown)
             return step.folder
 
