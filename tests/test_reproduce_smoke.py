@@ -1,4 +1,4 @@
-"""`playbyear-reproduce` with the commands themselves, tiny: twice the same figure, typed by hand the same, all of the matrix."""
+"""`playbyear-reproduce` with the commands themselves, tiny: twice the same figure, the same typed by hand, and all of it."""
 
 import shlex
 from pathlib import Path
