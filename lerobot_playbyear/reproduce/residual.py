@@ -9,6 +9,7 @@ Needs the extra `rl`. The same command goes on where a run was killed; the episo
 """
 
 import json
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,12 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig
+from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.random_utils import set_seed
 from safetensors import safe_open
 from safetensors.torch import load_file, save
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
 from lerobot_playbyear.datasets.files import write_atomically
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Observation
@@ -249,17 +251,17 @@ def _restore(model: Any, path: Path) -> None:
     model.num_timesteps, model._n_updates = progress["steps"], progress["updates"]
 
 
-def main() -> None:
-    from lerobot_playbyear.scripts.command import run_with_lerobot
-
-    def work(cfg: ResidualConfig) -> None:
-        if cfg.residual is None:
-            print(f"Residual: {learn(cfg)}")
-        else:
-            evaluate(cfg)
-
-    run_with_lerobot(work)
+@parser.wrap()
+def work(cfg: ResidualConfig) -> None:
+    if cfg.residual is None:
+        print(f"Residual: {learn(cfg)}")
+    else:
+        evaluate(cfg)
 
 
 if __name__ == "__main__":
-    main()
+    register_third_party_plugins()
+    try:
+        work()  # type: ignore[call-arg]  # its options are the command line's
+    except PlaybyearError as error:
+        sys.exit(f"error: {error}")
