@@ -27,7 +27,7 @@ OPTIONS_FILE = Path(__file__).with_name("options.json")
 
 
 def command(
-    interrupted: int | str = 130, flag: str = "", is_file_work: bool = False
+    interrupted: int | str = 130, flag: str = "", is_file_work: bool = False, words: tuple[str, ...] = ()
 ) -> Callable[[Callable[[], object]], Callable[[], None]]:
     """Decorates a function that imports what it needs and does a command's work, and has the command's name.
 
@@ -37,6 +37,7 @@ def command(
         interrupted: What Ctrl-C ends it with: an exit status, or what is to be said.
         flag: An option that needs no value.
         is_file_work: Whether all that it does is to read and write files: what these raise is then said in one line, too.
+        words: The options that its first words stand for, `playbyear-reproduce merge FOLDER`.
     """
 
     def decorate(work: Callable[[], object]) -> Callable[[], None]:
@@ -44,6 +45,10 @@ def command(
         def run() -> None:
             _prepare_console()
             sys.argv[1:] = [f"{option}=true" if option == flag else option for option in sys.argv[1:]]
+            for i, name in enumerate(words[: len(sys.argv) - 1], 1):
+                if sys.argv[i].startswith("-"):
+                    break
+                sys.argv[i] = f"--{name}={sys.argv[i]}"
             answer_at_once(f"playbyear-{work.__name__.replace('_', '-')}")
             from draccus.utils import ParsingError
 
