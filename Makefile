@@ -60,12 +60,11 @@ bench: install  ## Measures speed beside alternatives, in a quarter of an hour (
 checks: install  ## Checks that version 1 of every task needs hearing, some hours (ALL_TASKS="...")
 	for task in $(ALL_TASKS); do \
 	  OMP_NUM_THREADS=1 $(BIN)/python -m gym_playbyear.check $$task --jobs=$(TEST_JOBS) \
-	    --output=experiments/results/adversaries/$$task-check.json || [ $$? = 1 ]; done
-	$(BIN)/python -m experiments.adversary_table
+	    --output=outputs/checks/$$task-check.json || [ $$? = 1 ]; done
 
 adversaries: install  ## Trains the learned adversary, deaf and hearing, some hours in all (TASK=OccludedGrasp-v1)
 	for hears in false true; do \
-	  OMP_NUM_THREADS=1 $(BIN)/python -m experiments.adversaries --task=$(TASK) --hears=$$hears; done
+	  OMP_NUM_THREADS=1 $(BIN)/python examples/learned_adversary/learn.py --task=$(TASK) --hears=$$hears; done
 
 lock: install  ## Writes the versions in .venv to constraints.txt
 	VIRTUAL_ENV=$(CURDIR)/.venv $$(command -v $(BIN)/uv || command -v uv) pip freeze --exclude-editable \

@@ -4,7 +4,7 @@
     MUJOCO_GL=egl python examples/learn_with_stable_baselines3.py --task=OccludedGrasp-v1 --steps=1000000
 
 It shows how the two fit together, not that it learns: a step's sound is short, the reward comes at the end, and this policy
-remembers nothing. What has memory and imitates first: `experiments/adversaries.py`.
+remembers nothing. What has memory and imitates first: `examples/learned_adversary`.
 """
 
 import argparse

@@ -1,7 +1,7 @@
 """The table of who solves which task without hearing, beside the results: `python -m experiments.adversary_table`.
 
 It is made of the results in experiments/results/adversaries: those of `python -m gym_playbyear.check TASK`
-(`TASK-check.json`) and those of `python -m experiments.adversaries` (`TASK-deaf-...json`, `TASK-hears-...json`).
+(`TASK-check.json`) and those of `python examples/learned_adversary/learn.py` (`TASK-deaf-...json`, `TASK-hears-...json`).
 """
 
 from pathlib import Path

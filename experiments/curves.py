@@ -5,19 +5,18 @@
     python -m experiments.curves noise --task=OccludedGrasp-v1 --trained quieter_noise --levels 0 1 8 16
     python -m experiments.curves rooms --task=OccludedGrasp-v1 --trained recorded_noise --steps=4000 --levels 8
     python -m experiments.curves materials
-    python -m experiments.curves rooms --recordings=held_out --levels 2 8
+    python -m experiments.curves rooms --levels 8
 
 Noise, materials and rooms take the full policies that `experiments.ablations` trained, as they are: those of the preset `cpu`,
-which mixes generated noise into the sound, and never heard another material or a recording. `--trained` trains others here:
-with quieter noise in their sound, with recordings of other kinds than those that are tried, or without noise. `--recordings`
-adds voices, hits, music and footsteps that were recorded (`experiments.room_recordings`). Results that are there are kept.
+which mixes noise into the sound, and never heard another material, a voice, a clatter or another microphone. `--trained` trains
+others here: with quieter noise in their sound, with recordings of other kinds than those that are tried, or without
+noise. Results that are there are kept.
 """
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from experiments import room_recordings
 from experiments.ablations import STUDY
 from experiments.lottery import options_of_variant, recordings
 from experiments.protocol import (
@@ -111,17 +110,19 @@ def evaluated_under(study: str, job: Job, trained: Result, condition: dict[str, 
     return f"{path.stem}: {Result(**load(path)).summary}"
 
 
-def rooms(levels: Sequence[float], recorded: str | None = None) -> list[dict[str, str]]:
-    """Noise that no training draws from, and microphones of other frequency responses.
+def rooms(levels: Sequence[float]) -> list[dict[str, str]]:
+    """Noise of kinds that no training draws from, and microphones of other frequency responses.
 
     Args:
         levels: Of that noise, and of the background that these microphones hear.
-        recorded: The set of recordings that are tried, too.
     """
     folder = RUNS / "room_noise"
     recordings(folder, ROOM_SEED, KINDS)
-    paths = [folder / f"{kind}.wav" for kind in KINDS] + (room_recordings.recordings(recorded) if recorded else [])
-    noisy = [{"room_noise": str(path), "room_noise_level": f"{level:g}"} for path in paths for level in levels]
+    noisy = [
+        {"room_noise": str(folder / f"{kind}.wav"), "room_noise_level": f"{level:g}"}
+        for kind in KINDS
+        for level in levels
+    ]
     return noisy + [
         {"microphone_response": response} | ({} if level == 1 else {"noise_level": f"{level:g}"})
         for response in ("phone", "dull", "boomy")
@@ -137,7 +138,6 @@ def main() -> None:
     )
     parser.add_argument("--levels", nargs="+", type=float, help="of noise, as factors on its amplitude")
     parser.add_argument("--trained", choices=TRAINED, help="with this, instead of the ablations' policies")
-    parser.add_argument("--recordings", choices=room_recordings.SETS, help="of voices, hits, music and footsteps")
     options = parser.parse_args()
     if options.curve == "demonstrations":
         over_demonstrations(options.task, options.tried, options.seeds, options.jobs, options.threads)
@@ -146,7 +146,7 @@ def main() -> None:
     conditions = {
         "noise": lambda: noise,
         "materials": lambda: [{"cube_material": material} for material in CUBE_MATERIALS],
-        "rooms": lambda: rooms(options.levels or ROOM_LEVELS, options.recordings),
+        "rooms": lambda: rooms(options.levels or ROOM_LEVELS),
     }
     study = "-".join(filter(None, [options.curve, options.trained]))
     under_conditions(study, options.task, options.seeds, conditions[options.curve](), options.trained, options.steps)

@@ -23,9 +23,11 @@ training        datasets audio policy hub
 teleoperation   datasets episodes
 recording       datasets episodes hub teleoperation
 dagger          datasets policy episodes hub training
-scripts         datasets audio microphones repair policy episodes film inspection hub training teleoperation recording dagger
+reproduce       datasets policy episodes film training recording dagger
+scripts
 """
 _ALLOWED = {package: others for package, *others in map(str.split, _ARROWS.strip().splitlines())}
+_ALLOWED["scripts"] = [package for package in _ALLOWED if package != "scripts"]
 _AT_THE_TOP = {"__init__.py", "compat.py"}
 _TOP_NAMES = {"compat", "lazy_names", "__version__"}
 """What every package may import from the top."""

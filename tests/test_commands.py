@@ -1,7 +1,9 @@
 """Every command answers at once what needs no LeRobot: its help, a misspelt option, a dataset that is not there."""
 
 import json
+import os
 import re
+import subprocess
 import sys
 from importlib import metadata
 from itertools import batched
@@ -62,6 +64,16 @@ def test_help_and_a_misspelt_option_need_neither_lerobot_nor_torch():
         assert helps.startswith(command)
         assert "exit: 0" in helps
         assert "exit: 2" in refuses
+
+
+def test_help_may_be_read_to_its_beginning_only():
+    """As `head` does."""
+    read, write = os.pipe()
+    os.close(read)
+    program = "import sys; sys.argv[1:] = ['--help']; from lerobot_playbyear.scripts import commands; commands.train()"
+    done = subprocess.run([sys.executable, "-c", program], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_what_can_be_told_from_options_and_files_is_told_before_lerobot_is_imported(tmp_path):

@@ -1,15 +1,19 @@
-"""Our materials ring as long as measured objects of the same kind: the table of `experiments.decay_times`."""
+"""Our materials ring as long as measured objects of the same kind: the table of `tools/decay_times.py`."""
 
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments.decay_times import KINDS, decay_times, measure, measured, page
-from experiments.sound_scenes import box_on_table, listen
 from gym_playbyear.sound.materials import MATERIALS
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+
+from decay_times import KINDS, decay_times, measure, measured, page
+from sound_scenes import box_on_table, listen
 
 
 @pytest.mark.parametrize("material", MATERIALS)

@@ -1,19 +1,22 @@
 """The learned adversary: the tasks in numbers, a player whose actions do not depend on the truth, the committed table."""
 
 import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments import adversary_table
-from experiments.numeric_task import N_HEARD, N_PLAYER, NumericTask
+sys.path.insert(0, str(Path(__file__).parents[1] / "examples/learned_adversary"))
+from numeric_task import N_HEARD, N_PLAYER, NumericTask
 
+RESULTS = Path(__file__).parents[1] / "results"
 EASY, HARD, POUCH = "KeyBag-Easy-v1", "KeyBag-Hard-v1", "TellApart-v1"
 
 
 def test_the_recurrent_players_actions_do_not_depend_on_the_truth():
     torch = pytest.importorskip("torch")
-    recurrent_player = pytest.importorskip("experiments.recurrent_player")
+    recurrent_player = pytest.importorskip("recurrent_player")
     space = NumericTask("OccludedGrasp-v1", hears=False)
     policy = recurrent_player.RecurrentPlayer(space.observation_space, space.action_space, lambda _: 1e-3)
     observed = torch.randn(2, 5, space.observation_space.shape[0])
@@ -25,11 +28,11 @@ def test_the_recurrent_players_actions_do_not_depend_on_the_truth():
 
 
 def test_a_learner_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
-    adversaries = pytest.importorskip("experiments.adversaries")
-    monkeypatch.setattr(adversaries, "RUNS", tmp_path)
+    adversaries = pytest.importorskip("learn")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     options = ["--n_envs=2", "--n_steps=16", "--n_demonstrations=2", "--imitation_updates=2", "--updates_per_trial=1"]
     options += ["--trial_episodes=1", "--episodes=1", "--horizon=20", f"--output={tmp_path / 'result.json'}"]
+    options += [f"--folder={tmp_path / 'run'}"]
     options += ["--teacher=none"]
     adversaries.run(adversaries.parser().parse_args([*options, "--steps=64"]))
     result = adversaries.run(adversaries.parser().parse_args([*options, "--steps=128"]))
@@ -67,7 +70,18 @@ def test_other_tasks_in_numbers(name, options):
 
 
 def test_the_committed_table_is_what_the_results_say():
-    page = adversary_table.PAGE.read_text()
-    assert adversary_table.with_table(page, adversary_table.table()) == page, (
-        "run `python -m experiments.adversary_table`"
-    )
+    """`results/adversaries.md` says of every script what `results/adversaries.jsonl` does."""
+    rows = [json.loads(line) for line in (RESULTS / "adversaries.jsonl").read_text().splitlines()]
+    players = {row["task"]: row["players"] for row in rows}
+    lines = (line.split("|")[1:-1] for line in (RESULTS / "adversaries.md").read_text().splitlines())
+    table = [[cell.strip(" `*") for cell in line] for line in lines if len(line) == 6]
+    tasks = next(line[1:] for line in table if "OccludedGrasp-v1" in line)
+    compared = 0
+    for head, *cells in table:
+        name = head.rpartition("`")[2] if "`" in head else head
+        for task, cell in zip(tasks, cells, strict=True):
+            each = players[task].get(name)
+            if each is not None:
+                assert cell == f"{100 * each['successes'] / each['n_episodes']:.0f} %", (head, task)
+                compared += 1
+    assert compared == 40  # 20 more are of scripts that never led and are not played any more

@@ -7,9 +7,14 @@ in real time, and its sound goes through a sound server. An operator presses LeR
 import importlib.util
 import json
 import os
+import signal
+import socket
+import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +27,7 @@ from sound_server import SoundServer, why_not
 from support.pages import commands_of
 
 ROOT = Path(__file__).parents[1]
+RERUN_PORT = 9876  # LeRobot connects to it
 CHECKPOINT = "checkpoints/last/pretrained_model"
 SMALL = {"--preset": ["--preset=cpu", "--steps=4"], "--steps": 4, "--duration": 3, "--dataset.num_episodes": 2}
 
@@ -46,8 +52,14 @@ class Robot:
         """Runs a command of a page."""
         given = dict(word.split("=", 1) for word in words if word.startswith(("--robot.", "--teleop.")))
         command = [word for word in words if word.partition("=")[0] not in given]
-        if importlib.util.find_spec("rerun") is None and "--display_data=true" in command:  # needs lerobot[viz]
-            command.remove("--display_data=true")
+        if "--display_data=true" in command:
+            if importlib.util.find_spec("rerun") is not None:
+                with rerun_viewer():
+                    return self.run_with_devices(words, command, given)
+            command.remove("--display_data=true")  # needs lerobot[viz]
+        return self.run_with_devices(words, command, given)
+
+    def run_with_devices(self, words: Sequence[str], command: list[str], given: dict[str, str]) -> Done:
         devices = {}
         if "--robot.type" in given:
             devices["robot"] = self.in_place_of(yaml.safe_load(given.get("--robot.cameras", "{}")))
@@ -65,6 +77,35 @@ class Robot:
         if "--strategy.type=dagger" in words or words[0] == "bash":
             return Corrections(self.socket, range(100, 102))
         return Watches(self.socket, ends_after_s=3 if words[0] == "lerobot-teleoperate" else None)
+
+
+@contextmanager
+def rerun_viewer() -> Iterator[None]:
+    """What takes Rerun's data in place of its window; where nothing takes them, LeRobot's control loop stops."""
+    with tempfile.TemporaryDirectory() as folder:
+        saved = Path(folder) / "shown.rrd"
+        command = [sys.executable, "-m", "rerun_cli", "--serve-grpc", f"--port={RERUN_PORT}", f"--save={saved}"]
+        viewer = subprocess.Popen(command, start_new_session=True)  # it starts a program of its own
+        try:
+            wait_until(rerun_listens)
+            yield
+            shown = (b"observation.front", b"observation.gripper")
+            wait_until(lambda: all(name in saved.read_bytes() for name in shown))
+        finally:
+            os.killpg(viewer.pid, signal.SIGKILL)
+            viewer.wait()
+
+
+def rerun_listens() -> bool:
+    with socket.socket() as one:
+        return one.connect_ex(("127.0.0.1", RERUN_PORT)) == 0
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float = 60) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +154,11 @@ def test_a_round_of_corrections_as_the_example_has_it(robot, walked, monkeypatch
     file = yaml.safe_load((ROOT / "examples/so101.yaml").read_text())
     file = {"robot": robot.in_place_of(file["robot"]["cameras"]), "teleop": robot.leader(demonstrates=False)}
     Path("robot.yaml").write_text(yaml.safe_dump(file))
-    given = {"ROBOT": "robot.yaml", "POLICY": f"outputs/train/{CHECKPOINT}", "DEMOS": "outputs/find_cube_with_sound"}
+    given = {
+        "ROBOT": "robot.yaml",
+        "POLICY": f"outputs/find_cube_policy/{CHECKPOINT}",
+        "DEMOS": "outputs/find_cube_with_sound",
+    }
     for name, value in {**given, "STEPS": "3", "ACT_S": "3"}.items():
         monkeypatch.setitem(robot.environment, name, value)
     robot.run(["bash", str(ROOT / "examples/corrections.sh"), "outputs/round"])

@@ -1,14 +1,18 @@
 """Sound: it follows physics and not the simulator, the same seed sounds the same, and nothing silent is heard."""
 
 import dataclasses
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments import sound_physics
-from experiments.sound_scenes import level
 from gym_playbyear.contacts import ContactPair, Contacts
 from gym_playbyear.sound import Bending, Synthesizer
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
+import sound_physics
+from sound_scenes import level
 
 PAIRS = [
     ContactPair(("left_finger", "cube"), ("gripper", "cube")),

@@ -25,6 +25,7 @@ from lerobot_playbyear.microphones.finding import FindMicrophonesConfig
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.recording.record import RecordConfig
 from lerobot_playbyear.repair.repair import RepairConfig
+from lerobot_playbyear.reproduce.config import ReproduceConfig
 from lerobot_playbyear.scripts.command import OPTIONS_FILE
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
@@ -37,6 +38,7 @@ CONFIGS: dict[str, type] = {
     "playbyear-push": PushConfig,
     "playbyear-record": RecordConfig,
     "playbyear-repair": RepairConfig,
+    "playbyear-reproduce": ReproduceConfig,
     "playbyear-train": PlaybyearTrainConfig,
     "playbyear-video": VideoConfig,
 }

@@ -31,8 +31,9 @@ class AttemptsFile(gym.Wrapper):
     """Appends one line of JSON to a file at the end of every attempt.
 
     A line has `seed` (null where the environment drew it), `steps`, and what the environment's `info` says at the end:
-    `is_success`, `end`, `acted_early` and `n_closings` where the task tells them, and what the task kept secret. Attempts
-    that are broken off leave none. Several environments, also in processes of their own, may share a file.
+    `is_success`, `end`, `acted_early` and `n_closings` where the task tells them, and what the task kept secret. Of a failure
+    in one of our tasks it has `failure`, its mode (`gym_playbyear.failures`). Attempts that are broken off leave none.
+    Several environments, also in processes of their own, may share a file.
 
     Args:
         env: The environment.
@@ -45,6 +46,7 @@ class AttemptsFile(gym.Wrapper):
         self._path.parent.mkdir(parents=True, exist_ok=True)
         self._seed: int | None = None
         self._n_steps, self._is_over = 0, False
+        self._mode: Any = None
 
     @classmethod
     def around(cls, make: Callable[[], gym.Env], path: str) -> "AttemptsFile":
@@ -53,20 +55,34 @@ class AttemptsFile(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         self._seed, self._n_steps, self._is_over = seed, 0, False
-        return self.env.reset(seed=seed, options=options)
+        observed = self.env.reset(seed=seed, options=options)
+        self._mode = _failure_mode(self.unwrapped)
+        return observed
 
     def step(self, action):
         outcome = self.env.step(action)
         self._n_steps += 1
         _, _, terminated, truncated, info = outcome
+        if self._mode is not None:
+            self._mode.look(self.unwrapped)
         if (terminated or truncated) and not self._is_over:
             self._is_over = True
             values = {key: np.asarray(value) for key, value in info.items()}
             told = {key: value.tolist() for key, value in values.items() if value.dtype.kind in _PLAIN}
+            if self._mode is not None and not info["is_success"]:
+                told["failure"] = self._mode.told(self.unwrapped, info["end"])
             line = json.dumps({"seed": self._seed, "steps": self._n_steps, **told})
             with self._path.open("a") as file:
                 file.write(line + "\n")  # one write: lines of several processes do not mix
         return outcome
+
+
+def _failure_mode(env: gym.Env) -> Any:
+    """What watches an attempt at one of our tasks. They are imported when one is there, as in `config.py`."""
+    from gym_playbyear.environment import TaskEnv
+    from gym_playbyear.failures import FailureMode
+
+    return FailureMode(env) if isinstance(env, TaskEnv) else None
 
 
 class _AsksWhoHeard(gym.vector.VectorEnv):

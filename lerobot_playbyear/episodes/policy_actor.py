@@ -27,6 +27,9 @@ class PolicyActor:
         env_cfg: The environment's configuration, which knows the processors between both.
         preprocessor, postprocessor: The policy's own.
         autocast: Makes the context of the policy's precision.
+
+    Attributes:
+        policy: The policy.
     """
 
     def __init__(
@@ -37,7 +40,7 @@ class PolicyActor:
         postprocessor: PolicyProcessorPipeline,
         autocast: Callable[[], AbstractContextManager] = nullcontext,
     ) -> None:
-        self._policy, self._autocast = policy, autocast
+        self.policy, self._autocast = policy, autocast
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
         self._env_preprocessor, self._env_postprocessor = make_env_pre_post_processors(
             env_cfg=env_cfg, policy_cfg=policy.config
@@ -46,8 +49,8 @@ class PolicyActor:
     def reset(self, env: gym.Env) -> None:
         """An episode begins."""
         self._env = env
-        self._policy.eval()
-        self._policy.reset()
+        self.policy.eval()
+        self.policy.reset()
 
     @torch.no_grad()
     def act(self, observation: Observation) -> np.ndarray:
@@ -55,7 +58,7 @@ class PolicyActor:
         batch: dict[str, Any] = preprocess_observation(_as_batch(observation))
         batch["task"] = [task_description(self._env)]
         with self._autocast():
-            action = self._policy.select_action(self._preprocessor(self._env_preprocessor(batch)))
+            action = self.policy.select_action(self._preprocessor(self._env_preprocessor(batch)))
             action = self._env_postprocessor({ACTION: self._postprocessor(action)})[ACTION]
         return action.to("cpu", torch.float32).numpy()[0]
 

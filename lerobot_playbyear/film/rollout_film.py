@@ -65,7 +65,7 @@ def film(cfg: VideoConfig) -> Path:
         RolloutError: No policy is given and the environment has no script.
     """
     _check_options(cfg)
-    env = env_spec(cfg.env).make() if cfg.policy is None else _env_of_lerobot(cfg.env)
+    env = env_spec(cfg.env).make() if cfg.policy is None else env_of_lerobot(cfg.env)
     try:
         actor: Actor = Script(cfg.baseline)
         if cfg.policy is not None:
@@ -100,7 +100,7 @@ def _check_options(cfg: VideoConfig) -> None:
         raise InputError(f"--baseline={cfg.baseline}: it acts without a policy; leave it or --policy.path out.")
 
 
-def _env_of_lerobot(env_cfg: EnvConfig) -> gym.Env:
+def env_of_lerobot(env_cfg: EnvConfig) -> gym.Env:
     """The first environment that LeRobot makes for a configuration, also where Gymnasium knows none of that name."""
     vec: Any = next(iter(next(iter(make_env(env_cfg).values())).values()))
     env = vec.envs[0]

@@ -108,7 +108,10 @@ class PlaybyearNetwork(nn.Module):
         refs = [key for key in keys if name and key.rsplit(".", 1)[-1] == name]
         ref = waves[keys.index(refs[0])] if refs else None
         rc = colours[keys.index(refs[0])] if refs else None
-        return [self._hear(batch, key, n_frames, wave, colour, None if key in refs else ref, rc) for key, wave, colour in heard]
+        return [
+            self._hear(batch, key, n_frames, wave, colour, None if key in refs else ref, rc)
+            for key, wave, colour in heard
+        ]
 
     def _hear(self, batch, key: str, n_frames: int, wave: Tensor, colour: Tensor | None, ref=None, rc=None) -> Tensor:
         """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means.

@@ -27,7 +27,7 @@ OPTIONS_FILE = Path(__file__).with_name("options.json")
 
 
 def command(
-    interrupted: int | str = 130, flag: str = "", is_file_work: bool = False
+    interrupted: int | str = 130, flag: str = "", is_file_work: bool = False, words: tuple[str, ...] = ()
 ) -> Callable[[Callable[[], object]], Callable[[], None]]:
     """Decorates a function that imports what it needs and does a command's work, and has the command's name.
 
@@ -37,6 +37,7 @@ def command(
         interrupted: What Ctrl-C ends it with: an exit status, or what is to be said.
         flag: An option that needs no value.
         is_file_work: Whether all that it does is to read and write files: what these raise is then said in one line, too.
+        words: The options that its first words stand for, `playbyear-reproduce merge FOLDER`.
     """
 
     def decorate(work: Callable[[], object]) -> Callable[[], None]:
@@ -44,6 +45,10 @@ def command(
         def run() -> None:
             _prepare_console()
             sys.argv[1:] = [f"{option}=true" if option == flag else option for option in sys.argv[1:]]
+            for i, name in enumerate(words[: len(sys.argv) - 1], 1):
+                if sys.argv[i].startswith("-"):
+                    break
+                sys.argv[i] = f"--{name}={sys.argv[i]}"
             answer_at_once(f"playbyear-{work.__name__.replace('_', '-')}")
             from draccus.utils import ParsingError
 
@@ -122,6 +127,14 @@ def short_help(command: str) -> str:
     return (HELP / f"{command}.txt").read_text()
 
 
+def _print_to_a_reader(text: str) -> None:
+    """Prints what may be read to its beginning only, as `head` does."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
+
+
 def answer_at_once(command: str) -> None:
     """Prints the help, or which option there is not, and ends the process; otherwise does nothing.
 
@@ -132,7 +145,7 @@ def answer_at_once(command: str) -> None:
         sys.argv[1:] = [*(argument for argument in args if argument != "--help=all"), "--help"]
         return
     if "--help" in args or "-h" in args:
-        print(short_help(command).strip())
+        _print_to_a_reader(short_help(command).strip())
         sys.exit(0)
     if (lerobots := for_robots(command, args)) is not None:
         print(f"error: {lerobots}", file=sys.stderr)

@@ -86,6 +86,13 @@ def repair() -> None:
     sys.exit(0 if report.is_done else 1)
 
 
+@command("Interrupted. The same command goes on.", words=("action", "folder"))
+def reproduce() -> None:
+    from lerobot_playbyear.reproduce.run import reproduce
+
+    run_alone(reproduce)
+
+
 @command(is_file_work=True)
 def attach_audio() -> None:
     from lerobot_playbyear.audio.attach_audio import attach_audio

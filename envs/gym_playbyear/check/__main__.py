@@ -31,7 +31,9 @@ def main() -> int:
     parser.add_argument("--no-twin", action="store_true", help="do not compare twin environments")
     parser.add_argument("--jobs", type=int, default=1, help="processes side by side (default: 1)")
     parser.add_argument("--horizon", type=int, help="control steps of an episode (default: the task's own)")
-    parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of experiments.adversaries")
+    parser.add_argument("--options", type=json.loads, default={}, help='of the task, as JSON: {"contents": "pens"}')
+    parser.add_argument("--no-verdict", action="store_true", help="exit with 0 also if a limit is broken")
+    parser.add_argument("--learned", type=Path, nargs="+", default=[], help="results of examples/learned_adversary")
     parser.add_argument(
         "--output", type=Path, help="a JSON file for the results; the same command continues a stopped check"
     )
@@ -48,14 +50,14 @@ def main() -> int:
         twin=not arguments.no_twin,
         jobs=arguments.jobs,
         learned=[json.loads(path.read_text()) for path in arguments.learned],
-        options={} if arguments.horizon is None else {"horizon": arguments.horizon},
+        options=arguments.options | ({} if arguments.horizon is None else {"horizon": arguments.horizon}),
         progress=progress,
     )
     print(as_text(report))
     if progress is not None:
         arguments.output.write_text(json.dumps(asdict(report), indent=1) + "\n")
         progress.unlink(missing_ok=True)
-    return 1 if report.broken else 0
+    return 1 if report.broken and not arguments.no_verdict else 0
 
 
 if __name__ == "__main__":

@@ -255,7 +255,7 @@ def _row_of(result: dict[str, Any], task: str) -> Row:
     if result.get("task", task) != task or not {"hears", "name", "successes", "n_episodes"} <= result.keys():
         raise ValueError(
             f"learned: {result.get('name', result.get('task'))!r} is not a learner's result on {task!r}: give files that "
-            "`python -m experiments.adversaries` wrote for it."
+            "`python examples/learned_adversary/learn.py` wrote for it."
         )
     kind = "learned, hears" if result["hears"] else "learned, deaf"
     return Row(result["name"], kind, result["successes"], result["n_episodes"], {})

@@ -8,7 +8,7 @@ A struck body rings in its modes: damped sines (modal synthesis: van den Doel, K
   RealImpact (CVPR 2023) compares its recordings with: a mode of angular frequency w decays with (alpha + beta w^2) / 2. The
   others' are engineering values.
 - Damping by supports, that of plastic, cardboard and of what is made with `chosen` are set so that the median mode rings, in
-  every episode, as long as 10 to 90 % of the modes measured by Traer et al. (DAFx 2019): `experiments.decay_times`.
+  every episode, as long as 10 to 90 % of the modes measured by Traer et al. (DAFx 2019): `tools/decay_times.py`.
   They measured no film; it rings like paper.
 - Sizes, roughness and loudness are chosen; so are the frequencies of what is made with `chosen`.
 """

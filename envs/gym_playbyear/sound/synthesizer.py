@@ -222,7 +222,7 @@ class Synthesizer:
 # Spreads of what is drawn for every episode; all are chosen. Factors in decibels or in octaves either way.
 _PITCH_OCTAVES = 0.2  # of a body
 _MODE_OCTAVES = 0.04  # of each of its modes
-DAMPING_OCTAVES = 0.4  # within what was measured (`experiments.decay_times`)
+DAMPING_OCTAVES = 0.4  # within what was measured (`tools/decay_times.py`)
 _LOUDNESS_DB = 3.0
 _STIFFNESS_OCTAVES = 1.5  # of a contact
 _ROUGHNESS_OCTAVES = 0.7

@@ -1,10 +1,11 @@
 """A page of short sounds to listen to: blows, materials, friction, a hand that closes, two ears, a bag.
 
-    python -m experiments.sound_page --output=docs/media/sound
+    python tools/sound_page.py --output=docs/media/sound
 
 writes WAV files and `index.html`, in which a browser plays them. Nothing is random between runs.
 """
 
+import argparse
 import html
 import wave
 from collections.abc import Iterator
@@ -12,9 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from sound_scenes import Scene, box_on_table, box_pulled, listen, two_fingers
 
-from experiments.protocol import command_line
-from experiments.sound_scenes import Scene, box_on_table, box_pulled, listen, two_fingers
 from gym_playbyear.sound import Bending
 
 _RATE = 16000
@@ -88,7 +88,9 @@ def write(output: Path) -> int:
 
 
 def main() -> None:
-    output = command_line(__doc__, "output").parse_args().output
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("docs/media"))
+    output = parser.parse_args().output
     print(f"{output}: {write(output) / 1000:.0f} kB")
 
 

@@ -1,9 +1,9 @@
 """How long our materials ring, beside measured ones of the same kind.
 
     pip download --no-deps --no-binary=:all: tdw==1.13.0.0 && tar xzf tdw-1.13.0.0.tar.gz
-    python -m experiments.decay_times --tdw=tdw-1.13.0.0
+    python tools/decay_times.py --tdw=tdw-1.13.0.0
 
-writes `experiments/results/sound/decay_times.csv` and prints the table of docs/explanation/sound.md.
+writes `results/decay_times.csv` and prints the table of docs/explanation/sound.md.
 Without `--tdw` it only prints.
 
 Measured are the modes of struck objects, of which PyImpact plays the first ten of each (Traer, Cusimano and McDermott, "A
@@ -11,6 +11,7 @@ perceptually inspired generative model of rigid-body contact sounds", DAFx 2019)
 Massachusetts Institute of Technology, under the 2-clause BSD licence. Objects that the package holds twice count once.
 """
 
+import argparse
 import csv
 import json
 import re
@@ -19,11 +20,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.protocol import RESULTS, command_line
 from gym_playbyear.sound.materials import MATERIALS
 from gym_playbyear.sound.synthesizer import DAMPING_OCTAVES
 
-TABLE = RESULTS / "sound" / "decay_times.csv"
+TABLE = Path(__file__).parents[1] / "results/decay_times.csv"
 _SOURCE = "tdw 1.13.0.0, tdw/add_ons/py_impact/material_data (PyPI; Copyright 2020 MIT; BSD-2-Clause)"
 _PLAYED = 10  # modes of an object that PyImpact plays: the first
 KINDS = {
@@ -119,7 +119,7 @@ def page() -> str:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tdw", type=Path, help="folder into which the package was unpacked")
     options = parser.parse_args()
     if options.tdw:

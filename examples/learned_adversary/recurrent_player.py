@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numeric_task import N_PLAYER, NumericTask
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from sb3_contrib import RecurrentPPO
@@ -15,7 +16,6 @@ from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from experiments.numeric_task import N_PLAYER, NumericTask
 from gym_playbyear.check.report import EXPERT, deaf_scripts
 from gym_playbyear.panda import ACTION_SCALE
 

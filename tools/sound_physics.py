@@ -1,21 +1,21 @@
 """Does the sound follow physics? Level and spectrum over speed, force, slip and stiffness, and independence of the simulator.
 
-    python -m experiments.sound_physics
+    python tools/sound_physics.py
 
-measures small MuJoCo scenes (`experiments.sound_scenes`), prints the table and writes it to
-`experiments/results/sound/physics.csv`. `tests/test_sound.py` asserts every row.
+measures small MuJoCo scenes (`sound_scenes.py`), prints the table and writes it to
+`results/sound_physics.csv`. `tests/test_sound.py` asserts every row.
 """
 
 import csv
 import time
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from sound_scenes import CONTROL_HZ, Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
 
-from experiments.protocol import RESULTS, command_line
-from experiments.sound_scenes import CONTROL_HZ, Scene, box_on_table, box_pulled, centroid, level, listen, two_fingers
 from gym_playbyear.sound import Synthesizer
 
 _STEPS = (0.002, 0.001)  # s: the physics steps that are compared
@@ -202,14 +202,12 @@ def _row(what: str, values: Sequence, unit: str, figures: Sequence[float], of: s
 
 
 def main() -> None:
-    command_line(__doc__).parse_args()
     start = time.perf_counter()
     rows = [row for measure in MEASUREMENTS for row in measure()]
     print("| what | at | measured | wanted | |\n|---|---|---|---|---|")
     for row in rows:
         print(f"| {row.what} | {row.values} | {row.figures} | {row.wanted} | {'yes' if row.holds else 'NO'} |")
-    path = RESULTS / "sound" / "physics.csv"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = Path(__file__).parents[1] / "results" / "sound_physics.csv"
     with path.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(Row._fields)

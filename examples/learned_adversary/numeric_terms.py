@@ -213,5 +213,5 @@ def terms_of(task: DeafTask) -> Terms:
             return terms(task)
     raise ValueError(
         f"task={task.env.task!r} shows {', '.join(shown) or 'nothing'} in numbers: a learner needs `hidden_range`, or terms of "
-        "its own in gym_playbyear/adversaries/numeric_terms.py."
+        "its own in examples/learned_adversary/numeric_terms.py."
     )

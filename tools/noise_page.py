@@ -1,10 +1,11 @@
 """A picture and a film of the noise that training generates: each kind, first as it is, then in a room.
 
-    python -m experiments.noise_page --output=docs/media/noise
+    python tools/noise_page.py --output=docs/media/noise
 
 writes `kinds.png`, the spectrograms up to 8 kHz, and `kinds.mp4`, in which they are heard one after the other.
 """
 
+import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +15,6 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 from torch.nn import functional
 
-from experiments.protocol import command_line
 from lerobot_playbyear.film.video import amplify, spectrogram_strip, write_film
 from lerobot_playbyear.policy.generated_noise import STREAMS, STRUCK, GeneratedNoise, rooms
 
@@ -68,7 +68,9 @@ def _corner(index: int) -> tuple[int, int]:
 
 
 def main() -> None:
-    output: Path = command_line(__doc__, "output").parse_args().output
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("docs/media/noise"))
+    output: Path = parser.parse_args().output
     output.mkdir(parents=True, exist_ok=True)
     sounds = clips()
     page = picture(sounds)

@@ -1,21 +1,20 @@
 """A page to hear our materials beside measured objects of the same kind, and beside recordings where a free one was found.
 
-    python -m experiments.material_page --tdw=tdw-1.13.0.0 --minetest=unpacked --output=docs/media/materials
+    python tools/material_page.py --tdw=tdw-1.13.0.0 --minetest=unpacked --output=docs/media/materials
 
-writes a sound for each kind and `index.html`, in which a browser plays them. `experiments.decay_times` says how to unpack
+writes a sound for each kind and `index.html`, in which a browser plays them. `tools/decay_times.py` says how to unpack
 `tdw`; `unpacked` is made by `apt-get download minetest-data && dpkg -x minetest-data_*.deb unpacked`, on Debian 12.
 """
 
+import argparse
 import html
 from pathlib import Path
 from typing import NamedTuple
 
 import av
 import numpy as np
-
-from experiments.decay_times import KINDS, Measured, measured, objects
-from experiments.protocol import command_line
-from experiments.sound_scenes import box_on_table, listen
+from decay_times import KINDS, Measured, measured, objects
+from sound_scenes import box_on_table, listen
 
 _RATE = 32000
 _SECONDS, _PAUSE = 0.3, 0.2  # of a sound, and after it
@@ -111,7 +110,8 @@ def write(output: Path, tdw: Path, minetest: Path) -> int:
 
 
 def main() -> None:
-    parser = command_line(__doc__, "output")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("docs/media/materials"))
     parser.add_argument("--tdw", type=Path, required=True, help="folder into which the package was unpacked")
     parser.add_argument("--minetest", type=Path, required=True, help="the same of Debian's minetest-data")
     options = parser.parse_args()

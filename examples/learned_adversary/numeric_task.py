@@ -10,8 +10,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numeric_terms import N_SHOWN, N_TRUTH, terms_of
 
-from experiments.numeric_terms import N_SHOWN, N_TRUTH, terms_of
 from gym_playbyear.check.deaf import DeafTask, DeafView
 from gym_playbyear.panda import ACTION_SCALE
 

@@ -1,8 +1,7 @@
 """Recordings of voices, hits, music and footsteps, from packages of Debian, in two sets that share nothing: `choice`, on which
 choices are made, and `held_out`, which no training and no choice has heard.
 
-    python -m experiments.room_recordings --output=outputs/experiments/room_recordings
-    python -m experiments.curves rooms --recordings=held_out --levels 2 8
+    python tools/room_recordings.py --output=outputs/room_recordings
 
 The first line fetches the packages with apt (`--packages` names a folder that has them), checks every file against
 `results/room_recordings.json`, where its package, version, licence and hash stand, and mixes a WAV file per kind and set.
@@ -12,7 +11,9 @@ How loud: `--env.room_noise_level=L` makes the root mean square of the whole fil
 background's, `gym_playbyear.sound.BACKGROUND_RMS`, within 3 dB at each microphone and in each episode.
 """
 
+import argparse
 import hashlib
+import json
 import subprocess
 import zipfile
 from collections.abc import Sequence
@@ -27,11 +28,11 @@ import numpy as np
 from scipy import signal
 from scipy.io import wavfile
 
-from experiments.protocol import RESULTS, RUNS, command_line, load, save
 from gym_playbyear.sound import BACKGROUND_RMS
+from lerobot_playbyear.datasets.files import write_atomically
 
-LIST = RESULTS / "room_recordings.json"
-FOLDER = RUNS / "room_recordings"
+LIST = Path(__file__).parents[1] / "results/room_recordings.json"
+FOLDER = Path("outputs/room_recordings")
 RATE, SECONDS = 16000, 90
 KINDS = ("speech", "hits", "music", "footsteps")
 SETS = ("choice", "held_out")
@@ -199,13 +200,14 @@ def write_list(packages: Path) -> None:
         "background_rms": BACKGROUND_RMS,
         "levels": [2, 8],
     }
-    save(LIST, {"scaled": scaled, "seconds": SECONDS, "seed": SEED, "recordings": listed}, indent=1)
+    content = {"scaled": scaled, "seconds": SECONDS, "seed": SEED, "recordings": listed}
+    write_atomically(LIST, json.dumps(content, indent=1) + "\n")
 
 
 def make(output: Path, packages: Path) -> None:
     """Writes all recordings: `choice_speech.wav` and so on."""
     output.mkdir(parents=True, exist_ok=True)
-    for name, kinds in load(LIST)["recordings"].items():
+    for name, kinds in json.loads(LIST.read_text())["recordings"].items():
         for kind, listed in kinds.items():
             waves = [wave for source in listed for wave in read(source, packages)]
             mixed = mix(kind, waves, np.random.default_rng([SEED, *f"mix {name} {kind}".encode()]))
@@ -214,22 +216,8 @@ def make(output: Path, packages: Path) -> None:
             print(f"{path}: {len(waves)} files", flush=True)
 
 
-def recordings(name: str, folder: Path | None = None) -> list[Path]:
-    """The files of a set, in the order of `KINDS`.
-
-    Raises:
-        FileNotFoundError: They were not made.
-    """
-    folder = folder or FOLDER
-    paths = [folder / f"{name}_{kind}.wav" for kind in KINDS]
-    for path in paths:
-        if not path.is_file():
-            raise FileNotFoundError(f"{path} is missing: python -m experiments.room_recordings --output={folder}")
-    return paths
-
-
 def main() -> None:
-    parser = command_line(__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, default=FOLDER, help="folder of the WAV files")
     parser.add_argument("--packages", type=Path, default=FOLDER / "packages", help="folder of the packages")
     parser.add_argument("--list", action="store_true", help=f"write {LIST.name} first")

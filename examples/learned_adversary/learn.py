@@ -1,7 +1,7 @@
 """The learned adversary: a deaf recurrent policy trained by reinforcement, and the same learner with the contact signal.
 
-    python -m experiments.adversaries --task OccludedGrasp-v1 --hears=false
-    python -m experiments.adversaries --task OccludedGrasp-v1 --hears=true
+    python examples/learned_adversary/learn.py --task=OccludedGrasp-v1 --hears=false
+    python examples/learned_adversary/learn.py --task=OccludedGrasp-v1 --hears=true
 
 RecurrentPPO (sb3-contrib) on numbers: what a deaf policy gets of the arm and of the picture, with or without how hard the hand
 touches. The reward is dense and knows where the cube is; the critic sees the truth. The player first imitates a teacher
@@ -10,6 +10,7 @@ last checkpoint. If the deaf learner exceeds the blind scripts, the task does no
 not, the learner is too weak to prove anything.
 """
 
+import argparse
 import json
 import time
 from pathlib import Path
@@ -17,14 +18,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from sb3_contrib import RecurrentPPO
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
-
-from experiments.numeric_task import DISCOUNT, NumericTask
-from experiments.protocol import RESULTS, RUNS, command_line, save
-from experiments.recurrent_player import (
+from numeric_task import DISCOUNT, NumericTask
+from recurrent_player import (
     RecurrentPlayer,
     demonstrations,
     imitate,
@@ -32,6 +27,11 @@ from experiments.recurrent_player import (
     play_episode,
     save_checkpoint,
 )
+from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
 from gym_playbyear.check.report import EXPERT
 
 DEMONSTRATION_SEED = 10000
@@ -125,7 +125,7 @@ def run(arguments: Any) -> dict[str, Any]:
     """Teaches, explores, judges. Returns what `python -m gym_playbyear.check --learned` reads."""
     torch.set_num_threads(1)
     name = run_name(arguments)
-    folder = RUNS / "adversaries" / name
+    folder = arguments.folder or Path("outputs/learned_adversary") / name
     model = make_model(arguments)
     env = NumericTask(arguments.task, hears=arguments.hears, repeat=arguments.repeat, **environment_options(arguments))
     arguments.steps = arguments.steps or round(_EXPERIENCE * env.task.facts.control_hz)
@@ -145,10 +145,12 @@ def run(arguments: Any) -> dict[str, Any]:
         "successes": sum(solved),
         "n_episodes": len(solved),
         "first_seed": FINAL_SEED,
-        "options": {key: str(value) for key, value in vars(arguments).items() if key != "output"},
+        "options": {key: str(value) for key, value in vars(arguments).items() if key not in ("output", "folder")},
         **progress,
     }
-    save(arguments.output or RESULTS / "adversaries" / f"{name}.json", result, indent=1)
+    output = arguments.output or folder / "check.json"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    output.write_text(json.dumps(result, indent=1) + "\n")
     print(f"{name}: {sum(solved)} of {len(solved)}, after {progress['steps']} steps")
     return result
 
@@ -161,7 +163,7 @@ def run_name(arguments: Any) -> str:
 
 def parser():
     """The command line."""
-    made = command_line(__doc__)
+    made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("--task", default="OccludedGrasp-v1")
     made.add_argument(
         "--hears", type=lambda text: text.lower() == "true", default=False, help="true: with the contact signal"
@@ -182,7 +184,8 @@ def parser():
     made.add_argument("--trial_episodes", type=int, default=40, help="of a point of the curve")
     made.add_argument("--learning_rate", type=float, default=1e-4)
     made.add_argument("--deviation", type=float, default=0.04, help="of the actions it explores with, to begin with")
-    made.add_argument("--output", type=Path, help="of the result; by default in experiments/results/adversaries")
+    made.add_argument("--folder", type=Path, help="of the checkpoint; by default outputs/learned_adversary/NAME")
+    made.add_argument("--output", type=Path, help="of the result; by default check.json in that folder")
     return made
 
 

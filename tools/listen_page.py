@@ -1,11 +1,12 @@
 """A page of films to listen to: the expert in every task of version 1, with sound.
 
-    python -m experiments.listen_page --output=docs/media/listen
+    python tools/listen_page.py --output=docs/media/listen
 
 writes a film per task, `index.html`, in which a browser plays them, and `tasks.jpg`, a still of each; ten minutes on one core.
 Left is what people see, right what the policy's camera sees, below the spectrogram of the gripper's microphone.
 """
 
+import argparse
 import html
 from pathlib import Path
 from typing import NamedTuple
@@ -14,7 +15,6 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from experiments.protocol import command_line
 from lerobot_playbyear.film.video import amplify, compose, episode_sound, write_film
 
 _SIZE = 360  # pixels of a view's side
@@ -142,7 +142,9 @@ def page() -> str:
 
 
 def main() -> None:
-    output = command_line(__doc__, "output").parse_args().output
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, default=Path("docs/media"))
+    output = parser.parse_args().output
     output.mkdir(parents=True, exist_ok=True)
     stills = [film(scene, output) for scene in SCENES]
     shown = [

@@ -1,0 +1,219 @@
+"""A step of a cell: one command, run in a fork of this process, once, and again from where it was when it did not end well.
+
+Beside a step's folder stand its lock, its log, what its attempts took (`.begun.json`) and, when it is done, `.done.json`.
+"""
+
+import contextlib
+import ctypes
+import importlib
+import json
+import os
+import runpy
+import shutil
+import signal
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock
+
+from lerobot_playbyear.datasets.errors import InputError, PlaybyearError
+from lerobot_playbyear.datasets.files import parse_json, write_atomically
+from lerobot_playbyear.reproduce.plan import Step
+
+_IMPORTED = (
+    "lerobot.scripts.lerobot_eval",
+    "lerobot_playbyear.recording.record",
+    "lerobot_playbyear.training.train",
+    "lerobot_playbyear.dagger.run",
+    "lerobot_playbyear.film.rollout_film",
+)
+"""By the commands: with these a fork of this process starts in a second instead of fifteen."""
+
+_WITHOUT_WEIGHT = ("--policy.device=", "--policy.push_to_hub=")  # options: what is made is the same with others
+_LAST_LINES = 15  # of a log, in an error
+_PR_SET_PDEATHSIG = 1
+
+
+class StepError(PlaybyearError, RuntimeError):
+    """A command did not end well."""
+
+
+def prepare() -> None:
+    """Imports LeRobot and what learns, once for all forks."""
+    for module in _IMPORTED:
+        importlib.import_module(module)
+    from lerobot.envs import EnvConfig
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    with contextlib.suppress(KeyError, ImportError):
+        EnvConfig.get_choice_class("playbyear")()  # imports MuJoCo and the tasks
+
+
+def done(step: Step) -> dict[str, Any] | None:
+    """What is noted of a step that is done: its `command` and `minutes`; None before."""
+    mark = _beside(step, "done.json")
+    return dict(parse_json(mark.read_bytes())) if mark.is_file() else None
+
+
+def carry_out(step: Step, threads: int = 1) -> float:
+    """Runs a step's command, unless that was done; waits for another process that is at it.
+
+    Args:
+        step: The step.
+        threads: Of the command.
+
+    Returns:
+        The minutes that it took in all, those of attempts that were killed included.
+
+    Raises:
+        InputError: Its folder was made by another command.
+        StepError: The command failed; the message ends with its last lines.
+    """
+    step.folder.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(_beside(step, "lock"), poll_interval=0.5):
+        noted = done(step)
+        if noted is not None:
+            if _telling(noted["command"]) != _telling(step.shown):
+                raise InputError(
+                    f"{step.folder} was made by another command than the plan's:\n  {noted['command']}\n  {step.shown}\n"
+                    f"Remove it and {_beside(step, 'done.json')}, or choose another --output_dir."
+                )
+            return float(noted["minutes"])
+        begun, log = _beside(step, "begun.json"), _beside(step, "log")
+        spent = _minutes_before(begun, log)
+        command = resumed(step)
+        write_atomically(begun, json.dumps({"minutes": spent, "at": time.time()}))
+        start = time.monotonic()
+        status = in_a_fork(command, log, threads) if command else 0
+        spent += (time.monotonic() - start) / 60
+        if status:
+            write_atomically(begun, json.dumps({"minutes": spent}))
+            lines = log.read_text(errors="replace").replace("\r", "\n").splitlines()[-_LAST_LINES:]
+            raise StepError(f"{step.shown}\nended with {status}; {log} ends with\n" + "\n".join(lines))
+        write_atomically(
+            _beside(step, "done.json"), json.dumps({"command": step.shown, "minutes": round(spent, 3)}, indent=1)
+        )
+        return spent
+
+
+def resumed(step: Step) -> list[str]:
+    """The command that goes on where the step's last attempt stopped; empty if nothing is missing."""
+    command, folder = list(step.command), step.folder
+    given = dict(word.removeprefix("--").split("=", 1) for word in command if "=" in word)
+    if command[0] == "playbyear-record":
+        info = folder / "meta" / "info.json"
+        there = parse_json(info.read_bytes())["total_episodes"] if info.is_file() else 0
+        name = "--dataset.num_episodes="
+        missing = int(given[name.strip("-=")]) - there
+        return [f"{name}{missing}" if word.startswith(name) else word for word in command] if missing > 0 else []
+    if command[0] == "playbyear-train":
+        last = folder / "checkpoints" / "last"
+        options = last / "pretrained_model" / "train_config.json"
+        if options.is_file():
+            step_ = parse_json((last / "training_state" / "training_step.json").read_bytes())["step"]
+            return [] if step_ >= int(given["steps"]) else [command[0], "--resume=true", f"--config_path={options}"]
+    begun = command[0] == "playbyear-dagger" and (folder / "dagger_config.json").is_file()
+    if command[0] in ("playbyear-train", "lerobot-eval") or (command[0] == "playbyear-dagger" and not begun):
+        shutil.rmtree(folder, ignore_errors=True)  # what was killed before there was anything to go on with
+    return command
+
+
+def in_a_fork(command: list[str], log: Path, threads: int) -> int:
+    """Runs a command as if it were typed, in a fork of this process that ends with this process.
+
+    Returns:
+        Its exit status, negative if a signal ended it.
+    """
+    pid = forked(lambda: _become(command, log, threads))
+    try:
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    except BaseException:
+        os.kill(pid, signal.SIGTERM)
+        raise
+
+
+def forked(work: Callable[[], int]) -> int:
+    """Starts a copy of this process that does some work and ends with its status; on Linux also when this process ends.
+
+    Elsewhere what outlives this process keeps its locks, so that nobody else begins its work.
+
+    Returns:
+        The copy's number.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the threads that libraries keep: none of them is at work yet
+        pid = os.fork()
+    if pid == 0:
+        status = 1
+        try:
+            if sys.platform == "linux":
+                ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+            status = work()
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
+    return pid
+
+
+def _become(command: list[str], log: Path, threads: int) -> int:
+    with log.open("a") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    try:
+        if "torch" in sys.modules:
+            sys.modules["torch"].set_num_threads(threads)
+        print(f"$ {' '.join(command)}", flush=True)
+        _call(command)
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
+    return 0
+
+
+def _call(command: list[str]) -> None:
+    name, *rest = command
+    if name == "python":
+        module, path = (rest[1], None) if rest[0] == "-m" else (None, rest[0])
+        sys.argv = rest[1:] if module else rest
+        if module:
+            runpy.run_module(module, run_name="__main__", alter_sys=True)
+        else:
+            runpy.run_path(str(path), run_name="__main__")
+        return
+    sys.argv = command
+    next(iter(metadata.entry_points(group="console_scripts", name=name))).load()()
+
+
+def _beside(step: Step, ending: str) -> Path:
+    name = (
+        step.command[-1].rpartition("/")[2].partition(".")[0] if step.name == "film" else ""
+    )  # several share a folder
+    return step.folder.with_name(".".join(filter(None, [step.folder.name, name, ending])))
+
+
+def _minutes_before(begun: Path, log: Path) -> float:
+    """What earlier attempts took; one that was killed, until its last line."""
+    if not begun.is_file():
+        return 0.0
+    told = parse_json(begun.read_bytes())
+    last = max(0.0, log.stat().st_mtime - told["at"]) / 60 if "at" in told and log.exists() else 0.0
+    return float(told["minutes"]) + last
+
+
+def _telling(command: str) -> list[str]:
+    return [word for word in command.split() if not word.startswith(_WITHOUT_WEIGHT)]
