@@ -169,7 +169,6 @@ class PlaybyearConfig(PreTrainedConfig):
     augmentation_scale: float = 0.05
     audio_noise_db: float | None = None
     audio_noise_files: str | None = None
-    audio_reference: str | None = None
     low_dimensional_noise: float = 0.0
     low_dimensional_offset: float = 0.0
     spectrogram_momentum: float = 0.01

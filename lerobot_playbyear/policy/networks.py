@@ -104,16 +104,9 @@ class PlaybyearNetwork(nn.Module):
             noisy, colour = self.disturb(torch.stack(waves, dim=1))  # (B, microphones, n_heard * S)
             waves, colours = list(noisy.unbind(1)), colours if colour is None else list(colour.unbind(1))
         heard = zip(keys, waves, colours, strict=True)
-        name = self.config.audio_reference
-        refs = [key for key in keys if name and key.rsplit(".", 1)[-1] == name]
-        ref = waves[keys.index(refs[0])] if refs else None
-        rc = colours[keys.index(refs[0])] if refs else None
-        return [
-            self._hear(batch, key, n_frames, wave, colour, None if key in refs else ref, rc)
-            for key, wave, colour in heard
-        ]
+        return [self._hear(batch, key, n_frames, wave, colour) for key, wave, colour in heard]
 
-    def _hear(self, batch, key: str, n_frames: int, wave: Tensor, colour: Tensor | None, ref=None, rc=None) -> Tensor:
+    def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int, wave: Tensor, colour: Tensor | None) -> Tensor:
         """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means.
 
         Args:
@@ -139,14 +132,8 @@ class PlaybyearNetwork(nn.Module):
             shared = SharedStretches(n_frames, n_samples, config.window_samples, spectrogram.hop)
             if colour is not None:
                 colour = colour.repeat_interleave(shared.n_stretches, dim=0)  # (B * n_stretches, bins)
-            reference = None
-            if ref is not None:
-                reference = spectrogram.log_power(shared.stretches(ref))
-                if rc is not None:
-                    reference = reference + rc.repeat_interleave(shared.n_stretches, dim=0).unsqueeze(2)
-                reference = functional.max_pool1d(reference, 3, 1, 1)
             # (B * n_stretches, bins, columns)
-            levels = spectrogram(shared.stretches(wave), shared.stretches(begun), colour, reference)
+            levels = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
         n_columns = getattr(encoder, "window_columns", None)
         if _hears_waveform(encoder):
             start = wave.shape[1] - config.window_samples - (n_frames - 1) * n_samples

@@ -148,16 +148,13 @@ class LogSpectrogram(nn.Module):
         spectrum = spectrum[:, : self.n_bins]  # of the bins kept alone, and without a root
         return spectrum.real.square().addcmul_(spectrum.imag, spectrum.imag)
 
-    def forward(
-        self, wave: Tensor, begun: Tensor, colour: Tensor | None = None, reference: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, wave: Tensor, begun: Tensor, colour: Tensor | None = None) -> Tensor:
         """Spectrograms in which what precedes the episode is the average sound: zero.
 
         Args:
             wave: (B, samples) or (B, n, samples), in [-1, 1].
             begun: As many bool, False where the episode had not begun.
             colour: (B * n, n_bins), gains of another microphone [10 dB].
-            reference: (B * n, n_bins, n_segments), the levels that these are relative to [10 dB].
 
         Returns:
             (B * n, n_bins, n_segments).
@@ -168,8 +165,6 @@ class LogSpectrogram(nn.Module):
         levels = self.log_power(wave)
         if colour is not None:
             levels = levels + colour.unsqueeze(2)
-        if reference is not None:
-            levels = levels - reference
         if self.training and not self.keeps_statistics:
             self._update(levels.detach(), real)
         levels = (levels - self.mean[:, None]) * torch.rsqrt(self.variance + 1e-5)[:, None]
