@@ -41,6 +41,14 @@ def test_a_learner_goes_on_from_its_checkpoint(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("SB3*"))
 
 
+def test_a_player_imitates_the_expert():
+    recurrent_player = pytest.importorskip("recurrent_player")
+    env = NumericTask("OccludedGrasp-v1", hears=True)
+    ((observations, actions),) = recurrent_player.demonstrations(env, "expert", range(10000, 10001))
+    assert len(observations) == len(actions) > 10
+    assert actions[-1][3] == 1.0, "the hand is closed when it lifts"
+
+
 @pytest.mark.parametrize(("name", "options"), [(EASY, {}), (POUCH, {"contents": "screws"})])
 def test_other_tasks_in_numbers(name, options):
     env = NumericTask(name, hears=True, **options)

@@ -103,7 +103,7 @@ def demonstrations(env: NumericTask, teacher: str, seeds: range) -> list[tuple[n
             env.begin_action()
             for _ in range(env.repeat):
                 taken.append(expert.act() if expert else script.act(env.view))
-                done, info = env.step_physics(taken[-1])
+                done, info = env.advance(taken[-1])
                 if done:
                     break
             move = np.mean([action[:3] for action in taken], axis=0) * ACTION_SCALE / env.step_size

@@ -189,6 +189,8 @@ class Plan:
             ) from error
         if size not in known:
             raise InputError(f"--size={size} is not in the plan: choose from {', '.join(known)}.")
+        if twice := set(self.text["sizes"][size]) & set(self.text["steps"]):
+            raise InputError(f"--plan={path}: {', '.join(sorted(twice))} is a value and a step: give it another name.")
         self.size, self.output, self.device = size, output, device
 
     @cached_property

@@ -193,6 +193,7 @@ def _call(command: list[str]) -> None:
         if module:
             runpy.run_module(module, run_name="__main__", alter_sys=True)
         else:
+            sys.path.insert(0, os.path.dirname(os.path.abspath(str(path))))  # as Python does for a program
             runpy.run_path(str(path), run_name="__main__")
         return
     sys.argv = command
