@@ -75,7 +75,7 @@ def test_every_attempt_leaves_one_line_in_the_file(tmp_path):
     envs.close()
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     assert [line["seed"] for line in lines] == [11, 12, 13, 14]
-    assert lines[0].keys() == {"seed", "steps", "is_success", "end", "acted_early", "n_closings"}
+    assert lines[0].keys() == {"seed", "steps", "is_success", "end", "acted_early", "n_closings", "failure"}
     assert {(line["steps"], line["end"], line["is_success"]) for line in lines} == {(3, "time", False)}
 
 

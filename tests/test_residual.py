@@ -1,5 +1,6 @@
 """Residual reinforcement learning adds nothing at first, then little, to a policy that stays; a killed run goes on."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from support.shared import ENV, trained
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.reproduce import residual
-from lerobot_playbyear.reproduce.residual import Base, ResidualConfig, ResidualEnv, added, learn, make_model
+from lerobot_playbyear.reproduce.residual import Base, ResidualConfig, ResidualEnv, added, evaluate, learn, make_model
 
 pytest.importorskip("stable_baselines3")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -55,6 +56,13 @@ def test_before_it_learned_it_acts_as_the_policy_does(tmp_path):
         seen, *_ = env.step(residual_action)
     explored = np.stack([model.predict(seen, deterministic=False)[0] for _ in range(50)])
     assert 0.01 < explored.std() < 0.1, "it explores near the policy"
+
+
+def test_it_is_judged_on_the_episodes_that_it_is_told(tmp_path):
+    learned, attempts = learn(config(tmp_path, steps=20, warmup_steps=10, batch_size=4)), tmp_path / "attempts.jsonl"
+    judged = {"residual": learned, "seed": 50000, "n_episodes": 2, "env.attempts_file": attempts}
+    evaluate(config(tmp_path / "judged", **judged))
+    assert [json.loads(line)["seed"] for line in attempts.read_text().splitlines()] == [50000, 50001]
 
 
 def test_the_actor_waits_for_the_critic_and_a_run_goes_on_where_it_was_killed(tmp_path, monkeypatch):

@@ -115,9 +115,9 @@ class ResidualEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
         super().reset(seed=seed)
-        observation, info = self.env.reset(
-            seed=int(self.np_random.integers(10_000, 40_000))
-        )  # of attempts, not of judges
+        if seed is None:
+            seed = int(self.np_random.integers(10_000, 40_000))  # of what is learned from, not of what is judged on
+        observation, info = self.env.reset(seed=seed)
         self._base.reset(self.env)
         seen, self._action = self._base.look(observation)
         return seen, info
