@@ -232,7 +232,7 @@ def _kept(model: Any) -> bytes:
     tensors = {f"policy.{name}": value for name, value in model.policy.state_dict().items()}
     tensors |= {f"seen.{name}": torch.from_numpy(getattr(model.replay_buffer, name)[:n]) for name in _SEEN}
     tensors["log_ent_coef"] = model.log_ent_coef.detach()
-    progress = {"steps": model.num_timesteps, "updates": model._n_updates, "pos": model.replay_buffer.pos}
+    progress = {"steps": model.num_timesteps, "pos": model.replay_buffer.pos}
     return save(
         {name: value.clone().contiguous() for name, value in tensors.items()}, {"progress": json.dumps(progress)}
     )
@@ -248,7 +248,7 @@ def _restore(model: Any, path: Path) -> None:
     for name in _SEEN:
         getattr(buffer, name)[:n] = tensors[f"seen.{name}"].numpy()
     buffer.pos, buffer.full = progress["pos"], n == buffer.buffer_size
-    model.num_timesteps, model._n_updates = progress["steps"], progress["updates"]
+    model.num_timesteps = progress["steps"]
 
 
 @parser.wrap()
