@@ -122,6 +122,15 @@ def test_a_damaged_table_is_named(tmp_path):
         Table(tmp_path).rows()
 
 
+def test_a_strangers_row_names_no_other_file(tmp_path):
+    there, row = tmp_path / "there", {"task": "t", "variant": "v", "seed": 1, "size": "cpu"}
+    there.mkdir()
+    (there / "parts.jsonl").write_text(json.dumps(row | {"study": "../outside"}) + "\n")
+    with pytest.raises(InputError, match=r"its study is '../outside', wanted 'parts'"):
+        Table(tmp_path / "here").merge(Table(there))
+    assert not (tmp_path / "outside.jsonl").exists()
+
+
 class _Page(HTMLParser):
     """What a page asks of others."""
 

@@ -89,6 +89,8 @@ def _read(path: Path) -> list[Row]:
         try:
             row = dict(parse_json(line))
             key_of(row)
+            if row["study"] != path.stem:  # a study names the file that its rows are written to
+                raise ValueError(f"its study is {row['study']!r}, wanted {path.stem!r}")
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(
                 f"{path}:{number} is damaged: {error}. Put it back from a copy, or remove the line."
