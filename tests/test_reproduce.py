@@ -16,6 +16,7 @@ from reproduce_factory import arguments, call, counted, rows, write_plan
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.reproduce.plan import Plan
+from lerobot_playbyear.reproduce.run import print_plan, print_status
 from lerobot_playbyear.reproduce.table import Table, best_rate
 from lerobot_playbyear.scripts.command import OPTIONS_FILE, find_mistake
 from lerobot_playbyear.training.command_line import apply_preset
@@ -120,6 +121,14 @@ def test_a_damaged_table_is_named(tmp_path):
     (tmp_path / "parts.jsonl").write_text('{"study": "parts"\n')
     with pytest.raises(InputError, match=r"parts.jsonl:1 is damaged"):
         Table(tmp_path).rows()
+
+
+def test_the_plan_of_every_size_reads_the_committed_tables(capsys):
+    for size in SIZES:
+        cells, table = Plan(size, Path("out")).cells, Table(Path(__file__).parents[1] / "results")
+        print_plan(cells, table)
+        print_status(cells, table)
+        assert f"{len(cells)} cells" in capsys.readouterr().out
 
 
 def test_a_strangers_row_names_no_other_file(tmp_path):

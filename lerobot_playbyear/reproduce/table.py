@@ -91,6 +91,8 @@ def _read(path: Path) -> list[Row]:
             key_of(row)
             if row["study"] != path.stem:  # a study names the file that its rows are written to
                 raise ValueError(f"its study is {row['study']!r}, wanted {path.stem!r}")
+            if not isinstance(row.get("minutes", {}), dict):
+                raise ValueError(f"its minutes are {row['minutes']!r}, wanted those of each step by name")
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(
                 f"{path}:{number} is damaged: {error}. Put it back from a copy, or remove the line."
