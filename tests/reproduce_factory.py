@@ -80,6 +80,7 @@ def write_plan(folder: Path, seconds: float = 0.0, kind: str = "makes", n_seeds:
             "parts": {
                 "title": "Parts",
                 "about": "Each part removed.",
+                "first": 2,
                 "paper": {"full": "70 %"},
                 "tasks": {"Grasp": {}, "Place": {}},
                 "variants": ["full", "no_interventions", "no_audio"],
