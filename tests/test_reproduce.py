@@ -159,8 +159,8 @@ def test_the_report_shows_what_there_is_and_says_what_is_missing(tmp_path):
     assert call(tmp_path, "report").returncode == 0
     text = (tmp_path / "out/tiny/report.md").read_text()
     assert "3 of 12 cells are done" in text
-    assert "| full | 67 ± 0 %; first 2 episodes: 2, 2 | 67 ± 0 % | 100 ± 0 % | 2 of 2 | 70 % |" in text
-    assert "| no_interventions | not run |  |  | 0 of 2 |  |" in text
+    assert "| full | 67 ± 0 %; first 2 episodes: 2, 2 | 67 ± 0 % | 33 ± 0 % | 100 ± 0 % | 2 of 2 | 70 % |" in text
+    assert "| no_interventions | not run |  |  |  | 0 of 2 |  |" in text
     assert "| failures of the last checkpoint | dropped |" in text
     page = _Page()
     page.feed((tmp_path / "out/tiny/report.html").read_text())

@@ -102,7 +102,14 @@ def _task(found: Found, task: str, paper: dict[str, str], first: int) -> dict[st
 def _line(variant: str, rows: Sequence[Row | None], paper: str, first: int) -> dict[str, Any]:
     """A row of a task's table; without `success` where nothing was run. `first`: episodes that are told apart, too."""
     done = [row for row in rows if row is not None]
-    line = {"variant": variant, "paper": paper, "seeds": f"{len(done)} of {len(rows)}", "last": [], "same": []}
+    line = {
+        "variant": variant,
+        "paper": paper,
+        "seeds": f"{len(done)} of {len(rows)}",
+        "last": [],
+        "early": [],
+        "same": [],
+    }
     if not done:
         return {**line, "success": ""}
     if "players" in done[0]:
@@ -124,6 +131,7 @@ def _line(variant: str, rows: Sequence[Row | None], paper: str, first: int) -> d
         **line,
         "success": "; ".join([_shown(best), *apart]),
         "last": [rate(row["successes"]) for row in done if row.get("successes")],
+        "early": [rate(row["acted_early"]) for row in done if row.get("acted_early")],
         "same": [statistics.mean(curve[-_N_BEST:]) for curve in curves],
     }
 

@@ -108,8 +108,8 @@ def told(path: Path, first_seed: int, n: int) -> Row:
     """What a file of attempts says of n seeds.
 
     Returns:
-        `successes`, a text with 1 or 0 for each seed in their order; `failures` and `ends`, how often which; `groups`, the
-        successes apart for each of the contents, where there are several.
+        `successes` and `acted_early` (before anything was heard), texts with 1 or 0 for each seed in their order; `failures`
+        and `ends`, how often which; `groups`, the successes apart for each of the contents, where there are several.
 
     Raises:
         InputError: An attempt is missing.
@@ -129,6 +129,7 @@ def told(path: Path, first_seed: int, n: int) -> Row:
     return {
         "first_seed": first_seed,
         "successes": "".join(map(bit, own)),
+        "acted_early": "".join(str(int(line.get("acted_early", False))) for line in own),
         "failures": dict(Counter(line.get("failure", line["end"]) for line in failed).most_common()),
         "ends": dict(Counter(line["end"] for line in own).most_common()),
         **({"groups": groups} if len(groups) > 1 else {}),
