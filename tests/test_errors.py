@@ -75,7 +75,7 @@ record | --dataset.root={truncated} --resume=true | {truncated} | damaged | play
 record | --dataset.root={noise} --resume=true | {noise} does not fit | seed is absent there | choose another root
 train | --output_dir={full} | {full} already exists | resume
 train | --output_dir={file}/run | --output_dir={file}/run cannot be written: Not a directory | wanted
-train | --dataset.root={truncated} | file-000.parquet' is truncated | playbyear-repair --root={truncated}
+train | --dataset.root={truncated} | file-000.parquet is truncated | playbyear-repair --root={truncated}
 dagger | --output_dir={full} | {full} holds files, but no run of playbyear-dagger
 dagger | --interventions.root={demos} | --dataset and --interventions are the same dataset | of their own
 dagger | --interventions.root={out}/dagger | --output_dir={out}/dagger lies in the folder of --interventions

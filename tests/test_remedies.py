@@ -20,7 +20,7 @@ from support.old_layout import as_v21
 from support.recording import edit_column, edit_info
 from support.shared import TINY, run_in_process
 
-from lerobot_playbyear.datasets.info import check_dataset_files
+from lerobot_playbyear.datasets.reader import check_dataset_files
 from lerobot_playbyear.datasets.remedies import recompute_command, without_episodes
 from lerobot_playbyear.inspection.inspect import InspectConfig, InspectDatasetConfig, inspect
 from lerobot_playbyear.scripts.commands import repair, train

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
 from lerobot_playbyear.datasets.features import Features
-from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, list_files
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits
 from lerobot_playbyear.datasets.info import STATS_PATH, read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -96,23 +96,6 @@ def write_copy(
     (target / INFO_PATH).write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def check_tables(root: Path) -> None:
-    """Whether the tables of episodes are whole.
-
-    Raises:
-        ParquetDamageError: One is not; it is named.
-    """
-    for path in list_files(root, _EPISODES):
-        _read_named(path, ["length"])
-
-
-def _read_named(path: Path, columns: list[str] | None = None) -> pa.Table:
-    try:
-        return read_table(path, columns)
-    except ParquetDamageError as error:
-        raise ParquetDamageError(f"{path} is damaged: {error}.") from error
-
-
 def _write_frames(source: Path, target: Path, schema: pa.Schema, added: Columns, removed: Collection[str]) -> None:
     file = DataFile(source)
     metadata = file.schema.metadata or {}
@@ -149,7 +132,7 @@ def _values(frames: pa.Table, column: AddedColumn, kind: pa.DataType) -> pa.Arra
 
 
 def _write_rows(source: Path, target: Path, stats: Sequence[Mapping], removed: Collection[str]) -> None:
-    rows = _read_named(source)
+    rows = read_table(source)
     prefixes = tuple(f"{folder}/{key}/" for key in removed for folder in ("stats", AUDIO_FOLDER))
     rows = rows.select([name for name in rows.column_names if not name.startswith(prefixes)])
     rows = with_stats(rows, [dict(stats[episode]) for episode in rows.column("episode_index").to_pylist()])

@@ -12,8 +12,7 @@ from lerobot.utils.constants import SUCCESS
 from lerobot_playbyear.dagger.batches import frames_by_expert
 from lerobot_playbyear.datasets.durable import DurableWriter
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.info import check_dataset_files
-from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
+from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader, check_dataset_files
 from lerobot_playbyear.episodes.frames import INTERVENTION, SEED, save_episode
 from lerobot_playbyear.episodes.play import Episode
 from lerobot_playbyear.training.store import EpisodeStore

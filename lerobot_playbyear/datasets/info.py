@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-from lerobot_playbyear.datasets.errors import InputError, first_line
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import (
     DEFAULT_DATA_PATH,
     DEFAULT_VIDEO_PATH,
     EPISODES_DIR,
-    HF_LEROBOT_HOME,
     INFO_PATH,
     entries_below,
     fits,
@@ -30,7 +29,6 @@ from lerobot_playbyear.datasets.files import (
     parse_json,
 )
 from lerobot_playbyear.datasets.frame_rate import frame_rate
-from lerobot_playbyear.datasets.parquet import ParquetDamageError, check_room, holds_numbers, open_checked, read_table
 from lerobot_playbyear.datasets.remedies import convert_command, repair_command
 
 Info = Mapping[str, Any]
@@ -43,10 +41,8 @@ INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_ind
 
 _TEMPLATE = re.compile(r"(?:[^{}]|\{(?:video_key|(?:chunk|file)_index(?::0?\d?d)?)\})*")
 _FOLDERS = ("data", "data/*", "meta", "meta/episodes", "meta/episodes/*", "videos", "videos/*", "videos/*/*")
-_DATA, _EPISODES, _TABLES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "meta/*.parquet"
-_READ = (INFO_PATH, "meta/*.json", _TABLES, _EPISODES, _DATA, "videos/*/*/*")
+_READ = (INFO_PATH, "meta/*.json", "meta/*.parquet", f"{EPISODES_DIR}/*/*.parquet", "data/*/*.parquet", "videos/*/*/*")
 _MOST_NAMED = 4  # files of a folder
-_PLACES = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
 _LEAST_FPS, _MOST_FPS = 0.01, 1000
 _TOLERANCE = 4  # times as much as is there; less than that is damage, which the survey names
 
@@ -149,137 +145,6 @@ def file_inside(root: Path, name: str | PurePath) -> Path:
     if windows.anchor or PurePath(name).is_absolute() or ".." in (*windows.parts, *PurePath(name).parts):
         raise OutsideError(f"The dataset in '{root}' names the file '{name}', which is not in its folder.")
     return ordinary(root / name)
-
-
-def check_dataset_files(
-    repo_id: str, root: str | Path | None = None, revision: str | None = None
-) -> list[pq.FileMetaData]:
-    """Refuse a local dataset that is empty or was cut off while it was written, or that no one should trust.
-
-    Where no local dataset is, what the Hub's says about itself is fetched and checked; the rest LeRobot fetches later.
-
-    Args:
-        repo_id: The dataset's name.
-        root: Its folder; None means LeRobot's own place for `repo_id`.
-        revision: Of the dataset on the Hub, as LeRobot takes it.
-
-    Returns:
-        What its data files say of themselves; nothing where no local dataset is.
-
-    Raises:
-        InputError: Naming the file that is damaged, the folder without data, or what leads out of the folder or claims
-            more than is there.
-        OSError: A file cannot be read now, which says nothing about what it holds.
-    """
-    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
-    check_ordinary(folder)
-    if not (folder / INFO_PATH).is_file():
-        if list_folder(folder):  # LeRobot fetches into no folder that holds other files
-            raise InputError(f"{nothing_in(folder)}. Correct the folder.")
-        from lerobot.datasets import LeRobotDatasetMetadata
-
-        try:
-            meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
-        except Exception as error:  # LeRobot's, the Hub's or the network's
-            raise InputError(
-                f"{nothing_in(folder)}, and '{repo_id}' could not be had from the Hub: {type(error).__name__}: "
-                f"{first_line(error)}. Correct the name or the folder."
-            ) from error
-        check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
-        return []
-    footers: dict[str, dict[Path, pq.FileMetaData]] = {_DATA: {}, _EPISODES: {}, _TABLES: {}}
-    named = [(kind, path) for kind in footers for path in list_files(folder, kind)]
-    for kind, path in named:
-        try:
-            with open_checked(path) as file:
-                footers[kind][path] = file.metadata
-        except ParquetDamageError as error:
-            raise InputError(
-                f"'{path}' is truncated or not a parquet file ({error}). If the recording was "
-                f"killed, its episodes can be saved: {repair_command(folder)}"
-            ) from error
-        for group in [None] if kind == _TABLES else range(footers[kind][path].num_row_groups):
-            check_room(path, footers[kind][path], group)
-    check_parts(folder)
-    try:
-        if (folder / STATS_PATH).is_file():
-            parse_stats((folder / STATS_PATH).read_bytes())
-    except ValueError as error:
-        raise InputError(
-            f"'{folder / STATS_PATH}' cannot be read: {error}. Repair it: {repair_command(folder)}"
-        ) from error
-    data = [*footers[_DATA].values()]
-    check_claims(folder, data, sum(footer.num_rows for footer in footers[_EPISODES].values()))
-    _check_columns(folder, footers[_DATA])
-    _check_places(folder, footers[_DATA], list(footers[_EPISODES]))
-    return data
-
-
-def _check_columns(folder: Path, data: Mapping[Path, pq.FileMetaData]) -> None:
-    """Refuses texts where a feature is of numbers, which LeRobot would read as they are, and columns of one name.
-
-    Raises:
-        InputError: Naming the file and the column.
-    """
-    texts = ("string", "language", "image", "video", "audio")
-    numbers = {key: own["dtype"] for key, own in read_info(folder)["features"].items() if own["dtype"] not in texts}
-    for path, footer in data.items():
-        schema = footer.schema.to_arrow_schema()
-        if len(set(schema.names)) < len(schema.names):
-            raise InputError(f"'{path}' has two columns of one name. Record it again.")
-        for column in schema:
-            if column.name in numbers and not holds_numbers(column.type):
-                raise InputError(
-                    f"'{path}': its column '{column.name}' is {column.type}; wanted {numbers[column.name]}. Record it "
-                    f"again, or correct the features in {INFO_PATH}."
-                )
-
-
-def _check_places(folder: Path, data: Mapping[Path, pq.FileMetaData], tables: Iterable[Path]) -> None:
-    """Refuses what LeRobot would read wrongly: it finds rows by numbers in `meta/episodes`, in all files there are.
-
-    Raises:
-        InputError: A data file belongs to no episode, or frames are counted otherwise than they are there.
-    """
-    repair, info = f"Repair it: {repair_command(folder)}", read_info(folder)
-    films = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
-    names = {key: [f"videos/{key}/{name}" for name in ("chunk_index", "file_index")] for key in films}
-    rows: list[tuple[Any, ...]] = []
-    used: set[Path] = set()
-    for path in tables:
-        try:
-            table = read_table(path, [*_PLACES, *(name for own in names.values() for name in own)])
-            for key, own in names.items():
-                for chunk, file in set(zip(*(table.column(name).to_pylist() for name in own), strict=True)):
-                    name = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
-                    used.add(folder / name)
-        except ParquetDamageError as error:
-            raise InputError(f"'{path}' is damaged: {error}. {repair}") from error
-        rows += zip(*(table.column(name).to_pylist() for name in _PLACES), strict=True)
-    if not all(isinstance(value, int) for row in rows for value in row):
-        raise InputError(
-            f"meta/episodes of '{folder}' has rows in which {', '.join(_PLACES)} are not whole numbers. {repair}"
-        )
-    named = {folder / info["data_path"].format(chunk_index=row[-2], file_index=row[-1]) for row in rows}
-    if lost := [*sorted(named - set(data)), *(path for path in sorted(used) if not path.is_file())]:
-        raise InputError(f"'{lost[0]}' is missing, where meta/episodes says that episodes are. {repair}")
-    if stray := sorted(set(data) - named):
-        raise InputError(
-            f"'{stray[0]}' belongs to no episode, and LeRobot would read it all the same. If it is a copy, move it out of "
-            f"'{folder}'; otherwise: {repair_command(folder)}"
-        )
-    first = 0
-    for number, (episode, length, start, stop, *_) in enumerate(sorted(rows, key=lambda row: row[0])):
-        if (episode, start, stop) != (number, first, first + length):
-            raise InputError(
-                f"meta/episodes says that episode {episode} has {length} frames, from {start} to {stop}; wanted episode "
-                f"{number} from {first} on. {repair}"
-            )
-        first = stop
-    if first != (there := sum(footer.num_rows for footer in data.values())):
-        raise InputError(
-            f"The data files of '{folder}' hold {there:,} frames, and meta/episodes counts {first:,}. {repair}"
-        )
 
 
 def nothing_in(root: Path) -> str:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.errors import InputError
+from lerobot_playbyear.datasets.errors import InputError, first_line
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.findings import name_episodes
@@ -27,9 +27,10 @@ from lerobot_playbyear.datasets.frame_rate import frame_rate
 from lerobot_playbyear.datasets.info import (
     INDEX_COLUMNS,
     check_claims,
-    check_dataset_files,
+    check_ordinary,
     check_parts,
     file_inside,
+    list_folder,
     nothing_in,
 )
 from lerobot_playbyear.datasets.parquet import PIECE_BYTES, DataFile, column_to_numpy, episode_bounds
@@ -238,13 +239,15 @@ class DatasetReader(EpisodeReader):
         may_have_audio_files: bool = False,
     ) -> None:
         if meta is None:
-            is_local = bool(check_dataset_files(repo_id, root))
+            is_local = check_dataset_files(repo_id, root)
             from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
             if is_local:
                 meta = LeRobotDatasetMetadata(repo_id, root)
             else:  # it fetches what is missing
                 meta = LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).meta
+                if episodes is None:
+                    _refuse_damage(_look(Path(meta.root)))
         self.meta = meta
         folder = Path(meta.root)
         files = [DataFile(path) for path in list_files(folder, "data/*/*.parquet")]
@@ -316,19 +319,13 @@ class SurveyedDataset(EpisodeReader):
         if not (folder / INFO_PATH).is_file():
             folder = _fetch(repo_id, folder, episodes)
         try:
-            check_parts(folder)
-            found = survey(folder, thorough=False)
-            dataset = cls(repo_id, found, episodes)
-            check_claims(folder, [file.footer for file in dataset.files], len(found.episodes))
+            found = _look(folder)
         except (OSError, MemoryError) as error:
             said = f"it cannot be read now ({error or 'not enough memory'}); this is not damage, and may pass"
             raise InputError(f"The dataset in '{folder}' cannot be opened: {said}.") from error
-        if found.damage and not (damaged and dataset.episodes):
-            said, more = "; ".join(map(str, found.damage[:_LISTED])), len(found.damage) - _LISTED
-            raise InputError(
-                f"The dataset in '{folder}' cannot be opened: {said}{f'; and {more} more' if more > 0 else ''}. "
-                f"Repair it: {repair_command(folder)}"
-            )
+        dataset = cls(repo_id, found, episodes)
+        if not (damaged and dataset.episodes):
+            _refuse_damage(found)
         if not dataset.episodes:
             raise InputError(f"The dataset in '{folder}' is empty: no episode was saved. Record at least one.")
         return dataset
@@ -369,6 +366,65 @@ class SurveyedDataset(EpisodeReader):
     def _film(self, key: str, episode: EpisodeRows) -> tuple[Path, float]:
         place = self._places[episode.index][key]
         return film_path(self.root, self.info, key, place), place.start
+
+
+def check_dataset_files(repo_id: str, root: str | Path | None = None, revision: str | None = None) -> bool:
+    """Refuse a local dataset that is empty or damaged, or that no one should trust.
+
+    Where no local dataset is, what the Hub's says about itself is fetched and checked; the rest LeRobot fetches later.
+
+    Args:
+        repo_id: The dataset's name.
+        root: Its folder; None means LeRobot's own place for `repo_id`.
+        revision: Of the dataset on the Hub, as LeRobot takes it.
+
+    Returns:
+        Whether there is a local dataset.
+
+    Raises:
+        InputError: Naming what is damaged, the folder without data, or what leads out of the folder or claims more than is
+            there.
+        OSError: A file cannot be read now, which says nothing about what it holds.
+        MemoryError: There is no room for something.
+    """
+    folder = Path(root) if root is not None else HF_LEROBOT_HOME / repo_id
+    check_ordinary(folder)
+    if (folder / INFO_PATH).is_file():
+        _refuse_damage(_look(folder))
+        return True
+    if list_folder(folder):  # LeRobot fetches into no folder that holds other files
+        raise InputError(f"{nothing_in(folder)}. Correct the folder.")
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    try:
+        meta = LeRobotDatasetMetadata(repo_id, root=root, revision=revision)
+    except Exception as error:  # LeRobot's, the Hub's or the network's
+        raise InputError(
+            f"{nothing_in(folder)}, and '{repo_id}' could not be had from the Hub: {type(error).__name__}: "
+            f"{first_line(error)}. Correct the name or the folder."
+        ) from error
+    check_claims(Path(meta.root), [], 0 if meta.episodes is None else len(meta.episodes))
+    return False
+
+
+def _look(folder: Path) -> Survey:
+    """A quick survey of a dataset that has all of its parts, and claims no more than is there."""
+    check_parts(folder)
+    found = survey(folder, thorough=False)
+    files = {each.frames.file.path: each.frames.file for each in found.whole if each.frames}
+    check_claims(folder, [file.footer for file in files.values()], len(found.episodes))
+    return found
+
+
+def _refuse_damage(found: Survey) -> None:
+    if not found.damage:
+        return
+    wrong = [str(finding) for finding in found.findings if finding.level == "error"]
+    more = f"; and {len(wrong) - _LISTED} more" if len(wrong) > _LISTED else ""
+    raise InputError(
+        f"The dataset in '{found.root}' cannot be opened: {'; '.join(wrong[:_LISTED])}{more}. "
+        f"Repair it: {repair_command(found.root)}"
+    )
 
 
 def _fetch(repo_id: str, folder: Path, episodes: list[int] | None) -> Path:

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
 from lerobot_playbyear.datasets.errors import InputError
-from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
+from lerobot_playbyear.datasets.features import AUDIO_DTYPE, audio_keys, check_audio_features
 from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, is_listed, list_files, read_listed
 from lerobot_playbyear.datasets.findings import Finding, name_episodes, worst
 from lerobot_playbyear.datasets.info import (
@@ -217,7 +217,8 @@ def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[s
 def _schema(root: Path, info: Info) -> pa.Schema:
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
-    features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in info["features"].items()}
+    in_rows = {key: feature for key, feature in info["features"].items() if feature["dtype"] != AUDIO_DTYPE}
+    features = {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in in_rows.items()}
     try:
         return get_hf_features_from_features(features).arrow_schema
     except (ValueError, TypeError, KeyError, AttributeError) as error:
@@ -238,7 +239,7 @@ def _open(root: Path, path: Path, schema: pa.Schema, rescue: Rescue | None, find
             said = f"{name} has no valid end, as if the recording had been killed: it is read from its beginning"
             findings.append(_wrong("files", said))
             return DataFile(path, footer)
-        findings.append(_wrong("files", f"{name} cannot be read ({error})"))
+        findings.append(_wrong("files", f"{name} is truncated or not a parquet file ({error})"))
         return None
     if problem := _difference(file.schema, schema):
         like = f"{repair_command(root)} --like=<folder of a dataset with the same settings>"

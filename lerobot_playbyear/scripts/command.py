@@ -299,20 +299,3 @@ def _check_saved_options(args: list[str]) -> None:
                     raise ValueError("it holds no options")
             except ValueError as error:
                 raise InputError(f"{path} is damaged: {error}. Put it back from a copy.") from error
-
-
-def check_local_dataset(repo_id: str, root: str | None) -> None:
-    """Tells what is wrong with a dataset's files before all that learns is imported, which takes a third of a start.
-
-    Args:
-        repo_id: The dataset's name.
-        root: Its folder; None: in LeRobot's cache. An empty one is left to LeRobot, which asks the Hub.
-
-    Raises:
-        InputError: A file is damaged, or leads out of the folder, or the folder holds something else.
-    """
-    from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME
-    from lerobot_playbyear.datasets.info import check_dataset_files, list_folder
-
-    if list_folder(Path(root or HF_LEROBOT_HOME / repo_id)):
-        check_dataset_files(repo_id, root)

@@ -4,7 +4,7 @@ import logging
 import sys
 
 from lerobot_playbyear.datasets.errors import printable
-from lerobot_playbyear.scripts.command import check_local_dataset, command, run_alone, run_with_lerobot
+from lerobot_playbyear.scripts.command import command, run_alone, run_with_lerobot
 
 
 @command("Interrupted. The saved episodes are safe; --resume=true --dataset.num_episodes=N records N more.")
@@ -23,7 +23,6 @@ def train() -> None:
     from lerobot_playbyear.training.config import PlaybyearTrainConfig
 
     def train(cfg: PlaybyearTrainConfig) -> None:
-        check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
         from lerobot_playbyear.training.train import train as learn
 
         learn(cfg)
@@ -41,7 +40,6 @@ def dagger() -> None:
 
     def correct(cfg: DaggerConfig) -> None:
         cfg.check()
-        check_local_dataset(cfg.dataset.repo_id, cfg.dataset.root)
         from lerobot_playbyear.dagger.run import run_dagger
 
         run_dagger(cfg)

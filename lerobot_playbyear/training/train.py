@@ -19,8 +19,7 @@ from lerobot.utils.utils import format_big_number, init_logging, inside_slurm
 
 from lerobot_playbyear.datasets.errors import InputError, errors_of_input
 from lerobot_playbyear.datasets.files import check_can_be_made, check_no_links, entries_below
-from lerobot_playbyear.datasets.info import check_dataset_files
-from lerobot_playbyear.datasets.reader import DatasetReader
+from lerobot_playbyear.datasets.reader import DatasetReader, check_dataset_files
 from lerobot_playbyear.hub.push import METRICS_NAME, RUN_FOLDERS, PushOptions, check_upload, push_policy
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import (
