@@ -169,6 +169,13 @@ def place(name: str, *values: float | None):
     return change
 
 
+def add_a_column_of_its_name(root: Path) -> None:
+    edit_info(root, lambda info: info["features"].update({f"{EARS}_1": info["features"]["action"]}))
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    pq.write_table(table.append_column(f"{EARS}_1", table["action"]).replace_schema_metadata({}), path)
+
+
 def info(change):
     return lambda root: edit_info(root, change)
 
@@ -186,7 +193,7 @@ REFUSED = [
         r"shape is \[1000000000\]; wanted \(channels,\)",
     ),
     (info(lambda info: info["features"].update({f"{AUDIO_PREFIX}a/../b": info["features"].pop(TABLE)})), "without '/'"),
-    (info(lambda info: info["features"].update({f"{EARS}_1": info["features"]["action"]})), "which is there already"),
+    (add_a_column_of_its_name, "which is there already"),
     (microphone(sample_rate=8000), "has 16000 samples.*info says 8000"),
     (microphone(start_time_s=-1.0), "start_time_s is -1.0; wanted"),
     (place("from_timestamp", 0.0, float("nan"), 0.0), f"'{TABLE}', episode 1, .*from_timestamp is nan; wanted seconds"),

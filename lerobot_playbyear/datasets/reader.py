@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
-from lerobot_playbyear.datasets.errors import InputError, first_line
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input, first_line
 from lerobot_playbyear.datasets.features import AUDIO_DTYPE, Features, audio_keys, check_audio_features, is_depth
 from lerobot_playbyear.datasets.files import HF_LEROBOT_HOME, INFO_PATH, list_files
 from lerobot_playbyear.datasets.findings import name_episodes
@@ -254,9 +254,7 @@ class DatasetReader(EpisodeReader):
         tasks = {} if meta.tasks is None else dict(enumerate(meta.tasks.index.astype(str)))
         super().__init__(meta.repo_id, folder, frame_rate(meta.fps), meta.features, files, tasks)
         if not may_have_audio_files:
-            check_audio_features(
-                {key: own for key, own in self.features.items() if own["dtype"] == AUDIO_DTYPE}, self.fps
-            )
+            _refuse_audio_files(self.features)
         numbers = self.values("episode_index")
         bounds = zip(*episode_bounds(numbers), strict=True) if len(numbers) else ()
         found = [(int(numbers[start]), start, stop - start) for start, stop in bounds]
@@ -323,6 +321,7 @@ class SurveyedDataset(EpisodeReader):
         except (OSError, MemoryError) as error:
             said = f"it cannot be read now ({error or 'not enough memory'}); this is not damage, and may pass"
             raise InputError(f"The dataset in '{folder}' cannot be opened: {said}.") from error
+        _refuse_audio_files(found.info["features"])
         dataset = cls(repo_id, found, episodes)
         if not (damaged and dataset.episodes):
             _refuse_damage(found)
@@ -414,6 +413,11 @@ def _look(folder: Path) -> Survey:
     files = {each.frames.file.path: each.frames.file for each in found.whole if each.frames}
     check_claims(folder, [file.footer for file in files.values()], len(found.episodes))
     return found
+
+
+def _refuse_audio_files(features: Features) -> None:
+    with errors_of_input():
+        check_audio_features({key: own for key, own in features.items() if own["dtype"] == AUDIO_DTYPE}, 1)
 
 
 def _refuse_damage(found: Survey) -> None:

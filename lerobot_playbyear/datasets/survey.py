@@ -205,11 +205,11 @@ def _read_info(root: Path, like: Path | None, findings: list[Finding]) -> dict[s
     if known is not None and any(info[name] != known[name] for name in ("fps", "features")):
         findings.append(_wrong("info", f"{INFO_PATH}: its frame rate and features become those of {like}"))
         info = {**info, "fps": known["fps"], "features": known["features"]}
-    for key in audio_keys(info["features"]):
+    for key in (key for key in audio_keys(info["features"]) if info["features"][key]["dtype"] != AUDIO_DTYPE):
         try:
             check_audio_features({key: info["features"][key]}, info["fps"])
         except ValueError as error:
-            said = str(error).removeprefix(f"'{key}' ")
+            said = str(error).removeprefix(f"'{key}' ").rstrip(".")
             findings.append(_wrong("sample rate", said, remedy=f"Correct it in {INFO_PATH}", key=key))
     return info
 
@@ -285,9 +285,8 @@ def _read_frames(root: Path, file: DataFile, info: Info, thorough: bool, finding
     steps = {key: np.diff(values) for key, values in index.items()}
     breaks = (steps["episode_index"] != 0) | (steps["frame_index"] != 1) | (steps["row"] != 1)
     if breaks.sum() > _MOST_PIECES:
-        findings.append(
-            _wrong("files", f"{name}: its rows are of {breaks.sum() + 1:,} pieces of episodes, which nobody recorded")
-        )
+        said = f"{name}: its rows are of {breaks.sum() + 1:,} pieces of episodes, which nobody recorded"
+        findings.append(_wrong("files", said))
         return
     for start, stop in itertools.pairwise([0, *(np.flatnonzero(breaks) + 1).tolist(), len(index["row"])]):
         own = {key: values[start:stop] for key, values in index.items()}
@@ -509,10 +508,8 @@ def _read_tasks(root: Path, episodes: Sequence[Episode], rows: Rows, findings: l
         known = {task: text for task, text in texts.items() if task < n_frames}
     if nameless := sorted(set(wanted) - set(known)):
         remedy = "Put a table from a copy in its place, or correct the frames' task_index"
-        said_of = ", ".join(map(str, nameless[:8]))
-        findings.append(
-            _wrong("tasks", f"{TASKS_PATH}: frames are of task {said_of}, which has no text", remedy=remedy)
-        )
+        text = f"{TASKS_PATH}: frames are of task {', '.join(map(str, nameless[:8]))}, which has no text"
+        findings.append(_wrong("tasks", text, remedy=remedy))
     for task, text, numbers in ((each, text, own) for each in wanted for text, own in said[each].items()):
         if text != known.get(task, text) and not problem:
             others = name_episodes(numbers)
