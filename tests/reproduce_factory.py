@@ -27,7 +27,8 @@ time.sleep(float(seconds))
 folder.mkdir(parents=True, exist_ok=True)
 if kind == "evaluate":
     first, n = int(more[0]), int(more[1])
-    solved = {"is_success": True, "end": "success"}, {"is_success": False, "end": "time", "failure": "dropped", "acted_early": True}
+    failed = {"is_success": False, "end": "time", "failure": "dropped", "acted_early": True}
+    solved = {"is_success": True, "end": "success"}, failed
     lines = [{"seed": s, "steps": 3, **solved[s % 3 == 0]} for s in range(first, first + n)]
     (folder / "attempts.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
 else:
