@@ -39,7 +39,7 @@ _MOST_NUMBERS = 2**16  # of a state
 _USUAL_FPS = 20
 _LARGEST = 1000  # frames per second, and range of actions
 _AT_LEAST_0 = (
-    *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
+    *("audio_envelope_gain", "memory_displacement_gain", "memory_readers"),
     *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
 )
 
@@ -98,11 +98,11 @@ class PlaybyearConfig(PreTrainedConfig):
             replicate-padded crop [pixels of the original]; brightness: relative; hue: share of the colour circle; degrees:
             rotation; translate: share of the size; scale: relative.
         audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]. None: no
-            noise (the paper). Each item draws a colour, a hum and a level, uniformly from 20 dB below the floor to this one. It
-            decides how much noise the policy tolerates: 18 is 8 times the background's amplitude.
-        audio_noise_files: Folder of WAV or FLAC files. Three quarters of the items also get an excerpt of one. Its level is
-            drawn uniformly from the floor's to `audio_noise_db`. Only training reads it.
-        audio_colour_db: Standard deviation of a simulated microphone's gain, a smooth curve over frequency drawn per item [dB].
+            noise (the paper). Each item draws broadband noise, a hum and another frequency response of every microphone. Three
+            quarters also hear voices, blows, clatter, music, footsteps or a tool, generated, in a room. It decides how much
+            noise the policy tolerates: 18 is 8 times the background's amplitude.
+        audio_noise_files: Folder of WAV or FLAC files. Half of what would be generated is an excerpt of one instead. Only
+            training reads it.
         low_dimensional_noise: Standard deviation of noise on the normalised low-dimensional observations in training, drawn for
             every frame. The paper has none. Without it a policy memorises a few dozen demonstrations.
         low_dimensional_offset: Standard deviation of a second error, which all frames of an item share. It hides where a
@@ -169,7 +169,6 @@ class PlaybyearConfig(PreTrainedConfig):
     augmentation_scale: float = 0.05
     audio_noise_db: float | None = None
     audio_noise_files: str | None = None
-    audio_colour_db: float = 0.0
     low_dimensional_noise: float = 0.0
     low_dimensional_offset: float = 0.0
     spectrogram_momentum: float = 0.01
