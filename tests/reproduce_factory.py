@@ -28,7 +28,7 @@ folder.mkdir(parents=True, exist_ok=True)
 if kind == "evaluate":
     first, n = int(more[0]), int(more[1])
     failed = {"is_success": False, "end": "time", "failure": "dropped", "acted_early": True}
-    solved = {"is_success": True, "end": "success"}, failed
+    solved = {"is_success": True, "end": "success", "acted_early": False}, failed
     lines = [{"seed": s, "steps": 3, **solved[s % 3 == 0]} for s in range(first, first + n)]
     (folder / "attempts.jsonl").write_text("".join(json.dumps(line) + "\\n" for line in lines))
 else:

@@ -385,7 +385,9 @@ def test_rows_without_whole_numbers_are_refused(noise, tmp_path, name, value):
     table = pq.read_table(path).replace_schema_metadata({})
     values = pa.array([value] * len(table), pa.string() if value else pa.int64())
     pq.write_table(table.set_column(table.column_names.index(name), name, values), path)
-    with pytest.raises(InputError, match=r"episode.*playbyear-repair"):
+    said = {"episode_index": "names no episode", "data/file_index": "its frames are in .*, not in None"}
+    wrong = said.get(name, f"its {name} is {value!r}; wanted 12")
+    with pytest.raises(InputError, match=rf"meta/episodes.* {wrong}.*playbyear-repair"):
         check_dataset_files("a/b", root)
     assert not survey(root).is_undamaged
 

@@ -17,7 +17,7 @@ from reproduce_factory import arguments, call, counted, rows, write_plan
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.reproduce.plan import Plan
 from lerobot_playbyear.reproduce.run import print_plan, print_status
-from lerobot_playbyear.reproduce.table import Table, best_rate
+from lerobot_playbyear.reproduce.table import Table, best_rate, told
 from lerobot_playbyear.scripts.command import OPTIONS_FILE, find_mistake
 from lerobot_playbyear.training.command_line import apply_preset
 
@@ -129,6 +129,14 @@ def test_the_plan_of_every_size_reads_the_committed_tables(capsys):
         print_plan(cells, table)
         print_status(cells, table)
         assert f"{len(cells)} cells" in capsys.readouterr().out
+
+
+def test_who_acted_early_is_told_where_the_task_tells_it_of_every_attempt(tmp_path):
+    path, attempt = tmp_path / "attempts.jsonl", {"is_success": True, "end": "success"}
+    lines = [attempt | {"seed": 1, "acted_early": True}, attempt | {"seed": 2}]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert told(path, 1, 1)["acted_early"] == "1"
+    assert "acted_early" not in told(path, 1, 2)
 
 
 def test_a_strangers_row_names_no_other_file(tmp_path):

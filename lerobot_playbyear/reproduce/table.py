@@ -108,8 +108,9 @@ def told(path: Path, first_seed: int, n: int) -> Row:
     """What a file of attempts says of n seeds.
 
     Returns:
-        `successes` and `acted_early` (before anything was heard), texts with 1 or 0 for each seed in their order; `failures`
-        and `ends`, how often which; `groups`, the successes apart for each of the contents, where there are several.
+        `successes`, a text with 1 or 0 for each seed in their order; `failures` and `ends`, how often which; `groups`, the
+        successes apart for each of the contents, where there are several; `acted_early` (before anything was heard), such a
+        text, where the task tells it of every attempt.
 
     Raises:
         InputError: An attempt is missing.
@@ -126,13 +127,14 @@ def told(path: Path, first_seed: int, n: int) -> Row:
     for line in own:
         groups[line.get("contents", "")] = groups.get(line.get("contents", ""), "") + bit(line)
     failed = [line for line in own if not line["is_success"]]
+    early = [line.get("acted_early") for line in own]
     return {
         "first_seed": first_seed,
         "successes": "".join(map(bit, own)),
-        "acted_early": "".join(str(int(line.get("acted_early", False))) for line in own),
         "failures": dict(Counter(line.get("failure", line["end"]) for line in failed).most_common()),
         "ends": dict(Counter(line["end"] for line in own).most_common()),
         **({"groups": groups} if len(groups) > 1 else {}),
+        **({"acted_early": "".join(str(int(each)) for each in early)} if None not in early else {}),
     }
 
 
