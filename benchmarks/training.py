@@ -6,7 +6,8 @@ A whole update counts: augmentation, spectrograms, network, gradients, clipping 
 (`benchmarks/reference.py`) runs in a process of its own, with PyTorch's own memory allocation, in turn with ours. The limit
 is the time that the ResNet's forward and backward pass alone take for the frames that an update encodes. Then, on one thread,
 what hearing costs an update of the preset `cpu`: neighbouring windows share the columns of the spectrogram in which they
-coincide, with 25 ms between them all, with the paper's 35 ms those of every seventh frame. Noise as data.
+coincide, with 25 ms between them all, with the paper's 35 ms those of every seventh frame. And what rooms cost it.
+Noise as data.
 """
 
 import argparse
@@ -28,7 +29,12 @@ from lerobot_playbyear.training.learner import keep_freed_memory
 
 REFERENCE_WINDOWS = 4  # per update; its cost per window does not depend on it
 RUNS = 2  # per update
-EARS = {"25 ms": {"hop_s": 0.025}, "35 ms": {"hop_s": 0.035}, "deaf": {"use_audio": False}}
+EARS = {
+    "25 ms": {"hop_s": 0.025},
+    "35 ms": {"hop_s": 0.035},
+    "deaf": {"use_audio": False},
+    "in rooms": {"audio_room_noise": True},
+}
 
 
 def update_of(module: nn.Module, loss: Callable[[], torch.Tensor]) -> Callable[[], None]:
@@ -109,7 +115,11 @@ def hearing(turns: int) -> list[Row]:
     }
     ms = {ear: 1000 * value for ear, value in medians(in_turns(updates, turns)).items()}
     beside = ("every 35 ms", ms["35 ms"], "deaf", ms["deaf"])
-    return [Row("an update of the preset `cpu`, one thread, columns every 25 ms", ms["25 ms"], "ms", *beside)]
+    name = "an update of the preset `cpu`, one thread, columns every 25 ms"
+    return [
+        Row(name, ms["25 ms"], "ms", *beside),
+        Row(f"{name}, in rooms", ms["in rooms"], "ms", "without", ms["25 ms"]),
+    ]
 
 
 def measure(args: argparse.Namespace) -> list[Row]:

@@ -6,15 +6,17 @@ against it. A new operator goes here when both tables name a kernel for MPS.
 
 _KERNELS = """
     _fft_c2r _fft_r2c _local_scalar_dense _upsample_bilinear2d_aa add.Tensor add_.Tensor addcdiv_ addcmul_ addmm all
-    amax any any.dim as_strided bitwise_and.Tensor bitwise_not bmm cat ceil_ clamp clamp_ clamp_min constant_pad_nd cos
-    div.Tensor div_.Tensor empty.memory_format eq.Scalar equal exp fill_.Scalar fill_.Tensor gather ge.Scalar
-    grid_sampler_2d gt.Scalar isnan le.Scalar lerp.Scalar lerp_.Scalar lerp_.Tensor linalg_vector_norm log10 lt.Scalar
+    amax amin any any.dim as_strided avg_pool2d bitwise_and.Tensor bitwise_not bmm cat ceil_ clamp clamp_ clamp_min
+    constant_pad_nd cos cumsum div.Tensor div_.Tensor empty.memory_format eq.Scalar equal exp exp_ fill_.Scalar
+    fill_.Tensor flip floor floor_divide gather ge.Scalar grid_sampler_2d gt.Scalar gt.Tensor index.Tensor isnan
+    le.Scalar le.Tensor lerp.Scalar lerp.Tensor lerp_.Scalar lerp_.Tensor linalg_vector_norm log10 lt.Scalar lt.Tensor
     max_pool2d_with_indices max_pool2d_with_indices_backward maximum mean.dim minimum mm mul.Tensor mul_.Tensor
     native_batch_norm native_batch_norm_backward native_layer_norm native_layer_norm_backward neg normal_ permute
-    pow.Scalar pow.Tensor_Scalar pow.Tensor_Tensor reciprocal relu relu_ repeat round rsqrt scatter_add
-    set_.source_Storage set_.source_Storage_storage_offset sigmoid_ sigmoid_backward sin sqrt sqrt_ sub.Tensor
-    sub_.Tensor sum.dim_IntList tanh tanh_ tanh_backward threshold_backward unfold unfold_backward uniform_ view
-    view_as_complex view_as_real where.self zero_
+    pow.Scalar pow.Tensor_Scalar pow.Tensor_Tensor reciprocal reciprocal_ relu relu_ remainder.Tensor repeat round
+    rsqrt scatter_add searchsorted.Tensor set_.source_Storage set_.source_Storage_storage_offset sigmoid_
+    sigmoid_backward sin sqrt sqrt_ sub.Tensor sub_.Tensor sum.dim_IntList tanh tanh_ tanh_backward
+    threshold_backward unfold unfold_backward uniform_ upsample_linear1d view view_as_complex view_as_real
+    where.self zero_
 """
 KERNELS = frozenset(_KERNELS.split())
 """Operators with a kernel for MPS."""
@@ -30,6 +32,8 @@ COMPOSITES = {
     **dict.fromkeys(("full", "full_like", "new_ones", "ones_like", "ones", "scalar_tensor"), ("fill_.Scalar",)),
     "stack": ("cat",),
     # Random numbers
+    "randint": ("random_.from",),
+    "randperm": ("randperm.generator_out",),
     "rand": ("uniform_",),
     "rand_like": ("uniform_",),
     **dict.fromkeys(("randn", "randn_like"), ("normal_",)),
@@ -40,14 +44,19 @@ COMPOSITES = {
     "affine_grid_generator": ("linspace.out", "bmm", "mul_.Tensor"),
     "arange": ("arange.start_out",),
     "arange.start": ("arange.start_out",),
+    "complex": ("complex.out",),
     "convolution": ("_mps_convolution",),
     "convolution_backward": ("mps_convolution_backward",),
     "div.Scalar": ("div.Tensor",),
+    "fft_rfftfreq": ("arange.start_out", "mul_.Tensor"),
+    "hann_window": ("arange.start_out", "mul_.Tensor", "cos_", "add_.Tensor"),
     "logical_and_": ("logical_and.out",),
     "linspace": ("linspace.out",),
     "masked_fill.Scalar": ("masked_fill_.Scalar",),
     "mean": ("mean.dim",),
     "mul.Scalar": ("mul.Tensor",),
+    "remainder.Scalar": ("remainder.Tensor",),
+    "rsub.Scalar": ("sub.Tensor",),
     "sort": ("sort.stable",),
     "sum": ("sum.dim_IntList",),
 }

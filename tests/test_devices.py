@@ -47,7 +47,7 @@ both_trainers = pytest.mark.parametrize(
 USUAL = {"audio_noise_db": 0.0, "low_dimensional_noise": 0.03, "n_supervised_steps": 3}
 NOISY = (*TINY, "--policy.audio_noise_db=0", "--log_freq=1", "--seed=3")
 EVERYTHING = USUAL | {
-    **{"auxiliary_onset": 0.1, "auxiliary_way": 0.1, "audio_envelope_gain": 0.3, "audio_colour_db": 3.0},
+    **{"auxiliary_onset": 0.1, "auxiliary_way": 0.1, "audio_envelope_gain": 0.3, "audio_room_noise": True},
     **{"memory_displacement_gain": 10.0, "memory_readers": 2, "low_dimensional_offset": 0.1},
 }
 MODEL = "pretrained_model/model.safetensors"

@@ -198,6 +198,7 @@ CALLS = """
 policy | dtype: half | --policy.dtype must be one of auto, float32, bfloat16, float16, got 'half'
 policy | action_range: 0.0 | --policy.action_range must be above 0 and at most 1000, got 0
 policy | audio_noise_files: here | audio_noise_files=here | how loud | --policy.audio_noise_db=24
+policy | audio_room_noise: true | audio_room_noise=True | how loud | --policy.audio_noise_db=24
 policy | auxiliary_onset: -1.0 | --policy.auxiliary_onset must be at least 0 (none) and finite, got -1.0
 policy | memory_displacement_gain: 10.0, low_dimensional_gain: 0.0 | --policy.low_dimensional_gain is 0: give 4
 policy | memory_readers: 2 | --policy.memory_readers=2 read displacements | memory_displacement_gain is 0: give 10

@@ -1,5 +1,6 @@
 """How the policy hears: the paper's spectrogram at every sample rate, noise of rooms and other microphones in training."""
 
+import json
 import math
 import shutil
 
@@ -12,10 +13,12 @@ from support.policy import batch_of, make_config, make_episode, make_policy, ste
 from lerobot_playbyear.audio.audio_files import write_audio
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.policy import sound_augmentation
+from lerobot_playbyear.policy.generated_noise import STREAMS, STRUCK, GeneratedNoise
 from lerobot_playbyear.policy.modeling_playbyear import PlaybyearPolicy
 from lerobot_playbyear.policy.networks import AudioEncoder
-from lerobot_playbyear.policy.sound_augmentation import RecordedNoise, SoundAugmentation, mix_in_noise
+from lerobot_playbyear.policy.sound_augmentation import RecordedNoise, SoundAugmentation
 from lerobot_playbyear.policy.spectrogram import LogSpectrogram, SharedStretches, to_float_wave
+from lerobot_playbyear.training.command_line import RECIPES
 
 SEGMENT_S, HOP_S, N_BINS, WINDOW_S, RATE = 0.040, 0.035, 160, 2.0, 16000
 
@@ -92,16 +95,24 @@ def test_windows_that_share_segments_are_encoded_as_each_alone(sample_rate, fps,
 # Noise and other microphones in training
 
 
-def mixed_in(n_items: int, max_db: float, floor: float = 1e-3, n_samples: int = 32000) -> torch.Tensor:
-    """The noise that is mixed into white noise of this floor, in units of the floor: (n_items, n_samples)."""
+def augmentation(**options):
+    return SoundAugmentation(make_config(**options))
+
+
+def added(augment, n_items=400, n_samples=32000, n_microphones=1):
+    """The noise that is mixed into batches of white noise, in units of its floor: (n_items, n_microphones, n_samples)."""
     torch.manual_seed(0)
-    wave = floor * torch.randn(n_items, n_samples)
-    return (mix_in_noise(wave, max_db, 16000) - wave) / floor
+    waves = 1e-3 * torch.randn(n_items, n_microphones, n_samples)
+    return torch.cat([(augment(wave)[0] - wave) / 1e-3 for wave in waves.split(25)])
 
 
-def test_noise_in_training_is_as_loud_as_asked_for_white_to_pink_and_hums():
-    noise = mixed_in(400, 18.0)
-    level = 20 * torch.log10(noise.square().mean(dim=1).sqrt())
+def decibels(waves):
+    return 20 * torch.log10(waves.square().mean(dim=-1).sqrt())
+
+
+def test_a_microphones_own_noise_is_as_loud_as_asked_for_white_to_pink_and_hums():
+    noise = added(augmentation(audio_noise_db=18.0, n_frequency_bins=320))[:, 0]
+    level = decibels(noise)
     assert -21 < level.min() < -17  # the hum may be as loud as the broadband noise: 3 dB more, a lucky draw 6
     assert 15 < level.max() < 24
     torch.testing.assert_close(level.mean(), torch.tensor(0.0), rtol=0, atol=2.0)
@@ -115,7 +126,96 @@ def test_noise_in_training_is_as_loud_as_asked_for_white_to_pink_and_hums():
     hums = low.amax(dim=1) > 30 * low.median(dim=1).values
     assert hums.float().mean() > 0.5
     assert len(low.argmax(dim=1)[hums].unique()) > 30
-    torch.testing.assert_close(mix_in_noise(torch.zeros(3, 1600), 18.0, 16000), torch.zeros(3, 1600))
+    silence = torch.zeros(3, 1, 1600)
+    torch.testing.assert_close(augmentation(audio_noise_db=18.0)(silence)[0], silence)
+
+
+def heard_in_training(n_batches=8, **options):
+    """What the preset `cpu` mixes into its batches' sound, in units of the floor: (items, samples)."""
+    recipe = json.loads((RECIPES / "cpu.json").read_text())
+    kept = ("audio_noise_db", "n_memory_steps", "n_supervised_steps")
+    augment = augmentation(**{name: recipe["policy"][name] for name in kept}, **options)
+    torch.manual_seed(0)
+    waves = 1e-3 * torch.randn(n_batches, recipe["batch_size"], 1, 59200)
+    return torch.cat([(augment(wave)[0] - wave)[:, 0] / 1e-3 for wave in waves])
+
+
+def unsteady(noise):
+    """Between the loudest and the median 50 ms of each item [dB]: 1 to 2 of noise that is steady."""
+    levels = decibels(noise.unflatten(1, (-1, 800)))
+    return levels.amax(dim=1) - levels.median(dim=1).values
+
+
+def test_training_in_rooms_with_people():
+    """Most items hear something that is not steady, as voices and blows are; without the option none does."""
+    noise = heard_in_training(audio_room_noise=True)
+    assert (unsteady(heard_in_training()) < 6).all()
+    assert 0.35 < (unsteady(noise) > 6).float().mean() < 0.85
+    others = noise[decibels(noise) > 0]
+    spectra = torch.fft.rfft(others).abs().square()[:, : 74 * 168].unflatten(1, (-1, 148)).sum(dim=2)  # of 40 Hz each
+    shares = spectra / spectra.sum(dim=1, keepdim=True)
+    overlap = torch.minimum(shares[:, None], shares).sum(dim=2)
+    assert overlap.median() < 0.6  # each of its own colour
+
+
+@pytest.mark.parametrize("kind", [*STRUCK, *STREAMS])
+def test_every_kind_is_another_each_time_and_as_loud_as_the_others(kind):
+    torch.manual_seed(0)
+    made = GeneratedNoise()
+    if kind in STRUCK:
+        spectra = made.struck(torch.full((4,), STRUCK.index(kind)), 3.7, 15000)
+    else:
+        spectra = torch.stack([made.stream(kind, 3.7, 15000) for _ in range(4)])
+    clips = wave(spectra)
+    torch.testing.assert_close(decibels(clips), torch.zeros(4), rtol=0, atol=0.01)
+    likeness = clips @ clips.T / 30000
+    assert (likeness - torch.eye(4)).abs().max() < 0.5
+
+
+def test_items_hear_all_kinds_and_share_a_few_clips_of_a_batch():
+    torch.manual_seed(0)
+    made, seen = GeneratedNoise(), []
+    made.struck = lambda kinds, *_: torch.complex(kinds.float(), kinds * 0.0).unsqueeze(1)
+    made.stream = lambda kind, *_: torch.tensor([4.0 + [*STREAMS].index(kind)]).to(torch.complex64)
+    for _ in range(300):
+        batch = made(3.7, 1, 12).real.flatten()
+        assert len(batch.unique()) <= 4
+        seen.append(batch)
+    shares = torch.cat(seen).long().bincount() / 3600
+    torch.testing.assert_close(shares, torch.full((6,), 1 / 6), rtol=0, atol=0.03)
+
+
+def wave(spectra):
+    """As `GeneratedNoise` means it."""
+    return torch.fft.irfft(torch.nn.functional.pad(spectra, (1, 0)), norm="forward")
+
+
+def likeness(pairs):
+    """Of two microphones' noise, (N, 2, samples): largest correlation, and how much later the second hears it."""
+    spectra = torch.fft.rfft(pairs - pairs.mean(dim=2, keepdim=True))
+    across = torch.fft.irfft(spectra[:, 1] * spectra[:, 0].conj(), n=pairs.shape[2])
+    across = torch.cat([across[:, -240:], across[:, :241]], dim=1) / pairs.norm(dim=2).prod(dim=1, keepdim=True)
+    best = across.abs().max(dim=1)
+    return best.values, best.indices - 240
+
+
+def test_all_microphones_hear_the_same_source_each_in_its_own_way(monkeypatch):
+    """Later, by reflections of its own and not equally loud; in an empty room they have nothing in common."""
+    augment = augmentation(microphones=("gripper", "room"), audio_noise_db=20.0, audio_room_noise=True)
+    monkeypatch.setattr(sound_augmentation, "_ROOM_SHARE", 1.0)
+    with monkeypatch.context() as quiet:
+        quiet.setattr(augment, "_own", lambda *_: torch.zeros(()))
+        together = added(augment, n_microphones=2)
+    alike, later = likeness(together)
+    assert alike.median() > 0.4
+    assert alike.min() > 0.02
+    assert len(later.unique()) > 20
+    difference = decibels(together).diff(dim=1)
+    assert 3 < difference.abs().mean() < 9
+    assert decibels(together).amax() < 20  # 6 dB less than was asked for, and a room may raise a tone
+    monkeypatch.setattr(sound_augmentation, "_ROOM_SHARE", 0.0)
+    alone, _ = likeness(added(augment, n_microphones=2))
+    assert alone.median() < 0.2  # hums may meet
 
 
 def tone(frequency, rate, seconds=2.0, amplitude=0.1):
@@ -146,23 +246,19 @@ def test_excerpts_come_from_every_recording_at_one_loudness_and_from_all_over(re
     assert len(found[:, 0].unique()) > 10  # phases of the tones
 
 
-def augmentation(**options):
-    return SoundAugmentation(make_config(**options))
-
-
-def test_three_quarters_of_the_items_get_recorded_noise_and_none_more_than_was_asked_for(recordings):
-    torch.manual_seed(0)
-    augment, wave = augmentation(audio_noise_db=20.0, audio_noise_files=str(recordings)), 1e-4 * torch.randn(300, 8000)
-    torch.manual_seed(1)
-    room = mix_in_noise(wave, 20.0, RATE, augment.highest_hz)
-    torch.manual_seed(1)
-    recorded = (augment.noisy(wave) - room) / 1e-4  # in units of the floor
-    level = 20 * torch.log10(recorded.square().mean(dim=1).sqrt())
-    with_noise = level > -60
-    assert 0.68 < with_noise.float().mean() < 0.82
-    assert -1.5 < level[with_noise].min() < 1.5
-    assert 18.5 < level[with_noise].max() < 21.5
-    torch.testing.assert_close(level[with_noise].mean(), torch.tensor(10.0), rtol=0, atol=1.5)
+def test_half_of_what_items_hear_of_a_room_is_recorded_and_none_louder_than_was_asked_for(recordings, monkeypatch):
+    """Recorded are two tones."""
+    monkeypatch.setattr(SoundAugmentation, "_own", lambda *_: torch.zeros(()))
+    mixed = augmentation(audio_noise_db=20.0, audio_room_noise=True, audio_noise_files=str(recordings))
+    noise = added(mixed, 300, 8000)[:, 0]
+    level = decibels(noise)
+    assert 0.68 < (level > -60).float().mean() < 0.82
+    power = torch.fft.rfft(noise).abs().square()  # bins of 2 Hz
+    tones = power[:, 235:266].sum(dim=1) + power[:, 735:766].sum(dim=1)
+    recorded = (tones > 0.98 * power.sum(dim=1)) & (level > -60)
+    assert 0.28 < recorded.float().mean() < 0.47
+    assert -21 < level[recorded].min() < -9  # 6 dB below the floor, and a room may lower a tone
+    assert 10 < level[recorded].max() < 18  # 6 dB less than was asked for, and a room may raise a tone
 
 
 def test_a_folder_that_cannot_be_used_is_refused_with_what_to_do(recordings, tmp_path, monkeypatch):
@@ -229,9 +325,9 @@ def test_training_reads_the_folder_and_acting_does_not(recordings, tmp_path):
         again.train().forward(batch_of(again))
 
 
-def test_another_microphones_gain_is_smooth_and_as_strong_as_asked_for():
+def test_in_a_room_another_microphone_hears_each_item_with_a_smooth_response():
     torch.manual_seed(0)
-    gains = 10 * augmentation(audio_colour_db=4.0).colour(2000)  # [dB]
+    gains = 10 * augmentation(audio_noise_db=18.0).colour(1000, 2).flatten(0, 1)  # [dB]
     assert gains.shape == (2000, 160)
     deviation = gains.std(dim=0)
     assert deviation.min() > 2.5  # between two points it is their mean
@@ -239,12 +335,17 @@ def test_another_microphones_gain_is_smooth_and_as_strong_as_asked_for():
     assert gains.mean().abs() < 0.2
     steps = gains.diff(dim=1).abs().mean(dim=0)
     assert steps[40:].max() < 0.2  # 25 Hz further
-    assert augmentation().colour(5) is None
+    quiet = torch.randn(2, 1, 800)
+    noisy, gains = augmentation()(quiet)
+    assert noisy is quiet
+    assert gains is None
+    assert augmentation(audio_noise_db=18.0)(quiet)[1] is None
+    assert augmentation(audio_noise_db=18.0, audio_room_noise=True)(quiet)[1].shape == (2, 1, 160)
 
 
 def test_one_item_has_one_microphone_in_all_its_windows():
     """Its windows share stretches of sound: every one of them must be coloured alike, and no other item's way."""
-    policy = make_policy(audio_colour_db=6.0, n_supervised_steps=6, augmentation_crop=0.0).train()
+    policy = make_policy(audio_noise_db=6.0, audio_room_noise=True, n_supervised_steps=6, augmentation_crop=0.0).train()
     policy.keep_normalization()
     batch, seen = batch_of(policy), []
     ear = next(module for module in policy.model.modules() if isinstance(module, LogSpectrogram))

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 TINY = shared.TINY
 NOISY = ("--policy.audio_noise_db=6", "--steps=20")
-ADDITIONS = (*("auxiliary_onset=0.1", "auxiliary_way=0.1", "audio_envelope_gain=0.3", "audio_colour_db=3"),
+ADDITIONS = (*("auxiliary_onset=0.1", "auxiliary_way=0.1", "audio_envelope_gain=0.3", "audio_room_noise=true"),
            *("memory_displacement_gain=10", "memory_readers=2", "low_dimensional_offset=0.1"))  # fmt: skip
 EVERYTHING = tuple(f"--policy.{option}" for option in ADDITIONS)
 

@@ -234,10 +234,10 @@ class TaskEnv(gym.Env):
             )
         self._expert_rng = np.random.default_rng(self.np_random.integers(2**63))
         if self._synthesizer is not None:
-            rng = np.random.default_rng(self.np_random.integers(2**63))
-            self._synthesizer.reset(rng, self.materials)
+            seed = int(self.np_random.integers(2**63))
+            self._synthesizer.reset(np.random.default_rng(seed), self.materials)
             if self._room is not None:
-                self._room.reset(rng)
+                self._room.reset(np.random.default_rng((seed, 1)))
         # What wanders in the arm's sensors draws nothing from `np_random`.
         seeds: Any = self.np_random.bit_generator.seed_seq
         sensors_rng = np.random.default_rng(seeds.spawn(1)[0])

@@ -22,15 +22,25 @@ lets through is added to the sound; 0 puts it in the sound's place."""
 
 _MOST_HZ = 10**6  # of a recording
 
+# How a recording, which plays at one place, reaches a microphone: straight, and by reflections. All are chosen.
+_GAIN_DB = 3.0  # either way: one stands nearer than another
+_LATEST = 0.01  # s from the first microphone that hears it to the last: 3.4 m
+_REFLECTIONS = 16
+_REFLECTED_AFTER = (0.002, 0.12)  # s
+_REVERBERATION = (0.15, 0.8)  # s to fall by 60 dB
+_DIRECT_DB = (0.0, 15.0)  # of what comes straight, relative to all that is reflected
+
 
 class Room:
     """A room where a recording plays, and a microphone of another frequency response.
 
     Args:
-        microphones: Their names; each hears the recording from another place in it.
+        microphones: Their names. All hear the same recording at the same time, each with a gain, a delay and reflections of its
+            own, drawn for every episode.
         sample_rate: Samples per second.
         noise: A WAV file; it repeats. None: a silent room.
-        noise_level: Root mean square of the whole recording, in units of the usual background's.
+        noise_level: Root mean square of the whole recording, in units of the usual background's: within 3 dB of what is
+            broadband; a room weakens and raises tones.
         response: One of `RESPONSES`.
 
     Raises:
@@ -48,7 +58,7 @@ class Room:
         check_option("response", response, RESPONSES)
         if not 0.0 <= noise_level < np.inf:
             raise OptionError("room_noise_level", noise_level, "give 0 (silent) or more")
-        self._microphones = microphones
+        self._microphones, self._sample_rate = microphones, sample_rate
         recording = np.zeros(1, np.float32) if noise is None else _recording(str(noise), sample_rate)
         self._recording = noise_level * BACKGROUND_RMS * recording
         kind, corner, self._added = RESPONSES[response]
@@ -57,8 +67,9 @@ class Room:
 
     def reset(self, rng: np.random.Generator) -> None:
         """An episode begins, somewhere in the recording."""
-        (own,) = rng.spawn(1)
-        self._places = own.integers(len(self._recording), size=len(self._microphones))
+        shared, *each = rng.spawn(1 + len(self._microphones))  # so that a second microphone does not change the first
+        self._place = int(shared.integers(len(self._recording)))
+        self._draw_ways(shared, each)
         n_sections = 0 if self._filter is None else len(self._filter)
         self._state = np.zeros((n_sections, len(self._microphones), 2))
 
@@ -66,12 +77,29 @@ class Room:
         """What is heard there, int16, of what each microphone would hear without it, of one control step."""
         wave = np.stack([heard[name] for name in self._microphones]) / 32767.0  # (microphones, S)
         span = np.arange(wave.shape[1])
-        wave += self._recording[(self._places[:, None] + span) % len(self._recording)]
-        self._places = (self._places + len(span)) % len(self._recording)
+        if len(self._recording) > 1:
+            heard_at = (self._place - self._delays[:, :, None] + span) % len(self._recording)  # (microphones, ways, S)
+            wave += np.einsum("mw,mws->ms", self._gains, self._recording[heard_at])
+        self._place = (self._place + len(span)) % len(self._recording)
         if self._filter is not None:
             passed, self._state = signal.sosfilt(self._filter, wave, zi=self._state)
             wave = wave + self._added * passed if self._added else passed
         return dict(zip(self._microphones, pcm16(wave), strict=True))
+
+    def _draw_ways(self, shared: np.random.Generator, each: list[np.random.Generator]) -> None:
+        """Delays [samples] and gains, each (microphones, ways): the first way is the straight one."""
+        shortest, longest = np.log(_REVERBERATION)
+        decay = np.log(1000.0) / np.exp(shared.uniform(shortest, longest))  # 1/s
+        direct = 10 ** (shared.uniform(*_DIRECT_DB) / 20)
+        self._delays = np.zeros((len(each), 1 + _REFLECTIONS), int)
+        self._gains = np.zeros((len(each), 1 + _REFLECTIONS))
+        earliest, latest = np.log(_REFLECTED_AFTER)
+        for delays, gains, rng in zip(self._delays, self._gains, each, strict=True):
+            after = np.exp(rng.uniform(earliest, latest, _REFLECTIONS))
+            reflected = rng.standard_normal(_REFLECTIONS) * np.exp(-decay * after)
+            delays[:] = np.rint((rng.uniform(0.0, _LATEST) + np.append(0.0, after)) * self._sample_rate)
+            gains[:] = np.append(direct * np.linalg.norm(reflected), reflected)
+            gains *= 10 ** (rng.uniform(-_GAIN_DB, _GAIN_DB) / 20) / np.linalg.norm(gains)
 
 
 @cache

@@ -70,9 +70,9 @@ class PlaybyearEnvConfig(EnvConfig):
         image_size: Height and width of a camera's picture [pixels].
         sample_rate: Samples per second of every microphone [Hz], divisible by `fps`. 0: the task's own.
         sound: `waveform` (int16 PCM per microphone), `contact_force` (the paper's proxy, 6 numbers), or `none`.
-        microphones: Names of the microphones, with `sound=waveform`: `gripper`, `table`. None: the task's own.
+        microphones: Names of the microphones, with `sound=waveform`: `gripper`, `room`, `table`. None: the task's own.
         noise_level: Factor on the background noise and the arm's own hum. 1 is the task as published, 0 silence.
-        room_noise: A WAV file that plays in the room, over and over. None: no further noise.
+        room_noise: A WAV file that plays in the room, over and over; all microphones hear it. None: no further noise.
         room_noise_level: Loudness of that file, relative to the root mean square of the usual background.
         microphone_response: `flat`, or the frequency response of another microphone: `phone`, `dull`, `boomy`.
         spectrogram: For policies that see pictures of the sound: the folder of their dataset, made by

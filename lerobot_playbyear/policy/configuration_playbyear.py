@@ -39,7 +39,7 @@ _MOST_NUMBERS = 2**16  # of a state
 _USUAL_FPS = 20
 _LARGEST = 1000  # frames per second, and range of actions
 _AT_LEAST_0 = (
-    *("audio_envelope_gain", "memory_displacement_gain", "memory_readers", "audio_colour_db"),
+    *("audio_envelope_gain", "memory_displacement_gain", "memory_readers"),
     *("low_dimensional_noise", "low_dimensional_offset", "auxiliary_onset", "auxiliary_balance", "auxiliary_way"),
 )
 
@@ -100,9 +100,11 @@ class PlaybyearConfig(PreTrainedConfig):
         audio_noise_db: Largest level of noise mixed into training sound, relative to each item's own noise floor [dB]. None: no
             noise (the paper). Each item draws a colour, a hum and a level, uniformly from 20 dB below the floor to this one. It
             decides how much noise the policy tolerates: 18 is 8 times the background's amplitude.
-        audio_noise_files: Folder of WAV or FLAC files. Three quarters of the items also get an excerpt of one. Its level is
-            drawn uniformly from the floor's to `audio_noise_db`. Only training reads it.
-        audio_colour_db: Standard deviation of a simulated microphone's gain, a smooth curve over frequency drawn per item [dB].
+        audio_room_noise: Whether three quarters of the items also hear voices, blows, clatter, music, footsteps or a tool,
+            generated, in a room, 6 dB fainter than `audio_noise_db` at most; and whether spectrograms of all items are those
+            of other microphones, whose gain has a standard deviation of 4 dB over frequency.
+        audio_noise_files: Folder of WAV or FLAC files. The same, with excerpts of these; with both options half and half. Only
+            training reads it.
         low_dimensional_noise: Standard deviation of noise on the normalised low-dimensional observations in training, drawn for
             every frame. The paper has none. Without it a policy memorises a few dozen demonstrations.
         low_dimensional_offset: Standard deviation of a second error, which all frames of an item share. It hides where a
@@ -168,8 +170,8 @@ class PlaybyearConfig(PreTrainedConfig):
     augmentation_translate: float = 0.05
     augmentation_scale: float = 0.05
     audio_noise_db: float | None = None
+    audio_room_noise: bool = False
     audio_noise_files: str | None = None
-    audio_colour_db: float = 0.0
     low_dimensional_noise: float = 0.0
     low_dimensional_offset: float = 0.0
     spectrogram_momentum: float = 0.01
@@ -328,11 +330,12 @@ class PlaybyearConfig(PreTrainedConfig):
                 f"--policy.memory_readers={self.memory_readers} read displacements, and "
                 "--policy.memory_displacement_gain is 0: give 10, its usual value."
             )
-        if self.audio_noise_files is not None and self.audio_noise_db is None:
-            raise ValueError(
-                f"--policy.audio_noise_files={self.audio_noise_files} says nothing of how loud the noise may be: add "
-                "--policy.audio_noise_db=24 (dB above the recordings' own noise floor)."
-            )
+        for option in ("audio_noise_files", "audio_room_noise"):
+            if getattr(self, option) not in (None, False) and self.audio_noise_db is None:
+                raise ValueError(
+                    f"--policy.{option}={getattr(self, option)} says nothing of how loud the noise may be: add "
+                    "--policy.audio_noise_db=24 (dB above the recordings' own noise floor)."
+                )
         if self.audio_window_s < self.segment_s or self.hop_s <= 0:
             raise ValueError(
                 f"--policy.audio_window_s ({self.audio_window_s}) must hold at least one segment of "

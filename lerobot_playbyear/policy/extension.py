@@ -48,7 +48,7 @@ def register_audio_encoder[Factory: EncoderFactory](name: str) -> Callable[[Fact
     - `forward`: (N, config.n_frequency_bins, config.n_segments) -> (N, E), for any N: log power, about 0 +- 1 in
       every bin, and 0 where the episode had not begun;
     - optionally `hears_waveform = True`: then `forward` gets (N, config.window_samples) instead, in [-1, 1], 0 where the
-      episode had not begun. Training mixes noise into it; `audio_colour_db` changes spectrograms alone.
+      episode had not begun. Training mixes noise into it; other microphones' responses change spectrograms alone.
 
     In training neighbouring windows share segments. An encoder that is convolutional along time, without padding, may share its
     work too, and says so by an attribute `window_columns`: it then gets (N, n_frequency_bins, n_segments + extra) and returns

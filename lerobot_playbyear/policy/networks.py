@@ -81,7 +81,7 @@ class PlaybyearNetwork(nn.Module):
         """What the memory reads of every frame by itself, (B * n, D): the joint encoding, and what it compares with now."""
         config = self.config
         seen = [self._see(batch, key, n_frames) for key in config.camera_keys if config.use_vision]
-        heard = [self._hear(batch, key, n_frames) for key in config.audio_keys if config.use_audio]
+        heard = self._hear_all(batch, n_frames) if config.use_audio else []
         felt = [self._feel(batch, key, n_frames) for key in config.low_dimensional_keys]
         return self.memory_head.with_felt(self.fusion([*seen, *heard, *felt]), felt)
 
@@ -94,20 +94,36 @@ class PlaybyearNetwork(nn.Module):
         stacks = torch.cat([images[:, i : i + n_frames] for i in range(n_stacked)], dim=2)
         return self._normalize(self.vision[_module_name(key)](stacks.flatten(0, 1)))
 
-    def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int) -> Tensor:
-        """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means."""
+    def _hear_all(self, batch: dict[str, Tensor], n_frames: int) -> list[Tensor]:
+        """Every microphone's embeddings: in training all are in the same room."""
+        n_heard, keys = n_frames + self.config.audio_frames - 1, self.config.audio_keys
+        sounds = [newest(batch, key, n_heard, self.config.feature_shape(key)) for key in keys]  # (B, n_heard, S) each
+        waves = [to_float_wave(sound.flatten(1), key) for sound, key in zip(sounds, keys, strict=True)]
+        colours: list[Tensor | None] = [None] * len(keys)
+        if self.training:
+            noisy, colour = self.disturb(torch.stack(waves, dim=1))  # (B, microphones, n_heard * S)
+            waves, colours = list(noisy.unbind(1)), colours if colour is None else list(colour.unbind(1))
+        heard = zip(keys, waves, colours, strict=True)
+        return [self._hear(batch, key, n_frames, wave, colour) for key, wave, colour in heard]
+
+    def _hear(self, batch: dict[str, Tensor], key: str, n_frames: int, wave: Tensor, colour: Tensor | None) -> Tensor:
+        """One microphone's embeddings, (B * n, embedding size), and with `audio_envelope_gain` also its columns' means.
+
+        Args:
+            batch: Says where the episode had not begun.
+            key: The microphone's.
+            n_frames: How many are encoded, n.
+            wave: What it heard, (B, n_heard * S).
+            colour: Gains of another microphone, (B, bins) [10 dB].
+        """
         config = self.config
         n_heard = n_frames + config.audio_frames - 1
-        sound = newest(batch, key, n_heard, config.feature_shape(key))  # (B, n_heard, S)
-        wave = to_float_wave(sound.flatten(1), key)  # (B, n_heard * S)
-        colour = None
-        if self.training:
-            wave, colour = self.disturb.noisy(wave), self.disturb.colour(len(wave))
+        n_samples = wave.shape[1] // n_heard
         begun = torch.ones_like(wave, dtype=torch.bool)  # (B, n_heard * S)
         is_pad = before_episode(batch, n_heard)  # (B, n_heard)
         if is_pad is not None:
-            begun = ~is_pad.repeat_interleave(sound.shape[2], dim=1)
-        encoder, n_samples = self.hearing[_module_name(key)], sound.shape[2]
+            begun = ~is_pad.repeat_interleave(n_samples, dim=1)
+        encoder = self.hearing[_module_name(key)]
         levels = None
         if _module_name(key) in self.spectrogram:
             spectrogram = self.spectrogram[_module_name(key)]
