@@ -73,7 +73,7 @@ def test_an_action_outside_the_demonstrations_is_learned_only_within_the_range(a
         optimizer.zero_grad()
         policy.forward(batch)[0].backward()
         optimizer.step()
-    action = after(policy.predict_run(batch)[0, -1:].detach())[0]
+    action = after(policy.act_from(policy.memory_run(batch))[0, -1:].detach())[0]
     torch.testing.assert_close(action, torch.tensor([learned, 0.5]), atol=0.03, rtol=0)
 
 

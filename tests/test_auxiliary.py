@@ -57,7 +57,7 @@ def test_stepping_equals_training_windows(name):
     with torch.no_grad():
         stepped = step_through(policy, [episode])
     for last in (2, N_FRAMES - 1):  # the first windows begin before the episode
-        predicted = policy.predict_run(run_ending_at(episode, last, policy.config))
+        predicted = policy.act_from(policy.memory_run(run_ending_at(episode, last, policy.config)))
         n = min(policy.config.n_supervised_steps, last + 1)
         torch.testing.assert_close(predicted[:, -n:], stepped[:, last + 1 - n : last + 1], atol=1e-5, rtol=0)
 

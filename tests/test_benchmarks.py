@@ -30,7 +30,9 @@ def test_the_published_scheme_gives_our_actions_for_the_same_weights():
         "observation.state": state,
     }
     with torch.no_grad():
-        torch.testing.assert_close(reference(images, sound, state), policy.predict_run(batch)[:, 0], rtol=0, atol=1e-4)
+        torch.testing.assert_close(
+            reference(images, sound, state), policy.act_from(policy.memory_run(batch))[:, 0], rtol=0, atol=1e-4
+        )
 
 
 @pytest.mark.slow

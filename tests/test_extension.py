@@ -102,7 +102,7 @@ def test_an_encoder_of_windows_hears_the_same_in_training_and_in_a_rollout(optio
     policy = make_policy(**options)
     episode = make_episode(seed=1, config=policy.config)
     stepped = step_through(policy, [episode])
-    whole = policy.predict_run(run_ending_at(episode, 54, policy.config, 55), 55)
+    whole = policy.act_from(policy.memory_run(run_ending_at(episode, 54, policy.config, 55), 55))
     torch.testing.assert_close(stepped, whole, atol=1e-5, rtol=0)
 
 

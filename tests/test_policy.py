@@ -115,7 +115,7 @@ def test_stepping_equals_one_forward_over_the_episode(options):
     episode = make_episode(seed=1, config=policy.config)
     stepped = step_through(policy, [episode])
     with torch.enable_grad():  # the network as it learns; steps are taken by its folded copy
-        whole = policy.predict_run(run_ending_at(episode, N_STEPS - 1, policy.config, N_STEPS), N_STEPS)
+        whole = policy.act_from(policy.memory_run(run_ending_at(episode, N_STEPS - 1, policy.config, N_STEPS), N_STEPS))
     torch.testing.assert_close(stepped, whole, atol=1e-5, rtol=0)
 
 
@@ -127,7 +127,7 @@ def test_training_windows_equal_stepping_at_every_frame(n_supervised_steps):
     stepped = step_through(policy, [episode])
     for last in (0, 1, 5, 9, 10, 39, 40, 41, N_STEPS - 1):
         with torch.enable_grad():
-            predicted = policy.predict_run(run_ending_at(episode, last, policy.config))
+            predicted = policy.act_from(policy.memory_run(run_ending_at(episode, last, policy.config)))
         for back in range(min(n_supervised_steps, last + 1)):
             torch.testing.assert_close(predicted[:, -1 - back], stepped[:, last - back], atol=1e-5, rtol=0)
 
@@ -205,7 +205,7 @@ def test_an_action_of_one_number_is_supervised():
     batch["action"] = batch["action"][..., 0]  # (B, K) with B = K = 2
     with torch.no_grad():
         loss, _ = policy.forward(batch)
-        expected = (policy.predict_run(batch)[..., 0] - batch["action"]).square().mean()
+        expected = (policy.act_from(policy.memory_run(batch))[..., 0] - batch["action"]).square().mean()
     torch.testing.assert_close(loss, expected)
 
 
@@ -214,10 +214,10 @@ def test_a_renamed_observation_that_lost_its_padding_flags_is_still_padded():
     policy = make_policy(n_supervised_steps=2)
     batch = batch_of(policy, lasts=(3, 30))
     with torch.no_grad():
-        expected = policy.predict_run(batch)
+        expected = policy.act_from(policy.memory_run(batch))
         renamed = {key: value for key, value in batch.items() if key not in (f"{MICROPHONE}_is_pad",)}
         del renamed["observation.state_is_pad"]
-        torch.testing.assert_close(policy.predict_run(renamed), expected, rtol=0, atol=0)
+        torch.testing.assert_close(policy.act_from(policy.memory_run(renamed)), expected, rtol=0, atol=0)
 
 
 def test_a_rollout_with_another_sample_rate_is_refused():

@@ -18,11 +18,6 @@ _NEAR = 0.1  # [normalised units] errors of a way count squared up to here, and 
 _FAR = 1.0  # [normalised units] what is farther away is told as that far: carrying takes it to several, and nothing hangs on it
 
 
-def make_auxiliary(config: PlaybyearConfig) -> "AuxiliaryHeads | None":
-    """The heads that a configuration asks for; None where it asks for none."""
-    return AuxiliaryHeads(config) if any(weights_of(config).values()) else None
-
-
 def weights_of(config: PlaybyearConfig) -> dict[str, float]:
     """The weight of each kind of loss. A policy leaves out what it has not ears, or a body, enough for: all take one preset."""
     n_ears = len(config.audio_keys) if config.use_audio else 0

@@ -117,10 +117,11 @@ class PlaybyearPolicy(PreTrainedPolicy):
                 module.keeps_statistics = True
 
     def reset(self) -> None:
-        """Forgets the episode."""
+        """Forgets the episode; `memory`, (B, D), is what the policy remembers since the last `select_action`."""
         prepare_to_act(self.model)
         self._recent = RecentFrames(self.config)
         self._encodings: Tensor | None = None
+        self.memory: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, Tensor]]:
         """Mean squared error over the K windows of every item that end inside its episode.
@@ -172,28 +173,14 @@ class PlaybyearPolicy(PreTrainedPolicy):
         total = mean_over_processes(weight.sum()) if self.training else weight.sum()
         return (error * weight).sum() / total.clamp(min=1e-8)
 
-    def predict_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
-        """Actions of the last `n_steps` (default K) frames of every item, (B, n_steps, n_actions), normalised."""
-        return self.model.memory_head(self._encode(batch, n_steps))
-
     def memory_run(self, batch: dict[str, Tensor], n_steps: int | None = None) -> Tensor:
         """What the policy remembers at the last `n_steps` (default K) frames of every item, (B, n_steps, D)."""
-        return self.model.memory_head.recall(self._encode(batch, n_steps))
-
-    @property
-    def memory(self) -> Tensor:
-        """What it remembers since the last `select_action`, (B, D)."""
-        assert self._encodings is not None, "select_action comes first"
-        with torch.no_grad():
-            return self.model.memory_head.recall(self._encodings)[:, -1]
+        n_frames = (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1
+        return self.model.memory_head.recall(self.model.encode_run(batch, n_frames))
 
     def act_from(self, memories: Tensor) -> Tensor:
         """The actions (..., n_actions), normalised, that follow from memories (..., D)."""
         return self.model.memory_head.act(memories)
-
-    def _encode(self, batch: dict[str, Tensor], n_steps: int | None) -> Tensor:
-        """Joint encodings of every item's last frames, (B, R, D)."""
-        return self.model.encode_run(batch, (n_steps or self.config.n_supervised_steps) + self.config.memory_steps - 1)
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -215,12 +202,13 @@ class PlaybyearPolicy(PreTrainedPolicy):
         run = self._recent.add(batch, network.prepare_images)
         device = next(iter(run.values())).device
         with torch.autocast(device.type, enabled=False):  # bfloat16 would round positions to half a millimetre
-            encoding = network.encode_frame(run)  # (B, D)
+            encoding = network.encode(run, 1)  # (B, D)
             if self._encodings is None:
                 self._encodings = encoding.unsqueeze(1).repeat(1, self.config.memory_steps, 1)
             else:
                 self._encodings = torch.cat([self._encodings[:, 1:], encoding.unsqueeze(1)], dim=1)
-            return network.memory_head(self._encodings)[:, -1]
+            self.memory = network.memory_head.recall(self._encodings)[:, -1]  # (B, D)
+            return self.act_from(self.memory)
 
     def _check_sound(self, batch: dict[str, Tensor]) -> None:
         missing = [key for key in self.config.audio_keys if key not in batch] if self.config.use_audio else []

@@ -13,7 +13,7 @@ from torch.nn import functional
 from torchvision.models import ResNet
 
 from lerobot_playbyear.compat import BasicBlock
-from lerobot_playbyear.policy.auxiliary import make_auxiliary
+from lerobot_playbyear.policy.auxiliary import AuxiliaryHeads, weights_of
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.policy.extension import make_encoder, register_audio_encoder, register_vision_encoder
 from lerobot_playbyear.policy.image_augmentation import Augmentation, resize
@@ -37,7 +37,7 @@ class PlaybyearNetwork(nn.Module):
         self.config = config
         assert config.action_feature is not None
         self.augment = Augmentation(config)
-        sizes: list[int] = []  # of what is fused, in the order in which `_encode` lists it
+        sizes: list[int] = []  # of what is fused, in the order in which `encode` lists it
         if config.use_vision:
             encoders = {_module_name(key): make_encoder("vision_encoder", config) for key in config.camera_keys}
             self.vision = nn.ModuleDict(encoders)
@@ -58,14 +58,14 @@ class PlaybyearNetwork(nn.Module):
         self.fusion = Fusion(sum([*sizes, *felt]), config)
         self.memory_head = MemoryHead(config, config.action_feature.shape[0], sum(felt))
         # Last, so that all else begins with the weights that it has without.
-        self.auxiliary = make_auxiliary(config)
+        self.auxiliary = AuxiliaryHeads(config) if any(weights_of(config).values()) else None
 
     def encode_run(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
         """Joint encodings of the last `n_frames` frames of every item, each encoded once: (B, n_frames, D).
 
         Where the episode had not begun, the first frame's encoding repeats.
         """
-        encodings = self._encode(batch, n_frames).unflatten(0, (-1, n_frames))  # (B, n, D)
+        encodings = self.encode(batch, n_frames).unflatten(0, (-1, n_frames))  # (B, n, D)
         is_pad = before_episode(batch, n_frames)  # (B, n)
         if is_pad is None:
             return encodings
@@ -73,11 +73,7 @@ class PlaybyearNetwork(nn.Module):
         index = torch.maximum(torch.arange(n_frames, device=encodings.device), before.unsqueeze(1))  # (B, n)
         return encodings.gather(1, index.unsqueeze(-1).expand(-1, -1, encodings.shape[-1]))  # (B, n, D)
 
-    def encode_frame(self, run: dict[str, Tensor]) -> Tensor:
-        """Joint encoding of the newest frame: (B, D)."""
-        return self._encode(run, 1)
-
-    def _encode(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
+    def encode(self, batch: dict[str, Tensor], n_frames: int) -> Tensor:
         """What the memory reads of every frame by itself, (B * n, D): the joint encoding, and what it compares with now."""
         config = self.config
         seen = [self._see(batch, key, n_frames) for key in config.camera_keys if config.use_vision]
