@@ -31,6 +31,7 @@ from lerobot_playbyear.training.frame_cache import cached_columns, dataset_ident
 PLACES = ("memory", "disk", "auto")
 """Where a dataset's frames are kept."""
 
+_NUMBERING = ("episode_index", "frame_index", "task_index")  # read for what follows from it, and not kept
 _CAMERA_DTYPES = ("image", "video")
 _GPU_SHARE = 0.5  # of the free memory: the network and its gradients need the rest
 _MEMORY_SHARE = 0.5  # of what is free; what is on the disk is as fast as memory where it fits into it
@@ -47,13 +48,14 @@ class EpisodeStore:
     appended while training goes on.
 
     Args:
-        columns: Every feature, as a tensor of N rows.
+        columns: Every feature, as a tensor of N rows; without index columns.
         starts: First frame of each episode, (E,).
         ends: Frame after the last of each episode, (E,).
         fps: Frames per second [Hz].
-        tasks: The task texts that the column `task_index` counts.
+        tasks: The task texts that `task_index` counts.
         device: Where the tensors are kept.
         image_size: The size that pictures were shrunk to, if they were [pixels]. Appended ones will be, too.
+        task_index: (N,) the number of each frame's task. None: the first task's.
 
     Attributes:
         fps, tasks, device, image_size: As given.
@@ -69,6 +71,7 @@ class EpisodeStore:
         tasks: Sequence[str] = ("",),
         device: str | torch.device = "cpu",
         image_size: int | None = None,
+        task_index: Tensor | None = None,
     ) -> None:
         self.fps, self.image_size = fps, image_size
         self.tasks = list(tasks)
@@ -81,7 +84,6 @@ class EpisodeStore:
         edges = (self.starts, [end - 1 for end in self.ends])
         self._bounds = torch.stack([torch.tensor(edge).repeat_interleave(lengths) for edge in edges], dim=1)
         # (N, 2): first frame, and last one, of the episode of each frame
-        task_index = columns.get("task_index")
         self._task_index = torch.zeros(len(self), dtype=torch.long) if task_index is None else task_index.cpu()
 
     @classmethod
@@ -100,7 +102,7 @@ class EpisodeStore:
 
         Args:
             dataset: An opened dataset; its `delta_timestamps` do not matter.
-            keys: The features to read in addition to the index columns; None reads all but depth, text and language.
+            keys: The features to read; None reads all but depth, text, language and the index columns.
             device: Where to keep the tensors; None takes the GPU when at most half of its free memory is needed,
                 and the CPU otherwise.
             progress: Show a progress bar for the cameras.
@@ -139,10 +141,10 @@ class EpisodeStore:
                 _check_memory(n_bytes, device)
                 # One by one, so that a copy on another device never doubles the whole dataset.
                 columns = {key: _gathered(pieces(key), len(reader)).to(device) for key in features}
-        starts, ends = _episodes(columns, reader)
-        return cls(
-            columns, starts, ends, reader.fps, list(reader.meta.tasks.index), columns["index"].device, image_size
-        )
+        episode_index, frame_index, task_index = (columns.pop(key).cpu() for key in _NUMBERING)
+        starts, ends = _episodes(episode_index, frame_index, columns.get(IS_FIRST), reader)
+        tasks = list(reader.meta.tasks.index)
+        return cls(columns, starts, ends, reader.fps, tasks, device, image_size, task_index)
 
     def __len__(self) -> int:
         """The number of frames, N."""
@@ -212,7 +214,7 @@ class EpisodeStore:
 
         Args:
             frames: The episode's frames, as a `DurableWriter` of the store's features has taken them: a value for every
-                feature, images (H, W, C) or (C, H, W) uint8, and optionally `task`. Index columns are filled in.
+                feature, images (H, W, C) or (C, H, W) uint8, and optionally `task`.
 
         Raises:
             InputError: If there are no frames, or a value is NaN or infinite. The store is then unchanged.
@@ -220,15 +222,14 @@ class EpisodeStore:
         if len(frames) == 0:
             raise InputError("An episode without frames cannot be appended.")
         start, end = len(self), len(self) + len(frames)
-        tasks = list(self.tasks)
-        columns = {key: self._stacked(key, frames) for key in self._columns if key not in INDEX_COLUMNS}
-        columns.update(self._index_columns(frames, start, tasks))
+        texts = [str(frame.get("task", self.tasks[0])) for frame in frames]
+        columns = {key: self._stacked(key, frames) for key in self._columns}
+        self.tasks += [text for text in dict.fromkeys(texts) if text not in self.tasks]
         for key, values in columns.items():
             self._columns[key] = _with_rows(self._columns[key], start, values.to(self.device))
         self._bounds = _with_rows(self._bounds, start, torch.tensor([[start, end - 1]]).expand(len(frames), 2))
-        task_index = columns.get("task_index", torch.zeros(len(frames), dtype=torch.long))
+        task_index = torch.tensor([self.tasks.index(text) for text in texts])
         self._task_index = _with_rows(self._task_index, start, task_index)
-        self.tasks = tasks
         self.starts.append(start)
         self.ends.append(end)
 
@@ -253,20 +254,6 @@ class EpisodeStore:
         if values.dtype.is_floating_point and not values.isfinite().all():
             raise InputError(f"'{key}' holds NaN or infinite values in the new episode; wanted finite numbers.")
         return values.to(dtype)
-
-    def _index_columns(self, frames: Sequence[Mapping[str, Any]], start: int, tasks: list[str]) -> dict[str, Tensor]:
-        """The index columns of new frames; unknown task texts are added to `tasks`."""
-        texts = [str(frame.get("task", tasks[0])) for frame in frames]
-        tasks.extend(text for text in dict.fromkeys(texts) if text not in tasks)
-        frame_index = torch.arange(len(frames))
-        columns = {
-            "index": start + frame_index,
-            "episode_index": torch.full((len(frames),), self.n_episodes),
-            "frame_index": frame_index,
-            "task_index": torch.tensor([tasks.index(text) for text in texts]),
-            "timestamp": frame_index.to(torch.float32) / self.fps,
-        }
-        return {key: values for key, values in columns.items() if key in self._columns}
 
 
 def _sent_to(device: torch.device, values: Tensor) -> Tensor:
@@ -389,20 +376,16 @@ def _select_features(reader: DatasetReader, keys: Iterable[str] | None) -> dict[
     features, others = reader.features, {*LANGUAGE_COLUMNS, *reader.meta.depth_keys}
     others |= {key for key, feature in features.items() if feature["dtype"] == "string"}
     if keys is None:
-        keys = [key for key in features if key not in others]
-    keys = list(dict.fromkeys([*keys, *INDEX_COLUMNS, *([IS_FIRST] if _has_is_first(features) else [])]))
+        keys = [key for key in features if key not in others and key not in INDEX_COLUMNS]
+    is_first = features.get(IS_FIRST)
+    has_is_first = is_first is not None and is_first["dtype"] == "bool" and math.prod(is_first["shape"]) == 1
+    keys = list(dict.fromkeys([*keys, *_NUMBERING, *([IS_FIRST] if has_is_first else [])]))
     for key in keys:
         if key not in features:
             raise ValueError(f"The dataset '{reader.repo_id}' has no '{key}'; it has {sorted(features)}.")
         if key in others:
             raise ValueError(f"'{key}' ({features[key]['dtype']}) cannot be kept in memory: leave it out of the keys.")
     return {key: features[key] for key in keys}
-
-
-def _has_is_first(features: Mapping[str, Any]) -> bool:
-    """Whether the dataset has that column, and no other one of that name."""
-    feature = features.get(IS_FIRST)
-    return feature is not None and feature["dtype"] == "bool" and math.prod(feature["shape"]) == 1
 
 
 def _row_bytes(feature: Mapping[str, Any], image_size: int | None = None) -> int:
@@ -429,17 +412,18 @@ def _check_memory(n_bytes: int, device: torch.device) -> None:
         )
 
 
-def _episodes(columns: Mapping[str, Tensor], reader: DatasetReader) -> tuple[list[int], list[int]]:
-    starts, ends = episode_bounds(columns["episode_index"].cpu().numpy())
-    frame_index = columns["frame_index"].cpu()
+def _episodes(
+    episode_index: Tensor, frame_index: Tensor, is_first: Tensor | None, reader: DatasetReader
+) -> tuple[list[int], list[int]]:
+    starts, ends = episode_bounds(episode_index.numpy())
     for start, end in zip(starts, ends, strict=True):
         if not torch.equal(frame_index[start:end], torch.arange(end - start)):
             raise ValueError(
-                f"Episode {int(columns['episode_index'][start])} of '{reader.repo_id}' is incomplete: its {end - start} rows "
+                f"Episode {int(episode_index[start])} of '{reader.repo_id}' is incomplete: its {end - start} rows "
                 f"are not frames 0 to {end - start - 1}. Copy what is whole: {repair_command(reader.root)}"
             )
-    if IS_FIRST in columns and columns[IS_FIRST].dtype == torch.bool:
+    if is_first is not None and is_first.dtype == torch.bool:
         # LeRobot's rollout resets the policy after a pause: no window reaches back beyond it.
-        starts = sorted({*starts, *columns[IS_FIRST].reshape(-1).cpu().nonzero().reshape(-1).tolist()})
+        starts = sorted({*starts, *is_first.reshape(-1).cpu().nonzero().reshape(-1).tolist()})
         ends = [*starts[1:], *ends[-1:]]
     return starts, ends
