@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from lerobot_playbyear.teleoperation.panel import SCENE, SIZE, Control, Status, draw
 
@@ -224,15 +225,17 @@ class Screen:
         glfw.make_context_current(self.window)
         glfw.swap_interval(0)
         gl.glPixelStorei(gl.GL_UNPACK_ALIGNMENT, 1)
-        gl.glEnable(gl.GL_TEXTURE_2D)
-        self._textures: dict[tuple[int, int, int, int], int] = {}
+        self._scene: Image.Image | None = None
         glfw.focus_window(self.window)
 
     def show(self, image: np.ndarray, scene: np.ndarray | None = None) -> None:
         """Show a picture of `SIZE` and a scene, (height, width, 3) uint8; None: the last scene stays."""
-        self._load((0, 0, *SIZE), image)
+        left, top, *size = SCENE
         if scene is not None:
-            self._load(SCENE, scene)
+            self._scene = Image.fromarray(scene).resize(size, Image.Resampling.BILINEAR)
+        self._image = Image.fromarray(image)
+        if self._scene is not None:
+            self._image.paste(self._scene, (left, top))
         self.redraw()
 
     def redraw(self) -> None:
@@ -240,33 +243,10 @@ class Screen:
         gl, glfw = self._gl, self._glfw
         width, height = glfw.get_framebuffer_size(self.window)
         scale = min(width / SIZE[0], height / SIZE[1])
-        shown = (round(scale * SIZE[0]), round(scale * SIZE[1]))
+        shown = (max(round(scale * SIZE[0]), 1), max(round(scale * SIZE[1]), 1))
+        image = self._image.resize(shown, Image.Resampling.BILINEAR)
+        rows_up = image.transpose(Image.Transpose.FLIP_TOP_BOTTOM)  # OpenGL begins below
         gl.glClear(gl.GL_COLOR_BUFFER_BIT)
-        gl.glViewport((width - shown[0]) // 2, (height - shown[1]) // 2, *shown)
-        gl.glMatrixMode(gl.GL_PROJECTION)
-        gl.glLoadIdentity()
-        gl.glOrtho(0, SIZE[0], SIZE[1], 0, -1, 1)
-        for place, texture in self._textures.items():
-            self._draw(place, texture)
+        gl.glWindowPos2i((width - shown[0]) // 2, (height - shown[1]) // 2)
+        gl.glDrawPixels(*shown, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, rows_up.tobytes())
         glfw.swap_buffers(self.window)
-
-    def _load(self, place: tuple[int, int, int, int], image: np.ndarray) -> None:
-        gl = self._gl
-        if place not in self._textures:
-            self._textures[place] = gl.glGenTextures(1)
-        gl.glBindTexture(gl.GL_TEXTURE_2D, self._textures[place])
-        for name in (gl.GL_TEXTURE_MIN_FILTER, gl.GL_TEXTURE_MAG_FILTER):
-            gl.glTexParameteri(gl.GL_TEXTURE_2D, name, gl.GL_LINEAR)
-        for name in (gl.GL_TEXTURE_WRAP_S, gl.GL_TEXTURE_WRAP_T):
-            gl.glTexParameteri(gl.GL_TEXTURE_2D, name, gl.GL_CLAMP_TO_EDGE)
-        height, width = image.shape[:2]
-        gl.glTexImage2D(gl.GL_TEXTURE_2D, 0, gl.GL_RGB, width, height, 0, gl.GL_RGB, gl.GL_UNSIGNED_BYTE, image)
-
-    def _draw(self, place: tuple[int, int, int, int], texture: int) -> None:
-        gl, (left, top, width, height) = self._gl, place
-        gl.glBindTexture(gl.GL_TEXTURE_2D, texture)
-        gl.glBegin(gl.GL_QUADS)
-        for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)):
-            gl.glTexCoord2f(x, y)
-            gl.glVertex2f(left + x * width, top + y * height)
-        gl.glEnd()
