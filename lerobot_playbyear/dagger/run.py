@@ -148,7 +148,11 @@ def _make_loop(cfg: DaggerConfig, folder: RunFolder, state: RunState, stack: Exi
     if state.first_episodes is None:
         state.first_episodes = corrections.n_episodes
         state.next_seed = next_seed(cfg.interventions.folder, cfg.episode_seed) if cfg.is_online else 0
-    _check_there_is_something_to_do(cfg, corrections)
+    if not cfg.is_online and corrections.n_episodes == 0:
+        raise InputError(
+            f"The intervention dataset '{cfg.interventions.repo_id}' is empty: collect attempts with --num_episodes, or give "
+            "one that holds some."
+        )
     windows = PolicyWindows(cfg.policy, demos.meta, cfg.rename_map)
     demonstrations = read_store(demos, windows, training)
     corrections.read(windows.keys or [], demonstrations.device, demonstrations.image_size)
@@ -180,14 +184,6 @@ def _forget_all(learner: Learner, seed: int) -> None:
     for name, values in fresh.items():
         if not any(name.startswith(prefix) for prefix in kept):
             weights[name].copy_(values)
-
-
-def _check_there_is_something_to_do(cfg: DaggerConfig, corrections: Corrections) -> None:
-    if not cfg.is_online and corrections.n_episodes == 0:
-        raise InputError(
-            f"The intervention dataset '{cfg.interventions.repo_id}' is empty: collect attempts with --num_episodes, or give "
-            "one that holds some."
-        )
 
 
 def _print_results(cfg: DaggerConfig, folder: RunFolder, state: RunState, loop: Loop) -> None:

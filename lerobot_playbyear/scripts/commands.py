@@ -20,31 +20,20 @@ def train() -> None:
     from lerobot_playbyear.training.command_line import apply_preset, with_long_store
 
     sys.argv[1:] = apply_preset(with_long_store(sys.argv[1:]))
-    from lerobot_playbyear.training.config import PlaybyearTrainConfig
-
-    def train(cfg: PlaybyearTrainConfig) -> None:
-        from lerobot_playbyear.training.train import train as learn
-
-        learn(cfg)
+    from lerobot_playbyear.training.train import train
 
     run_with_lerobot(train)
 
 
 @command("Interrupted. Go on with --resume=true and the same --output_dir.")
 def dagger() -> None:
-    from lerobot_playbyear.dagger.config import DaggerConfig, with_saved_options
+    from lerobot_playbyear.dagger.config import with_saved_options
+    from lerobot_playbyear.dagger.run import run_dagger
     from lerobot_playbyear.teleoperation import config as _teleop  # noqa: F401  (registers --expert.type=teleop)
     from lerobot_playbyear.training.command_line import with_long_store
 
     sys.argv[1:] = with_saved_options(with_long_store(sys.argv[1:]))
-
-    def correct(cfg: DaggerConfig) -> None:
-        cfg.check()
-        from lerobot_playbyear.dagger.run import run_dagger
-
-        run_dagger(cfg)
-
-    run_with_lerobot(correct)
+    run_with_lerobot(run_dagger)
 
 
 @command(is_file_work=True)

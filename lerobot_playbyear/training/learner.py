@@ -378,21 +378,13 @@ def _why_not(key: str, feature: Mapping[str, Any], is_used: bool, is_seen: bool)
     return ""
 
 
-def _sound_steps(config: PlaybyearConfig) -> dict[str, dict[str, Any]]:
-    """What a trained policy's own steps for sound are made with: its options, or those given now.
-
-    Raises:
-        ValueError: A step is not registered, or has no such option.
-    """
-    return {name: microphone_step(name, config).get_config() for name in config.audio_steps}
-
-
 def _make_processors(
     cfg: PlaybyearTrainConfig, policy: PreTrainedPolicy, dataset_stats: Any, device: torch.device
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Pre- and postprocessor: new ones, or a checkpoint's with new statistics.
 
-    Without statistics those of the checkpoint stay; so does a resumed run in lerobot-train.
+    Without statistics those of the checkpoint stay; so does a resumed run in lerobot-train. Its own steps for sound are made
+    with its options, or those given now.
     """
     config = policy.config
     stats = {} if dataset_stats is None else {"stats": dataset_stats}
@@ -405,7 +397,8 @@ def _make_processors(
             "normalizer_processor": {"features": features, "norm_map": norm_map, **stats},
             "rename_observations_processor": {"rename_map": cfg.rename_map},
         }
-        kwargs["preprocessor_overrides"] |= _sound_steps(config)
+        steps = {name: microphone_step(name, config).get_config() for name in config.audio_steps}
+        kwargs["preprocessor_overrides"] |= steps
         unnormalizer = {"features": config.output_features, "norm_map": norm_map, **stats}
         kwargs["postprocessor_overrides"] = {"unnormalizer_processor": unnormalizer}
     path, revision = config.pretrained_path, getattr(config, "pretrained_revision", None)

@@ -62,7 +62,9 @@ def train(cfg: PlaybyearTrainConfig) -> Path:
             logging.getLogger().setLevel(logging.ERROR)
         if cfg.seed is not None:
             set_seed(cfg.seed)
-        _configure_backends(cfg)
+        torch.backends.cudnn.deterministic = cfg.cudnn_deterministic
+        torch.backends.cudnn.benchmark = not cfg.cudnn_deterministic
+        torch.backends.cuda.matmul.allow_tf32 = True
         with accelerator.main_process_first():  # it downloads, and the others find what is there
             dataset, held_out = make_train_eval_datasets(cfg)
         reader = DatasetReader.of(dataset)
@@ -215,12 +217,6 @@ def read_store(
         f"{time.perf_counter() - start:.1f} s"
     )
     return store
-
-
-def _configure_backends(cfg: PlaybyearTrainConfig) -> None:
-    torch.backends.cudnn.deterministic = cfg.cudnn_deterministic
-    torch.backends.cudnn.benchmark = not cfg.cudnn_deterministic
-    torch.backends.cuda.matmul.allow_tf32 = True
 
 
 def _push(cfg: PlaybyearTrainConfig, learner: Learner) -> None:
