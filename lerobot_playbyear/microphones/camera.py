@@ -178,7 +178,6 @@ class MicrophoneCamera(Camera):
         config, width, height = self.config, self.width or 0, self.height or 0
         rows = n_rows(config.sample_rate, width)
         self._spectrogram = RollingSpectrogram(config.sample_rate, height - rows, width, config.low_db, config.high_db)
-        self._label = _drawn_label(f"{config.low_db:g} to {config.high_db:g} dB", width, height - rows)
         self._session = 1 + secrets.randbelow(2**32 - 1)
         _cameras.add(self)
         try:
@@ -256,9 +255,6 @@ class MicrophoneCamera(Camera):
         grey = self._spectrogram.draw(counter, self._samples)
         picture = np.zeros((self.height or 0, self.width or 0, 3), np.uint8)
         picture[: len(grey)] = grey[:, :, None]
-        if self._label is not None:
-            label_height, label_width = self._label.shape
-            picture[:label_height, TIMECODE_WIDTH : TIMECODE_WIDTH + label_width] = self._label[:, :, None]
         kept = self._samples(counter - n_kept(config.sample_rate), counter)
         write_strip(picture, Strip(self._session, counter, config.sample_rate, kept, config.low_db, config.high_db))
         write_timecode(picture, self._session, counter)
@@ -278,16 +274,3 @@ class MicrophoneCamera(Camera):
             logging.info("The session's sound is in %s%s.", file.path, ", not to its end" if file.error else "")
         card, self._card = self._card, None
         leave_card(self.config, card)
-
-
-def _drawn_label(text: str, width: int, height: int) -> np.ndarray | None:
-    """The range of levels as it stands beside the timecode, (h, w) uint8; None where there is no room for it."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    font = ImageFont.load_default()
-    _, _, right, bottom = (round(edge) for edge in font.getbbox(text))
-    if TIMECODE_WIDTH + right + 4 > width or bottom + 4 > height:
-        return None
-    label = Image.new("L", (right + 4, bottom + 4))
-    ImageDraw.Draw(label).text((2, 2), text, fill=255, font=font)
-    return np.asarray(label)
