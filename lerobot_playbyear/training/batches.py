@@ -18,8 +18,6 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_playbyear.datasets.features import audio_keys, check_audio_features
-from lerobot_playbyear.datasets.parquet import stretches
-from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.store import EpisodeStore, features_at, sample_rate_in
 
@@ -192,41 +190,10 @@ def learned_meta(policy: PlaybyearConfig, meta: LeRobotDatasetMetadata) -> LeRob
     return meta
 
 
-def first_of_each_task(reader: DatasetReader, n_samples: int) -> Tensor | None:
-    """The frames that `--max_eval_samples` leaves of held-out episodes, as lerobot-train chooses them.
-
-    Args:
-        reader: Of the held-out episodes.
-        n_samples: How many frames, shared evenly by the tasks, at least one of each; 0: all.
-
-    Returns:
-        (N,) bool, the first ones of each task; None where all frames count.
-    """
-    if n_samples <= 0:
-        return None
-    tasks = torch.from_numpy(reader.values("task_index"))
-    kinds = tasks.unique()
-    chosen = torch.zeros(len(tasks), dtype=torch.bool)
-    for kind in kinds:
-        chosen[(tasks == kind).nonzero().squeeze(1)[: max(1, n_samples // len(kinds))]] = True
-    return chosen
-
-
-def runs_of_each_frame(store: EpisodeStore, n_windows: int, chosen: Tensor | None = None) -> Tensor:
-    """The last frames of runs in which every frame lies once; the first run of an episode may be shorter.
-
-    Args:
-        store: The episodes.
-        n_windows: Windows per run, K.
-        chosen: (N,) bool, the frames that count; None: all. A stretch of them that begins within an episode may have up to
-            K - 1 frames before it in its first run.
-    """
-    ends = []
-    for start, end in zip(store.starts, store.ends, strict=True):
-        counts = torch.ones(end - start, dtype=torch.bool) if chosen is None else chosen[start:end]
-        both = stretches(counts.numpy()) + start
-        ends += [torch.arange(after - 1, first - 1, -n_windows) for first, after in both.tolist()]
-    return torch.cat(ends)
+def runs_of_each_frame(store: EpisodeStore, n_windows: int) -> Tensor:
+    """The last frames of runs of K windows in which every frame lies once; the first run of an episode may be shorter."""
+    bounds = zip(store.starts, store.ends, strict=True)
+    return torch.cat([torch.arange(end - 1, start - 1, -n_windows) for start, end in bounds])
 
 
 def prefetched(batches: Iterator[Batch]) -> Iterator[Batch]:

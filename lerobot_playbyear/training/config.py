@@ -66,6 +66,7 @@ class PlaybyearTrainConfig(TrainPipelineConfig):
             "--ema.enable": ema is not None and ema.enable,
             "--parallelism.dp_shard": parallelism is not None and parallelism.is_sharded,
             "--job.target": self.job.is_remote,
+            "--max_eval_samples": self.max_eval_samples > 0,
             "--dataset.image_transforms.enable": self.dataset.image_transforms.enable,
             "--reward_model": self.is_reward_model_training,
             "--peft": self.peft is not None,

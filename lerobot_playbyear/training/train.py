@@ -25,7 +25,6 @@ from lerobot_playbyear.policy.configuration_playbyear import PlaybyearConfig
 from lerobot_playbyear.training.batches import (
     Batch,
     PolicyWindows,
-    first_of_each_task,
     learned_meta,
     make_batches,
     runs_of_each_frame,
@@ -173,8 +172,7 @@ def _loss_of(
 ) -> Loss:
     """What gives the mean loss over held-out episodes."""
     store = read_store(held_out, windows, cfg, is_shared)
-    chosen = first_of_each_task(held_out, cfg.max_eval_samples)
-    runs = runs_of_each_frame(store, windows.n_windows, chosen)
+    runs = runs_of_each_frame(store, windows.n_windows)
 
     def loss() -> float:
         parts = runs.split(cfg.batch_size)
