@@ -147,7 +147,6 @@ dagger | --eval_every=1 --eval.n_episodes=0 | --eval.n_episodes=0: give at least
 dagger | --new_weights=true | --new_weights=true: a policy that knows nothing cannot be corrected
 dagger | --method.type=redo --skip_s=1 | --skip_s=1 | --method.type=redo the expert chooses every frame
 dagger | --method.type=robot_gated --method.intervention_share=1.5 | intervention_share=1.5: give a share
-dagger | --expert.type=scripted --expert.reaction_s=0.5 | --expert.reaction_s=0.5 | give --expert.person=true
 dagger | --policy.action_range=2 | action_range=2.0 | trained with 1.0 | playbyear-train --preset=cpu --policy.path
 dagger | --env.sample_rate=8000 | observation.audio.gripper is int16 (800,) at 16000 Hz there | --env.*
 dagger | --dataset.root={48_kHz} | recorded at 48000 Hz | trained with 16000 Hz
@@ -155,7 +154,6 @@ dagger | --dataset.root={six_joints} | 'observation.state' has shape (6,) | trai
 dagger | --policy.path={act} | the type 'act' | --policy.type=playbyear | lerobot-rollout
 dagger | WORLD_SIZE=2 | 2 processes were started, and playbyear-dagger works in one
 dagger | --env.task=TellApart-v1 --method.type=no_handback | TellApart-v1 | no_handback needs one | --method.type=redo
-dagger | --env.task=TellApart-v1 --method.type=redo --expert.person=true | `intervention_gate()` | own_expert.py
 dagger | --output_dir={finished}/out | {finished}/out holds a run already | --resume=true
 learn | --method.type=redo --interventions.root={finished}/corrections | frames that the policy chose | another --method.type
 learn | --interventions.root={untagged} | wanted 'intervention', bool (1,), and there is no such feature

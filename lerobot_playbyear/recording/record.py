@@ -198,8 +198,6 @@ def _check_options(cfg: RecordConfig) -> None:
         raise InputError(f"--seed={cfg.seed}: give 0 or more.")
     if not isinstance(cfg.expert, ScriptedExpertConfig | TeleopExpertConfig):
         raise InputError(f"--expert.type={cfg.expert.type} demonstrates nothing: give scripted or teleop.")
-    if getattr(cfg.expert, "person", False):
-        raise InputError("--expert.person=true: it corrects a policy, and does not demonstrate; leave it out.")
     if not cfg.dataset.video and cfg.dataset.rgb_encoder != RGBEncoderConfig():
         raise InputError("--dataset.rgb_encoder.* encodes video: give --dataset.video=true, too, or leave it out.")
     if cfg.dataset.push_to_hub:
