@@ -12,7 +12,7 @@ from support.shared import ENV, trained
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.reproduce import residual
-from lerobot_playbyear.reproduce.residual import Base, ResidualConfig, ResidualEnv, added, evaluate, learn, make_model
+from lerobot_playbyear.reproduce.residual import ResidualConfig, ResidualEnv, added, evaluate, learn, make_model
 
 pytest.importorskip("stable_baselines3")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -45,8 +45,7 @@ def test_what_is_added_is_bounded_and_never_the_grippers():
 
 def test_before_it_learned_it_acts_as_the_policy_does(tmp_path):
     cfg = config(tmp_path)
-    base = Base(load_policy_actor(cfg.policy, cfg.env))
-    env = ResidualEnv(env_spec(cfg.env).make(), base, cfg.bound)
+    env = ResidualEnv(env_spec(cfg.env).make(), load_policy_actor(cfg.policy, cfg.env), cfg.bound)
     model = make_model(cfg, env)
     seen, _ = env.reset(seed=50000)
     assert env.observation_space.contains(seen)

@@ -119,7 +119,8 @@ def test_a_whole_update_never_waits_for_the_card(make, batches, monkeypatch):
         on_it = {key: on_card(value) if isinstance(value, Tensor) else value for key, value in batch.items()}
         parts.preprocessor.steps = [_moved(step) for step in parts.preprocessor.steps]
         monkeypatch.setattr(parts.accelerator, "backward", lambda loss: _give_gradients(parts.policy))
-        figures = Figures(4, type("Store", (), {"__len__": lambda _: 38, "n_episodes": 3})())
+        store = type("Store", (), {"__len__": lambda _: 38, "n_episodes": 3})()
+        figures = Figures(4, store, 0, parts.accelerator)
         with Waits() as waits, without_cudnn():
             for _ in range(2):
                 figures.add(parts.update(on_it, 1.0))

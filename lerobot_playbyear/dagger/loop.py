@@ -227,7 +227,7 @@ class Loop:
         assert self.training.optimizer is not None
         grad_clip_norm = self.training.optimizer.grad_clip_norm
         set_seed(self._random_seed(_UPDATES, self.state.round))
-        tracker = Figures(self.cfg.batch_size, self.demonstrations, learner.step)
+        tracker = Figures(self.cfg.batch_size, self.demonstrations, learner.step, learner.accelerator)
         for number in range(n_updates):
             self.report.doing(f"learning {number + 1}/{n_updates}")
             rate = self.cfg.rate(learner.step, number, n_updates, self.state.first_episodes or 0)

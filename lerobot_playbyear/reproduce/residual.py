@@ -78,37 +78,17 @@ class ResidualConfig:
         return ["policy"]
 
 
-class Base:
-    """The policy that stays as it is, and what the learner sees of it.
-
-    Args:
-        actor: The policy.
-    """
-
-    def __init__(self, actor: PolicyActor) -> None:
-        self._actor, self._policy = actor, actor.policy
-
-    def reset(self, env: gym.Env) -> None:
-        self._actor.reset(env)
-
-    def look(self, observation: Observation) -> tuple[np.ndarray, np.ndarray]:
-        """What the learner sees (D + state + action,) float32, and the policy's action (action dim,)."""
-        action = self._actor.act(observation)
-        memory = self._policy.memory[0].to("cpu", torch.float32).numpy()
-        return np.concatenate([memory, observation["agent_pos"], action]).astype(np.float32), action
-
-
 class ResidualEnv(gym.Env):
     """A task in which the policy acts, and a learner adds to it.
 
     Args:
         env: The task.
-        base: The policy.
+        actor: The policy, which stays as it is.
         bound: As in `ResidualConfig`.
     """
 
-    def __init__(self, env: gym.Env, base: Base, bound: float) -> None:
-        self.env, self._base, self._bound = env, base, bound
+    def __init__(self, env: gym.Env, actor: PolicyActor, bound: float) -> None:
+        self.env, self._actor, self._bound = env, actor, bound
         seen, _ = self.reset(seed=0)
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, seen.shape, np.float32)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (_N_DISPLACED,), np.float32)
@@ -118,14 +98,19 @@ class ResidualEnv(gym.Env):
         if seed is None:
             seed = int(self.np_random.integers(10_000, 40_000))  # of what is learned from, not of what is judged on
         observation, info = self.env.reset(seed=seed)
-        self._base.reset(self.env)
-        seen, self._action = self._base.look(observation)
-        return seen, info
+        self._actor.reset(self.env)
+        return self._look(observation), info
 
     def step(self, action):
         observation, reward, terminated, truncated, info = self.env.step(added(self._action, action, self._bound))
-        seen, self._action = self._base.look(observation)
-        return seen, float(reward), terminated, truncated, info
+        return self._look(observation), float(reward), terminated, truncated, info
+
+    def _look(self, observation: Observation) -> np.ndarray:
+        """What the learner sees, (D + state + action,) float32: what the policy remembers, the arm, and the policy's action."""
+        self._action = self._actor.act(observation)
+        policy: Any = self._actor.policy
+        memory = policy.memory[0].to("cpu", torch.float32).numpy()
+        return np.concatenate([memory, observation["agent_pos"], self._action]).astype(np.float32)
 
     def close(self):
         self.env.close()
@@ -184,8 +169,7 @@ def make_model(cfg: ResidualConfig, env: ResidualEnv) -> Any:
 def learn(cfg: ResidualConfig) -> Path:
     """Learns, or goes on. Returns the folder of what was learned."""
     set_seed(cfg.seed)
-    base = Base(load_policy_actor(cfg.policy, cfg.env))
-    env = ResidualEnv(env_spec(cfg.env).make(), base, cfg.bound)
+    env = ResidualEnv(env_spec(cfg.env).make(), load_policy_actor(cfg.policy, cfg.env), cfg.bound)
     model, kept = make_model(cfg, env), cfg.output_dir / "resume.safetensors"
     if kept.is_file():
         _restore(model, kept)
@@ -208,7 +192,7 @@ def learn(cfg: ResidualConfig) -> Path:
 
 def evaluate(cfg: ResidualConfig) -> None:
     """Plays episodes from `cfg.seed` on; `--env.attempts_file` keeps how they ended."""
-    env = ResidualEnv(env_of_lerobot(cfg.env), Base(load_policy_actor(cfg.policy, cfg.env)), cfg.bound)
+    env = ResidualEnv(env_of_lerobot(cfg.env), load_policy_actor(cfg.policy, cfg.env), cfg.bound)
     model = make_model(cfg, env)
     model.actor.load_state_dict(load_file(Path(str(cfg.residual)) / "model.safetensors"))
     n_solved = 0

@@ -157,12 +157,10 @@ class Figures:
         batch_size: Items per update and process.
         store: What they are drawn from.
         step: Updates done before.
-        accelerator: Of the processes whose figures are averaged; None: of this one alone.
+        accelerator: Of the processes whose figures are averaged.
     """
 
-    def __init__(
-        self, batch_size: int, store: EpisodeStore, step: int = 0, accelerator: Accelerator | None = None
-    ) -> None:
+    def __init__(self, batch_size: int, store: EpisodeStore, step: int, accelerator: Accelerator) -> None:
         meters = {
             "loss": AverageMeter("loss", ":.3f", reduction="mean"),
             "grad_norm": AverageMeter("grdn", ":.3f"),
@@ -172,7 +170,6 @@ class Figures:
         }
         if torch.cuda.is_available():
             meters["gpu_mem_gb"] = AverageMeter("mem_gb", ":.2f")
-        self._accelerator = accelerator
         self._tracker = metrics_tracker(
             accelerator, batch_size, len(store), store.n_episodes, meters, initial_step=step
         )
@@ -188,8 +185,7 @@ class Figures:
     def read(self) -> tuple[dict[str, float], str]:
         """The averages since the last time, by name and as a line. Every process has to call it."""
         self._take_in()
-        if self._accelerator is not None:
-            self._tracker.reduce_across_ranks()
+        self._tracker.reduce_across_ranks()
         figures, line = self._tracker.to_dict(), str(self._tracker)
         self._tracker.reset_averages()
         return figures, line
