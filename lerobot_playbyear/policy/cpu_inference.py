@@ -182,7 +182,8 @@ class FoldedCopy:
 
     def of(self, network: ResNet) -> ResNet:
         """The folded copy of a network as it is now."""
-        weights = _fingerprint(network)
+        # Where every weight lies and how often it was changed: other after every update, loading and move to a device.
+        weights = tuple((each.data_ptr(), n_changes(each)) for each in (*network.parameters(), *network.buffers()))
         if self._copy is None or weights != self._made_of:
             self.drop()
             with torch.inference_mode(False), torch.no_grad():
@@ -205,9 +206,3 @@ class FoldedCopy:
     def __getstate__(self) -> dict[str, Any]:
         """Of a copy or a pickle: nothing, for it belongs to another network."""
         return vars(FoldedCopy())
-
-
-def _fingerprint(network: nn.Module) -> tuple[tuple[int, int], ...]:
-    """Where every weight lies and how often it was changed: other after every update, loading and move to a device."""
-    tensors = (*network.parameters(), *network.buffers())
-    return tuple((tensor.data_ptr(), n_changes(tensor)) for tensor in tensors)

@@ -78,10 +78,6 @@ class Cell:
         return self.plan.output / self.size / "cells" / self.name
 
     @property
-    def is_by_policy(self) -> bool:
-        return "record" in self._course
-
-    @property
     def _course(self) -> list[str]:
         return list(self.plan.text["courses"][self.fill(self.values["course"])])
 
@@ -116,7 +112,7 @@ class Cell:
     @property
     def candidates(self) -> list[Candidate]:
         """The checkpoints that are evaluated, the last one at the end; none of a script."""
-        if not self.is_by_policy and self._course != ["residual"]:
+        if "record" not in self._course and self._course != ["residual"]:
             return []
         found: list[Candidate] = []
         before, every, updates = 0, int(self.values["every"]), int(self.values["updates"])

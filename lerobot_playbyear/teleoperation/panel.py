@@ -99,7 +99,10 @@ def draw(status: Status) -> np.ndarray:
     _draw_frame(canvas, status)
     y = _draw_progress(canvas, status, 24)
     y = _draw_levels(canvas, status, y + 22)
-    y = _draw_gripper(canvas, status, y + 22) if status.gripper else y
+    if status.gripper:
+        y += 22
+        wait = f", changes in {status.cooldown_s:.1f} s" if status.cooldown_s > 0 else ""
+        _draw_fact(canvas, y, "Gripper", status.gripper + wait)
     _draw_pace(canvas, status, y + 22)
     keys = _keys(tuple(status.keys))
     image.paste(keys, (_LEFT, SIZE[1] - 18 - keys.height))
@@ -149,12 +152,6 @@ def _draw_history(draw: ImageDraw.ImageDraw, levels: list[float], n_shown: int, 
         left, right = round(_RIGHT + 1 - (age + 1) * step), round(_RIGHT + 1 - age * step) - 1
         top = y + height - round(height * (1 - level / FLOOR_DB))
         draw.rectangle((left, top, max(right, left), y + height), fill=_BAR)
-
-
-def _draw_gripper(draw: ImageDraw.ImageDraw, status: Status, y: int) -> int:
-    rest = f"{status.gripper}, changes in {status.cooldown_s:.1f} s" if status.cooldown_s > 0 else status.gripper
-    _draw_fact(draw, y, "Gripper", rest)
-    return y
 
 
 def _draw_pace(draw: ImageDraw.ImageDraw, status: Status, y: int) -> None:
