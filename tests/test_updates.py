@@ -19,7 +19,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from lerobot_playbyear.training import EpisodeStore, RunSampler, run_weights
 from lerobot_playbyear.training.batches import PolicyWindows
 from lerobot_playbyear.training.config import PlaybyearTrainConfig
-from lerobot_playbyear.training.learner import fuse, load_training_state, make_learner, prefer_channels_last
+from lerobot_playbyear.training.learner import load_training_state, make_learner, prepare_for_gpu
 from lerobot_playbyear.training.report import Figures
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -110,7 +110,7 @@ def test_a_whole_update_never_waits_for_the_card(make, batches, monkeypatch):
     """
     _, parts = make(*EVERYTHING)
     batch = next(batches(parts))
-    fuse(parts.optimizer.optimizer)
+    prepare_for_gpu(parts.policy, parts.optimizer.optimizer)
     with FakeTensorMode(allow_non_fake_inputs=True):
         move_to_card(parts.policy)
         parameters = iter(list(parts.policy.parameters()))
@@ -149,8 +149,7 @@ def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(
     _, plain = make()
     expected = learn(plain, batches(plain), 3)
     cfg, parts = make()
-    prefer_channels_last(parts.policy, parts.optimizer.optimizer)
-    fuse(parts.optimizer.optimizer)
+    prepare_for_gpu(parts.policy, parts.optimizer.optimizer)
     given = batches(parts)
     assert learn(parts, given, 3) == pytest.approx(expected, rel=1e-4)
     folder = tmp_path / "checkpoint"
@@ -164,8 +163,7 @@ def test_what_a_gpu_is_given_learns_the_same_and_is_saved_and_resumed_as_before(
 
     cfg, resumed = make()
     resumed.policy.load_state_dict(load_file(folder / "pretrained_model" / "model.safetensors"))
-    prefer_channels_last(resumed.policy, resumed.optimizer.optimizer)
-    fuse(resumed.optimizer.optimizer)
+    prepare_for_gpu(resumed.policy, resumed.optimizer.optimizer)
     resumed.step = load_training_state(folder, resumed.optimizer.optimizer, resumed.scheduler)
     again = batches(resumed)
     for _ in range(3):

@@ -274,8 +274,7 @@ def make_learner(
         step = load_training_state(cfg.checkpoint_path, optimizer, scheduler)
     if accelerator.device.type == "cuda":
         policy.to(accelerator.device)  # before its weights and the optimizer's state are laid out again
-        prefer_channels_last(policy, optimizer)
-        fuse(optimizer)
+        prepare_for_gpu(policy, optimizer)
     if cfg.compile:
         compile_networks(policy)
     policy, optimizer, scheduler = accelerator.prepare(policy, optimizer, scheduler)
@@ -428,31 +427,21 @@ def keep_freed_memory() -> None:
             mallopt(parameter, value)
 
 
-def prefer_channels_last(policy: nn.Module, optimizer: Optimizer) -> None:
-    """Lays the weights of convolutions out as a GPU's tensor cores read them, and the optimizer's state with them.
+def prepare_for_gpu(policy: nn.Module, optimizer: Optimizer) -> None:
+    """Lays the weights of convolutions out as a GPU's tensor cores read them, and makes Adam's step one kernel.
 
-    Checkpoints stay as they are: safetensors saves contiguous tensors alone, and so the optimizer hands its state out.
+    The optimizer's state is laid out like the weights, and none of it need lie on the host, so nothing waits for it.
+    Checkpoints stay as they are: safetensors saves contiguous tensors alone, and LeRobot resumes none whose options have
+    other types than the optimizer's, where `fused` was not set.
 
     Args:
         policy: Whatever learns.
         optimizer: Of its parameters; it may have a state already.
     """
     policy.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimizer.register_state_dict_post_hook(_contiguous)
-    optimizer.register_load_state_dict_post_hook(_like_parameters)
-    _like_parameters(optimizer)
-
-
-def fuse(optimizer: Optimizer) -> None:
-    """Makes Adam's step one kernel. Its state need not lie on the host, so nothing waits for it.
-
-    Checkpoints do not say so: LeRobot resumes none whose options have other types than the optimizer's, which were not set.
-    """
-    if not isinstance(optimizer, Adam):
-        return
-    optimizer.register_state_dict_post_hook(_as_if_not_fused)
-    optimizer.register_load_state_dict_post_hook(_fused)
-    _fused(optimizer)
+    optimizer.register_state_dict_post_hook(_as_saved)
+    optimizer.register_load_state_dict_post_hook(_as_on_gpu)
+    _as_on_gpu(optimizer)
 
 
 def compile_networks(policy: PlaybyearPolicy) -> None:
@@ -466,28 +455,21 @@ def compile_networks(policy: PlaybyearPolicy) -> None:
         part.compile()
 
 
-def _contiguous(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+def _as_saved(optimizer: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
     def saved(values: Mapping[str, Any]) -> dict[str, Any]:
         return {key: value.contiguous() if isinstance(value, Tensor) else value for key, value in values.items()}
 
-    return {**state, "state": {number: saved(values) for number, values in state["state"].items()}}
+    fused = {"fused": None} if isinstance(optimizer, Adam) else {}
+    groups = [{**group, **fused} for group in state["param_groups"]]
+    return {**state, "state": {n: saved(values) for n, values in state["state"].items()}, "param_groups": groups}
 
 
-def _like_parameters(optimizer: Optimizer) -> None:
+def _as_on_gpu(optimizer: Optimizer) -> None:
     for parameter, values in optimizer.state.items():
         for key, value in values.items():
             if isinstance(value, Tensor) and value.dim() == _CONVOLUTION_DIMENSIONS:
                 values[key] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
-
-
-def _fused(optimizer: Optimizer) -> None:
-    for group in optimizer.param_groups:
+            elif key == "step" and isinstance(optimizer, Adam):
+                values[key] = value.to(parameter.device)
+    for group in optimizer.param_groups if isinstance(optimizer, Adam) else ():
         group["fused"] = True
-        for parameter in group["params"]:
-            state = optimizer.state.get(parameter, {})
-            if "step" in state:
-                state["step"] = state["step"].to(parameter.device)
-
-
-def _as_if_not_fused(_: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
-    return {**state, "param_groups": [{**group, "fused": None} for group in state["param_groups"]]}
