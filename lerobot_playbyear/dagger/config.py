@@ -135,14 +135,6 @@ class DaggerConfig:
             raise InputError("--steps is for --num_episodes=0; with episodes give --updates_per_episode.")
         if not self.is_online and not self.steps:
             raise InputError("--num_episodes=0 collects nothing: give --steps, how many updates to make.")
-        self._check_method()
-        if self.is_online and self.env is None:
-            raise InputError(
-                "No environment: give --env.type and --env.task, or --num_episodes=0 --steps=N to learn from recorded "
-                "corrections alone."
-            )
-
-    def _check_method(self) -> None:
         self.method.check()
         if not 0 <= (self.skip_s or 0) < math.inf:
             raise InputError(f"--skip_s={self.skip_s}: give 0 or more seconds.")
@@ -155,6 +147,11 @@ class DaggerConfig:
             raise InputError(
                 "--new_weights=true: a policy that knows nothing cannot be corrected. Collect attempts first, and then learn "
                 "from all of them with --num_episodes=0 --steps=N --new_weights=true and another --output_dir."
+            )
+        if self.is_online and self.env is None:
+            raise InputError(
+                "No environment: give --env.type and --env.task, or --num_episodes=0 --steps=N to learn from recorded "
+                "corrections alone."
             )
 
     def n_skipped(self, fps: float) -> int:

@@ -113,7 +113,9 @@ class GateModel:
             for each in played:
                 if each.is_visited and self._half[each.seed] == half:
                     continue
-                own = slice(_last_takeover(each.by_expert), None)
+                # Before the last takeover the expert made the outcome what it was.
+                begins = np.flatnonzero(each.by_expert[1:] & ~each.by_expert[:-1]) + 1
+                own = slice(int(begins[-1]) if len(begins) else 0, None)
                 seen.append(torch.cat([self._scaled(each.memories), each.actions.float()], dim=-1)[own])
                 ahead = torch.arange(len(each.memories) - 1, -1, -1)[own]
                 outcomes.append(each.success * _DISCOUNT ** ahead.float())
@@ -175,12 +177,6 @@ def _asked(trace: Trace, limits: Thresholds) -> np.ndarray:
     """Whether a robot would have asked, in the steps of which that can be told."""
     asks = np.logical_or.accumulate(limits.are_exceeded(trace.novelty, trace.risk) & trace.is_own)
     return asks[trace.is_own | asks]
-
-
-def _last_takeover(by_expert: np.ndarray) -> int:
-    """From which step on the outcome of an attempt tells of it: before the last takeover the expert made it what it was."""
-    begins = np.flatnonzero(by_expert[1:] & ~by_expert[:-1]) + 1
-    return int(begins[-1]) if len(begins) else 0
 
 
 def _fit(network: nn.Module, inputs: Tensor, targets: Tensor, loss_of: Callable[..., Tensor]) -> None:

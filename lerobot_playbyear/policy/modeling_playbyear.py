@@ -195,7 +195,13 @@ class PlaybyearPolicy(PreTrainedPolicy):
         Raises:
             ValueError: There is no sound in the observation.
         """
-        self._check_sound(batch)
+        missing = [key for key in self.config.audio_keys if key not in batch] if self.config.use_audio else []
+        if missing:
+            raise ValueError(
+                f"This policy hears, and there is no sound in the observation: {', '.join(missing)} is missing. "
+                "On a robot lerobot-rollout hears by --robot.cameras='{mic: {type: microphone, device: ...}}'. "
+                "lerobot.async_inference registers no packages, and carries no sound."
+            )
         if self.training:
             self.eval()
         network = self.model
@@ -209,15 +215,6 @@ class PlaybyearPolicy(PreTrainedPolicy):
                 self._encodings = torch.cat([self._encodings[:, 1:], encoding.unsqueeze(1)], dim=1)
             self.memory = network.memory_head.recall(self._encodings)[:, -1]  # (B, D)
             return self.act_from(self.memory)
-
-    def _check_sound(self, batch: dict[str, Tensor]) -> None:
-        missing = [key for key in self.config.audio_keys if key not in batch] if self.config.use_audio else []
-        if missing:
-            raise ValueError(
-                f"This policy hears, and there is no sound in the observation: {', '.join(missing)} is missing. "
-                "On a robot lerobot-rollout hears by --robot.cameras='{mic: {type: microphone, device: ...}}'. "
-                "lerobot.async_inference registers no packages, and carries no sound."
-            )
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:

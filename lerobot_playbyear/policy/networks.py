@@ -49,7 +49,7 @@ class PlaybyearNetwork(nn.Module):
             self.hearing = nn.ModuleDict()
             for name in map(_module_name, config.audio_keys):
                 self.hearing[name] = make_encoder("audio_encoder", config)
-                if not _hears_waveform(self.hearing[name]) or config.audio_envelope_gain:
+                if not getattr(self.hearing[name], "hears_waveform", False) or config.audio_envelope_gain:
                     self.spectrogram[name] = LogSpectrogram(*grid, config.spectrogram_momentum)
             self.disturb = SoundAugmentation(config)
             n_columns = config.n_segments if config.audio_envelope_gain else 0
@@ -131,7 +131,7 @@ class PlaybyearNetwork(nn.Module):
             # (B * n_stretches, bins, columns)
             levels = spectrogram(shared.stretches(wave), shared.stretches(begun), colour)
         n_columns = getattr(encoder, "window_columns", None)
-        if _hears_waveform(encoder):
+        if getattr(encoder, "hears_waveform", False):
             start = wave.shape[1] - config.window_samples - (n_frames - 1) * n_samples
             windows = (wave * begun)[:, start:].unfold(1, config.window_samples, n_samples)  # (B, n, samples)
             embeddings = encoder(windows.flatten(0, 1))
@@ -409,10 +409,6 @@ def before_episode(batch: dict[str, Tensor], n_frames: int) -> Tensor | None:
     """
     flags = [batch[name] for name in batch if name.startswith(OBS_PREFIX) and name.endswith("_is_pad")]
     return next((is_pad[:, -n_frames:] for is_pad in flags if is_pad.shape[1] >= n_frames), None)
-
-
-def _hears_waveform(encoder: nn.Module) -> bool:
-    return bool(getattr(encoder, "hears_waveform", False))
 
 
 def _module_name(key: str) -> str:

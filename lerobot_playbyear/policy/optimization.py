@@ -32,8 +32,10 @@ def training_dtype(asked: str | None, use_amp: bool, device: str) -> str | None:
     kind = torch.device(device).type
     if asked is None and use_amp:
         asked = "auto" if kind == "cuda" else str(torch.get_autocast_dtype(kind)).removeprefix("torch.")
+    if asked == "auto" and kind == "cuda":
+        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float16"
     if asked == "auto":
-        return _fastest(kind)
+        return "bfloat16" if kind == "cpu" and computes_bfloat16() else "float32"
     if asked is not None and not _computes(kind, asked):
         logging.warning(f"The device '{device}' cannot train in {asked}: --policy.dtype is float32 here.")
         return "float32"
@@ -53,12 +55,6 @@ def computes_512_bits() -> bool:
 def _has_any(*names: str) -> bool:
     capabilities: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()
     return any(capabilities.get(name, False) for name in names)
-
-
-def _fastest(kind: str) -> str:
-    if kind == "cuda":
-        return "bfloat16" if torch.cuda.is_bf16_supported(including_emulation=False) else "float16"
-    return "bfloat16" if kind == "cpu" and computes_bfloat16() else "float32"
 
 
 def _computes(kind: str, dtype: str) -> bool:

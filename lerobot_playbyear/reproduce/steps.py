@@ -18,7 +18,6 @@ import warnings
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 from filelock import FileLock
 
@@ -56,12 +55,6 @@ def prepare() -> None:
         EnvConfig.get_choice_class("playbyear")()  # imports MuJoCo and the tasks
 
 
-def done(step: Step) -> dict[str, Any] | None:
-    """What is noted of a step that is done: its `command` and `minutes`; None before."""
-    mark = _beside(step, "done.json")
-    return dict(parse_json(mark.read_bytes())) if mark.is_file() else None
-
-
 def carry_out(step: Step, threads: int = 1) -> float:
     """Runs a step's command, unless that was done; waits for another process that is at it.
 
@@ -78,15 +71,15 @@ def carry_out(step: Step, threads: int = 1) -> float:
     """
     step.folder.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(_beside(step, "lock"), poll_interval=0.5):
-        noted = done(step)
-        if noted is not None:
+        done, begun, log = (_beside(step, ending) for ending in ("done.json", "begun.json", "log"))
+        if done.is_file():
+            noted = parse_json(done.read_bytes())
             if _telling(noted["command"]) != _telling(step.shown):
                 raise InputError(
                     f"{step.folder} was made by another command than the plan's:\n  {noted['command']}\n  {step.shown}\n"
-                    f"Remove it and {_beside(step, 'done.json')}, or choose another --output_dir."
+                    f"Remove it and {done}, or choose another --output_dir."
                 )
             return float(noted["minutes"])
-        begun, log = _beside(step, "begun.json"), _beside(step, "log")
         spent = _minutes_before(begun, log)
         command = resumed(step)
         write_atomically(begun, json.dumps({"minutes": spent, "at": time.time()}))
@@ -97,9 +90,7 @@ def carry_out(step: Step, threads: int = 1) -> float:
             write_atomically(begun, json.dumps({"minutes": spent}))
             lines = log.read_text(errors="replace").replace("\r", "\n").splitlines()[-_LAST_LINES:]
             raise StepError(f"{step.shown}\nended with {status}; {log} ends with\n" + "\n".join(lines))
-        write_atomically(
-            _beside(step, "done.json"), json.dumps({"command": step.shown, "minutes": round(spent, 3)}, indent=1)
-        )
+        write_atomically(done, json.dumps({"command": step.shown, "minutes": round(spent, 3)}, indent=1))
         return spent
 
 
