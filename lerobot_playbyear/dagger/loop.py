@@ -113,8 +113,8 @@ class Loop:
                 "something else changed it. Begin a new run in another --output_dir; it may append to the same dataset."
             )
         figures, by_expert = self.corrections.last()
-        cost = self._cost(by_expert)
-        figures |= {"outcome": "kept", **cost, **self.method.recovered(cost), "recovered": True}
+        self.method.note_recovered()
+        figures |= {"outcome": "kept", **self._cost(by_expert), "recovered": True}
         state.fruitless.clear()
         self._count(figures)
         self.report.bar.update(1)
@@ -188,7 +188,7 @@ class Loop:
             "success": episode.success,
             "outcome": outcome,
         }
-        self._count(figures | self._cost(episode.interventions) | dict(self.method.figures()) | _rounded(spent))
+        self._count(figures | self._cost(episode.interventions) | _rounded(spent))
 
     def _count(self, figures: dict[str, Any]) -> None:
         """Makes an attempt count."""

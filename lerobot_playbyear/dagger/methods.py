@@ -4,9 +4,8 @@ A method of your own is a subclass of `Method` with what it does otherwise than 
 `--method.type`; its options are fields of a dataclass.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import draccus
 import gymnasium as gym
@@ -81,17 +80,8 @@ class Method(draccus.ChoiceRegistry):
     def note(self, episode: Episode, outcome: str) -> None:
         """An attempt was made, and saved if it is kept; it counts after this."""
 
-    def figures(self) -> Mapping[str, float]:
-        """Further figures of the last attempt."""
-        return {}
-
-    def recovered(self, cost: Mapping[str, Any]) -> Mapping[str, float]:
-        """The same of an attempt that was saved just before the run was killed, and counts after this.
-
-        Args:
-            cost: What `attempt_figures` says of it.
-        """
-        return {}
+    def note_recovered(self) -> None:
+        """The same of an attempt that was saved just before the run was killed, and counts after this."""
 
     def close(self) -> None:
         """No attempt follows."""

@@ -1,7 +1,6 @@
 """Robot-gated queries: the robot asks for help where it is new or risky to it (ThriftyDAgger, Hoque et al., 2021)."""
 
-import time
-from collections.abc import Container, Mapping
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -61,7 +60,6 @@ class RobotGated(Method):
     def __post_init__(self) -> None:
         self._others: Corrections | None = None
         self._fitted_round = -1
-        self._seconds = 0.0  # that the gate took to learn
 
     def wrap(self, expert: Expert) -> Expert:
         self.shows_failures = self.redo_failed and not expert.decides  # type: ignore[misc]
@@ -97,7 +95,7 @@ class RobotGated(Method):
         self._thresholds: Thresholds | None = None
         if self.is_alone or demonstrates:
             return
-        start, state = time.perf_counter(), self._state
+        state = self._state
         if state.method.get("round") != state.round:
             state.method |= {"round": state.round, "next_seed": state.next_seed}
             self._loop.folder.commit(state)
@@ -109,7 +107,6 @@ class RobotGated(Method):
                 self._traces[each.seed] = self._model.trace(each)
         latest = [self._traces[seed] for seed in sorted(self._traces)[-_N_LATEST:]]
         self._thresholds = thresholds_for(latest, self.intervention_share)
-        self._seconds = time.perf_counter() - start
 
     def _fit(self, before_seed: int) -> None:
         """Learns from all attempts with smaller seeds."""
@@ -137,17 +134,9 @@ class RobotGated(Method):
             if episode.seed not in _seeds(self._others.store):  # not saved before the run was killed
                 self._others.append(episode)
 
-    def figures(self) -> Mapping[str, Any]:
-        seconds, self._seconds = self._seconds, 0.0
-        return {"n_asked_steps": self._expert.n_asked, "n_calls": self._expert.n_calls, "gate_s": round(seconds, 4)}
-
-    def recovered(self, cost: Mapping[str, Any]) -> Mapping[str, Any]:
+    def note_recovered(self) -> None:
         if self._state.to_show is not None:
             self._shown.append(self._state.to_show)
-            return {"n_asked_steps": 0, "n_calls": 0}
-        if self._expert.decides:
-            return {}  # a person who is called may come or not: what was asked is lost
-        return {"n_asked_steps": cost["n_expert_steps"], "n_calls": cost["n_takeovers"]}
 
     # What the policy remembers at every frame
 
@@ -202,9 +191,6 @@ class Asked(Showing):
     Args:
         expert: The expert.
         method: Knows when the robot asks.
-
-    Attributes:
-        n_asked, n_calls: Steps of the attempt in which the robot asked, and how often it began to.
     """
 
     def __init__(self, expert: Expert, method: RobotGated) -> None:
@@ -214,15 +200,12 @@ class Asked(Showing):
     def reset(self, env: gym.Env) -> None:
         super().reset(env)
         self._asks = self._acts = False
-        self.n_asked = self.n_calls = 0
 
     def wants_control(self, observation: Observation, policy_action: np.ndarray) -> bool:
         if self.demonstrates:
             return super().wants_control(observation, policy_action)
         begins = not self._asks and self._method.asks(policy_action)
         self._asks |= begins
-        self.n_asked += self._asks
-        self.n_calls += begins
         if self.decides:
             self.expert.call(self._asks)
         wants = self.expert.wants_control(observation, policy_action)  # a script looks
