@@ -93,7 +93,7 @@ def test_the_dataset_is_a_plain_one_of_successes_with_corrections(finished):
     intervention, success = column(dataset, "intervention").ravel(), column(dataset, "next.success").ravel()
 
     assert dataset.num_episodes == 3
-    shares = [line["intervention_share"] for line in metrics(finished, "attempt") if line["outcome"] == "kept"]
+    shares = [1 - line["autonomy"] for line in metrics(finished, "attempt") if line["outcome"] == "kept"]
     for row, share in zip(dataset.meta.episodes, shares, strict=True):
         episode = slice(row["dataset_from_index"], row["dataset_to_index"])
         assert success[episode][-1]

@@ -120,7 +120,6 @@ class Corrections:
         figures = {
             "seed": int(self.store.column(SEED)[end - 1]),
             "n_frames": end - start,
-            "intervention_share": round(float(by_expert.mean()), 4),
             "success": bool(self.store.column(SUCCESS)[-1].any()) if SUCCESS in self.store.keys else True,
         }
         return figures, by_expert

@@ -184,7 +184,6 @@ class Loop:
         figures = {
             "seed": episode.seed,
             "n_frames": len(episode),
-            "intervention_share": round(episode.intervention_share, 4),
             "success": episode.success,
             "outcome": outcome,
         }

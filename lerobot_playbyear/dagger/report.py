@@ -103,7 +103,6 @@ class Totals:
         takeovers, switches: Of control.
         person_seconds: Of a person's time.
         autonomy: Share of the steps in which the policy acted; 1 without an attempt.
-        mean_takeover_steps: Steps of a takeover; 0 without one.
     """
 
     attempts: int
@@ -112,7 +111,6 @@ class Totals:
     switches: int
     person_seconds: float
     autonomy: float
-    mean_takeover_steps: float
 
     @classmethod
     def of(cls, lines: Iterable[Mapping[str, Any]]) -> "Totals":
@@ -127,7 +125,6 @@ class Totals:
             switches,
             person_seconds=round(seconds, 2),
             autonomy=1 - expert_steps / steps if steps else 1.0,
-            mean_takeover_steps=expert_steps / takeovers if takeovers else 0.0,
         )
 
 
@@ -141,5 +138,4 @@ def round_figures(lines: Sequence[Mapping[str, Any]], number: int) -> dict[str, 
     totals = Totals.of(lines)
     own = Totals.of(line for line in lines if line.get("round") == number - 1)
     spent = {name: getattr(totals, name) for name in ("expert_steps", "takeovers", "switches", "person_seconds")}
-    means = {"autonomy": round(own.autonomy, 4), "mean_takeover_steps": round(own.mean_takeover_steps, 2)}
-    return {**spent, **means}
+    return {**spent, "autonomy": round(own.autonomy, 4)}
