@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from huggingface_hub import ModelCard
     from lerobot.configs import PreTrainedConfig
     from lerobot.teleoperators.gamepad import GamepadTeleop
-    from lerobot.teleoperators.keyboard import KeyboardTeleop
     from lerobot.utils.logging_utils import MetricsTracker
     from torch import Tensor
 
@@ -140,11 +139,6 @@ def card_writer(policy: Any, config: "PreTrainedConfig") -> "Callable[..., Model
         return card
 
     return write
-
-
-def held_keys(teleop: "KeyboardTeleop") -> dict[Any, bool]:
-    """The keyboard's keys and whether each is down; the teleoperator's own, which can be changed."""
-    return teleop.current_pressed
 
 
 def has_gamepad(teleop: "GamepadTeleop") -> bool:

@@ -30,7 +30,6 @@ SAID = [
         "lerobot-train takes a dataset of another frame rate without a word",
     ),
     # Attributes of LeRobot's objects
-    ("teleoperators.keyboard:KeyboardTeleop", "self.current_pressed[", "held keys are forgotten at every step"),
     ("teleoperators.gamepad:GamepadTeleop", "self.gamepad = ", _PAD),
     ("teleoperators.gamepad.gamepad_utils:GamepadController", "self.running = False", _PAD),
 ]

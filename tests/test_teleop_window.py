@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import threading
-from importlib.util import find_spec
 
 import gymnasium as gym
 import numpy as np
@@ -166,9 +165,8 @@ def person_corrects(screen, process, log):
 
 @pytest.mark.slow
 @pytest.mark.timeout(500)
-def test_playbyear_dagger_learns_from_a_person_at_lerobots_keyboard(screen, tmp_path):
-    kind = "keyboard_ee" if find_spec("pynput") else "keyboard_window"
-    options = ("--expert.type=teleop", f"--expert.teleop.type={kind}", "--num_episodes=1", "--env.episode_length=2000")
+def test_playbyear_dagger_learns_from_a_person(screen, tmp_path):
+    options = ("--expert.type=teleop", "--num_episodes=1", "--env.episode_length=2000")
     program = "from lerobot_playbyear.scripts.commands import dagger; dagger()"
     command = [sys.executable, "-c", program, *arguments(tmp_path, *options)]
     log = tmp_path / "log.txt"
@@ -240,7 +238,6 @@ def test_a_key_is_let_go_when_the_window_loses_the_keyboard_and_the_window_tells
     wait_for(lambda: "space" in windows[0].keys._held)
     screen.focus(screen.window("second"))
     wait_for(lambda: "space" not in windows[0].keys._held)
-    assert not windows[0].keys.has_focus
     screen.let_go("space")
     screen.kill_window(screen.window("second"))
     wait_for(lambda: not windows[1].is_open)

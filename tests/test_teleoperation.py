@@ -14,7 +14,7 @@ from gymnasium.spaces import Box
 from lerobot.rollout.configs import DAggerKeyboardConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
 from lerobot.teleoperators.gamepad import GamepadTeleopConfig
-from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleopConfig, KeyboardTeleop, KeyboardTeleopConfig
+from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleopConfig, KeyboardTeleopConfig
 
 from lerobot_env_playbyear import PlaybyearEnvConfig
 from lerobot_playbyear.dagger.config import DaggerConfig
@@ -38,7 +38,6 @@ from lerobot_playbyear.teleoperation.controls import (
     STAY,
     TAKEN,
     ActionMapping,
-    Controls,
     KeyboardWindowTeleop,
     KeyboardWindowTeleopConfig,
     PersonLeftError,
@@ -176,24 +175,6 @@ def test_the_windows_keys_move_the_hand_as_they_say():
         keys.look()
         moved.append(tuple(teleop.get_action().values()))
     assert moved == [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (0, 1, 1)]
-
-
-class Listening(ScriptedTeleop, KeyboardTeleop):
-    """Hears the keyboard whichever window has it, as LeRobot's own does."""
-
-
-def test_what_is_typed_into_other_windows_moves_nothing():
-    pytest.importorskip("pynput", reason="LeRobot's keyboard needs pynput", exc_type=ImportError)
-    keys = WindowKeys()
-    on = {TeleopEvents.IS_INTERVENTION, TeleopEvents.SUCCESS}
-    teleop = Listening(ScriptedTeleopConfig(), [(1, 0, 0, CLOSE)], [on])
-    controls = Controls(teleop, keys)
-    wish = controls.read()
-    assert (wish.overrides, wish.verdict) == (False, None)
-    assert wish.action == {"delta_x": 0, "delta_y": 0, "delta_z": 0, "gripper": STAY}
-    keys.has_focus = True
-    wish = controls.read()
-    assert (wish.overrides, wish.verdict, wish.action["delta_x"]) == (True, Verdict.SUCCESS, 1)
 
 
 def test_the_keys_are_lerobots_and_the_page_and_the_panel_say_what_they_do():
@@ -433,7 +414,7 @@ def test_the_robot_calls_and_a_person_who_came_is_called_no_more(monkeypatch):
 def test_a_resumed_run_has_the_same_person(tmp_path):
     """What playbyear-dagger keeps of its options, and reads again with --resume=true."""
     source = DatasetPlace("test/none")
-    expert = TeleopExpertConfig(KeyboardEndEffectorTeleopConfig(use_gripper=False), speed=0.4)
+    expert = TeleopExpertConfig(GamepadTeleopConfig(use_gripper=False), speed=0.4)
     path = tmp_path / "dagger_config.json"
     path.write_text(json.dumps(DaggerConfig(source, source, env=PlaybyearEnvConfig(), expert=expert).options()))
     assert draccus.parse(DaggerConfig, config_path=path, args=[]).expert == expert
@@ -442,7 +423,7 @@ def test_a_resumed_run_has_the_same_person(tmp_path):
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (KeyboardEndEffectorTeleopConfig(), "pynput"),
+        (KeyboardEndEffectorTeleopConfig(), "give --expert.teleop.type=keyboard_window"),
         (GamepadTeleopConfig(), "gamepad"),
         (KeyboardTeleopConfig(), "keyboard_window"),
     ],

@@ -1,7 +1,6 @@
 #!/usr/bin/env bash
 # Installs what some tests need, where that is possible without asking: the browser that playbyear-inspect's page runs in; for
-# the window a virtual screen and a program that presses keys on it; and pynput, with which LeRobot's keyboard_ee hears them.
-# Without them those tests are skipped, without pynput one of them; so this never fails.
+# the window a virtual screen and a program that presses keys on it. Without them those tests are skipped; so this never fails.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 
@@ -24,12 +23,4 @@ install_for() {
 has chromium || has chromium-browser || has google-chrome || has google-chrome-stable \
   || install_for Chromium "the page" chromium
 { has Xvfb && has xdotool; } || install_for "Xvfb and xdotool" "the window" xvfb xdotool
-
-if ! .venv/bin/python -c 'import importlib.util as u, sys; sys.exit(u.find_spec("pynput") is None)'; then
-  echo "Installing pynput for the test of LeRobot's keyboard"
-  uv=$(command -v uv || echo .venv/bin/uv)
-  UV_LINK_MODE=${UV_LINK_MODE:-copy} VIRTUAL_ENV=$PWD/.venv timeout 300 "$uv" pip install --quiet \
-    --python .venv/bin/python --constraint constraints.txt pynput \
-    || echo "Without pynput the test of LeRobot's keyboard is skipped: it could not be installed (it needs a C compiler)"
-fi
 exit 0

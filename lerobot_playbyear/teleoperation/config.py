@@ -30,7 +30,7 @@ class TeleopExpertConfig(ExpertConfig):
 
     Args:
         teleop: LeRobot teleoperator that moves the arm: `keyboard_window` (the window's keys; nothing to install),
-            `keyboard_ee`, `gamepad`, or another registered one.
+            `gamepad`, or another registered one, but for `keyboard_ee`, which hears what is typed into other windows.
         speed: Size of a full displacement, as a share of the environment's largest.
         directions: Axes that move the hand along x, y and z, such as `-y,x,z`. None: those that fit the view of our tasks.
         gripper_cooldown_s: Least time between two changes of the gripper [s]. The paper's and our tasks' is 2.
@@ -102,6 +102,10 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoper
         ExpertError: Something is not installed or not plugged in; the message says what.
     """
     option = f"--expert.teleop.type={config.type}"
+    if config.type == "keyboard_ee":
+        raise ExpertError(
+            f"{option} hears what is typed into other windows: give --expert.teleop.type=keyboard_window."
+        )
     try:
         if isinstance(config, KeyboardWindowTeleopConfig):
             teleop: Teleoperator = KeyboardWindowTeleop(config, window.keys)
@@ -116,9 +120,6 @@ def connect_teleoperator(config: TeleoperatorConfig, window: Window) -> Teleoper
     has_pad = not isinstance(teleop, GamepadTeleop) or has_gamepad(teleop)
     if not teleop.is_connected or not has_pad:
         teleop.disconnect() if teleop.is_connected else None
-        hint = {
-            "gamepad": "no gamepad was found. Plug one in",
-            "keyboard_ee": "pynput hears keys on an X11 screen, Windows and macOS, not on Wayland or without a screen",
-        }.get(config.type, "it says that it is not connected. Plug it in")
-        raise ExpertError(f"{option}: {hint}, or take --expert.teleop.type=keyboard_window.")
+        hint = "no gamepad was found" if config.type == "gamepad" else "it says that it is not connected"
+        raise ExpertError(f"{option}: {hint}. Plug it in, or take --expert.teleop.type=keyboard_window.")
     return teleop

@@ -8,9 +8,7 @@ import gymnasium as gym
 import numpy as np
 from lerobot.lerobot_types import RobotAction
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, TeleopEvents
-from lerobot.teleoperators.keyboard import KeyboardEndEffectorTeleop, KeyboardTeleop
 
-from lerobot_playbyear.compat import held_keys
 from lerobot_playbyear.episodes.experts import ExpertError
 from lerobot_playbyear.episodes.play import Verdict
 from lerobot_playbyear.teleoperation.window import WindowKeys
@@ -60,8 +58,6 @@ _EVENTS = (
     (TeleopEvents.TERMINATE_EPISODE, Verdict.FAILURE),
 )
 """The first that is set says how the attempt ends: LeRobot sets 'terminate' beside the others."""
-
-_NO_MOVE = {**dict.fromkeys(DELTAS, 0.0), GRIPPER: STAY}
 
 
 class PersonLeftError(KeyboardInterrupt):
@@ -113,9 +109,7 @@ class Controls:
             return Wish(action={}, leaves=True)
         self._keys.look()
         action: Mapping[str, Any] = self._teleop.get_action()
-        events = _events_of(self._teleop)
-        if isinstance(self._teleop, KeyboardTeleop) and not self._keys.has_focus:
-            events, action = {}, _NO_MOVE  # it hears what is typed into other windows, too
+        events = dict(self._teleop.get_teleop_events()) if hasattr(self._teleop, "get_teleop_events") else {}
         began = {event for event, is_on in events.items() if is_on and not self._events.get(event, False)}
         self._events = events
         pressed = self._keys.pressed
@@ -130,20 +124,6 @@ class Controls:
             verdict=verdict or next((verdict for event, verdict in _EVENTS if event in began), None),
             leaves=LEAVE in pressed,
         )
-
-
-def _events_of(teleop: Teleoperator) -> dict[TeleopEvents, bool]:
-    if not hasattr(teleop, "get_teleop_events"):
-        return {}
-    if not isinstance(teleop, KeyboardEndEffectorTeleop):
-        return dict(teleop.get_teleop_events())
-    # LeRobot's keyboard forgets held keys when it is asked for events, until the screen repeats them half a second later.
-    # Released ones stay forgotten: it would let them cancel the opposite direction.
-    keys = held_keys(teleop)
-    held = {key: True for key, is_pressed in keys.items() if is_pressed}
-    events = dict(teleop.get_teleop_events())
-    keys.update(held)
-    return events
 
 
 @TeleoperatorConfig.register_subclass("keyboard_window")
@@ -225,7 +205,7 @@ class ActionMapping:
         if n != len(self._names) and not (self.moves_hand and n in (3, 4)):
             raise ExpertError(
                 f"The teleoperator gives {', '.join(self._names) or 'nothing'}, and the environment's action is {n} numbers. "
-                "Give a teleoperator of the end effector (--expert.teleop.type=keyboard_window, keyboard_ee, gamepad) for "
+                "Give a teleoperator of the end effector (--expert.teleop.type=keyboard_window, gamepad) for "
                 "actions dx, dy, dz and gripper, or one with as many numbers as the action has."
             )
         self._axes, self._signs = _parse(directions)

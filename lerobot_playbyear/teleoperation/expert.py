@@ -20,12 +20,11 @@ from lerobot_playbyear.teleoperation.window import Window
 if TYPE_CHECKING:
     from lerobot_playbyear.teleoperation.config import TeleopExpertConfig
 
-_DIRECTIONS = {"keyboard_ee": "-x,-y,z", "gamepad": "-y,x,z"}
+_DIRECTIONS = {"gamepad": "-y,x,z"}
 """For the view of our tasks (right on the screen is x, away is y), per type of teleoperator; others have `x,y,z`."""
 
 _MOVING_KEYS = {
     "keyboard_window": [(name, KEYS[name]) for name in ("Arrows", "E, D")],
-    "keyboard_ee": [("Arrows", KEYS["Arrows"]), ("Shift", "left: down, right: up")],
     "gamepad": [("Sticks", "left: plane, right: height"), ("RB", "hold to take over")],
 }
 

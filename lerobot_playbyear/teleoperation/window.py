@@ -39,7 +39,6 @@ class WindowKeys:
     Attributes:
         held: Keys that were held at the last look, or tapped before it.
         pressed: Keys that were pressed before the last look, in their order.
-        has_focus: Whether the window hears keys.
     """
 
     def __init__(self) -> None:
@@ -48,7 +47,6 @@ class WindowKeys:
         self._pressed_since: list[str] = []
         self.held: frozenset[str] = frozenset()
         self.pressed: tuple[str, ...] = ()
-        self.has_focus = False
 
     def look(self) -> None:
         """Take in what happened since the last time."""
@@ -141,11 +139,7 @@ class Window:
     def _listen(self) -> None:
         with contextlib.suppress(EOFError, OSError):
             while True:
-                key, is_pressed = self._connection.recv()
-                if key:
-                    self.keys.note(key, is_pressed)
-                else:
-                    self.keys.has_focus = is_pressed
+                self.keys.note(*self._connection.recv())
         if self.is_open:
             logging.info("The window was closed.")
         self.is_open = False
@@ -160,7 +154,7 @@ def show_window(title: str, connection: Connection) -> None:
     Args:
         title: Of the window.
         connection: Statuses and pictures come through it. It sends why no window can be opened, or "", and then keys with
-            whether they are down, and "" with whether the window has the focus.
+            whether they are down.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the control loop handles Ctrl-C and closes the window
     try:
@@ -192,12 +186,10 @@ def _run(glfw: Any, screen: "Screen", connection: Connection) -> None:
             connection.send((name, action == glfw.PRESS))
 
     glfw.set_key_callback(screen.window, on_key)
-    glfw.set_window_focus_callback(screen.window, lambda window, has: connection.send(("", bool(has))))
     glfw.set_window_refresh_callback(screen.window, lambda window: screen.redraw())
     status, arrived = Status(), time.monotonic()
     screen.show(draw(status))
     connection.send("")
-    connection.send(("", bool(glfw.get_window_attrib(screen.window, glfw.FOCUSED))))
     while not glfw.window_should_close(screen.window):
         if connection.poll():
             (status, picture), arrived = connection.recv(), time.monotonic()
