@@ -85,7 +85,8 @@ class BalancedBatches:
         is_shown = ~shown[_IS_PAD]  # (B/2, K)
         frames = (last.unsqueeze(1) + torch.tensor(self._windows.action_deltas)).clamp(min=0)  # (B/2, K)
         by_expert = self._learned[frames].to(is_shown.device) & ~corrections[_IS_PAD]
-        n, generator = int(min(is_shown.sum(), by_expert.sum())), self._generator(number)
+        seed = np.random.SeedSequence([self._seed + 2, number]).generate_state(1, np.uint64)[0]
+        n, generator = int(min(is_shown.sum(), by_expert.sum())), torch.Generator().manual_seed(int(seed))
         shown[_IS_PAD] = ~_kept(is_shown, n, generator)
         corrections[_IS_PAD] = ~_kept(by_expert, n, generator)
         return shown, corrections
@@ -93,10 +94,6 @@ class BalancedBatches:
     def is_learned(self, attempts: EpisodeStore) -> Tensor:
         """Which frames of attempts are learned from, (N,) bool."""
         return frames_learned_from(attempts, self._n_skipped)
-
-    def _generator(self, number: int) -> torch.Generator:
-        seed = np.random.SeedSequence([self._seed + 2, number]).generate_state(1, np.uint64)[0]
-        return torch.Generator().manual_seed(int(seed))
 
 
 class JoinedBatches(BalancedBatches):

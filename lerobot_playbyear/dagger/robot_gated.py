@@ -68,6 +68,8 @@ class RobotGated(Method):
 
     def begin(self, loop: "Loop") -> None:
         self._loop, self._state = loop, loop.state
+        self._policy: Any = loop.learner.unwrapped
+        self._shown: list[int] = loop.state.method.setdefault("shown_seeds", [])
         own = loop.cfg.interventions
         source = replace(own, repo_id=f"{own.repo_id}_{ATTEMPTS}", root=str(loop.folder.path / ATTEMPTS))
         self._others = loop.corrections.another(source)
@@ -80,11 +82,6 @@ class RobotGated(Method):
     def is_alone(self) -> bool:
         state = self._state
         return state.to_show is None and state.attempts - state.discarded - len(self._shown) < self.rollouts
-
-    @property
-    def _shown(self) -> list[int]:
-        shown: list[int] = self._state.method.setdefault("shown_seeds", [])
-        return shown
 
     def prepare(self, demonstrates: bool) -> None:
         """Learns what is new and what is risky to the policy of this round, from what there was when the round began.
@@ -139,10 +136,6 @@ class RobotGated(Method):
             self._shown.append(self._state.to_show)
 
     # What the policy remembers at every frame
-
-    @property
-    def _policy(self) -> Any:
-        return self._loop.learner.unwrapped
 
     def _attempts(self, seeds: Container[int]) -> list[Played]:
         """The attempts with these seeds, in their order, which is that of time.

@@ -57,8 +57,6 @@ def run_dagger(cfg: DaggerConfig) -> Path:
             stack.enter_context(folder.locked())
             state = _begin_or_go_on(cfg, folder, folder.claim(cfg.resume))
             loop = _make_loop(cfg, folder, state, stack)
-        if cfg.is_online:
-            print("Unlike in lerobot-rollout, attempts are not uploaded; playbyear-push does it.")
         loop.run()
     _print_results(cfg, folder, state, loop)
     if cfg.policy is not None and cfg.policy.push_to_hub and state.checkpoint is not None:
@@ -233,10 +231,6 @@ def _print_what_is_learned(cfg: DaggerConfig, loop: Loop) -> None:
     if int(is_learned.sum()) < int(by_expert.sum()):
         skipped_s = cfg.n_skipped(store.fps) / store.fps
         text += f"; the first {skipped_s:g} s of every correction are left out (--skip_s)"
-    spans = [slice(start, end) for start, end in zip(store.starts, store.ends, strict=True)]
-    n_without = sum(bool(by_expert[span].any() and not is_learned[span].any()) for span in spans)
-    if n_without:
-        text += f", and with that all of {n_without} of {len(spans)} attempts, whose corrections are shorter"
     print(f"Corrections: {text}")
 
 

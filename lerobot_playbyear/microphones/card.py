@@ -84,11 +84,6 @@ class CardClock:
             self._offsets.pop()
         self._offsets.append((n_written, offset))
 
-    @property
-    def is_set(self) -> bool:
-        """Whether a chunk has come."""
-        return bool(self._offsets)
-
     def written_at(self, time_s: float) -> float:
         """How many samples had come at a time, or will have [s of time.perf_counter]; a fraction between two."""
         return (time_s - self._start) * self._rate
@@ -148,7 +143,7 @@ class CardRecording:
         have the length that they have in time. Fewer only where chunks are later than that.
         """
         with self._changed:
-            if not self._clock.is_set:
+            if self.written == 0:
                 return 0
             waits = sorted(wait for _, wait in self._bursts)
             usual = waits[int(_USUAL * len(waits))] if waits else 0.0
@@ -158,7 +153,7 @@ class CardRecording:
     def _note_burst(self, came_s: float) -> None:
         """A chunk came; the first one of a burst tells how long samples wait."""
         is_first, self._came_s = came_s - self._came_s > CHUNK_S / 2, came_s
-        if is_first and self._clock.is_set:
+        if is_first and self.written > 0:
             self._bursts.append((came_s, (self._clock.written_at(came_s) - self.written) / self._rate))
         while self._bursts and self._bursts[0][0] < came_s - 1:
             self._bursts.popleft()

@@ -199,9 +199,8 @@ class PortAudioMicrophone(Microphone):
                 stream.close(ignore_errors=True)
 
     def _take(self, chunk: np.ndarray, n: int, when: Any, status: Any) -> None:
-        now = time.perf_counter()
         # PortAudio's own times are estimates that may be too early, and on ALSA they may stand at 0.
-        self._heard(chunk[:, : self.channels], now)
+        self._heard(chunk[:, : self.channels], time.perf_counter())
 
     def _finished(self) -> None:
         if self.is_connected:

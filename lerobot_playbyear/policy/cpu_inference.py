@@ -5,7 +5,7 @@ Attached from outside, after the network was made: the same function, the same n
 """
 
 import copy
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -58,7 +58,10 @@ class FoldedVisionEncoder(VisionEncoder):
         """(N, 3 * n_stacked, size, size) in [0, 1] -> (N, embedding_size)."""
         if self._can_act() and not torch.is_grad_enabled():
             return self._folded.look(self.network, self.normalize(stacks))
-        with _precise_if_single_pixels(stacks):
+        # Of a single pixel, oneDNN's bfloat16 gradient of a convolution with stride 2 is random, and is written beyond its
+        # memory (torch 2.11).
+        is_pixel = stacks.device.type == "cpu" and max(stacks.shape[-2:]) <= _SINGLE_PIXELS
+        with torch.autocast("cpu", enabled=False) if is_pixel else nullcontext():
             return super().forward(stacks)
 
     def normalize(self, stacks: Tensor) -> Tensor:
@@ -87,14 +90,6 @@ class FoldedVisionEncoder(VisionEncoder):
 
     def _can_act(self) -> bool:
         return not self.training and self.mean.dtype == torch.float32
-
-
-def _precise_if_single_pixels(stacks: Tensor) -> AbstractContextManager:
-    """Without autocast on a CPU: of a single pixel, oneDNN's bfloat16 gradient of a convolution with stride 2 is random, and is
-    written beyond its memory (torch 2.11)."""
-    if stacks.device.type == "cpu" and max(stacks.shape[-2:]) <= _SINGLE_PIXELS:
-        return torch.autocast("cpu", enabled=False)
-    return nullcontext()
 
 
 def fold_batch_norm(network: ResNet) -> ResNet:

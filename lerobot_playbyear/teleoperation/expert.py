@@ -107,7 +107,9 @@ class TeleopExpert(Expert):
         self.mapping = ActionMapping(teleop.action_features, env.action_space, directions, options.speed)
         self.gripper = Gripper(round(options.gripper_cooldown_s * env_fps))
         self.pace = Pace(self.clock_fps)
-        n_samples, reason = _samples_of_a_step(env), ""
+        assert isinstance(env.observation_space, gym.spaces.Dict)
+        blocks = microphone_blocks(env.observation_space.sample())
+        n_samples, reason = len(next(iter(blocks.values()), ())), ""  # of the first microphone in a step
         if not options.play_sound:
             reason = "--expert.play_sound=false"
         elif self.clock_fps != env_fps:
@@ -237,9 +239,3 @@ class TeleopExpert(Expert):
             status.cooldown_s = round(self.gripper.blocked_steps / self.pace.fps, 2)
         status.sound = self.speaker.problem
         self.window.show(status, picture)
-
-
-def _samples_of_a_step(env: gym.Env) -> int:
-    """How many samples the first microphone of an environment gives in a step; 0 without one."""
-    assert isinstance(env.observation_space, gym.spaces.Dict)
-    return len(next(iter(microphone_blocks(env.observation_space.sample()).values()), ()))

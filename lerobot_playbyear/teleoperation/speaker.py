@@ -19,10 +19,9 @@ _MOST_BLOCKS = 6  # more than this is too late to be played
 
 
 def microphone_blocks(observation: Observation) -> dict[str, np.ndarray]:
-    """The samples (S,) of each microphone in a raw observation, floats of full scale 1, by the microphone's name."""
-    blocks = {key.removeprefix(_AUDIO): np.asarray(v) for key, v in observation.items() if key.startswith(_AUDIO)}
-    is_pcm = {name: np.issubdtype(block.dtype, np.integer) for name, block in blocks.items()}
-    return {name: block.astype(np.float32) / (_FULL_SCALE if is_pcm[name] else 1) for name, block in blocks.items()}
+    """The samples (S,) of each microphone in a raw observation, int16 there, as floats of full scale 1, by its name."""
+    blocks = {key.removeprefix(_AUDIO): value for key, value in observation.items() if key.startswith(_AUDIO)}
+    return {name: np.asarray(block, np.float32) / _FULL_SCALE for name, block in blocks.items()}
 
 
 def level_db(block: np.ndarray) -> float:
