@@ -61,11 +61,10 @@ def finish_journal(root: Path) -> None:
         remedy = f"If nothing is being recorded there, delete it and run `{repair_command(root)}`"
         raise _error(journal, "is not an ordinary file", remedy)
     for name in names:
-        target = root / name
-        made = make_folders(target.parent)
-        os.replace(root / STAGING / name, target)
-        for folder in {target.parent, *made}:
-            flush(folder)
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        os.replace(root / STAGING / name, root / name)
+        for folder in name.parents:  # any of them may be new
+            flush(root / folder)
     journal.unlink()
     flush(journal.parent)
     shutil.rmtree(root / STAGING, ignore_errors=True)  # only folders are left in it
@@ -120,13 +119,6 @@ def check_scratch(root: Path) -> None:
     for name in (SCRATCH, STAGING):
         if (root / name).is_symlink():
             raise _error(root / name, f"is a link to {os.readlink(root / name)}; wanted a folder", "Remove it")
-
-
-def make_folders(folder: Path) -> list[Path]:
-    """Makes a folder and its parents where they are missing. Returns the folders that got a new entry."""
-    missing = [path for path in (folder, *folder.parents) if not path.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    return [path.parent for path in missing]
 
 
 def _staged_files(root: Path) -> list[Path]:

@@ -7,7 +7,6 @@ and every page carries a checksum, so that a flipped bit is found instead of hea
 
 import contextlib
 import os
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -29,8 +28,7 @@ PIECE_BYTES = 2**26
 
 _BUFFER_BYTES = 2**20
 _COLUMN_BYTES, _OBJECT_BYTES = 4, 20  # of a number, in a column and as Python has it, about
-_IMPOSSIBLE_BYTES = 2**40  # more memory than any part of a file takes
-_PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
+_PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, OverflowError)
 
 
 @contextlib.contextmanager
@@ -47,13 +45,11 @@ def parsing(path: Path | None = None) -> Iterator[None]:
     """
     try:
         yield
+    except (ParquetDamageError, MemoryError):
+        raise
     except _PARSE_ERRORS as error:
-        if isinstance(error, ParquetDamageError):
-            raise
         if isinstance(error, OSError) and error.errno:  # pyarrow sets it where the system refused
             raise OSError(error.errno, os.strerror(error.errno), error.filename or (path and str(path))) from error
-        if isinstance(error, MemoryError) and not _asks_for_the_impossible(error):
-            raise
         raise ParquetDamageError(first_line(error)) from error
 
 
@@ -111,7 +107,6 @@ class DataFile:
         footer: Its footer, or what is taken for it.
         schema: Of its columns.
         n_rows: All its rows.
-        is_rescued: Whether it has lost its own footer.
 
     Raises:
         ParquetDamageError: It is not a complete parquet file.
@@ -121,7 +116,6 @@ class DataFile:
     def __init__(self, path: Path, footer: pq.FileMetaData | None = None) -> None:
         with open_checked(path, footer) as file:
             self.path, self.footer, self.schema = path, file.metadata, file.schema_arrow
-        self.is_rescued = footer is not None
         sizes = [self.footer.row_group(group).num_rows for group in range(self.footer.num_row_groups)]
         self._edges = [0, *np.cumsum(sizes, dtype=int).tolist()]
         self.n_rows = self._edges[-1]
@@ -326,9 +320,3 @@ def _flat(chunk: pa.Array) -> np.ndarray:
     if chunk.null_count:
         raise ValueError(f"{chunk.null_count} values are missing")
     return chunk.to_numpy(zero_copy_only=False)
-
-
-def _asks_for_the_impossible(error: MemoryError) -> bool:
-    """Whether more memory was asked for than there can be: a size in the file was misread."""
-    asked = re.search(r"alloc of size (\d+) failed", str(error))
-    return asked is not None and int(asked[1]) > _IMPOSSIBLE_BYTES

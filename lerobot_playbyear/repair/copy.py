@@ -93,12 +93,6 @@ class _Kept(NamedTuple):
     number: int
     first_index: int
 
-    @property
-    def stays(self) -> bool:
-        """Whether no number in its frames changes."""
-        own = (self.frames.episode, self.frames.first_index)
-        return self.frames.is_numbered and own == (self.number, self.first_index)
-
     def numbers(self) -> dict[str, np.ndarray]:
         """The columns of its frames that change, (n,)."""
         index = np.arange(self.first_index, self.first_index + self.frames.length)
@@ -113,23 +107,17 @@ class _Kept(NamedTuple):
 
 
 def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
-    """Writes the frames, file by file, each as it is where nothing in it changes. Returns the episodes' rows."""
+    """Writes the frames, file by file. Returns the episodes' rows."""
     by_file: dict[Path, list[_Kept]] = defaultdict(list)
     first_index = 0
     for number, episode in enumerate(survey.whole):
         assert episode.frames is not None
         by_file[episode.frames.file.path].append(_Kept(episode, episode.frames, number, first_index))
         first_index += episode.frames.length
-    for place, (path, kept) in enumerate(by_file.items()):
+    for place, kept in enumerate(by_file.values()):
         chunk, number = divmod(place, survey.info["chunks_size"])
         name = target / DEFAULT_DATA_PATH.format(chunk_index=chunk, file_index=number)
-        file = kept[0].frames.file
-        is_whole = not file.is_rescued and sum(one.frames.length for one in kept) == file.n_rows
-        if is_whole and all(one.stays for one in kept):
-            name.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(path, name)
-        else:
-            write_tables(name, (one.table() for one in kept), file.schema)
+        write_tables(name, (one.table() for one in kept), kept[0].frames.file.schema)
         for one in kept:
             places = {
                 "episode_index": one.number,
@@ -151,7 +139,7 @@ def _row(survey: Survey, kept: _Kept) -> dict[str, Any]:
         texts = [survey.tasks.get(task, unknown_task(task)) for task in kept.frames.tasks]
         stats = stats_columns(_episode_stats(survey, kept.episode, kept.table()))
         return {"tasks": texts, "length": kept.frames.length, **stats, **places}
-    moved = {} if kept.stays else stats_columns(numeric_stats(kept.numbers(), survey.info["features"]))
+    moved = stats_columns(numeric_stats(kept.numbers(), survey.info["features"]))
     return {**row, **{name: value for name, value in moved.items() if name in row}, **places}
 
 
