@@ -97,15 +97,17 @@ class Episode:
     Args:
         number: Its number.
         frames: Where all of it is there.
-        row: Its row in `meta/episodes`, where that is right.
+        row: Its row in `meta/episodes`; empty where it has none.
+        contradiction: What that says and the frames and films do not, if anything.
         places: Of each camera with films, where its pictures are.
         reason: Why not all of it is there.
     """
 
     number: int
     frames: Frames | None = None
-    row: Mapping[str, Any] | None = None
-    places: Mapping[str, Place] = field(default_factory=dict)
+    row: Mapping[str, Any] = field(default_factory=dict)
+    contradiction: str | None = None
+    places: dict[str, Place] = field(default_factory=dict)
     reason: str = ""
 
 
@@ -178,9 +180,9 @@ def survey(root: str | Path, thorough: bool = True, rescue: Rescue | None = None
         for frames in _read_frames(root, file, info, thorough, findings)
     ]
     rows = _read_rows(root, sum(frames.length for frames in found), findings)
-    episodes = _find_films(root, info, _match(root, found, rows, info), rows, thorough)
-    tasks = _read_tasks(root, episodes, rows, findings)
-    findings += _judge_episodes(root, info, episodes, rows)
+    episodes = _find_films(root, info, _match(root, found, rows, info), thorough)
+    tasks = _read_tasks(root, episodes, findings)
+    findings += _judge_episodes(info, episodes)
     findings += _judge_counts(root, info, episodes, found)
     return Survey(root, info, schema, episodes, tasks, findings)
 
@@ -346,20 +348,16 @@ def _read_rows(root: Path, n_frames: int, findings: list[Finding]) -> dict[int, 
 
 
 def _match(root: Path, found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
-    """Finds each episode's frames, and where its row says that its pictures are."""
+    """Finds each episode's frames."""
     frames_of: dict[int, list[Frames]] = defaultdict(list)
     for frames in found:
         frames_of[frames.episode].append(frames)
-    films = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
     episodes = []
     for number in sorted({*frames_of, *rows}):
-        said = {key: place_in_row(rows.get(number, {}), key) for key in films}
-        places = {key: place for key, place in said.items() if place is not None}
         row = rows.get(number, {})
-        own = sorted(
-            frames_of[number], key=lambda frames: str(frames.file.path.relative_to(root)) != data_path(info, row)
-        )
-        episodes.append(replace(_choose(number, own, row), places=places))
+        name = data_path(info, row)
+        own = sorted(frames_of[number], key=lambda frames: str(frames.file.path.relative_to(root)) != name)
+        episodes.append(replace(_choose(number, own, row), row=row))
     return episodes
 
 
@@ -382,31 +380,27 @@ def _choose(number: int, found: Sequence[Frames], row: Mapping[str, Any]) -> Epi
     return Episode(number, reason=reason)
 
 
-def _find_films(root: Path, info: Info, episodes: list[Episode], rows: Rows, thorough: bool) -> list[Episode]:
+def _find_films(root: Path, info: Info, episodes: list[Episode], thorough: bool) -> list[Episode]:
     """Finds each episode's pictures in films. An episode without them is lost."""
     for key, feature in info["features"].items():
         if feature["dtype"] == "video":
             lengths = [episode.frames.length if episode.frames else None for episode in episodes]
-            said = [episode.places.get(key) for episode in episodes]
-            places = find_places(root, info, key, lengths, said, thorough)
-            for i, place in enumerate(places):
+            said = [place_in_row(episode.row, key) for episode in episodes]
+            for i, place in enumerate(find_places(root, info, key, lengths, said, thorough)):
                 if isinstance(place, str):
                     reason = f"its pictures of '{key}' are lost: {place}"
                     episodes[i] = replace(episodes[i], frames=None, reason=reason)
                 elif place is not None:
-                    episodes[i] = replace(episodes[i], places={**episodes[i].places, key: place})
+                    episodes[i].places[key] = place
     for i, episode in enumerate(episodes):
-        row = rows.get(episode.number)
-        if episode.frames and row and not _contradiction(root, info, row, episode):
-            episodes[i] = replace(episode, row=row)
+        if episode.frames and episode.row:
+            episodes[i] = replace(episode, contradiction=_contradiction(root, info, episode, episode.frames))
     return episodes
 
 
-def _contradiction(root: Path, info: Info, row: Mapping[str, Any], episode: Episode) -> str | None:
+def _contradiction(root: Path, info: Info, episode: Episode, frames: Frames) -> str | None:
     """What an episode's row says that its frames and films do not."""
-    frames = episode.frames
-    assert frames is not None
-    end = frames.first_index + frames.length
+    row, end = episode.row, frames.first_index + frames.length
     said = {"length": frames.length, "dataset_from_index": frames.first_index, "dataset_to_index": end}
     for key, place in episode.places.items():
         said |= place.columns(key)
@@ -438,19 +432,19 @@ def data_path(info: Info, row: Mapping[str, Any]) -> str | None:
         return None
 
 
-def _judge_episodes(root: Path, info: Info, episodes: Sequence[Episode], rows: Rows) -> Iterator[Finding]:
+def _judge_episodes(info: Info, episodes: Sequence[Episode]) -> Iterator[Finding]:
     lost: dict[str, list[int]] = defaultdict(list)
     for episode in episodes:
         if not episode.frames:
             lost[episode.reason].append(episode.number)
-        elif episode.row is None and (row := rows.get(episode.number)):
-            said = f"the row of episode {episode.number} in {EPISODES_DIR} is wrong: {_contradiction(root, info, row, episode)}"
+        elif episode.contradiction:
+            said = f"the row of episode {episode.number} in {EPISODES_DIR} is wrong: {episode.contradiction}"
             yield _wrong("rows", said, [episode.number])
     for reason, numbers in lost.items():
         yield _wrong("rows", f"{name_episodes(numbers)}: {reason}", numbers)
-    whole = [(episode.number, episode.frames) for episode in episodes if episode.frames]
-    if without := [number for number, _ in whole if number not in rows]:
+    if without := [episode.number for episode in episodes if episode.frames and not episode.row]:
         yield _wrong("rows", f"the rows of {name_episodes(without)} in {EPISODES_DIR} are lost", without)
+    whole = [(episode.number, episode.frames) for episode in episodes if episode.frames]
     if mixed := [number for number, frames in whole if not frames.is_numbered]:
         yield _wrong("rows", f"{name_episodes(mixed)}: frames are not numbered one after the other in 'index'", mixed)
     if untimely := [number for number, frames in whole if not frames.is_timely]:
@@ -491,19 +485,19 @@ def _judge_counts(root: Path, info: Info, episodes: Sequence[Episode], found: Se
         yield _wrong("statistics", f"{STATS_PATH} cannot be read: {error}")
 
 
-def _read_tasks(root: Path, episodes: Sequence[Episode], rows: Rows, findings: list[Finding]) -> dict[int, str]:
+def _read_tasks(root: Path, episodes: Sequence[Episode], findings: list[Finding]) -> dict[int, str]:
     """The text of each task. Where the table lacks one, what all episodes of only this task say in their rows."""
-    frames_of = {episode.number: episode.frames for episode in episodes if episode.frames}
+    whole = [(episode, episode.frames) for episode in episodes if episode.frames]
     said: dict[int, dict[str, list[int]]] = defaultdict(lambda: defaultdict(list))
-    for number, frames in frames_of.items():
-        texts = rows.get(number, {}).get("tasks")
+    for episode, frames in whole:
+        texts = episode.row.get("tasks")
         if isinstance(texts, list) and len(texts) == len(frames.tasks) == 1:
-            said[frames.tasks[0]][str(texts[0])].append(number)
-    wanted = sorted({task for frames in frames_of.values() for task in frames.tasks})
+            said[frames.tasks[0]][str(texts[0])].append(episode.number)
+    wanted = sorted({task for _, frames in whole for task in frames.tasks})
     known, problem = _tasks_in_table(root)
     if problem and wanted:
         findings.append(_wrong("tasks", f"{TASKS_PATH} {problem}; its texts are those that the episodes' rows say"))
-        n_frames = sum(frames.length for frames in frames_of.values())
+        n_frames = sum(frames.length for _, frames in whole)
         texts = {task: next(iter(said[task])) if len(said[task]) == 1 else unknown_task(task) for task in wanted}
         known = {task: text for task, text in texts.items() if task < n_frames}
     if nameless := sorted(set(wanted) - set(known)):

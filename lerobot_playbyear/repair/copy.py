@@ -135,7 +135,7 @@ def _row(survey: Survey, kept: _Kept) -> dict[str, Any]:
     """An episode's row: its own, with the statistics of its new numbers, or one that is made again."""
     places = {name: value for key, own in kept.episode.places.items() for name, value in own.columns(key).items()}
     row = kept.episode.row
-    if row is None:
+    if not row or kept.episode.contradiction:
         texts = [survey.tasks.get(task, unknown_task(task)) for task in kept.frames.tasks]
         stats = stats_columns(_episode_stats(survey, kept.episode, kept.table()))
         return {"tasks": texts, "length": kept.frames.length, **stats, **places}
