@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import PIL.Image
 from lerobot.configs import RGBEncoderConfig, infer_depth_unit, rgb_encoder_defaults
 from lerobot.datasets import CODEBASE_VERSION
 from lerobot.datasets.feature_utils import create_empty_dataset_info
@@ -26,7 +25,6 @@ from lerobot.datasets.image_writer import image_array_to_pil_image
 from lerobot.datasets.io_utils import load_info
 from lerobot.datasets.utils import DatasetInfo
 from lerobot.utils.constants import DEFAULT_FEATURES
-from torch import Tensor
 
 from lerobot_playbyear.datasets.episode_files import stage_episode
 from lerobot_playbyear.datasets.errors import DatasetWriteError, InputError
@@ -154,11 +152,9 @@ class DurableWriter:
             raise DatasetWriteError(
                 f"Episode {self.num_episodes} is not saved yet: call save_episode again, or discard_episode."
             )
-        values = {key: _as_array(value) for key, value in frame.items()}
-        check_frame(values, self._info.features)
+        check_frame(frame, self._info.features)
         self._check_memory()
-        kept = {key: self._kept(key, value) for key, value in values.items()}
-        self._frames.append(kept)
+        self._frames.append({key: self._kept(key, value) for key, value in frame.items()})
         if len(self._frames) > _UNCOMPRESSED:
             self._finish_frame(self._frames[-1 - _UNCOMPRESSED])
 
@@ -216,7 +212,7 @@ class DurableWriter:
             return value.copy() if isinstance(value, np.ndarray) else value
         try:
             picture = image_array_to_pil_image(value).copy()
-        except (ValueError, NotImplementedError, TypeError) as error:
+        except (ValueError, NotImplementedError, TypeError, AttributeError) as error:
             raise InputError(f"'{key}': {error}") from error
         if is_depth(feature):
             feature["info"].setdefault("depth_unit", infer_depth_unit(value.dtype))
@@ -322,6 +318,7 @@ def check_undamaged(root: Path) -> None:
 
     Raises:
         DatasetDamagedError: It is damaged; with what is wrong, and the command that repairs it.
+        InputError: A whole part of it is missing.
         DatasetWriteError: It cannot be read.
     """
     try:
@@ -329,10 +326,7 @@ def check_undamaged(root: Path) -> None:
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
     if not found.is_undamaged:
-        try:
-            check_parts(root)
-        except InputError as error:
-            raise DatasetDamagedError(str(error)) from error
+        check_parts(root)
         command = repair_command(root)
         raise DatasetDamagedError(
             f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "
@@ -357,13 +351,6 @@ def _new_info(fps: int, features: Mapping[str, dict], robot_type: str | None) ->
     own = {key: {**deepcopy(feature), "shape": tuple(feature["shape"])} for key, feature in features.items()}
     has_films = any(feature["dtype"] == "video" for feature in features.values())
     return create_empty_dataset_info(CODEBASE_VERSION, fps, {**own, **DEFAULT_FEATURES}, has_films, robot_type)
-
-
-def _as_array(value: Any) -> Any:
-    """A value of a frame as LeRobot's checks take it."""
-    if isinstance(value, Tensor):
-        return value.numpy()
-    return np.asarray(value) if isinstance(value, PIL.Image.Image) else value
 
 
 def _largest_bytes(feature: Mapping[str, Any]) -> int:
