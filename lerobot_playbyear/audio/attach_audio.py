@@ -7,7 +7,7 @@ LeRobot is imported when the dataset's files have been looked at.
 """
 
 import json
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
@@ -18,17 +18,15 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, cut_into_frames, read_audio
 from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_tracks
-from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
+from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_marks
 from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
-from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, new_folder, scratch_folder
+from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, scratch_folder
 from lerobot_playbyear.datasets.findings import name_episodes
 from lerobot_playbyear.datasets.frame_rate import divides, exact_rate, nearest_sample_rate
 from lerobot_playbyear.datasets.info import check_links, nothing_in
 from lerobot_playbyear.datasets.next_command import training_command
-from lerobot_playbyear.datasets.parquet import ParquetDamageError
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader
-from lerobot_playbyear.datasets.remedies import repair_command
 
 if TYPE_CHECKING:
     from lerobot_playbyear.audio.dataset_copy import Columns
@@ -183,34 +181,13 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         else:
             source = (_session if cfg.files is None else _files)(cfg, dataset, _keys(cfg, dataset), scratch)
             added = _read([source], cfg, dataset, scratch)
-        write_new_dataset(dataset.root, target, added, removed, notes)
+        from lerobot_playbyear.audio.dataset_copy import write_copy
+
+        write_copy(dataset.root, target, added, removed, notes)
     heard = [f"{key} at {added[key].feature['info']['sample_rate']} Hz" for key in audio_keys(added)]
     print(printable(f"\nDataset: {target} ({len(dataset.episodes)} episodes with {', '.join(heard)})"))
     print(printable(f"Train on it: {training_command(cfg.output.repo_id, [*dataset.features, *added], target)}"))
     return target
-
-
-def write_new_dataset(
-    root: Path, target: Path, added: "Columns", removed: Collection[str] = (), notes: Features | None = None
-) -> None:
-    """Writes a dataset made from another, which is there only when it is complete and on the disk itself.
-
-    Args:
-        root: The other's folder.
-        target: Its folder, which is not there yet.
-        added, removed, notes: In what it differs; see `write_copy`.
-
-    Raises:
-        AttachError: A table of the other is damaged.
-        OSError: Something cannot be read or written.
-    """
-    from lerobot_playbyear.audio.dataset_copy import write_copy
-
-    try:
-        with new_folder(target) as unfinished:
-            write_copy(root, unfinished, added, removed, notes)
-    except ParquetDamageError as error:
-        raise AttachError(f"{error} Repair it first: {repair_command(root)}") from error
 
 
 def output_folder(place: DatasetPlace) -> Path:
@@ -422,19 +399,16 @@ def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], sc
 
 def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
     """When each episode began, on the clock [s]."""
-    if cfg.clock is not None:
-        try:
-            known: dict[int, float] | None = read_clock(cfg.clock)
-        except OSError as error:
-            raise ClockError(f"--clock={cfg.clock} cannot be read: {error}") from error
-    else:
-        known = read_episode_starts(root)
     source = cfg.clock or root / CLOCK_PATH
-    if known is None:
+    try:
+        known = read_clock(source)
+    except FileNotFoundError as error:
         raise AttachError(
             f"Nothing says when the episodes began: there is no {source}. Give --clock=times.csv with lines "
             "episode,seconds: for each episode when its first frame was taken."
-        )
+        ) from error
+    except OSError as error:
+        raise ClockError(f"{source} cannot be read: {error}") from error
     missing = [episode for episode in range(n_episodes) if episode not in known]
     if missing:
         raise AttachError(

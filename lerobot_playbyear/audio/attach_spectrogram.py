@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from lerobot_playbyear.audio.attach_audio import AttachError, open_for_copy, output_folder, write_new_dataset
+from lerobot_playbyear.audio.attach_audio import AttachError, open_for_copy, output_folder
 from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture, picture_feature
 from lerobot_playbyear.datasets.errors import errors_of_input, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
@@ -72,9 +72,11 @@ def attach_spectrogram(cfg: AttachSpectrogramConfig) -> Path:
     """
     target = output_folder(cfg.output)
     dataset = open_for_copy(cfg.dataset)
+    from lerobot_playbyear.audio.dataset_copy import write_copy
+
     with errors_of_input():
         fitted = [_with_levels(dataset, plan, cfg) for plan in _plan(cfg, dataset)]
-        write_new_dataset(dataset.root, target, {how.feature: _column(dataset, how) for how in fitted})
+        write_copy(dataset.root, target, {how.feature: _column(dataset, how) for how in fitted})
     for how in fitted:
         told = f"{how.feature}: the last {how.seconds:.2f} s of '{how.microphone}', {how.width} x {how.height}, "
         print(printable(f"{told}{how.low_db:g} to {how.high_db:g} dB"))

@@ -15,8 +15,9 @@ from lerobot.utils.constants import DEFAULT_FEATURES
 from tqdm import tqdm
 
 from lerobot_playbyear.audio.lerobot_audio import AUDIO_FOLDER
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.features import Features
-from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits
+from lerobot_playbyear.datasets.files import EPISODES_DIR, INFO_PATH, entries_below, fits, new_folder
 from lerobot_playbyear.datasets.info import STATS_PATH, read_info
 from lerobot_playbyear.datasets.parquet import (
     DataFile,
@@ -28,6 +29,7 @@ from lerobot_playbyear.datasets.parquet import (
     write_rows,
     write_tables,
 )
+from lerobot_playbyear.datasets.remedies import repair_command
 from lerobot_playbyear.datasets.statistics import add_stats, with_stats, write_stats
 
 _SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
@@ -55,22 +57,30 @@ Columns = Mapping[str, AddedColumn]
 def write_copy(
     root: Path, target: Path, added: Columns, removed: Collection[str] = (), notes: Features | None = None
 ) -> None:
-    """Writes a dataset with more columns.
+    """Writes a dataset with more columns, which is there only when it is complete and on the disk itself.
 
     Args:
         root: The dataset, as `open_for_copy` opens it.
-        target: An empty folder.
+        target: Where; nothing is there yet.
         added: The columns, by their keys; all of the same episodes.
         removed: Features with files of sound in whose place they come.
         notes: What the `info` of other features says more.
 
     Raises:
-        ParquetDamageError: A table is damaged.
+        InputError: A table is damaged.
         OSError: Something cannot be read or written.
     """
+    try:
+        with new_folder(target) as unfinished:
+            _write_files(root, unfinished, added, removed, notes or {})
+    except ParquetDamageError as error:
+        raise InputError(f"{error} Repair it first: {repair_command(root)}") from error
+
+
+def _write_files(root: Path, target: Path, added: Columns, removed: Collection[str], notes: Features) -> None:
     info = read_info(root)
     features = {key: feature for key, feature in info["features"].items() if key not in removed}
-    for key, more in (notes or {}).items():
+    for key, more in notes.items():
         features[key] = {**features[key], "info": {**(features[key].get("info") or {}), **more}}
     own = {key: feature for key, feature in features.items() if key not in DEFAULT_FEATURES}
     info["features"] = {**own, **{key: dict(column.feature) for key, column in added.items()}, **features}
