@@ -54,7 +54,9 @@ class ControlStepSound:
             (S,) int16, and whether the step is the first one of a recording, or after a pause.
         """
         last, self._last = self._last, strip
-        n, size, kept = _samples_between(last, strip), self._size, len(strip.samples)
+        n, size, kept = None, self._size, len(strip.samples)
+        if last is not None and (last.session, last.sample_rate) == (strip.session, strip.sample_rate):
+            n = strip.counter - last.counter if strip.counter >= last.counter else None
         self.n_heard = n
         if size + 2 * HALF > kept:
             raise ValueError(
@@ -66,14 +68,6 @@ class ControlStepSound:
             return strip.samples[kept - size - HALF : kept - HALF], is_first
         places = kept - 1 - HALF - n + (np.arange(size) + 1) * (n / size)  # (S,), the last one ends with the step
         return interpolate(strip.samples, places), is_first
-
-
-def _samples_between(last: Strip | None, strip: Strip) -> int | None:
-    """From one step's end to the next; None where these are not of one recording."""
-    if last is None or last.session != strip.session or last.sample_rate != strip.sample_rate:
-        return None
-    n = strip.counter - last.counter
-    return n if n >= 0 else None
 
 
 def check_pace(spacing: Sequence[int], sample_rate: int, fps: float, what: str, is_live: bool = False) -> None:

@@ -242,12 +242,11 @@ class DatasetReader(EpisodeReader):
             is_local = check_dataset_files(repo_id, root)
             from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 
-            if is_local:
-                meta = LeRobotDatasetMetadata(repo_id, root)
-            else:  # it fetches what is missing
-                meta = LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).meta
+            if not is_local:  # it fetches what is missing
+                root = LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).root
                 if episodes is None:
-                    _refuse_damage(_look(Path(meta.root)))
+                    _refuse_damage(_look(root))
+            meta = LeRobotDatasetMetadata(repo_id, root)
         self.meta = meta
         folder = Path(meta.root)
         files = [DataFile(path) for path in list_files(folder, "data/*/*.parquet")]
