@@ -15,9 +15,8 @@ import numpy as np
 
 from lerobot_playbyear.datasets.features import samples_per_frame, to_pcm_s16
 
-SOUND_FORMATS = "wav,w64,flac,aiff,au,caf,mp3,ogg,aac,ac3,amr,ape,tta,wv,mov,matroska,avi,mpeg,mpegts,flv,asf"
-"""FFmpeg's names of the formats of files that hold sound themselves."""
-
+# FFmpeg's names of the formats of files that hold sound themselves. Playlists, which would have other files opened, are none.
+_FORMATS = "wav,w64,flac,aiff,au,caf,mp3,ogg,aac,ac3,amr,ape,tta,wv,mov,matroska,avi,asf"
 _WITHOUT_HEADER = {b"FLV": "flv", b"\x00\x00\x01\xba": "mpeg", b"G": "mpegts"}
 
 logger = logging.getLogger(__name__)
@@ -62,13 +61,11 @@ def read_audio(path: str | Path) -> tuple[np.ndarray, int]:
     return np.concatenate([samples for samples, _ in parts]), parts[0][1]
 
 
-def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tuple[np.ndarray, int]]:
+def audio_pieces(path: str | Path) -> Iterator[tuple[np.ndarray, int]]:
     """As `read_audio`, in pieces of bounded size, each with the sample rate; silence, how long it may be, is no exception.
 
     Args:
         path: The file.
-        formats: FFmpeg's names of the formats that it may have, separated by commas. Playlists, which would have other files
-            opened, are none of them.
 
     Raises:
         AudioFileError: The file is missing, or holds no sound that can be decoded.
@@ -78,7 +75,7 @@ def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tup
         raise AudioFileError(f"There is no sound file {path}.")
     position = rate = 0
     try:
-        with _opened(path, formats) as container:
+        with _opened(path) as container:
             if not container.streams.audio:
                 raise AudioFileError(f"{path} holds no sound.")
             sound: Any = container.streams.audio[0]
@@ -118,20 +115,15 @@ def audio_pieces(path: str | Path, formats: str = SOUND_FORMATS) -> Iterator[tup
 
 
 @contextlib.contextmanager
-def _opened(path: Path, formats: str) -> Iterator[av.container.InputContainer]:
+def _opened(path: Path) -> Iterator[av.container.InputContainer]:
     with _WholeSamples(path) as file:
         begin = file.read(4)
         file.seek(0)
         source: Any = file if file.room else str(path)
-        found = [
-            name for mark, name in _WITHOUT_HEADER.items() if begin.startswith(mark) and name in formats.split(",")
-        ]
-        if found:
-            opened = av.open(source, format=found[0])  # with options PyAV 15.1 ends in a segmentation fault
-        else:
-            others = ",".join(name for name in formats.split(",") if name not in _WITHOUT_HEADER.values())
-            opened = av.open(source, options={"format_whitelist": others})
-        with opened:
+        found = [name for mark, name in _WITHOUT_HEADER.items() if begin.startswith(mark)]
+        # With a format and options PyAV 15.1 ends in a segmentation fault.
+        how: dict[str, Any] = {"format": found[0]} if found else {"options": {"format_whitelist": _FORMATS}}
+        with av.open(source, **how) as opened:
             yield opened
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -149,7 +150,10 @@ def compose(
         width = picture.shape[1]
         if strip is None:
             strip = spectrogram_strip(sound[:, 0], sample_rate, width, _STRIP_HEIGHT)
-            strip = _label(strip, f"{min(TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz")
+            labelled = Image.fromarray(strip)
+            top = f"{min(TOP_FREQUENCY, sample_rate // 2) / 1000:g} kHz"
+            ImageDraw.Draw(labelled).text((4, 2), top, fill=(255, 255, 255))
+            strip = np.asarray(labelled)
         cursor = min(round(width * (index + 1) / n_pictures), width - 1)
         shown = strip.copy()
         shown[:, cursor:] = (shown[:, cursor:] * _DIMMED).astype(np.uint8)
@@ -181,13 +185,18 @@ def write_film(
     """
     path, n_channels = Path(path), min(sound.shape[1], 2)
     with new_file(path) as partial, av.open(str(partial), "w", options={"movflags": "+faststart"}) as film:
-        audio = _add_audio_stream(film, sample_rate, n_channels) if n_channels else None
-        video = None
+        audio: Any = None
+        if n_channels:
+            audio = film.add_stream("aac", rate=sample_rate)
+            audio.layout, audio.bit_rate = "stereo" if n_channels == 2 else "mono", 96_000 * n_channels
+        video: Any = None
         for index, picture in enumerate(frames):
             height, width = (size - size % 2 for size in picture.shape[:2])
             picture = picture[:height, :width]
             if video is None:
-                video = _add_video_stream(film, fps, height, width, x264_options or {})
+                video = film.add_stream("libx264", rate=exact_rate(fps))
+                video.height, video.width, video.pix_fmt = height, width, "yuv420p"
+                video.options = {"crf": "20", "preset": "veryfast", **(x264_options or {})}
             film.mux(video.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
             if audio is not None:
                 first, end = (round(i * sample_rate / fps) for i in (index, index + 1))
@@ -201,29 +210,9 @@ def write_film(
     return path
 
 
-def _add_video_stream(film, fps: float, height: int, width: int, x264_options: Mapping[str, str]):
-    stream = film.add_stream("libx264", rate=exact_rate(fps))
-    stream.height, stream.width, stream.pix_fmt = height, width, "yuv420p"
-    stream.options = {"crf": "20", "preset": "veryfast", **x264_options}
-    return stream
-
-
-def _add_audio_stream(film, sample_rate: int, n_channels: int):
-    stream = film.add_stream("aac", rate=sample_rate)
-    stream.layout = "stereo" if n_channels == 2 else "mono"
-    stream.bit_rate = 96_000 * n_channels
-    return stream
-
-
 def _audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av.AudioFrame:
     """Samples (n, 1 or 2) of 16-bit PCM [Hz: `sample_rate`] as FFmpeg takes them, from the place `first_sample` on."""
     layout = "stereo" if samples.shape[1] == 2 else "mono"
     frame = av.AudioFrame.from_ndarray(samples.astype(np.int16).reshape(1, -1), format="s16", layout=layout)
     frame.sample_rate, frame.pts, frame.time_base = sample_rate, first_sample, Fraction(1, sample_rate)
     return frame
-
-
-def _label(strip: np.ndarray, text: str) -> np.ndarray:
-    image = Image.fromarray(strip)
-    ImageDraw.Draw(image).text((4, 2), text, fill=(255, 255, 255))
-    return np.asarray(image)
