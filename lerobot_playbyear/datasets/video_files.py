@@ -98,16 +98,15 @@ class _Films:
 
     def __init__(self, root: Path, info: Info, key: str) -> None:
         self._root, self._info, self._key = root, info, key
-        self._wrong: dict[Path, str | None] = {}
-        self._times: dict[Path, np.ndarray] = {}
+        self._found: dict[tuple[Path, bool], np.ndarray | str] = {}
 
     def after(self, before: Place | None, length: int) -> Place | None:
         """Where the next episode's pictures are: behind the last ones, or in the next film where those end it."""
         if before is None:
             return None
         chunk, file, start = before.chunk, before.file, before.end
-        times = self._times_of(film_path(self._root, self._info, self._key, before))
-        if start and (len(times) == 0 or times[-1] < start - TOLERANCE_S):
+        times = self._times(film_path(self._root, self._info, self._key, before))
+        if start and (isinstance(times, str) or len(times) == 0 or times[-1] < start - TOLERANCE_S):
             chunk, file = (chunk, file + 1) if file + 1 < self._info["chunks_size"] else (chunk + 1, 0)
             start = 0.0
         return Place(chunk, file, start, start + length / self._info["fps"])
@@ -115,35 +114,33 @@ class _Films:
     def problem(self, place: Place, length: int, closely: bool) -> str | None:
         """What is wrong with the film of a place, or that it lacks pictures of these frames."""
         path = film_path(self._root, self._info, self._key, place)
-        name = path.relative_to(self._root)
-        if problem := self._problem_of(path):
-            return f"{name} {problem}"
+        name, times = path.relative_to(self._root), self._times(path, closely)
+        if isinstance(times, str):
+            return f"{name} {times}"
         if closely:
-            times = self._times_of(path)
             wanted = place.start + np.arange(length) / self._info["fps"]
             after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
             near = times.take([after - 1, after], mode="clip") if len(times) else np.full((2, 1), np.inf)
             if np.abs(near - wanted).min(axis=0).max() >= TOLERANCE_S + np.spacing(np.float32(place.end)):
-                return f"{name} {self._problem_of(path) or 'lacks some of the pictures'}"
+                return f"{name} lacks some of the pictures"
         return None
 
-    def _problem_of(self, path: Path) -> str | None:
-        if path not in self._wrong:
-            with naming(path):
-                is_there = is_listed(self._root, path.relative_to(self._root))
-                self._wrong[path] = ("is cut off" if _is_cut_off(path) else None) if is_there else "is missing"
-        return self._wrong[path]
+    def _times(self, path: Path, closely: bool = True) -> np.ndarray | str:
+        """When a film's pictures are shown, or what is wrong with it; none of them where it is not looked at closely."""
+        if (path, closely) not in self._found:
+            self._found[path, closely] = self._look(path, closely)
+        return self._found[path, closely]
 
-    def _times_of(self, path: Path) -> np.ndarray:
-        if path not in self._times:
-            self._times[path] = np.empty(0)
-            if self._problem_of(path) is None:
-                try:
-                    with naming(path):
-                        self._times[path] = picture_times(path)
-                except av.FFmpegError as error:
-                    self._wrong[path] = f"is not a video that can be read: {error}"
-        return self._times[path]
+    def _look(self, path: Path, closely: bool) -> np.ndarray | str:
+        with naming(path):
+            if not is_listed(self._root, path.relative_to(self._root)):
+                return "is missing"
+            if _is_cut_off(path):
+                return "is cut off"
+            try:
+                return picture_times(path) if closely else np.empty(0)
+            except av.FFmpegError as error:
+                return f"is not a video that can be read: {error}"
 
 
 def picture_times(path: Path) -> np.ndarray:

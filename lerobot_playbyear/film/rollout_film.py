@@ -15,6 +15,7 @@ from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Actor, Episode, Observation, play
 from lerobot_playbyear.episodes.pool import Script
+from lerobot_playbyear.film.dataset_film import blocks_of
 from lerobot_playbyear.film.video import compose, film_sound, inset, write_film
 
 _AUDIO = "audio."  # how raw observations name microphones
@@ -116,8 +117,9 @@ def write_episode_film(episode: Episode, path: Path, fps: float) -> None:
         path: Of the film, an mp4.
         fps: Steps per second.
     """
-    blocks = np.stack([_sound(observation) for observation in episode.observations])  # (T + 1, S, n_microphones)
-    sound, sample_rate = film_sound(blocks, fps)
+    keys = [key for key in episode.observations[0] if key.startswith(_AUDIO)]
+    heard = [np.concatenate([observation[key] for observation in episode.observations]) for key in keys]
+    sound, sample_rate = film_sound(blocks_of(heard, len(episode.observations)), fps)
     views = [_first_camera(observation) for observation in episode.observations]
     pictures = (p if v is None else inset(p, v) for p, v in zip(episode.watched, views, strict=True))
     write_film(path, compose(pictures, len(views), sound, sample_rate), fps, sound, sample_rate)
@@ -126,10 +128,3 @@ def write_episode_film(episode: Episode, path: Path, fps: float) -> None:
 def _first_camera(observation: Observation) -> np.ndarray | None:
     pixels: Any = observation.get("pixels")
     return next(iter(pixels.values()), None) if isinstance(pixels, dict) else pixels
-
-
-def _sound(observation: Observation) -> np.ndarray:
-    """(S, n_microphones) int16, of those with the first one's rate; without one (0, 0)."""
-    blocks = [block for key, block in observation.items() if key.startswith(_AUDIO)]
-    blocks = [block for block in blocks if len(block) == len(blocks[0])]
-    return np.stack(blocks, axis=-1) if blocks else np.zeros((0, 0), np.int16)

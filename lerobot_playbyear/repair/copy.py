@@ -1,6 +1,5 @@
 """The repaired copy of a dataset: every episode that a survey calls whole; what is wrong around it is made again."""
 
-import math
 import shutil
 from collections import defaultdict
 from collections.abc import Collection, Iterator
@@ -17,8 +16,8 @@ from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits
 from lerobot_playbyear.datasets.info import STATS_PATH
-from lerobot_playbyear.datasets.parquet import column_to_numpy, with_values, write_rows, write_tables
-from lerobot_playbyear.datasets.pictures import open_picture, video_pictures
+from lerobot_playbyear.datasets.parquet import with_values, write_rows, write_tables
+from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.statistics import (
     Stats,
     add_stats,
@@ -29,7 +28,6 @@ from lerobot_playbyear.datasets.statistics import (
     write_stats,
 )
 from lerobot_playbyear.datasets.survey import TASKS_PATH, Episode, Frames, Survey, unknown_task
-from lerobot_playbyear.datasets.video_files import TOLERANCE_S, film_path
 
 _REMADE = (INFO_PATH, STATS_PATH, TASKS_PATH, "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet")
 
@@ -108,8 +106,8 @@ class _Kept(NamedTuple):
 
 def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
     """Writes the frames, file by file. Returns the episodes' rows."""
+    dataset, first_index = SurveyedDataset(survey.root.name, survey), 0
     by_file: dict[Path, list[_Kept]] = defaultdict(list)
-    first_index = 0
     for number, episode in enumerate(survey.whole):
         assert episode.frames is not None
         by_file[episode.frames.file.path].append(_Kept(episode, episode.frames, number, first_index))
@@ -128,46 +126,36 @@ def _write_data(survey: Survey, target: Path) -> Iterator[dict[str, Any]]:
                 "meta/episodes/chunk_index": 0,
                 "meta/episodes/file_index": 0,
             }
-            yield {**_row(survey, one), **places}
+            yield {**_row(dataset, one), **places}
 
 
-def _row(survey: Survey, kept: _Kept) -> dict[str, Any]:
+def _row(dataset: SurveyedDataset, kept: _Kept) -> dict[str, Any]:
     """An episode's row: its own, with the statistics of its new numbers, or one that is made again."""
     places = {name: value for key, own in kept.episode.places.items() for name, value in own.columns(key).items()}
     row = kept.episode.row
     if not row or kept.episode.contradiction:
-        texts = [survey.tasks.get(task, unknown_task(task)) for task in kept.frames.tasks]
-        stats = stats_columns(_episode_stats(survey, kept.episode, kept.table()))
-        return {"tasks": texts, "length": kept.frames.length, **stats, **places}
-    moved = stats_columns(numeric_stats(kept.numbers(), survey.info["features"]))
+        texts = [dataset.tasks.get(task, unknown_task(task)) for task in kept.frames.tasks]
+        return {"tasks": texts, "length": kept.frames.length, **stats_columns(_episode_stats(dataset, kept)), **places}
+    moved = stats_columns(numeric_stats(kept.numbers(), dataset.features))
     return {**row, **{name: value for name, value in moved.items() if name in row}, **places}
 
 
-def _episode_stats(survey: Survey, episode: Episode, frames: pa.Table) -> Stats:
+def _episode_stats(dataset: SurveyedDataset, kept: _Kept) -> Stats:
     """The statistics of one episode, as LeRobot has them: of pictures, from as many as it samples.
 
     Raises:
         ValueError: A picture or a film lies outside the folder, or a picture has another size than the feature says.
     """
+    (episode,) = (each for each in dataset.episodes if each.index == kept.episode.number)
     numbers: dict[str, np.ndarray] = {}
     stats: Stats = {}
-    root, sampled = survey.root, sample_indices(len(frames))
-    for key, feature in survey.info["features"].items():
-        shape = tuple(feature["shape"])
+    sampled = set(sample_indices(len(episode)))
+    for key, feature in dataset.features.items():
         if is_depth(feature) or feature["dtype"] in ("string", "language"):
             continue
-        if feature["dtype"] == "image":
-            pictures = []
-            for index in sampled:
-                with open_picture(frames.column(key)[index].as_py(), root, key, feature) as image:
-                    pictures.append(np.asarray(image.convert("RGB")))
-            stats[key] = picture_stats(pictures)
-        elif feature["dtype"] == "video":
-            place = episode.places[key]
-            times = [place.start + index / survey.info["fps"] for index in sampled]
-            film = film_path(root, survey.info, key, place)
-            stats[key] = picture_stats(video_pictures(film, times, TOLERANCE_S, key, shape))
+        if feature["dtype"] in ("image", "video"):
+            pictures = enumerate(dataset.pictures(key, episode))
+            stats[key] = picture_stats(picture for number, picture in pictures if number in sampled)
         else:
-            values = column_to_numpy(frames.column(key))
-            numbers[key] = values.reshape(len(frames), *(() if math.prod(shape) == 1 else shape))
-    return {**numeric_stats(numbers, survey.info["features"]), **stats}
+            numbers[key] = dataset.values(key, episode)
+    return {**numeric_stats(numbers | kept.numbers(), dataset.features), **stats}
