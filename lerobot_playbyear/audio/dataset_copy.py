@@ -132,12 +132,8 @@ def _write_frames(source: Path, target: Path, schema: pa.Schema, added: Columns,
 
 def _values(frames: pa.Table, column: AddedColumn, kind: pa.DataType) -> pa.Array:
     """A new column of frames that follow each other in one episode."""
-    episode = frames.column("episode_index")[0].as_py()
-    numbers = column_to_numpy(frames.column("frame_index"))
-    first, last = int(numbers[0]), int(numbers[-1])
-    own = column.values(episode)[first : last + 1]
-    if len(own) != len(frames) or (np.diff(numbers) != 1).any():
-        raise ValueError(f"frames {first} to {last} of episode {episode} are not numbered one after the other")
+    episode, first = (frames.column(name)[0].as_py() for name in ("episode_index", "frame_index"))
+    own = column.values(episode)[first : first + len(frames)]
     return numpy_to_column(own, kind) if isinstance(own, np.ndarray) else pa.array(own, kind)
 
 

@@ -318,7 +318,6 @@ def check_undamaged(root: Path) -> None:
 
     Raises:
         DatasetDamagedError: It is damaged; with what is wrong, and the command that repairs it.
-        InputError: A whole part of it is missing.
         DatasetWriteError: It cannot be read.
     """
     try:
@@ -326,7 +325,10 @@ def check_undamaged(root: Path) -> None:
     except OSError as error:
         raise DatasetWriteError(f"Cannot read {root}: {error}. Nothing was changed.") from error
     if not found.is_undamaged:
-        check_parts(root)
+        try:
+            check_parts(root)
+        except InputError as error:
+            raise DatasetDamagedError(str(error)) from error
         command = repair_command(root)
         raise DatasetDamagedError(
             f"{found}\nNothing was changed, and nothing is appended to a damaged dataset. `{command} --dry_run=true` looks "

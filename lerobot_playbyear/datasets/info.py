@@ -1,19 +1,16 @@
 """What a dataset says about itself in `meta/info.json`, and what it may refer to and claim: it may be a stranger's.
 
-Files that it names lie in its folder. A feature claims no more values a row than the data files hold. Whoever opens, copies
-or uploads a dataset reads it through this module. LeRobot, which takes seconds to import, is not needed for that.
+Files that it names lie in its folder. Whoever opens, copies or uploads a dataset reads it through this module. LeRobot, which takes seconds to import, is not needed for that.
 """
 
 import glob
-import math
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path, PurePath, PureWindowsPath
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
 from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.files import (
@@ -218,28 +215,18 @@ def check_parts(root: Path, can_be_repaired: bool = False) -> None:
             )
 
 
-def check_claims(root: Path, footers: Iterable[pq.FileMetaData], n_episodes: int) -> None:
-    """Refuses a dataset whose `meta/info.json` claims far more than its files hold.
+def check_claims(root: Path, n_episodes: int) -> None:
+    """Refuses a dataset whose `meta/info.json` claims far more episodes than there are.
 
     Args:
         root: The dataset's folder.
-        footers: Of its data files.
         n_episodes: The rows of its `meta/episodes`.
 
     Raises:
-        InfoError: A shape or a number of episodes is out of all proportion.
+        InfoError: It does.
         Exception: As `read_info`.
     """
-    info = read_info(root)
-    held = _values_held(footers, list(info["features"]))
-    for key, feature in info["features"].items():
-        claimed = math.prod(feature["shape"])
-        if key in held and claimed > _TOLERANCE * held[key]:
-            raise InfoError(
-                f"{root / INFO_PATH}: '{key}' has shape {feature['shape']}, {claimed:,} values a row, but the data files "
-                f"hold {held[key]:,.4g} a row. Correct the shape."
-            )
-    total = info["total_episodes"]
+    total = read_info(root)["total_episodes"]
     if total > _TOLERANCE * max(n_episodes, 1):
         raise InfoError(
             f"{root / INFO_PATH}: total_episodes is {total:,}, but meta/episodes has {n_episodes:,}. "
@@ -339,18 +326,3 @@ def _check_templates(root: Path, info: Info) -> None:
             raise OutsideError(f"{root / INFO_PATH}: {name} is {template!r}; wanted something like {default!r}.")
         for key in keys or [""]:
             file_inside(root, template.format(video_key=key, chunk_index=0, file_index=0))
-
-
-def _values_held(footers: Iterable[pq.FileMetaData], keys: Sequence[str]) -> dict[str, float]:
-    """How many values of each feature of numbers a row has on average; those of pictures and text are left out."""
-    n_values: dict[str, int] = {}
-    n_rows = 0
-    for footer in footers:
-        n_rows += footer.num_rows
-        for group in map(footer.row_group, range(footer.num_row_groups)):
-            for column in map(group.column, range(group.num_columns)):
-                path = f"{column.path_in_schema}."
-                key = max((key for key in keys if path.startswith(f"{key}.")), key=len, default=None)
-                if key is not None and column.physical_type != "BYTE_ARRAY":
-                    n_values[key] = n_values.get(key, 0) + column.num_values
-    return {key: count / n_rows for key, count in n_values.items()} if n_rows else {}
