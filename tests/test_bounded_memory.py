@@ -11,7 +11,7 @@ from lerobot.datasets.compute_stats import get_feature_stats
 from lerobot_playbyear.datasets.free_memory import available_memory
 from lerobot_playbyear.datasets.reader import DatasetReader
 from lerobot_playbyear.datasets.statistics import sound_stats
-from lerobot_playbyear.film.dataset_film import encode
+from lerobot_playbyear.film.video import encode
 from lerobot_playbyear.training import EpisodeStore
 
 FPS = 30

@@ -28,7 +28,8 @@ from PIL import Image
 from support.recording import edit_column, edit_info
 
 from lerobot_playbyear.audio import write_audio
-from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
+from lerobot_playbyear.datasets.errors import InputError
 from lerobot_playbyear.datasets.findings import worst
 from lerobot_playbyear.datasets.reader import DatasetReader, SurveyedDataset
 from lerobot_playbyear.datasets.survey import survey
@@ -133,7 +134,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "attach": attached,
     "push": lambda root: push_dataset("me/hostile", root),
 }
-ERRORS = {"train": (ValueError, OSError), "attach": AttachError, "push": HubError}  # of the others ValueError
+ERRORS = {"train": (ValueError, OSError), "attach": InputError, "push": HubError}  # of the others ValueError
 FILES_MADE = {"page": "page.html", "attach": "copy"}
 
 
@@ -479,8 +480,8 @@ def test_large_pictures_are_decoded_one_at_a_time(tmp_path):
 
 def test_a_rate_without_a_common_divisor_takes_no_gigabytes():
     rate = 44_101
-    blocks = np.ones((2, rate, 2), np.int16)
+    sound = [np.ones(2 * rate, np.int16)] * 2
     heard = []
-    assert grown_by(lambda: heard.append(film_sound(blocks, 1, gain=1.0))) < 300
+    assert grown_by(lambda: heard.append(film_sound(sound, 2, 1, gain=1.0))) < 300
     samples, higher = heard[0]
     assert (higher, len(samples)) == (48_000, pytest.approx(96_000, abs=100))

@@ -14,7 +14,7 @@ from lerobot.utils.feature_utils import hw_to_dataset_features
 from support.recording import edit_info
 
 from lerobot_playbyear.audio import camera_sound
-from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, DatasetPlace, attach_audio
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, DatasetPlace, attach_audio
 from lerobot_playbyear.audio.audio_files import write_audio
 from lerobot_playbyear.audio.control_steps import HALF, ControlStepSound
 from lerobot_playbyear.audio.microphone_pictures import (
@@ -258,7 +258,7 @@ def test_only_the_episodes_are_named_whose_sound_is_missing(tmp_path):
     both = Both(tmp_path / "unused", sound(8))
     root = recorded(tmp_path / "heard", both, [counters_of(8), counters_of(8, 30000)], video=True)
     session_path(tmp_path / "sessions", 0x11, "2026-01-01_00-00-00").unlink()
-    with pytest.raises(AttachError, match=r"images\.mic, episode 0: its pictures were compressed.*_00000011\.wav"):
+    with pytest.raises(InputError, match=r"images\.mic, episode 0: its pictures were compressed.*_00000011\.wav"):
         attached(root, tmp_path / "sessions")
 
 
@@ -268,7 +268,7 @@ def test_a_dataset_of_the_hub_gets_no_sound_of_this_machines_sessions_by_itself(
     session = Session(tmp_path / "own", sound(8))
     root = recorded(tmp_path / "strange", session, [counters_of(8)], video=True)
     (root / ".cache/huggingface").mkdir(parents=True)
-    with pytest.raises(AttachError, match="came from the Hub and may be a stranger's"):
+    with pytest.raises(InputError, match="came from the Hub and may be a stranger's"):
         attached(root)
     shutil.rmtree(root / ".cache")
     attached(root)
@@ -284,12 +284,12 @@ def test_a_hand_back_begins_anew_however_short_the_pause(tmp_path):
 def test_what_is_missing_is_named_and_nothing_is_written(tmp_path):
     session = Session(tmp_path / "sessions", sound(8))
     root = recorded(tmp_path / "heard", session, [counters_of(10)], video=True)
-    with pytest.raises(AttachError, match=r"session's file \*_abcdef01.wav is not in .*--session=FOLDER"):
+    with pytest.raises(InputError, match=r"session's file \*_abcdef01.wav is not in .*--session=FOLDER"):
         attached(root)
     write_audio(session_path(tmp_path / "short", session.session, "x"), sound(0.1), RATE)
-    with pytest.raises(AttachError, match="has 1600 samples, and a frame needs 8000"):
+    with pytest.raises(InputError, match="has 1600 samples, and a frame needs 8000"):
         attached(root, tmp_path / "short")
-    with pytest.raises(AttachError, match=r"fps=20, and the control steps are 33\.3 ms apart"):
+    with pytest.raises(InputError, match=r"fps=20, and the control steps are 33\.3 ms apart"):
         attached(recorded(tmp_path / "fast", session, [[8000 + 533 * i for i in range(10)]]))
     assert not list(tmp_path.glob("*_with_sound"))
 

@@ -17,7 +17,7 @@ from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import play
 from lerobot_playbyear.episodes.policy_actor import load_policy_actor
 from lerobot_playbyear.film.rollout_film import VideoConfig, film
-from lerobot_playbyear.film.video import compose, episode_sound, write_film
+from lerobot_playbyear.film.video import compose, film_sound, write_film
 
 FPS, SAMPLE_RATE = 20, 16000
 BLOCK = SAMPLE_RATE // FPS
@@ -54,7 +54,7 @@ def test_a_click_is_heard_when_it_is_seen(tmp_path):
     blocks = np.zeros((40, BLOCK), np.int16)
     blocks[20, -10:] = 20000
     pictures = [np.zeros((32, 32, 3), np.uint8)] * 40
-    sound = episode_sound(blocks)
+    sound, _ = film_sound([blocks.reshape(-1)], 40, FPS)
     assert sound.shape == (40 * BLOCK, 1)
     path = write_film(tmp_path / "click.mp4", compose(pictures, 40, sound, SAMPLE_RATE), FPS, sound, SAMPLE_RATE)
     _, heard = decode(path)

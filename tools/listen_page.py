@@ -15,7 +15,7 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from lerobot_playbyear.film.video import amplify, compose, episode_sound, write_film
+from lerobot_playbyear.film.video import compose, film_sound, write_film
 
 _SIZE = 360  # pixels of a view's side
 _FINER = 2  # the people's view is drawn so many times larger, so that its edges become smooth
@@ -101,9 +101,9 @@ def film(scene: Scene, output: Path) -> np.ndarray:
         done = terminated or truncated
         frames.append(_frame(env, observation))
         blocks.append(observation["audio.gripper"])
-    fps, rate = env.control_hz, len(blocks[0]) * env.control_hz
+    fps = env.control_hz
     env.close()
-    sound = amplify(episode_sound(np.stack(blocks)))
+    sound, rate = film_sound([np.concatenate(blocks)], len(blocks), fps)
     pictures = compose(frames, len(frames), sound, rate)
     path = write_film(output / f"{scene.name}.mp4", pictures, fps, sound, rate, _QUALITY)
     print(f"{path}: seed {seed}, {len(frames) / fps:.0f} s, {path.stat().st_size / 1000:.0f} kB", flush=True)

@@ -36,10 +36,6 @@ _SPARE_S = 1.0  # of a file's sound behind what the episodes need
 _FORMATS = "mov,mp4,m4a,wav,flac,ogg,matroska,webm,mp3,aac"  # none of which names other files
 
 
-class AttachError(InputError):
-    """Sound cannot be attached; nothing was written."""
-
-
 @dataclass
 class AttachAudioConfig:
     """Options of `playbyear-attach-audio`.
@@ -158,7 +154,7 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         The copy's folder. It is there only when it is complete.
 
     Raises:
-        AttachError: Naming every episode whose sound is missing, too short, or of another kind.
+        InputError: Naming every episode whose sound is missing, too short, or of another kind.
         InputError: The copy's folder cannot be made, before any sound is read.
         OSError: The copy cannot be written.
     """
@@ -194,12 +190,12 @@ def output_folder(place: DatasetPlace) -> Path:
     """Where a new dataset is to be written.
 
     Raises:
-        AttachError: Something is there already.
+        InputError: Something is there already.
         InputError: It cannot be made.
     """
     target = place.folder
     if target.exists():
-        raise AttachError(f"{target} is there already. Choose another --output.root, or delete it.")
+        raise InputError(f"{target} is there already. Choose another --output.root, or delete it.")
     check_can_be_made(target, f"--output.root={target}")
     return target
 
@@ -212,17 +208,17 @@ def open_for_copy(place: DatasetPlace, may_have_audio_files: bool = False) -> Da
         may_have_audio_files: See `DatasetReader`.
 
     Raises:
-        AttachError: There is none, or it is not so.
+        InputError: There is none, or it is not so.
     """
     if place.root is not None and not (Path(place.root) / INFO_PATH).is_file():
-        raise AttachError(f"{nothing_in(Path(place.root))}. Correct --dataset.root.")
+        raise InputError(f"{nothing_in(Path(place.root))}. Correct --dataset.root.")
     try:
         dataset = DatasetReader(place.repo_id, place.root, may_have_audio_files=may_have_audio_files)
         check_links(dataset.root)  # the copy would hold what they lead to
-    except InputError as error:
-        raise AttachError(str(error)) from error
+    except InputError:
+        raise
     except Exception as error:  # also what the Hub's client raises
-        raise AttachError(f"The dataset '{place.repo_id}' in {place.folder} cannot be opened: {error}") from error
+        raise InputError(f"The dataset '{place.repo_id}' in {place.folder} cannot be opened: {error}") from error
     return dataset
 
 
@@ -230,11 +226,11 @@ def raise_all(errors: list[str]) -> None:
     """Ends with what is wrong with sound, the first of it where it is much.
 
     Raises:
-        AttachError: If there is anything.
+        InputError: If there is anything.
     """
     if errors:
         more = f"\n  ... and {len(errors) - _MOST_ERRORS} more" if len(errors) > _MOST_ERRORS else ""
-        raise AttachError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
+        raise InputError("Nothing was written.\n  " + "\n  ".join(errors[:_MOST_ERRORS]) + more)
 
 
 # What the options say
@@ -247,22 +243,22 @@ def _is_in_dataset(cfg: AttachAudioConfig) -> bool:
 def _check_source(cfg: AttachAudioConfig, has_own_files: bool) -> None:
     """Whether the options say where the sound is, and in one way."""
     if cfg.files is not None and cfg.session is not None:
-        raise AttachError("--files has the sound of each episode, --session that of all; both are given. Give one.")
+        raise InputError("--files has the sound of each episode, --session that of all; both are given. Give one.")
     if _is_in_dataset(cfg):
         own = ("the dataset's own files", "offset", "sample_rate", "pad")
         source, *taken = own if has_own_files else ("microphones recorded as cameras", "session", "microphone")
         for option in fields(AttachAudioConfig):
             value = getattr(cfg, option.name)
             if option.name not in ("dataset", "output", *taken) and value != option.default:
-                raise AttachError(
+                raise InputError(
                     f"--{option.name}={value} is for --files and one --session=FILE, not for {source}. Leave it out, or say "
                     "where the files are."
                 )
     if cfg.files is not None and "{episode" not in cfg.files:
-        raise AttachError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
+        raise InputError(f"--files={cfg.files}: say with {{episode}} where the episode's number stands.")
     for name in ("clock", "marks"):
         if cfg.session is None and getattr(cfg, name) is not None:
-            raise AttachError(f"--{name}={getattr(cfg, name)} is for --session. Leave it out.")
+            raise InputError(f"--{name}={getattr(cfg, name)} is for --session. Leave it out.")
 
 
 def _keys(cfg: AttachAudioConfig, dataset: DatasetReader) -> list[str]:
@@ -270,11 +266,11 @@ def _keys(cfg: AttachAudioConfig, dataset: DatasetReader) -> list[str]:
     keys = [name if name.startswith(AUDIO_PREFIX) else AUDIO_PREFIX + name for name in names]
     for key in keys:
         if "/" in key or key == AUDIO_PREFIX or keys.count(key) > 1:
-            raise AttachError(f"--microphone={cfg.microphone}: give each microphone a name of its own, without '/'.")
+            raise InputError(f"--microphone={cfg.microphone}: give each microphone a name of its own, without '/'.")
         if key in dataset.meta.features:
-            raise AttachError(f"'{key}' is in the dataset already. Give another --microphone.")
+            raise InputError(f"'{key}' is in the dataset already. Give another --microphone.")
     if cfg.channel is not None and len(keys) > 1:
-        raise AttachError(f"--channel={cfg.channel} is for one microphone; --microphone names {len(keys)}.")
+        raise InputError(f"--channel={cfg.channel} is for one microphone; --microphone names {len(keys)}.")
     return keys
 
 
@@ -282,7 +278,7 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     """The offset of each episode [s], from the options.
 
     Raises:
-        AttachError: `offsets` is not a list of as many numbers.
+        InputError: `offsets` is not a list of as many numbers.
     """
     offset = cfg.offset or 0.0
     if cfg.offsets is None:
@@ -290,9 +286,9 @@ def _offsets(cfg: AttachAudioConfig, n_episodes: int) -> list[float]:
     try:
         values = [float(value) for value in json.loads(cfg.offsets.read_bytes())]
     except (OSError, ValueError, TypeError) as error:
-        raise AttachError(f"--offsets={cfg.offsets} is not a list of numbers in JSON: {error}") from error
+        raise InputError(f"--offsets={cfg.offsets} is not a list of numbers in JSON: {error}") from error
     if len(values) != n_episodes:
-        raise AttachError(f"--offsets={cfg.offsets} has {len(values)} values; the dataset has {n_episodes} episodes.")
+        raise InputError(f"--offsets={cfg.offsets} has {len(values)} values; the dataset has {n_episodes} episodes.")
     return [offset + value for value in values]
 
 
@@ -303,11 +299,11 @@ def _read(sources: list[Source], cfg: AttachAudioConfig, dataset: DatasetReader,
     """Cuts the sound of all episodes, so that what is wrong with it is known before anything is written.
 
     Raises:
-        AttachError: Naming every episode whose sound is missing, too short or of another kind.
+        InputError: Naming every episode whose sound is missing, too short or of another kind.
     """
     fps = dataset.fps
     if cfg.sample_rate is not None and not divides(fps, cfg.sample_rate):
-        raise AttachError(
+        raise InputError(
             f"--sample_rate={cfg.sample_rate}: wanted a multiple of {exact_rate(fps).numerator} Hz, such as "
             f"{nearest_sample_rate(cfg.sample_rate, fps)}, since the dataset has {fps} frames per second."
         )
@@ -358,7 +354,7 @@ def _files(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], _: P
         try:
             return str(Path(pattern.format(episode=episode)))
         except (KeyError, IndexError, ValueError) as error:
-            raise AttachError(
+            raise InputError(
                 f"--files={pattern} cannot be filled in: {error}. Only {{episode}} may be in it."
             ) from error
 
@@ -380,7 +376,7 @@ def _session(cfg: AttachAudioConfig, dataset: DatasetReader, keys: list[str], sc
         samples, rate = _decoded(pieces, scratch / "session")
         _new_rate(cfg, rate, dataset.fps)
     except (AudioFileError, ValueError) as error:
-        raise AttachError(f"Nothing was written. {path}: {error}") from error
+        raise InputError(f"Nothing was written. {path}: {error}") from error
     if cfg.marks is not None:
         print(
             f"{path}: its clock runs at {line.speed:.6f} of the episodes' clock ({(line.speed - 1) * 1e6:+.0f} parts in a "
@@ -403,7 +399,7 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
     try:
         known = read_clock(source)
     except FileNotFoundError as error:
-        raise AttachError(
+        raise InputError(
             f"Nothing says when the episodes began: there is no {source}. Give --clock=times.csv with lines "
             "episode,seconds: for each episode when its first frame was taken."
         ) from error
@@ -411,7 +407,7 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
         raise ClockError(f"{source} cannot be read: {error}") from error
     missing = [episode for episode in range(n_episodes) if episode not in known]
     if missing:
-        raise AttachError(
+        raise InputError(
             f"{source} has no time for {name_episodes(missing)}; the dataset has {n_episodes} episodes. Add it."
         )
     return [known[episode] for episode in range(n_episodes)]

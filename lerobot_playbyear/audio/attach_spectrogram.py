@@ -12,9 +12,9 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
-from lerobot_playbyear.audio.attach_audio import AttachError, open_for_copy, output_folder
-from lerobot_playbyear.audio.sound_picture import FLOOR_DB, SoundPicture, picture_feature
-from lerobot_playbyear.datasets.errors import errors_of_input, printable
+from lerobot_playbyear.audio.attach_audio import open_for_copy, output_folder
+from lerobot_playbyear.audio.sound_picture import FLOOR_DB, PICTURE_PREFIX, SoundPicture
+from lerobot_playbyear.datasets.errors import InputError, errors_of_input, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, check_audio_features
 from lerobot_playbyear.datasets.pictures import encode_picture
 from lerobot_playbyear.datasets.reader import DatasetPlace, DatasetReader, EpisodeRows
@@ -89,25 +89,24 @@ def _plan(cfg: AttachSpectrogramConfig, dataset: DatasetReader) -> list[SoundPic
     features, fps = dataset.meta.features, dataset.fps
     rates = check_audio_features(features, fps)
     if not rates:
-        raise AttachError(
+        raise InputError(
             f"The dataset in {dataset.root} has no sound in columns '{AUDIO_PREFIX}<microphone>'. Choose another, or add "
             "sound first: playbyear-attach-audio."
         )
     names = [key.removeprefix(AUDIO_PREFIX) for key in rates]
     for name in cfg.microphones or []:
         if name not in names:
-            raise AttachError(f"--microphones names '{name}'; the dataset in {dataset.root} has {', '.join(names)}.")
+            raise InputError(f"--microphones names '{name}'; the dataset in {dataset.root} has {', '.join(names)}.")
     wanted = names if cfg.microphones is None else list(dict.fromkeys(cfg.microphones))
     if not wanted:
-        raise AttachError("--microphones names none. Name at least one, or leave it out for all.")
+        raise InputError("--microphones names none. Name at least one, or leave it out for all.")
     height, width = _size(cfg, features)
     columns = _columns_per_frame(cfg, width, fps)
     plans: list[SoundPicture] = []
     for name in wanted:
-        key = AUDIO_PREFIX + name
-        feature = picture_feature(key, cfg.name)
+        key, feature = AUDIO_PREFIX + name, PICTURE_PREFIX + cfg.name.replace("{microphone}", name)
         if feature in features or feature in [plan.feature for plan in plans] or "/" in feature:
-            raise AttachError(
+            raise InputError(
                 f"--name={cfg.name}: '{feature}' is in the dataset in {dataset.root} already, or is not a valid name. Give "
                 "another, such as --name='heard_{microphone}'."
             )
@@ -127,7 +126,7 @@ def _size(cfg: AttachSpectrogramConfig, features: dict) -> tuple[int, int]:
 
 def _columns_per_frame(cfg: AttachSpectrogramConfig, width: int, fps: float) -> int:
     if not 0 < cfg.seconds * fps <= width + 1e-6:
-        raise AttachError(
+        raise InputError(
             f"--seconds={cfg.seconds:g}: wanted above 0 and at most {width / fps:.2f}, since each frame takes one of {width} "
             "columns at least. Give that, or a larger --width."
         )
@@ -152,7 +151,7 @@ def _with_levels(dataset: DatasetReader, plan: SoundPicture, cfg: AttachSpectrog
     total = counts.sum(axis=0)
     low, high = cfg.low_db, cfg.high_db
     if not total.any() and (low is None or high is None):
-        raise AttachError(
+        raise InputError(
             f"'{plan.microphone}' holds nothing but silence. Choose others with --microphones, or give --low_db and --high_db."
         )
     if low is None:

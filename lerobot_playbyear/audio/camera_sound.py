@@ -9,7 +9,7 @@ import numpy as np
 from huggingface_hub.constants import HF_HUB_CACHE
 from tqdm import tqdm
 
-from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, AttachError, PutAside, raise_all
+from lerobot_playbyear.audio.attach_audio import AttachAudioConfig, PutAside, raise_all
 from lerobot_playbyear.audio.control_steps import ControlStepSound, check_pace
 from lerobot_playbyear.audio.dataset_copy import AddedColumn, Columns
 from lerobot_playbyear.audio.microphone_pictures import (
@@ -24,7 +24,7 @@ from lerobot_playbyear.audio.microphone_pictures import (
     read_timecode,
 )
 from lerobot_playbyear.audio.sound_picture import PICTURE_PREFIX
-from lerobot_playbyear.datasets.errors import printable
+from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import (
     INTERVENTION,
     IS_FIRST,
@@ -64,12 +64,12 @@ def read_camera_sound(cfg: AttachAudioConfig, dataset: DatasetReader, scratch: P
         pause. And what the `info` of the microphones' pictures says more.
 
     Raises:
-        AttachError: There is no such microphone, or its samples are not there.
+        InputError: There is no such microphone, or its samples are not there.
     """
     keys = [key for key in microphone_pictures(dataset.meta) if audio_key_of(key) not in dataset.meta.features]
     chosen = keys if cfg.microphone is None else [PICTURE_PREFIX + name.strip() for name in cfg.microphone.split(",")]
     if not keys or not set(chosen) <= set(keys):
-        raise AttachError(
+        raise InputError(
             f"The cameras of this dataset that are microphones without attached sound: {', '.join(keys) or 'none'}; wanted "
             f"{', '.join(chosen) or 'one'}. Sound that was recorded beside it is attached with --files or --session."
         )
@@ -213,13 +213,13 @@ class _MicrophoneReader:
         """Whether the recording's steps are as long as its frame rate says.
 
         Raises:
-            AttachError: They are not.
+            InputError: They are not.
         """
         fps, rate = self._dataset.fps, self._source_rate
         try:
             check_pace([n for own in self._spacing for n in own], rate, fps, "the dataset")
         except ValueError as error:
-            raise AttachError(f"Nothing was written. {self._key}: {error}.") from error
+            raise InputError(f"Nothing was written. {self._key}: {error}.") from error
         for episode, own in enumerate(self._spacing):
             try:
                 check_pace(own, rate, fps, f"episode {episode}", is_live=True)

@@ -30,7 +30,7 @@ from lerobot_playbyear.datasets.parquet import (
     write_tables,
 )
 from lerobot_playbyear.datasets.remedies import repair_command
-from lerobot_playbyear.datasets.statistics import add_stats, with_stats, write_stats
+from lerobot_playbyear.datasets.statistics import add_stats, stats_columns, write_stats
 
 _SCRATCH = ("images", ".cache", ".git")  # what is in these folders is not the dataset's
 _DATA, _EPISODES = "data/*/*.parquet", f"{EPISODES_DIR}/*/*.parquet"
@@ -141,5 +141,7 @@ def _write_rows(source: Path, target: Path, stats: Sequence[Mapping], removed: C
     rows = read_table(source)
     prefixes = tuple(f"{folder}/{key}/" for key in removed for folder in ("stats", AUDIO_FOLDER))
     rows = rows.select([name for name in rows.column_names if not name.startswith(prefixes)])
-    rows = with_stats(rows, [dict(stats[episode]) for episode in rows.column("episode_index").to_pylist()])
+    more = [stats_columns(stats[episode]) for episode in rows.column("episode_index").to_pylist()]
+    for name in more[0] if more else ():
+        rows = rows.append_column(name, pa.array([own[name] for own in more]))
     write_rows(rows.replace_schema_metadata(None), target)

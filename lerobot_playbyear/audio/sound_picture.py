@@ -319,8 +319,3 @@ def read_pictures(path: str | Path) -> list[SoundPicture]:
     if not pictures:
         raise InputError(f"{file} names no pictures of sound; make some: playbyear-attach-spectrogram")
     return pictures
-
-
-def picture_feature(microphone: str, pattern: str) -> str:
-    """The key of a microphone's pictures: the pattern says with {microphone} where its name stands."""
-    return PICTURE_PREFIX + pattern.replace("{microphone}", microphone.removeprefix(AUDIO_PREFIX))

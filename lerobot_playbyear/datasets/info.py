@@ -1,6 +1,7 @@
 """What a dataset says about itself in `meta/info.json`, and what it may refer to and claim: it may be a stranger's.
 
-Files that it names lie in its folder. Whoever opens, copies or uploads a dataset reads it through this module. LeRobot, which takes seconds to import, is not needed for that.
+Files that it names lie in its folder. Whoever opens, copies or uploads a dataset reads it through this module. LeRobot, which
+takes seconds to import, is not needed for that.
 """
 
 import glob

@@ -7,7 +7,7 @@ and every page carries a checksum, so that a flipped bit is found instead of hea
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -216,12 +216,6 @@ def numpy_to_column(values: np.ndarray, kind: pa.DataType) -> pa.Array:
     if pa.types.is_fixed_size_list(kind):
         column = pa.FixedSizeListArray.from_arrays(column, kind.list_size)
     return column.cast(kind)
-
-
-def with_values(table: pa.Table, name: str, values: Sequence | np.ndarray) -> pa.Table:
-    """A table with other values in one of its columns, which keeps its place and its type."""
-    field = table.schema.field(name)
-    return table.set_column(table.column_names.index(name), field, pa.array(values, field.type))
 
 
 def episode_bounds(episode_index: np.ndarray) -> tuple[list[int], list[int]]:

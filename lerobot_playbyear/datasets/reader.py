@@ -144,7 +144,7 @@ class EpisodeReader:
         except ValueError as error:
             raise ValueError(
                 f"'{key}' of dataset '{self.repo_id}' cannot be read as {stop - start} rows of shape {shape}: {error}. "
-                "Record the damaged episodes again, or leave them out with --dataset.episodes."
+                "Record the damaged episodes again, leave them out with --dataset.episodes, or correct meta/info.json."
             ) from error
 
     def sound(self, key: str, episode: EpisodeRows) -> np.ndarray:

@@ -9,12 +9,11 @@ repetition in a few bytes, and whoever reads it sees what LeRobot would have wri
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from lerobot.datasets.compute_stats import (
     DEFAULT_QUANTILES,
     aggregate_stats,
@@ -79,14 +78,6 @@ def numeric_stats(columns: Mapping[str, np.ndarray], features: Features) -> Stat
 def stats_columns(stats: Mapping[str, Mapping[str, np.ndarray]]) -> dict[str, list]:
     """An episode's statistics as the columns of its row in `meta/episodes`."""
     return {f"stats/{key}/{name}": value.tolist() for key, own in stats.items() for name, value in own.items()}
-
-
-def with_stats(rows: pa.Table, stats: Sequence[Stats]) -> pa.Table:
-    """Rows of `meta/episodes`, with more statistics of each episode; all of the same features."""
-    columns = [stats_columns(own) for own in stats]
-    for name in columns[0] if columns else ():
-        rows = rows.append_column(name, pa.array([own[name] for own in columns]))
-    return rows
 
 
 def row_stats(row: Mapping[str, Any]) -> Stats:

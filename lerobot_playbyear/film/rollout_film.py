@@ -15,7 +15,6 @@ from lerobot_playbyear.datasets.files import check_can_be_made
 from lerobot_playbyear.episodes.environment import env_spec
 from lerobot_playbyear.episodes.play import Actor, Episode, Observation, play
 from lerobot_playbyear.episodes.pool import Script
-from lerobot_playbyear.film.dataset_film import blocks_of
 from lerobot_playbyear.film.video import compose, film_sound, inset, write_film
 
 _AUDIO = "audio."  # how raw observations name microphones
@@ -119,7 +118,7 @@ def write_episode_film(episode: Episode, path: Path, fps: float) -> None:
     """
     keys = [key for key in episode.observations[0] if key.startswith(_AUDIO)]
     heard = [np.concatenate([observation[key] for observation in episode.observations]) for key in keys]
-    sound, sample_rate = film_sound(blocks_of(heard, len(episode.observations)), fps)
+    sound, sample_rate = film_sound(heard, len(episode.observations), fps)
     views = [_first_camera(observation) for observation in episode.observations]
     pictures = (p if v is None else inset(p, v) for p, v in zip(episode.watched, views, strict=True))
     write_film(path, compose(pictures, len(views), sound, sample_rate), fps, sound, sample_rate)

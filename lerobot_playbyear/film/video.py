@@ -1,6 +1,8 @@
 """Films with sound: pictures of an episode above the spectrogram of what was heard, and the sound itself."""
 
-from collections.abc import Iterable, Iterator, Mapping
+import itertools
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -23,43 +25,43 @@ _DYNAMIC_RANGE_DB = 70.0
 _DIMMED = 0.4  # brightness of what has not been heard yet
 _LOUDEST = 0.7  # of full scale
 _MAX_GAIN = 100.0
+_SOUND_BIT_RATE = 200_000  # bits per second, of two channels
+_LOWEST_BIT_RATE = 60_000  # of the pictures
+_LIMITED_BIT_RATE = 20_000_000  # of the pictures; a film that may have more is not limited at all
+_NOT_READ = 96  # grey level of a picture that could not be read
+_EMPTY_SIZE = 16  # pixels; the picture of an episode without cameras, which the page hides
 # Control points of a dark-to-bright colour scale whose lightness grows evenly.
 _COLOURS = np.array(
     [(0, 0, 4), (40, 11, 84), (101, 21, 110), (159, 42, 99), (212, 72, 66), (245, 125, 21), (252, 255, 164)]
 )
 
 
-def episode_sound(blocks: np.ndarray) -> np.ndarray:
-    """The sound of an episode, in time with its pictures.
+def film_sound(
+    sound: Sequence[np.ndarray], n_pictures: int, fps: float, gain: float | None = None
+) -> tuple[np.ndarray, int]:
+    """The sound of a film: in time with its pictures, amplified, and at a sample rate that AAC has.
 
     The block of frame t was heard before its picture was taken, so the film, which shows picture t from then on,
     plays block t + 1 with it; silence goes with the last picture.
 
     Args:
-        blocks: (T + 1, S) or (T + 1, S, n_microphones) int16, the block of each observation.
-
-    Returns:
-        ((T + 1) * S, n_microphones) int16.
-    """
-    blocks = blocks[..., None] if blocks.ndim == 2 else blocks
-    shifted = np.concatenate([blocks[1:], np.zeros_like(blocks[:1])])  # (T + 1, S, n_microphones)
-    return shifted.reshape(blocks.shape[0] * blocks.shape[1], blocks.shape[2])
-
-
-def film_sound(blocks: np.ndarray, fps: float, gain: float | None = None) -> tuple[np.ndarray, int]:
-    """The sound of an episode, in time with its pictures, amplified, and at a sample rate that AAC has.
-
-    Args:
-        blocks: As for `episode_sound`; S is 0 without a microphone.
+        sound: For each microphone what it heard, (n * S,) in steps of 16-bit PCM. The first two are heard, or only the first
+            if their rates differ.
+        n_pictures: n.
         fps: Frames per second.
         gain: By how much it is amplified; None: see `amplify`.
 
     Returns:
         (n, n_microphones) int16, and the sample rate [Hz].
     """
-    samples, sample_rate = amplify(episode_sound(blocks), gain), sample_rate_of(blocks.shape[1], fps)
-    rate = next((rate for rate in _AAC_RATES if rate >= sample_rate), _AAC_RATES[-1])
-    return (resample(samples, sample_rate, rate) if samples.size else samples), rate
+    heard = [own for own in sound[:2] if len(own) == len(sound[0])]
+    size = len(heard[0]) // n_pictures if heard else 0
+    rate = next((rate for rate in _AAC_RATES if rate >= sample_rate_of(size, fps)), _AAC_RATES[-1])
+    if not size:
+        return np.zeros((0, 0), np.int16), rate
+    pcm = np.clip(np.stack(heard, axis=-1), -32768, 32767).astype(np.int16)  # (n * S, n_microphones)
+    shifted = np.concatenate([pcm[size:], np.zeros_like(pcm[:size])])
+    return resample(amplify(shifted, gain), sample_rate_of(size, fps), rate), rate
 
 
 def amplify(samples: np.ndarray, gain: float | None = None) -> np.ndarray:
@@ -216,3 +218,86 @@ def _audio_frame(samples: np.ndarray, sample_rate: int, first_sample: int) -> av
     frame = av.AudioFrame.from_ndarray(samples.astype(np.int16).reshape(1, -1), format="s16", layout=layout)
     frame.sample_rate, frame.pts, frame.time_base = sample_rate, first_sample, Fraction(1, sample_rate)
     return frame
+
+
+# Of an episode of a dataset
+
+
+def tile(
+    pictures: Mapping[str, Iterator[np.ndarray]], n_frames: int, height: int
+) -> tuple[list[int], Iterator[np.ndarray]]:
+    """Puts the pictures of all cameras beside each other.
+
+    Args:
+        pictures: For each camera its n pictures (H, W, 3) uint8; one that ends early is grey from there on.
+        n_frames: n.
+        height: Of the tiles [pixels], at most; small pictures are enlarged by a whole factor.
+
+    Returns:
+        The width of each camera's tile [pixels], and the n tiled pictures (height, sum of widths, 3) uint8.
+    """
+    if not pictures:
+        blank = np.zeros((_EMPTY_SIZE, _EMPTY_SIZE, 3), np.uint8)
+        return [], itertools.repeat(blank, n_frames)
+    first = {camera: next(stream, None) for camera, stream in pictures.items()}
+    shapes = [picture.shape[:2] if picture is not None else (1, 1) for picture in first.values()]
+    tallest = max(_fitted(shape[0], height) for shape in shapes)
+    sizes = [(_even(shape[1] * tallest / shape[0]), tallest) for shape in shapes]
+
+    def frames() -> Iterator[np.ndarray]:
+        for index in range(n_frames):
+            shown = [first[camera] if index == 0 else next(stream, None) for camera, stream in pictures.items()]
+            yield np.concatenate([_resize(*pair) for pair in zip(shown, sizes, strict=True)], axis=1)
+        for stream in pictures.values():
+            next(stream, None)  # lets the streams come to their end
+
+    return [width for width, _ in sizes], frames()
+
+
+def encode(
+    path: Path,
+    pictures: Iterator[np.ndarray],
+    n_pictures: int,
+    fps: float,
+    sound: Sequence[np.ndarray],
+    gain: float,
+    most_bytes: int = 2**28,
+) -> Path:
+    """Writes an mp4 with the sound of the first two microphones, left and right, in time with the pictures.
+
+    Args:
+        path: Of the film.
+        pictures: n pictures (H, W, 3) uint8, H and W even.
+        n_pictures: n.
+        fps: Frames per second [Hz].
+        sound: As for `film_sound`.
+        gain: By how much to amplify.
+        most_bytes: About how large it may become: the film of an episode of hours is coarser, so that a browser can
+            hold it.
+    """
+    samples, sample_rate = film_sound(sound, n_pictures, fps, gain)
+    # Key frames every second, so that stepping backwards is quick.
+    options = {"crf": "23", "g": str(math.ceil(fps))}
+    bit_rate = max(round(8 * most_bytes * fps / n_pictures) - _SOUND_BIT_RATE, _LOWEST_BIT_RATE)
+    if bit_rate < _LIMITED_BIT_RATE:
+        options |= {"maxrate": str(bit_rate), "bufsize": str(2 * bit_rate)}
+    return write_film(path, pictures, fps, samples, sample_rate, options)
+
+
+def _fitted(size: int, limit: int) -> int:
+    return _even(size * max(limit // size, 1) if size <= limit else limit)
+
+
+def _even(size: float) -> int:
+    return max(2 * round(size / 2), 2)
+
+
+def _resize(picture: np.ndarray | None, size: tuple[int, int]) -> np.ndarray:
+    """To (width, height)."""
+    if picture is None:
+        return np.full((size[1], size[0], 3), _NOT_READ, np.uint8)
+    if picture.shape[:2] == size[::-1]:
+        return picture
+    larger = size[1] >= picture.shape[0]
+    method = Image.Resampling.NEAREST if larger else Image.Resampling.BOX
+    return np.asarray(Image.fromarray(picture).resize(size, method))

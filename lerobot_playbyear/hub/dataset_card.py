@@ -14,8 +14,7 @@ from lerobot_playbyear.datasets.info import OutsideError
 from lerobot_playbyear.datasets.markdown import code, text
 from lerobot_playbyear.datasets.next_command import training_command
 from lerobot_playbyear.datasets.reader import SurveyedDataset
-from lerobot_playbyear.film.dataset_film import blocks_of, tile
-from lerobot_playbyear.film.video import compose, film_sound, write_film
+from lerobot_playbyear.film.video import compose, film_sound, tile, write_film
 from lerobot_playbyear.inspection.motion import INTERVENTION, SUCCESS, first_success
 from lerobot_playbyear.inspection.sound import heard
 
@@ -166,8 +165,7 @@ def film_preview(dataset: SurveyedDataset, path: Path) -> str:
     episode = (solved or dataset.episodes)[0]
     shown = replace(episode, stop=min(episode.stop, episode.start + round(_LONGEST_S * dataset.fps)))
     microphones, n_frames = dataset.timed_microphones, len(shown)
-    blocks = blocks_of([heard(dataset, key, shown) for key in microphones[:2]], n_frames)
-    sound, sample_rate = film_sound(blocks, dataset.fps)
+    sound, sample_rate = film_sound([heard(dataset, key, shown) for key in microphones[:2]], n_frames, dataset.fps)
     streams = {camera: dataset.pictures(camera, shown) for camera in dataset.cameras}
     pictures = tile(streams, n_frames, _PICTURE_HEIGHT)[1] if streams else itertools.repeat(_BLANK, n_frames)
     write_film(path, compose(pictures, n_frames, sound, sample_rate), dataset.fps, sound, sample_rate)

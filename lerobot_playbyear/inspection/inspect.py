@@ -114,7 +114,7 @@ def check_numbers(dataset: SurveyedDataset, action_range: Sequence[float] | None
         *check_interventions(dataset),
         *check_success(dataset),
         *check_sample_rates(dataset),
-        *check_sound(dataset),
+        *(finding for key in dataset.timed_microphones for finding in check_sound(dataset, key)),
     ]
 
 

@@ -26,8 +26,7 @@ from lerobot_playbyear.datasets.files import new_file
 from lerobot_playbyear.datasets.findings import Finding, summary, worst
 from lerobot_playbyear.datasets.frame_rate import sample_rate_of
 from lerobot_playbyear.datasets.reader import EpisodeRows, SurveyedDataset
-from lerobot_playbyear.film.dataset_film import encode, tile
-from lerobot_playbyear.film.video import TOP_FREQUENCY, WINDOW_S, gain_of, spectra
+from lerobot_playbyear.film.video import TOP_FREQUENCY, WINDOW_S, encode, gain_of, spectra, tile
 from lerobot_playbyear.inspection.motion import INTERVENTION, block_levels, first_success, sudden_sounds
 from lerobot_playbyear.inspection.sound import FULL_SCALE, heard, runs
 from lerobot_playbyear.inspection.structure import facts, finite

@@ -61,12 +61,6 @@ class _Spans:
         return Finding(check, level, message, self.key, self.episodes, figures)
 
 
-def check_sound(dataset: SurveyedDataset) -> Iterator[Finding]:
-    """All checks of the microphones whose rows are what their sample rate says."""
-    for key in dataset.timed_microphones:
-        yield from _check_microphone(dataset, key)
-
-
 def heard(dataset: SurveyedDataset, key: str, episode: EpisodeRows) -> np.ndarray:
     """What a microphone heard in an episode, (n * S,) float32 in steps of 16-bit PCM.
 
@@ -136,7 +130,8 @@ def repeats(samples: np.ndarray, samples_per_frame: int) -> list[tuple[int, int]
     return merged
 
 
-def _check_microphone(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
+def check_sound(dataset: SurveyedDataset, key: str) -> Iterator[Finding]:
+    """All checks of a microphone whose rows are what its sample rate says."""
     samples_per_frame = dataset.features[key]["shape"][0]
     sample_rate = float(sample_rate_of(samples_per_frame, dataset.fps))
     dead, quiet, offset = [], [], []

@@ -16,7 +16,7 @@ from lerobot_playbyear.audio.recorder_clock import renumber_episode_starts
 from lerobot_playbyear.datasets.features import is_depth
 from lerobot_playbyear.datasets.files import DEFAULT_DATA_PATH, EPISODES_DIR, INFO_PATH, entries_below, fits
 from lerobot_playbyear.datasets.info import STATS_PATH
-from lerobot_playbyear.datasets.parquet import with_values, write_rows, write_tables
+from lerobot_playbyear.datasets.parquet import write_rows, write_tables
 from lerobot_playbyear.datasets.reader import SurveyedDataset
 from lerobot_playbyear.datasets.statistics import (
     Stats,
@@ -100,7 +100,8 @@ class _Kept(NamedTuple):
         """Its frames."""
         table = self.frames.file.read(self.frames.start, self.frames.start + self.frames.length)
         for key, values in self.numbers().items():
-            table = with_values(table, key, values)
+            field = table.schema.field(key)
+            table = table.set_column(table.column_names.index(key), field, pa.array(values, field.type))
         return table
 
 
