@@ -224,12 +224,10 @@ def read_marks(text: str | None) -> ClockLine:
         pairs.append((sound_s, clock_s))
     sound, clock = np.array(pairs).T
     origin_clock, origin_sound = float(clock.mean()), float(sound.mean())
-    if len(pairs) == 1:
-        return ClockLine(1.0, origin_clock, origin_sound)
     spread = clock - origin_clock
     if len(set(clock.tolist())) < len(clock):
         raise ClockError(f"--marks={text}: two marks have the same time on the clock; wanted different moments.")
-    speed = float(spread @ (sound - origin_sound) / (spread @ spread))
+    speed = float(spread @ (sound - origin_sound) / (spread @ spread)) if len(pairs) > 1 else 1.0
     error = float(np.abs(sound - origin_sound - speed * spread).max())
     if abs(speed - 1) > _MOST_DRIFT:
         raise ClockError(

@@ -63,10 +63,8 @@ def stage_episode(root: Path, info: DatasetInfo, frames: Sequence[Mapping[str, A
     index, n_frames, first = info.total_episodes, len(frames), info.total_frames
     texts = [frame["task"] for frame in frames]
     tasks = _tasks(root, texts)
-    columns: dict[str, Any] = {}
-    for key, feature in info.features.items():
-        if key not in DEFAULT_FEATURES:
-            columns[key] = _column([frame[key] for frame in frames], feature)
+    own = {key: feature for key, feature in info.features.items() if key not in DEFAULT_FEATURES}
+    columns: dict[str, Any] = {key: _column([frame[key] for frame in frames], own[key]) for key in own}
     columns["timestamp"] = np.arange(n_frames) / info.fps  # float64 in statistics, as LeRobot has them
     columns["frame_index"] = np.arange(n_frames)
     columns["episode_index"] = np.full(n_frames, index)

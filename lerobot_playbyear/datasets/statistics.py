@@ -105,9 +105,7 @@ def write_stats(stats: Stats, root: Path) -> None:
     """Writes `meta/stats.json` as LeRobot does, but each feature on one line: vectors of thousands take less room."""
     narrow = json.JSONEncoder(separators=(",", ":"))
     lines = [f"{json.dumps(key)}: {narrow.encode(value)}" for key, value in serialize_dict(stats).items()]
-    path = root / STATS_PATH
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("{\n" + ",\n".join(lines) + "\n}\n")
+    (root / STATS_PATH).write_text("{\n" + ",\n".join(lines) + "\n}\n")
 
 
 def _rounded(value: float) -> float:

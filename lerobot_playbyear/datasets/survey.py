@@ -49,9 +49,6 @@ TASKS_PATH = "meta/tasks.parquet"
 Rescue = Callable[[Path, pa.Schema], pq.FileMetaData | None]
 """Makes the footer of a parquet file that has lost its own, from the file and the columns that it should have."""
 
-Rows = Mapping[int, Mapping[str, Any]]
-"""The rows of `meta/episodes`, by their episodes' numbers."""
-
 _TIME_TOLERANCE_S = 1e-3
 _MOST_LOST = 10_000  # episodes of which rows are left without frames
 _MOST_PIECES = 20_000  # of episodes in a file: LeRobot's hold 100 MB
@@ -347,7 +344,7 @@ def _read_rows(root: Path, n_frames: int, findings: list[Finding]) -> dict[int, 
     return rows
 
 
-def _match(root: Path, found: Iterable[Frames], rows: Rows, info: Info) -> list[Episode]:
+def _match(root: Path, found: Iterable[Frames], rows: dict[int, dict[str, Any]], info: Info) -> list[Episode]:
     """Finds each episode's frames."""
     frames_of: dict[int, list[Frames]] = defaultdict(list)
     for frames in found:

@@ -364,10 +364,8 @@ def evaluation_of(checkpoint: Path) -> dict[str, float] | None:
         step = int(parse_json(state.read_bytes())["step"])
     except (ValueError, TypeError, LookupError, OverflowError):
         return None
-    evaluations = [line for line in read_metrics(folder.parent.parent.parent) if line.get("kind") == "eval"]
-    found = [
-        line for line in evaluations if line.get("step") == step and isinstance(line.get("pc_success"), int | float)
-    ]
+    lines = [line for line in read_metrics(folder.parents[2]) if isinstance(line.get("pc_success"), int | float)]
+    found = [line for line in lines if (line.get("kind"), line.get("step")) == ("eval", step)]
     return found[-1] if found else None
 
 

@@ -49,10 +49,9 @@ def check_actions(dataset: SurveyedDataset, bounds: Sequence[float] | None = Non
         bounds: Lowest and highest value allowed; beyond them is an error. None: where nine values in ten lie in
             [-1, 1] that range is taken to be meant, and beyond it is a warning.
     """
-    if _ACTION in dataset.unreadable:
-        return
     if _ACTION not in dataset.numbers:
-        yield Finding("actions", "warning", f"no '{_ACTION}' column: nothing can be learned from this dataset")
+        if _ACTION not in dataset.unreadable:
+            yield Finding("actions", "warning", f"no '{_ACTION}' column: nothing can be learned from this dataset")
         return
     actions = dataset.values(_ACTION).reshape(len(dataset), -1)
     finite: np.ndarray = np.where(np.isfinite(actions), actions, 0)  # (N, D)
@@ -81,10 +80,9 @@ def check_actions(dataset: SurveyedDataset, bounds: Sequence[float] | None = Non
 
 def check_interventions(dataset: SurveyedDataset) -> Iterator[Finding]:
     """How much of the dataset the expert acted in."""
-    if INTERVENTION in dataset.unreadable:
-        return
     if INTERVENTION not in dataset.numbers:
-        yield Finding("interventions", "info", f"no '{INTERVENTION}' column")
+        if INTERVENTION not in dataset.unreadable:
+            yield Finding("interventions", "info", f"no '{INTERVENTION}' column")
         return
     tagged = dataset.values(INTERVENTION).astype(bool)
     spans = sum(len(runs(tagged[episode.rows])) for episode in dataset.episodes)
@@ -103,10 +101,9 @@ def check_interventions(dataset: SurveyedDataset) -> Iterator[Finding]:
 
 def check_success(dataset: SurveyedDataset) -> Iterator[Finding]:
     """How many episodes reached the task's goal."""
-    if SUCCESS in dataset.unreadable:
-        return
     if SUCCESS not in dataset.numbers:
-        yield Finding("success", "info", f"no '{SUCCESS}' column")
+        if SUCCESS not in dataset.unreadable:
+            yield Finding("success", "info", f"no '{SUCCESS}' column")
         return
     failed = [episode.index for episode in dataset.episodes if first_success(dataset, episode) == -1]
     n_episodes = len(dataset.episodes)

@@ -60,7 +60,6 @@ class PageWriter(contextlib.ExitStack):
 
     def __init__(self, path: Path, dataset: SurveyedDataset, picture_height: int = 240) -> None:
         super().__init__()
-        self.path = path
         self._dataset = dataset
         self._data = EpisodeData(dataset)
         self._picture_height = picture_height
@@ -94,7 +93,7 @@ class PageWriter(contextlib.ExitStack):
             }
         )
 
-    def finish(self, findings: Sequence[Finding]) -> Path:
+    def finish(self, findings: Sequence[Finding]) -> None:
         """Writes what concerns the whole dataset, and puts the file into its place."""
         whole = {
             "facts": facts(self._dataset),
@@ -109,7 +108,6 @@ class PageWriter(contextlib.ExitStack):
         }
         self._write("application/json", "dataset", [_json(whole)])
         self._file.write(self._after)
-        return self.path
 
     def _write(self, kind: str, name: str, parts: Iterable[str]) -> None:
         self._file.write(f'<script type="{kind}" id="{name}">')

@@ -52,7 +52,9 @@ def write_copy(survey: Survey, target: Path) -> None:
     if not any(each.check == "tasks" for each in survey.damage):
         shutil.copy2(survey.root / TASKS_PATH, target / TASKS_PATH)  # it may have columns of its own
     else:
-        write_tasks(_tasks_table(survey), target)
+        numbers = range(max(survey.tasks, default=-1) + 1)  # LeRobot finds a task by its place
+        texts = [survey.tasks.get(number, unknown_task(number)) for number in numbers]
+        write_tasks(pd.DataFrame({"task_index": list(numbers)}, index=pd.Index(texts, name="task")), target)
     write_stats(add_stats(None, map(row_stats, rows)), target)
     n_frames = sum(row["length"] for row in rows)
     counts = {"total_episodes": len(rows), "total_frames": n_frames, "total_tasks": len(survey.tasks)}
@@ -74,13 +76,6 @@ def _is_scratch(name: Path, features: Collection[str]) -> bool:
     """Whether a file is what was only needed while an episode was written."""
     folder, inside = name.parts[0], name.parts[1:2]
     return folder == "images" and bool(inside) and (inside[0] in features or inside[0].startswith("."))
-
-
-def _tasks_table(survey: Survey) -> Any:
-    """As LeRobot keeps it: a task's number in `task_index`, its text as the index. LeRobot finds a task by its place."""
-    numbers = range(max(survey.tasks, default=-1) + 1)
-    texts = [survey.tasks.get(number, unknown_task(number)) for number in numbers]
-    return pd.DataFrame({"task_index": list(numbers)}, index=pd.Index(texts, name="task"))
 
 
 class _Kept(NamedTuple):

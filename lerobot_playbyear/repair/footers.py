@@ -85,8 +85,7 @@ def rescue(path: Path, schema: pa.Schema) -> pq.FileMetaData | None:
     footer = _empty_footer(schema)
     columns = [chunk.value(3) for chunk in footer.value(4).values[0].value(1).values]
     footer[3] = (I64, sum(n_rows for n_rows, _ in groups))
-    row_groups = [_row_group(columns, n_rows, chunks) for n_rows, chunks in groups]
-    footer[4] = (LIST, Elements(STRUCT, row_groups))
+    footer[4] = (LIST, Elements(STRUCT, [_row_group(columns, *group) for group in groups]))
     encoded = write_struct(footer)
     try:
         with parsing(path):

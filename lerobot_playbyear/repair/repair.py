@@ -98,7 +98,6 @@ def repair(cfg: RepairConfig) -> RepairReport:
 
 def look(root: Path, like: Path | None = None) -> RepairReport:
     """What a repair would keep. Arguments and errors as for `repair_dataset`."""
-    check_there(root)
     if like is not None and not (like / INFO_PATH).is_file():
         raise InputError(f"--like={like} holds no LeRobotDataset: no {INFO_PATH}. Give one with the same settings.")
     report = RepairReport(survey(root, rescue=rescue, like=like))
