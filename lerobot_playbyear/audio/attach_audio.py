@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 _MOST_ERRORS = 10  # that are listed
 _SPARE_S = 1.0  # of a file's sound behind what the episodes need
-_FORMATS = "mov,mp4,m4a,wav,flac,ogg,matroska,webm,mp3,aac"  # none of which names other files
 
 
 @dataclass
@@ -449,7 +448,7 @@ def _checked_pieces(track: AudioTrack, path: Path, last_s: float) -> Iterator[tu
         AudioFileError: It is not, or cannot be decoded.
     """
     n_samples = 0
-    for samples, rate in audio_pieces(path, _FORMATS):
+    for samples, rate in audio_pieces(path):
         if samples.shape[1] != track.n_channels:
             raise AudioFileError(
                 f"it has {samples.shape[1]} channels; the feature's shape says {track.n_channels}. Correct meta/info.json."

@@ -7,6 +7,7 @@ and every page carries a checksum, so that a flipped bit is found instead of hea
 
 import contextlib
 import os
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -28,7 +29,8 @@ PIECE_BYTES = 2**26
 
 _BUFFER_BYTES = 2**20
 _COLUMN_BYTES, _OBJECT_BYTES = 4, 20  # of a number, in a column and as Python has it, about
-_PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, OverflowError)
+_IMPOSSIBLE_BYTES = 2**40  # more memory than any part of a file takes
+_PARSE_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, IndexError, MemoryError, OverflowError)
 
 
 @contextlib.contextmanager
@@ -45,11 +47,13 @@ def parsing(path: Path | None = None) -> Iterator[None]:
     """
     try:
         yield
-    except (ParquetDamageError, MemoryError):
+    except ParquetDamageError:
         raise
     except _PARSE_ERRORS as error:
         if isinstance(error, OSError) and error.errno:  # pyarrow sets it where the system refused
             raise OSError(error.errno, os.strerror(error.errno), error.filename or (path and str(path))) from error
+        if isinstance(error, MemoryError) and not _asks_for_the_impossible(error):
+            raise
         raise ParquetDamageError(first_line(error)) from error
 
 
@@ -314,3 +318,9 @@ def _flat(chunk: pa.Array) -> np.ndarray:
     if chunk.null_count:
         raise ValueError(f"{chunk.null_count} values are missing")
     return chunk.to_numpy(zero_copy_only=False)
+
+
+def _asks_for_the_impossible(error: MemoryError) -> bool:
+    """Whether more memory was asked for than there can be: a size in the file was misread."""
+    asked = re.search(r"alloc of size (\d+) failed", str(error))
+    return asked is not None and int(asked[1]) > _IMPOSSIBLE_BYTES
