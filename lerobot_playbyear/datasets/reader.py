@@ -245,7 +245,7 @@ class DatasetReader(EpisodeReader):
             if not is_local:  # it fetches what is missing
                 root = LeRobotDataset(repo_id, root, episodes=None if episodes is None else list(episodes)).root
                 if episodes is None:
-                    _refuse_damage(_look(root))
+                    _refuse_damage(_look(Path(root)))
             meta = LeRobotDatasetMetadata(repo_id, root)
         self.meta = meta
         folder = Path(meta.root)
