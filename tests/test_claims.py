@@ -151,6 +151,18 @@ def listening() -> list[str]:
     ]
 
 
+def interventions() -> list[str]:
+    (alone, *_), (full,), (redo,) = (
+        rows("interventions", GRASP, variant) for variant in ("no_interventions", "full", "redo")
+    )
+    assert (full["expert"]["kept"], redo["expert"]["kept"]) == (100, 50)
+    return [
+        f"{share([alone])} become {share([full])} by HG-DAgger as published: 100 corrected episodes, "
+        f"{full['expert']['person_minutes']:.0f} operator minutes. Fifty failed scenes make them {share([redo])}, "
+        f"in {redo['expert']['person_minutes']:.0f} minutes."
+    ]
+
+
 def real_time() -> list[str]:
     loop = {row["variant"]: row["figures"] for row in ROWS if row["study"] == "robot_loop"}
 
@@ -183,7 +195,7 @@ def others() -> list[str]:
 
 def test_every_rate_is_a_tables():
     page = " ".join((ROOT / "docs/results.md").read_text().split())
-    parts = (main_table, listening, demonstrations, noise, corrections, real_time, others)
+    parts = (main_table, listening, demonstrations, noise, corrections, interventions, real_time, others)
     found = [*OTHERS, *(claim for part in parts for claim in part())]
     assert [claim for claim in found if claim not in page] == []
     for claim in found:

@@ -13,6 +13,7 @@ import pytest
 from dataset_factory import make_dataset
 from nbclient import NotebookClient
 from recording_factory import load
+from safetensors.torch import load_file
 from support.pages import ROOT, blocks
 
 from lerobot_playbyear.audio import read_audio
@@ -123,6 +124,25 @@ def test_a_folder_of_films_becomes_a_dataset(run, tmp_path, capsys):
         loudness = [np.abs(item["observation.audio.camera"].numpy().astype(int)).max() for item in items]
         assert int(np.argmax(loudness)) == flash  # heard by the time of the picture
         np.testing.assert_array_equal(items[3]["action"].numpy(), [6, 7])
+
+
+def test_act_begins_with_cut_pictures_and_keeps_cutting_them(run, commands, tmp_path):
+    root, start = tmp_path / "demos", tmp_path / "start"
+    make_dataset(root, (12,), image_size=32)
+    small = ("dim_model=32", "n_heads=2", "dim_feedforward=32", "chunk_size=4", "n_action_steps=4", "latent_dim=4")
+    run("start_act.py", root, start, "--crop", "front=0,8,32,16", "--size=32", *small)
+
+    command = ("lerobot-train", f"--policy.path={start}", "--policy.push_to_hub=false", "--dataset.repo_id=tests/noise")
+    places = (f"--dataset.root={root}", "--dataset.video_backend=pyav", f"--output_dir={tmp_path / 'train'}")
+    commands.succeed(*command, *places, "--steps=1", "--batch_size=2", "--num_workers=0", "--policy.device=cpu")
+
+    trained = tmp_path / "train/checkpoints/last/pretrained_model"
+    first, *_ = json.loads((trained / "policy_preprocessor.json").read_text())["steps"]
+    assert first["registry_name"] == "image_crop_resize_processor"
+    cut = {"observation.images.front": [0, 8, 32, 16]}
+    assert first["config"] == {"crop_params_dict": cut, "resize_size": [32, 32]}
+    means = [value for key, value in load_file(trained / "model.safetensors").items() if key.endswith("running_mean")]
+    assert all(value.abs().max() > 0 for value in means)  # the frozen norms know what they see
 
 
 def test_the_pages_programs_run(tmp_path, monkeypatch, capsys):
