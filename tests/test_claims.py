@@ -152,14 +152,14 @@ def listening() -> list[str]:
 
 
 def interventions() -> list[str]:
-    (alone, *_), (full,), (redo,) = (
-        rows("interventions", GRASP, variant) for variant in ("no_interventions", "full", "redo")
+    (alone, *_), (full,), (redo,), (twice,) = (
+        rows("interventions", GRASP, variant) for variant in ("no_interventions", "full", "redo", "equal_updates")
     )
     assert (full["expert"]["kept"], redo["expert"]["kept"]) == (100, 50)
     return [
         f"{share([alone])} become {share([full])} by HG-DAgger as published: 100 corrected episodes, "
-        f"{full['expert']['person_minutes']:.0f} operator minutes. Fifty failed scenes make them {share([redo])}, "
-        f"in {redo['expert']['person_minutes']:.0f} minutes."
+        f"{full['expert']['person_minutes']:.0f} operator minutes. 50 failed scenes make them {share([redo])}, "
+        f"in {redo['expert']['person_minutes']:.0f} minutes; twice the updates alone {share([twice])}."
     ]
 
 
