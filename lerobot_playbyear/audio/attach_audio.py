@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from lerobot_playbyear.audio.audio_files import AudioFileError, audio_pieces, cut_into_frames, read_audio
 from lerobot_playbyear.audio.lerobot_audio import AudioTrack, column_names, has_audio_files, read_tracks
-from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_marks
+from lerobot_playbyear.audio.recorder_clock import CLOCK_PATH, ClockError, read_clock, read_episode_starts, read_marks
 from lerobot_playbyear.datasets.errors import InputError, printable
 from lerobot_playbyear.datasets.features import AUDIO_PREFIX, Features, audio_feature, audio_keys
 from lerobot_playbyear.datasets.files import INFO_PATH, check_can_be_made, scratch_folder
@@ -153,8 +153,8 @@ def attach_audio(cfg: AttachAudioConfig) -> Path:
         The copy's folder. It is there only when it is complete.
 
     Raises:
-        InputError: Naming every episode whose sound is missing, too short, or of another kind.
-        InputError: The copy's folder cannot be made, before any sound is read.
+        InputError: Naming every episode whose sound is missing, too short, or of another kind; or the copy's folder cannot be
+            made, before any sound is read.
         OSError: The copy cannot be written.
     """
     has_own_files = cfg.files is None and cfg.session is None and has_audio_files(cfg.dataset.folder)
@@ -396,14 +396,14 @@ def _starts(cfg: AttachAudioConfig, root: Path, n_episodes: int) -> list[float]:
     """When each episode began, on the clock [s]."""
     source = cfg.clock or root / CLOCK_PATH
     try:
-        known = read_clock(source)
-    except FileNotFoundError as error:
+        known = read_clock(cfg.clock) if cfg.clock else read_episode_starts(root)
+    except OSError as error:
+        raise ClockError(f"{source} cannot be read: {error}") from error
+    if known is None:
         raise InputError(
             f"Nothing says when the episodes began: there is no {source}. Give --clock=times.csv with lines "
             "episode,seconds: for each episode when its first frame was taken."
-        ) from error
-    except OSError as error:
-        raise ClockError(f"{source} cannot be read: {error}") from error
+        )
     missing = [episode for episode in range(n_episodes) if episode not in known]
     if missing:
         raise InputError(
